@@ -23,10 +23,10 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
 
     Args:
         plan: plan of the run.
-        kind: kind of the command: start, stop, target_force_n or speed_m_s.
-        value: value in N or m/s; None for start and stop.
+        kind: kind of the command: start, stop, resume, target_force_n or speed_m_s.
+        value: value in N or m/s; None for start, stop and resume.
     """
-    if kind in ("start", "stop"):
+    if kind in ("start", "stop", "resume"):
         return None
     needs = ("scan", "press") if kind == "target_force_n" else ("scan",)
     task = plan.scene.task

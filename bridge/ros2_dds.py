@@ -1,10 +1,10 @@
 """Live ROS 2 topics without ROS: Cyclone DDS with ROS's names, types, hashes and quality of service; commands back.
 
 Topics carry the bytes of the one encoder. Commands are taken only where `[bridge] ros2_commands` says so:
-`/canprobe/start` and `/canprobe/stop` (std_msgs/Empty), `/canprobe/target_force` in N and `/canprobe/speed` in m/s
-(std_msgs/Float64), and the trajectory of a free arm where ros2_control's controller takes it. Each is answered on
-`/canprobe/status`; one that the scene's own limits forbid is refused there. A sample without valid data, as
-DDS delivers it when the last writer of a topic leaves or dies, is no command.
+`/canprobe/start`, `/canprobe/stop` and `/canprobe/resume` (std_msgs/Empty), `/canprobe/target_force` in N and
+`/canprobe/speed` in m/s (std_msgs/Float64), and the trajectory of a free arm where ros2_control's controller takes it.
+Each is answered on `/canprobe/status`; one that the scene's own limits forbid is refused there. A sample without valid
+data, as DDS delivers it when the last writer of a topic leaves or dies, is no command.
 
 Source: ROS 2's mapping to DDS names (`rt/` before a topic), REP 2016 (`typehash=…;` in USER_DATA), rmw_cyclonedds.
 """
@@ -33,10 +33,11 @@ from canprobe.mechanics.types import Floats
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
 START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)
+RESUME = Topic("/canprobe/resume", EMPTY)
 FORCE, SPEED = Topic("/canprobe/target_force", FLOAT64), Topic("/canprobe/speed", FLOAT64)
 TRAJECTORY = Topic("/joint_trajectory_controller/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", depth=1)
 STATUS = Topic("/canprobe/status", STRING, depth=10, transient=True)
-COMMANDS = {START: "start", STOP: "stop", FORCE: "target_force_n", SPEED: "speed_m_s"}
+COMMANDS = {START: "start", STOP: "stop", RESUME: "resume", FORCE: "target_force_n", SPEED: "speed_m_s"}
 POLL_SAMPLES = 8
 """Number of samples between two looks for commands."""
 LOOPBACK = """\

@@ -19,6 +19,7 @@ from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.check import check
 from canprobe.cell.session.check_joints import check_joints
 from canprobe.cell.session.emulation import emulate, emulate_eds
 from canprobe.cell.session.home import home
@@ -37,6 +38,7 @@ __all__ = [
     "OpenCell",
     "RunResult",
     "Target",
+    "check",
     "check_joints",
     "commission",
     "emulate",
@@ -193,6 +195,7 @@ def open_cell(
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
     rows_kept: int | None = None,
+    recover: bool = False,
 ) -> OpenCell:
     """A cell for your own controllers; leaving its block always disables the drives and closes the bus.
 
@@ -211,6 +214,9 @@ def open_cell(
         force, observers, bridge: as for `run`.
         rows_kept: number of cycles whose rows of the log are kept; by default all, about 1 KiB for each, in the folder
             where there is one. With a number the truth is not kept, and a scan is not scored.
+        recover: come back after a node was switched off or reset, or the interface was down. `run` raises the error of
+            the loss, and the next `run` waits for the nodes and brings them up again. A controller that says
+            `can_go_on` is held instead where the arm stands, and goes on after `OpenCell.resume`.
 
     Returns:
         The cell; ``with`` brings it up.
@@ -229,4 +235,5 @@ def open_cell(
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
-    return OpenCell(make_plan(resolve(resolved)), RunOptions(folder, say, observers, rows_kept))
+    options = RunOptions(folder, say, observers, rows_kept, recover=recover)
+    return OpenCell(make_plan(resolve(resolved)), options)

@@ -1,5 +1,6 @@
-"""What pages do not say by themselves: keys of a scene and imports, from the code; all that was measured, from
-docs/measured.json; with `notebooks`, what these show. The figures of the packaged scenes go into the package too.
+"""What pages do not say by themselves: keys of a scene, points of `conform` and imports, from the code; all that was
+measured, from docs/measured.json; with `notebooks`, what these show. The figures of the packaged scenes go into the
+package too.
 
 `python docs/generate.py [notebooks]`
 """
@@ -14,16 +15,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from conform_page import conform_page
 from room_imports import imports_svg
 from scene_keys import scene_keys
 from schemas import FILES, schema_of
 
 from canprobe.cell.results.expected import FIGURES, expected_text, range_text, seeds_text
 from canprobe.cell.scene.load import packaged_scenes
+from canprobe.fieldbus.tools.judge import RULES
 
 DOCS = Path(__file__).parent
 EXPECTED = DOCS.parent / "canprobe" / "scenes" / "expected.json"
 SCHEMAS = DOCS.parent / "canprobe" / "schemas"
+RULES_MARKED = re.compile(r"(<!-- rules -->).*?(<!-- /rules -->)", re.DOTALL)
 MARKED = re.compile(r"(<!-- measured (\w+) -->).*?(<!-- /measured -->)", re.DOTALL)
 GALLERY = """\
 # Gallery of scenes
@@ -126,17 +130,28 @@ def gallery(measured: Mapping[str, Any]) -> str:
     return "\n\n".join(rows) + "\n"
 
 
+def with_rules(page: str) -> str:
+    """The page on the judge of masters, with all rules between its marks."""
+    heads = ("rule", "fault of a master", "severity", "what a good one does", "source")
+    rows = [(f"{r.number:02}", r.name, r.severity.value, r.expected, r.source) for r in RULES]
+    return RULES_MARKED.sub(lambda found: f"{found[1]}\n\n{_table([heads, *rows])}\n\n{found[2]}", page)
+
+
 def pages() -> Iterator[tuple[Path, str]]:
     """Every file that is generated, wholly or between marks, and its text."""
     measured = read_measured()
     yield EXPECTED, expected_figures(measured)
     yield DOCS / "gallery.md", gallery(measured)
     yield DOCS / "scene-keys.md", scene_keys()
+    page = DOCS / "conform.md"
+    yield page, conform_page(page.read_text(encoding="utf-8"), measured)
     for file in FILES:
         yield SCHEMAS / f"{file}.json", json.dumps(schema_of(file), ensure_ascii=False, indent=1) + "\n"
     yield DOCS / "img" / "imports.svg", imports_svg()
     readme = DOCS.parent / "README.md"
     yield readme, with_accuracy(readme.read_text(encoding="utf-8"), measured)
+    judge = DOCS / "judge.md"
+    yield judge, with_rules(judge.read_text(encoding="utf-8"))
     for page in sorted(DOCS.glob("*.md")):
         text = page.read_text(encoding="utf-8")
         if MARKED.search(text):

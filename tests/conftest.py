@@ -31,9 +31,12 @@ import sharing
 import standstill
 import system_packages
 from hangup import hangup_heard  # noqa: F401
+from plugin_arguments import PLUGINS
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
+
+pytest_plugins = ["pytester", *PLUGINS]
 
 hypothesis.settings.register_profile(
     "canprobe",

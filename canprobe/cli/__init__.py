@@ -22,7 +22,7 @@ import traceback
 from collections.abc import Sequence
 
 import canprobe
-from canprobe.cell.session.terminal import Report
+from canprobe.cell.session.terminal import StepReport
 from canprobe.cli.completion import complete
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.parser import Parser
@@ -36,10 +36,13 @@ COMMANDS = (
     "schema",
     "init",
     "plan",
+    "check",
     "run",
     "up",
     "emulate",
     "inject",
+    "conform",
+    "judge",
     "scan",
     "monitor",
     "replay",
@@ -92,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     _prepare_streams()
     for name in BLAS_THREADS:  # before numpy is loaded
         os.environ.setdefault(name, "1")
-    report, args = Report(), argparse.Namespace()
+    report, args = StepReport(), argparse.Namespace()
     try:
         args = parser_of(arguments).parse_args(arguments)
         args.report, report.verbosity = report, getattr(args, "verbosity", 0)
@@ -174,7 +177,7 @@ def _with_scene(text: str, args: argparse.Namespace) -> str:
     return re.sub(r"(?<=type: canprobe up ).+?(?= --home)", lambda _: shlex.quote(str(args.scene)) + cell, text)
 
 
-def _complain(report: Report, text: str, status: int) -> int:
+def _complain(report: StepReport, text: str, status: int) -> int:
     for line in text.splitlines():
         report.complain(f"canprobe: {line}")
     return status

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from datetime import date
 
-from canprobe.cell.session.terminal import Report
+from canprobe.cell.session.terminal import StepReport
 from canprobe.cli.argument_types import folder_path, word
 from canprobe.cli.common_arguments import BUS, add_options, add_verbosity, seed
 from canprobe.cli.output import print_json
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _steps(report: Report) -> Callable[[str], None]:
+def _steps(report: StepReport) -> Callable[[str], None]:
     """A function that reports the next step; the steps of each bring-up only with -v."""
 
     def say(line: str) -> None:

@@ -1,4 +1,4 @@
-"""List the packaged cells and arrays, and print the folders of their files."""
+"""List the packaged cells and arrays, with the folders of their files, and those that other packages offer."""
 
 from __future__ import annotations
 

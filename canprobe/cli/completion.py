@@ -53,8 +53,9 @@ class _Completer:
 def _packaged(kind: str) -> Callable[[], Iterable[str]]:
     def names() -> Iterable[str]:
         from canprobe.cell.scene.load import packaged_files
+        from canprobe.cell.scene.offers import offers
 
-        return packaged_files(kind)
+        return [*packaged_files(f"{kind}s"), *(offer.name for offer in offers(kind))]
 
     return names
 
@@ -84,9 +85,9 @@ def _eds() -> Iterable[str]:
 
 
 _NAMES = {
-    "scene": _Completer(_packaged("scenes"), ("toml",)),
-    "what": _Completer(_packaged("scenes"), ("toml",)),
-    "cell": _Completer(_packaged("cells"), ("toml",)),
+    "scene": _Completer(_packaged("scene"), ("toml",)),
+    "what": _Completer(_packaged("scene"), ("toml",)),
+    "cell": _Completer(_packaged("cell"), ("toml",)),
     "bus": _Completer(_buses),
     "bridge": _Completer(_bridges),
     "eds": _Completer(_eds, ("eds", "dcf")),

@@ -121,7 +121,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
             raise UsageError(f"emulate: --{name} belongs to --eds; of a scene's nodes, choose with --nodes")
     scene = loaded(args)
     wanted = _nodes(args.nodes, scene)
-    target = _scene_target(args, scene)
+    target = scene_target(args, scene)
     if absent := sorted(set(args.without_id) - set(wanted)):
         raise UsageError(f"--without-id: {absent} is not among the nodes to serve, {list(wanted)}")
 
@@ -139,6 +139,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         homed=args.parent is not None,  # a run cannot home its emulated nodes
         faults=args.inject,
         say=args.report.say,
+        outlasts=args.parent is not None,  # the run decides whether it comes back
     )
 
 
@@ -147,7 +148,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     for option in ("nodes", "seed", "truth", "without_id"):
         if getattr(args, option) not in (None, ()):
             raise UsageError(f"emulate: --{option.replace('_', '-')} belongs to a scene, not to {source}")
-    files = _eds_files(args)
+    files = eds_files(args)
     channels = [channel for _, channel in args.channel or [(None, None)]]
     if len(channels) > 1 or (args.channel and args.channel[0][0] is not None):
         raise UsageError(f"emulate: with {source} there is one channel, without a name: --channel CH")
@@ -166,7 +167,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     )
 
 
-def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
+def eds_files(args: argparse.Namespace, command: str = "emulate") -> list[tuple[str | Path, int]]:
     """File and node id of each node without a scene."""
     if args.bus_yml is not None:
         from canprobe.lab.bridge.bus_yml import read_bus_yml
@@ -175,13 +176,15 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
             raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
         return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml, args.report.say)]
     if len(args.eds) != len(args.node_id):
-        raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
+        raise UsageError(
+            f"{command}: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own"
+        )
     if len(args.serial) > len(args.eds):
         raise UsageError(f"emulate: {len(args.serial)} --serial, but {len(args.eds)} --eds")
     return list(zip(args.eds, args.node_id, strict=True))
 
 
-def _scene_target(args: argparse.Namespace, scene: Scene) -> Target:
+def scene_target(args: argparse.Namespace, scene: Scene) -> Target:
     """The bus of the nodes: a channel without a name is for all of them, else each has that of the scene."""
     given = args.channel or []
     real = real_target(args.bus, given[0][1] if given else None, args.bitrate, bitrate_else=scene.bus.bitrate)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from canprobe.fieldbus.bus.real.interrupts import TERMINATION_SIGNALS, Terminated, raise_terminated
 
@@ -36,3 +36,23 @@ def left_by_ctrl_c() -> Iterator[None]:
         raise
     except KeyboardInterrupt:
         pass
+
+
+@contextlib.contextmanager
+def first_ctrl_c(asked: Callable[[], None]) -> Iterator[None]:
+    """Within the block the first Ctrl-C calls `asked`; the second one interrupts as usual."""
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(*_: object) -> None:
+        signal.signal(signal.SIGINT, before)
+        asked()
+
+    try:
+        signal.signal(signal.SIGINT, ask)
+    except ValueError:  # not the main thread, which alone receives signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -15,6 +15,34 @@ _LOOK_EVERY = 20
 """Cycles between two looks at the terminal: each costs a system call."""
 
 
+class LetterKey:
+    """A letter and Enter on stdin, where that is a terminal.
+
+    Args:
+        letter: the letter.
+    """
+
+    def __init__(self, letter: str) -> None:
+        self._letter = letter
+        self._descriptor = sys.stdin.fileno() if sys.stdin.isatty() else None
+        self._left = 0
+
+    def pressed(self) -> bool:
+        """Whether a line of this letter was typed since the last look. Called in each cycle."""
+        self._left -= 1
+        if self._descriptor is None or self._left > 0:
+            return False
+        self._left = _LOOK_EVERY
+        typed = b""
+        while select.select([self._descriptor], [], [], 0)[0]:
+            data = os.read(self._descriptor, 4096)
+            if not data:
+                self._descriptor = None
+                break
+            typed += data
+        return self._letter in (line.strip().lower() for line in typed.decode(errors="replace").splitlines())
+
+
 class TerminalOperator:
     """Reads whole lines from a file descriptor.
 

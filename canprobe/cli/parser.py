@@ -21,7 +21,13 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that keeps examples as written and complains in one line."""
+    """An argument parser that keeps examples as written and complains in one line.
+
+    Attributes:
+        takes_command: whether what stands behind `--` is a command, which is kept as the list `command`.
+    """
+
+    takes_command = False
 
     def __init__(self, **settings: object) -> None:
         settings.setdefault("formatter_class", _Formatter)
@@ -34,7 +40,13 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse like argparse; unknown arguments are reported by their command, not by the root."""
+        command: list[str] = []
+        if self.takes_command and "--" in (args or ()):
+            split = args.index("--")
+            args, command = args[:split], args[split + 1 :]
         found, rest = super().parse_known_args(args, namespace)
+        if self.takes_command:
+            found.command = command
         if rest:
             self.refuse_unknown(rest)
         return found, rest

@@ -36,6 +36,7 @@ examples:
   canprobe plan mine.toml --auto
   canprobe plan mine.toml --rehearse
   canprobe plan cylinder --measured runs/cylinder-20260101-120000-000
+  canprobe plan cylinder --measured conform.json
   canprobe plan cylinder --export dbc --export dcf --out config/
   canprobe plan cylinder --figure plan.png
 """
@@ -46,7 +47,10 @@ def add_arguments(parser: Parser) -> None:
     """Add the command's arguments."""
     add_scene(parser)
     parser.add_argument(
-        "--measured", metavar="LOG", type=Path, help="compare a candump log or the folder of a run with the plan"
+        "--measured",
+        metavar="LOG",
+        type=Path,
+        help="compare a candump log, the folder of a run, or the --json report of `canprobe conform` with the plan",
     )
     parser.add_argument(
         "--rehearse",
@@ -157,6 +161,15 @@ def _scene_beside(log: Path) -> str | None:
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
     """Print the measured traffic of each bus; status 3 where it is not as planned."""
+    if log.suffix == ".json":
+        from canprobe.cell.results.device_times import read_device_times
+
+        times = read_device_times(log, plan)
+        if as_json:
+            print_json(times.as_dict())
+        else:
+            print(times.text(), end="")
+        return 0 if times.as_planned else 3
     from canprobe.cell.results.traffic import measure_traffic
 
     if (ran := _scene_beside(log)) not in (None, plan.scene.name):

@@ -44,7 +44,7 @@ def add_arguments(parser: Parser) -> None:
         dest="figures",
         action="store_false",
         default=None,
-        help="draw no report.png, surface.png and report.html [the scene's scene.figures]",
+        help="draw no report.png and surface.png [the scene's scene.figures]",
     )
     add_options(parser, "--json")
     add_verbosity(parser)

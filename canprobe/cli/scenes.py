@@ -1,4 +1,4 @@
-"""List the packaged scenes, with the figures to expect of them, and print the folder of their files.
+"""List the packaged scenes, with the figures to expect of them, and those that other packages offer.
 
 The figures are RMS errors of the contact force, and of the curvature that the estimator in the loop reports. Each is
 given as the lowest and the highest over several seeds.
@@ -40,21 +40,30 @@ def print_packaged(
     """Print name and title of every packaged file of some kinds, their folders, and advice.
 
     Args:
-        advice: line of advice for each kind.
+        advice: line of advice for each kind; with scenes the estimators of other packages are listed, too.
         args: arguments of the command.
         expected: expected figures from `read_expected`.
     """
     from canprobe.cell.results.expected import LISTED_FIGURES, expected_text, seeds_text
-    from canprobe.cell.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
+    from canprobe.cell.scene.load import (
+        offered,
+        packaged_arrays,
+        packaged_cells,
+        packaged_files,
+        packaged_scenes,
+    )
+    from canprobe.cell.scene.offers import offers
 
     titles = {"scene": packaged_scenes, "cell": packaged_cells, "array": packaged_arrays}
     document: list[dict[str, Any]] = []
     for kind, then in advice.items():
-        found, paths = titles[kind](), packaged_files(f"{kind}s")
+        found, paths, others = titles[kind](), packaged_files(f"{kind}s"), offered(kind, args.report.say)
         if args.json:
             for name, title in found:
                 figures = {} if expected is None else {"expected": expected["scenes"].get(name, {})}
-                document.append({"kind": kind, "name": name, "title": title, "path": str(paths[name]), **figures})
+                row = {"kind": kind, "name": name, "title": title, "path": str(paths[name]), "package": "canprobe"}
+                document.append({**row, **figures})
+            document += [{"kind": kind, **row} for row in others]
         else:
             if expected is None:
                 print_table(found)
@@ -64,6 +73,11 @@ def print_packaged(
                 )
                 print(f"figures: RMS errors to expect, lowest–highest of the seeds {seeds_text(expected)}")
             print(f"in {next(iter(paths.values())).parent}; {then}")
+            print_table([(row["name"], row["title"], f"of the package {row['package']}") for row in others])
+    if "scene" in advice:
+        document += [{"kind": "estimator", "name": one.name, "package": one.package} for one in offers("estimator")]
+        if not args.json:
+            print_table([(one.name, f"estimator of the package {one.package}") for one in offers("estimator")])
     if args.json:
         print_json(document)
     return 0

@@ -20,6 +20,7 @@ examples:
   canprobe up free --bus socketcan --channel can0
   canprobe up free --bus socketcan --channel can0 --check-joints
   canprobe up cell.toml --bus socketcan --channel can0 --home
+  canprobe up free --bus socketcan --channel can0 --recover
 """
 
 
@@ -38,6 +39,12 @@ def add_arguments(parser: Parser) -> None:
         action="store_true",
         help='home the joints with zero = "homing" one after the other, and end; asks before each',
     )
+    parser.add_argument(
+        "--recover",
+        action="store_true",
+        help="come back after a node was switched off or reset, or the interface was down: stop, wait, bring up again"
+        " and hold; `r` and Enter let requested motion go on",
+    )
     parser.add_argument("--yes", action="store_true", help="with --check-joints or --home: do not ask")
     add_verbosity(parser)
 
@@ -51,6 +58,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("up: --yes goes with --check-joints or --home")
     if args.bridge and option is not None:
         raise UsageError(f"up: {option} feeds no --bridge")
+    if args.recover and option is not None:
+        raise UsageError(f"up: {option} moves one joint after the other with somebody beside it; leave out --recover")
     scene = scene_of(args)
     if option is not None and not args.yes and not sys.stdin.isatty():
         raise UsageError(f"up {option} asks before each motion and needs a terminal; --yes leaves that out")
@@ -64,5 +73,10 @@ def run(args: argparse.Namespace) -> int:
         step(scene, operator=None if args.yes else TerminalOperator(), say=args.report.say)
         return 0
     with left_by_ctrl_c():
-        api.up(scene, bridge=args.bridge, say=args.report.say)
+        if args.recover:
+            from canprobe.cli.operator import LetterKey
+
+            api.up(scene, bridge=args.bridge, say=args.report.say, recover=True, asked=LetterKey("r").pressed)
+        else:
+            api.up(scene, bridge=args.bridge, say=args.report.say)
     return 0

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
     from canprobe.fieldbus.bus.virtual.timed import TimedBus
     from canprobe.fieldbus.drive.from_eds import make_eds_node
-    from canprobe.fieldbus.eds.packaged import check_eds, load_eds
+    from canprobe.fieldbus.eds.packaged import check_eds, eds_path, load_eds
     from canprobe.fieldbus.node.serve import serve
     from canprobe.fieldbus.node.slave_node import SlaveNode
 
@@ -55,6 +55,7 @@ _MODULES = {
     "TimedBus": "bus.virtual.timed",
     "VirtualClock": "bus.clock",
     "check_eds": "eds.packaged",
+    "eds_path": "eds.packaged",
     "load_eds": "eds.packaged",
     "make_eds_node": "drive.from_eds",
     "open_port": "bus.real.opening",
@@ -72,6 +73,7 @@ __all__ = [
     "TimedBus",
     "VirtualClock",
     "check_eds",
+    "eds_path",
     "load_eds",
     "make_eds_node",
     "open_port",

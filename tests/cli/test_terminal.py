@@ -12,7 +12,7 @@ import pytest
 from canprobe import api
 from canprobe.cell.results.expected import expected_text, figures_of, read_expected
 from canprobe.cell.scene.load import packaged_scenes
-from canprobe.cell.session.terminal import Report, painted
+from canprobe.cell.session.terminal import StepReport, painted
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.output import print_summary, print_table
 
@@ -32,10 +32,10 @@ def plain(monkeypatch):
 
 
 def test_bar_is_as_wide_as_the_terminal_and_redraws_only_what_changes():
-    assert Report(stream=io.StringIO()).bar() is None
-    assert Report(-1, Terminal()).bar() is None, "quiet"
+    assert StepReport(stream=io.StringIO()).bar() is None
+    assert StepReport(-1, Terminal()).bar() is None, "quiet"
     terminal = Terminal()
-    show = Report(stream=terminal).bar()
+    show = StepReport(stream=terminal).bar()
     for done in (0, 0.01, 5, 10):
         show(done, 10)
     drawn = terminal.getvalue()
@@ -46,7 +46,7 @@ def test_bar_is_as_wide_as_the_terminal_and_redraws_only_what_changes():
 
 def test_a_step_stands_above_the_bar_and_an_error_below():
     terminal = Terminal()
-    report = Report(stream=terminal)
+    report = StepReport(stream=terminal)
     report.bar()(5, 10)
     bar = terminal.getvalue()[1:].removesuffix("\x1b[K")
     terminal.truncate(0)
@@ -66,7 +66,7 @@ def test_a_step_stands_above_the_bar_and_an_error_below():
 )
 def test_quiet_and_verbose(verbosity, terminal, lines):
     stream = Terminal() if terminal else io.StringIO()
-    report = Report(verbosity, stream)
+    report = StepReport(verbosity, stream)
     report.say("warning: hot")
     report.say("said")
     report.detail("detail")

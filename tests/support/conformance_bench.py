@@ -10,7 +10,7 @@ import re
 import threading
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -131,8 +131,6 @@ def _on_vcan(node: SlaveNode, stack: ExitStack) -> Bench:
         except BaseException as error:
             failures.append(error)
 
-    patch = stack.enter_context(pytest.MonkeyPatch.context())
-    patch.setattr("canprobe.fieldbus.node.serve.garbage_collection_paused", nullcontext)  # 0.2 s a node in the guest
     thread = threading.Thread(target=run, name=node.name)
 
     def end() -> None:

@@ -10,7 +10,7 @@ import pytest
 from serial_adapter import SerialAdapter
 from waiting import wait_until
 
-from canprobe.cell.session.terminal import Report
+from canprobe.cell.session.terminal import StepReport
 from canprobe.cli import main
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import MonotonicClock
@@ -125,12 +125,12 @@ def test_emulated_nodes_wait_for_their_bus_until_ctrl_c(
     adapter.acknowledge(False)
     told: list[str] = []
 
-    def say(_: Report, line: str) -> None:
+    def say(_: StepReport, line: str) -> None:
         told.append(line)
         if "waiting for the bus" in line:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(Report, "say", say)
+    monkeypatch.setattr(StepReport, "say", say)
     nodes = [word for n in range(1, 7) for word in ("--eds", "puma260_joint", "--node-id", str(n))]
     assert main(["emulate", *nodes, "--channel", adapter.name]) == 0
     assert told[-1] == f"{adapter.name}: frames that nobody acknowledged were dropped from its transmit queue"

@@ -329,6 +329,7 @@ class PatchReader:
         self._calibration = calibration
         self._force = ForceReading(calibration)
         self.image = np.zeros(pad.shape, np.uint8)
+        self._last: tuple[TactileSample, Patch] | None = None
         self.taxels = (
             SilentTaxels(pad.shape, calibration.dead, blur_pitch=calibration.blur_m / pad.pitch_m)
             if pad.is_grid
@@ -336,23 +337,27 @@ class PatchReader:
         )
 
     def read(self, sample: TactileSample) -> Patch:
-        """The patch of a sample; samples come in the order of their times."""
+        """The patch of a sample, computed once; samples come in the order of their times."""
+        if self._last is None or self._last[0] is not sample:
+            self._last = sample, self._read(sample)
+        return self._last[1]
+
+    def _read(self, sample: TactileSample) -> Patch:
         frame, t_s = sample.frame, sample.t_sample_ns * 1e-9
         if frame.features is not None:  # moments do not show which taxels they are made of
             return self._force.step(t_s, patch_from_features(frame.features, self._calibration))
         self.image, bridged, share = frame.taxels, 0, 0.0
-        self.look(sample)
         if self.taxels is not None:
+            self.taxels.look(frame.taxels, frame.window, sample.t_sample_ns)
             self.image, bridged, share = self.taxels.bridged(frame.taxels, frame.window)
         patch = compute_patch(self.image, self._calibration, window=frame.window)
         if bridged:
             patch = patch._replace(dead=patch.dead + bridged, bridged=share)
         return self._force.step(t_s, patch)
 
-    def look(self, sample: TactileSample) -> None:
-        """Look for taxels that do not measure, without a patch; moments do not show them."""
-        if self.taxels is not None and sample.frame.features is None:
-            self.taxels.look(sample.frame.taxels, sample.frame.window, sample.t_sample_ns)
+    def widen(self, spread: float) -> None:
+        """State forces with this relative standard deviation from now on: the calibration is another array's."""
+        self._force.widen(spread)
 
     @property
     def found(self) -> int:

@@ -90,9 +90,12 @@ class BringUp:
         setups: configurations of the nodes.
         settings: times, retries, and whether the nodes store their configuration.
         say: called with each step, for the user.
+        listened: whether the caller has listened for another master until now.
+        resets: whether the nodes are reset; else they are only made pre-operational, and keep what they hold.
 
     Attributes:
         took_over: the nodes were reset by this cell. Before that it must not send: another master may use them.
+        released: nodes that confirmed on the way out that they watch this master no more.
     """
 
     def __init__(
@@ -102,6 +105,9 @@ class BringUp:
         setups: tuple[NodeSetup, ...],
         settings: BringUpSettings,
         say: Callable[[str], None],
+        *,
+        listened: bool = False,
+        resets: bool = True,
     ) -> None:
         self._network = network
         self._watch = watch
@@ -111,8 +117,10 @@ class BringUp:
         self._booted: dict[int, int] = {}
         self._history: dict[int, str] = {}
         self._refused: set[tuple[int, int]] = set()
-        self._listened = False
+        self._listened = listened
+        self._resets = resets
         self.took_over = False
+        self.released: set[int] = set()
 
     def run(self) -> None:
         """All steps up to the NMT start.
@@ -124,7 +132,11 @@ class BringUp:
         self.listen()
         if not self._setups:
             return
-        self._reset()
+        if self._resets:
+            self._reset()
+        else:
+            self.took_over, self._booted = True, dict(self._watch.boot_ups)
+            self._network.port.send_batch([pack_nmt(NmtCommand.PRE_OPERATIONAL, s.node_id) for s in self._setups])
         self._configure_all()
         self.listen()
         self._refuse_unconfigured()
@@ -342,10 +354,15 @@ class BringUp:
     def _not_operational(self) -> list[NodeSetup]:
         return [s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL]
 
+    def booted_again(self) -> set[int]:
+        """Nodes that have booted since their reset, by themselves or by somebody else."""
+        return {node_id for node_id, count in self._booted.items() if self._watch.boot_ups[node_id] > count}
+
     def _refuse_unconfigured(self) -> None:
         """A node that has booted since its reset has lost its configuration, and would run with its defaults."""
+        again = self.booted_again()
         for setup in self._setups:
-            if self._watch.boot_ups[setup.node_id] > self._booted[setup.node_id]:
+            if setup.node_id in again:
                 raise self._error(
                     f"({setup.name}) booted again after it was configured: check its power, and that no other node has"
                     " its id",
@@ -392,6 +409,7 @@ class BringUp:
                 return
             try:
                 yield from write_entry(setup, Write(HEARTBEAT_CONSUMER, 1, 0, "the master leaves"))
+                self.released.add(setup.node_id)
             except NodeError as error:
                 failures.append(error)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 from types import TracebackType
@@ -11,9 +12,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from canprobe.cell.master.array import RawReceiver, make_patch_reader, make_tactile
+from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_patch_reader, make_tactile
+from canprobe.cell.master.as_found import FoundNodes
 from canprobe.cell.master.bringup import BringUp
-from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
+from canprobe.cell.master.controller import (
+    Command,
+    Controller,
+    Measurement,
+    SampleReader,
+    TactileSample,
+    as_controller,
+    check_command,
+)
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.homing import Homing
@@ -24,7 +34,7 @@ from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.master.raw_array_start import RawArrayStart
-from canprobe.cell.master.supervision import Finding, Reaction, Seen, limits_of
+from canprobe.cell.master.supervision import Condition, Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import make_setups
@@ -36,6 +46,7 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+from canprobe.mechanics.touch.patch.image import Patch
 
 Result = TypeVar("Result")
 
@@ -69,6 +80,7 @@ class Cell:
             brought up and reached over the port.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
         zeros: file that records the zeros of real drives that are homed.
+        before: stopped cell of the same run, whose log, notes, counters and time this one continues.
 
     Attributes:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
@@ -79,6 +91,10 @@ class Cell:
         supervisor: the checks, from bring-up on.
         cycle: None before bring-up is done.
         homing: homing of the drives without an absolute encoder; None where there are none.
+        bring_up: the steps of bring-up.
+        found: the nodes as a check found them; None of another cell.
+        stopped_by: condition that stopped the cell; None where something else did.
+        doubted: nodes that may have been without power, so that a drive has to be homed; set before entering.
     """
 
     def __init__(
@@ -92,20 +108,21 @@ class Cell:
         direct: Callable[..., Cycle] | None = None,
         origin_ns: int = 0,
         zeros: Path | None = None,
+        before: Cell | None = None,
     ) -> None:
         setup = plan.setup
         rows = options.rows_folder
-        self.log = RunLog(options.rows_kept, rows)
-        self.tactile_log = TactileLog(options.rows_kept, rows)
+        self.log: RunLog = RunLog(options.rows_kept, rows) if before is None else before.log
+        self.tactile_log: TactileLog = TactileLog(options.rows_kept, rows) if before is None else before.tactile_log
         self.drives = make_drives(plan)
-        self.tactile = make_tactile(plan)
-        self.notes = Notes()
+        self.tactile: ArrayReceiver | None = make_tactile(plan) if before is None else before.tactile
+        self.notes: Notes = Notes() if before is None else before.notes
         self.watch = NodeWatch(plan.node_ids)
         self.cycle: Cycle | None = None
         guard = JointGuard(plan) if setup.arm is not None else None
         seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
-        self._reader = reader = make_patch_reader(setup)
-        self.supervisor = Supervisor(seen, guard, None if guard is None or reader is None else reader.read)
+        self._reader: SampleReader | None = make_patch_reader(setup)
+        self.supervisor = Supervisor(seen, guard, None if guard is None or self._reader is None else self._patch)
         slides = setup.arm.model.chain.prismatic if setup.arm is not None else ()
         self._slides = np.array(slides, dtype=bool) if any(slides) else None
         self._plan = plan
@@ -117,7 +134,18 @@ class Cell:
         self._network = PumpedNetwork(port, other=self._other)
         self._make_cycle = direct or Cycle
         setups = make_setups(plan) if direct is None else ()  # without setups, bring-up only takes its time
-        self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
+        settings, check = setup.bring_up, options.to_check
+        if check:  # nothing is commanded or stored, such as a tare
+            setups = tuple(replace(one, writes=tuple(w for w in one.writes if w.read_back)) for one in setups)
+            settings = replace(settings, store=False)
+        self.bring_up = BringUp(
+            self._network, self.watch, setups, settings, self._say, listened=before is not None, resets=not check
+        )
+        self.found = FoundNodes(self._network, self.watch, setups, settings) if check else None
+        self.stopped_by: Condition | None = None
+        self.doubted: frozenset[int] = frozenset()
+        self._stopped = False
+        self._before = before
         self._raw_array = (
             RawArrayStart(self.tactile, self._network, setup.bring_up.boot_up_s, self._say)
             if isinstance(self.tactile, RawReceiver)
@@ -130,9 +158,21 @@ class Cell:
         self._running = False
         self._retreats_for: CanprobeError | None = None
         self._controller = Controller()
+        self._remarks_noted = 0
         for node_id in self.watch.node_ids:
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self.watch.push)
+        if before is not None:
+            self._count_on(before)
+
+    def _count_on(self, before: Cell) -> None:
+        """Continue the counters of the cell before."""
+        if self.drives is not None and before.drives is not None:
+            for name in ("late", "missed", "malformed", "implausible"):
+                setattr(self.drives, name, getattr(before.drives, name))
+        self.watch.communication = before.watch.communication
+        seen, earlier = self.supervisor, before.supervisor
+        seen.counts, seen.first, seen.seen.overruns = earlier.counts, earlier.first, earlier.seen.overruns
 
     @property
     def start_ns(self) -> int:
@@ -169,7 +209,7 @@ class Cell:
         Raises:
             BusError: when there is one.
         """
-        self._bring_up.listen()
+        self.bring_up.listen()
 
     def hear(self, frames: Iterable[TimedFrame]) -> None:
         """Take frames that arrived before bring-up, while another reader waited on the port."""
@@ -178,7 +218,10 @@ class Cell:
 
     def __enter__(self) -> Cell:
         try:
-            self._bring_up.run()
+            if self.found is not None:
+                self.bring_up.listen()
+                self.found.look()
+            self.bring_up.run()
             if self._raw_array is not None:
                 self._raw_array.start()
             self.cycle = self._make_cycle(
@@ -190,15 +233,22 @@ class Cell:
                 other=self._network.feed,
                 on_arrival=not isinstance(self._port.clock, VirtualClock),
                 kept=self._options.rows_kept,
+                **({} if self._before is None else {"before": self._before.cycle}),
             )
+            if self._before is not None and self.tactile is not None:
+                self.tactile.newest_cycle = self.cycle.number  # its age counts from the first SYNC of this cell
+            self._before = None
             self.log.start_s = self.start_ns * 1e-9
             self.watch.start(self._port.clock.now_ns())
             if self.homing is not None:
                 self.homing.look()
+                self.homing.doubt(self.doubted)
                 if not self._options.to_home:
                     self.homing.refuse_unhomed()
         except BaseException as error:
-            self.close()
+            self.stop()
+            if not self._options.recover:
+                self.close()
             self._name_another_master(error)
             raise
         return self
@@ -235,7 +285,10 @@ class Cell:
         """The first half of `run`: enable the drives for a controller, which `advance` then runs."""
         runs = as_controller(controller)
         with self._one_at_a_time(), self._naming_another_master():
-            self._controller, self._retreats_for = runs, None
+            self._controller, self._retreats_for, self._remarks_noted = runs, None, 0
+            if runs.reader is not None:
+                self._note_silent_taxels()
+                self._reader = runs.reader
             self._enable()
 
     def advance(self, cycles: int | None, progress: Callable[[Measurement], None] = lambda _: None) -> bool:
@@ -255,6 +308,16 @@ class Cell:
                 if self._run_cycle(interrupts, progress):
                     return True
         return False
+
+    def idle(self, seconds: float) -> None:
+        """Cycle with disabled drives and without a controller; nothing is supervised, and no row is kept."""
+        assert self.cycle is not None
+        if self.drives is not None:
+            self.drives.goal = DriveState.SWITCH_ON_DISABLED
+        for _ in range(max(1, round(seconds * 1e9 / self._plan.sync.period_ns))):
+            self._look(self.cycle.begin())
+            self.cycle.end(None)
+            self.cycle.count_work()
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
@@ -343,7 +406,7 @@ class Cell:
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         times = self._plan.setup.bring_up
-        with self._bring_up.confirm_modes(times.enable_s) as modes:
+        with self.bring_up.confirm_modes(times.enable_s) as modes:
             self._cycle_until((), WARM_UP_S, check=modes.serve)
             while modes.waiting:
                 self._cycle_until((), self._one_cycle_s, check=modes.serve)
@@ -407,8 +470,12 @@ class Cell:
         self._note_alarms()
         seen = self.supervisor.seen
         seen.restarts = self._controller.restarts
+        for remark in self._controller.remarks[self._remarks_noted :]:
+            self._remarks_noted += 1
+            self.notes.add(remark, t_s=(self.start_ns + measurement.t_ns) * 1e-9)
+            self._say(remark)
         if self._reader is not None and measurement.tactile is not None:
-            self._reader.look(measurement.tactile)
+            self._reader.read(measurement.tactile)
             seen.silent_taxels = self._reader.found
         self.supervisor.step(
             measurement,
@@ -422,6 +489,7 @@ class Cell:
     def _supervise_enabling(self) -> None:
         finding = self.supervisor.finding(enabling=True)
         if finding is not None and finding.condition.reaction is not Reaction.HOLD:
+            self.stopped_by = finding.condition
             raise finding.error
 
     def _supervise_homing(self) -> None:
@@ -446,7 +514,7 @@ class Cell:
         return self._holding
 
     def _react(self, finding: Finding) -> None:
-        reaction = finding.condition.reaction
+        self.stopped_by, reaction = finding.condition, finding.condition.reaction
         if reaction is Reaction.RETREAT and self._controller.lets_go:
             self._retreats_for = self._retreats_for or finding.error
             self._controller.retreat(str(finding.error))
@@ -507,7 +575,18 @@ class Cell:
     # the way out
 
     def close(self) -> None:
-        """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
+        """Stop safely and close the bus. Never raises; failures are faults."""
+        self.stop()
+        self._try(self._port.close)
+        self._note_silent_taxels()
+        for line in self.supervisor.notes():
+            self.notes.add(line)
+
+    def stop(self) -> None:
+        """Stop safely, once: quick stop, disable, pre-operational. Never raises; failures are faults."""
+        if self._stopped:
+            return
+        self._stopped = True
         self._try(self._stop_drives)
         if force := self.supervisor.pressing():
             free = "free it; a run does not begin while the array measures a force"
@@ -516,12 +595,17 @@ class Cell:
             self._try(self._raw_array.stop)
         if self.homing is not None:
             self._try(self.homing.keep)
-        self._try(self._bring_up.release)
-        self._try(self._port.close)
+        self._try(self.bring_up.release)
+        if self.found is not None and self.bring_up.took_over:
+            self._try(self.found.restore)
+
+    def _patch(self, sample: TactileSample) -> Patch:
+        assert self._reader is not None
+        return self._reader.read(sample)
+
+    def _note_silent_taxels(self) -> None:
         if self._reader is not None and (words := self._reader.faults):
             self.notes.add(words + SILENT_TAXELS)
-        for line in self.supervisor.notes():
-            self.notes.add(line)
 
     def _try(self, action: Callable[[], None]) -> None:
         """Run one step of the way out to its end: an interrupt repeats it once, a failure is noted."""

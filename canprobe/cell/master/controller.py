@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.patch.image import Patch
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +113,38 @@ def check_command(command: Command, *, arm: bool) -> None:
             raise UsageError(f"controller: expected estimate to be a SurfaceEstimate, got {command.estimate!r}")
 
 
+class SampleReader(Protocol):
+    """Makes the patch of each tactile sample, once, and finds taxels that do not measure (`array.PatchReader`)."""
+
+    def read(self, sample: TactileSample) -> Patch:
+        """The patch of a sample; samples come in the order of their times."""
+
+    @property
+    def found(self) -> int:
+        """Number of taxels that were found not to measure."""
+
+    @property
+    def faults(self) -> str:
+        """Taxels that do not measure, in words; empty where none was found."""
+
+
 class Controller:
     """Base of everything that a cell can run: `step` decides a cycle, the other methods do nothing by default.
 
     Attributes:
         lets_go: True: the controller supervises its contact and takes the probe off the object when `retreat` is
             called. False, the default: the cell does both.
+        can_go_on: True: after the cell has come back from a loss (``recover`` of `canprobe.open_cell`) the controller
+            goes on from where the arm stands, once motion is asked for. False, the default: a loss ends it.
     """
 
     lets_go: bool = False
+    can_go_on: bool = False
+
+    @property
+    def reader(self) -> SampleReader | None:
+        """The reader of its tactile samples, which the supervision uses too; None: the cell has its own."""
+        return None
 
     def step(self, measurement: Measurement) -> Command:
         """Decide one cycle. Called when its TPDOs are in; the command is sent at once.
@@ -156,10 +180,26 @@ class Controller:
             reason: reason for `Command.stop_reason`.
         """
 
+    def asks_to_go_on(self) -> bool:
+        """Whether motion is asked for in a way that the controller knows. Called in each cycle of a hold."""
+        return False
+
+    def go_on(self, measurement: Measurement) -> None:
+        """Prepare to go on after a loss, from where the arm stands. Called before the first step after it.
+
+        Args:
+            measurement: the state of the cell, whose time has gone on meanwhile.
+        """
+
     @property
     def restarts(self) -> int:
         """How often the estimator of this controller diverged and started again."""
         return 0
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What the controller has found to be wrong with the cell, a line each; more come, and none goes."""
+        return ()
 
 
 class _Function(Controller):

@@ -143,6 +143,7 @@ class Cycle:
         on_arrival: whether the cycle goes on when the last TPDO arrives, in real time. Before the first look arrivals
             do not wake the process: a real bus brings one after the other, and most are in by then.
         kept: number of cycles whose times are kept; None for all.
+        before: cycle of a cell that this one comes after; number, time and statistics go on from it.
     """
 
     def __init__(
@@ -156,16 +157,18 @@ class Cycle:
         other: Callable[[list[TimedFrame]], None],
         on_arrival: bool,
         kept: int | None = None,
+        before: Cycle | None = None,
     ) -> None:
-        self.number = -1
-        self.statistics = CycleStatistics.of_last(kept)
-        self.t_first_ns = port.clock.now_ns() + plan.sync.period_ns
+        now_ns, period_ns = port.clock.now_ns(), plan.sync.period_ns
+        self.number: int = -1 if before is None else before.number
+        self.statistics: CycleStatistics = CycleStatistics.of_last(kept) if before is None else before.statistics
+        self.t_first_ns: int = now_ns + period_ns if before is None else before.t_first_ns
         self.t_ns = 0
         self.sync_ns = 0
         self.late_ns = 0
         self._heartbeat_ns = 0
         self._port = port
-        self._period_ns = plan.sync.period_ns
+        self._period_ns = period_ns
         self._looks_ns = plan.traffic.budget.looks_ns
         self._on_arrival = on_arrival
         self._drives, self._tactile = drives, tactile
@@ -173,7 +176,7 @@ class Cycle:
         self._watch = watch
         self._other = other
         self._sync = SyncCounter(plan.sync.overflow)
-        self._deadline = self.t_first_ns
+        self._deadline = self.t_first_ns + ((now_ns - self.t_first_ns) // period_ns + 1) * period_ns
         self._started_ns = self._sent_ns = 0
 
     def begin(self) -> Measurement:

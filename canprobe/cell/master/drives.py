@@ -302,6 +302,11 @@ class DriveGroup:
         q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it
         return q
 
+    def last_place(self, time_ns: int) -> tuple[Floats, Floats]:
+        """Joint positions as last reported (n,), rad or m, and the way (n,) that each may have gone on in a time."""
+        ways = np.abs(self._model.q_per_unit) @ np.array([track.way(time_ns) for track in self._tracks])
+        return units_to_joints(self._model, [float(track.counts) for track in self._tracks]), ways
+
     @property
     def states(self) -> tuple[DriveState | None, ...]:
         """CiA 402 state of each drive, from its last statusword; None where that is a word of no state."""

@@ -18,7 +18,7 @@ import contextlib
 import json
 import math
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE, NodeSetup, Write
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.scene.setup import HomingParameters
-from canprobe.errors import CanprobeError, NodeError, UsageError
+from canprobe.errors import CanprobeError, NodeError, UsageError, check_schema
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
@@ -71,21 +71,33 @@ _MOVES = {
 """Direction in which a drive counts, and what it looks for, of the common methods."""
 
 
+SCHEMA = 1
+"""Version of the record of zeros."""
+
+
+class UnhomedError(NodeError):
+    """A drive has to be homed before it may be enabled."""
+
+
 class ZeroRecord:
     """The record of the zeros of a cell's drives, by node id, in a file.
 
     Args:
         path: path of a JSON file; None: nothing is kept.
+
+    Raises:
+        UsageError: the file is of a newer canprobe. One that cannot be read counts as none: the drives are homed again.
     """
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
         self._nodes: dict[str, dict[str, Any]] = {}
         if path is not None and path.is_file():
-            try:
-                self._nodes = dict(json.loads(path.read_text(encoding="utf-8"))["nodes"])
-            except (OSError, ValueError, KeyError, TypeError):
-                self._nodes = {}  # as where it was never written: the drives are homed again
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                content = json.loads(path.read_text(encoding="utf-8"))
+                nodes = dict(content["nodes"])
+                check_schema(path, content.get("schema", 1), SCHEMA, "remove it, and home the drives again")
+                self._nodes = nodes
 
     def entry(self, node_id: int) -> dict[str, Any]:
         """The entry of a node; empty where nothing is known."""
@@ -106,7 +118,7 @@ class ZeroRecord:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise UsageError(f"{self._path.parent}: {error.strerror}") from error
-            write_text(self._path, json.dumps({"nodes": self._nodes}, indent=1) + "\n")
+            write_text(self._path, json.dumps({"schema": SCHEMA, "nodes": self._nodes}, indent=1) + "\n")
 
 
 class Homing:
@@ -167,17 +179,29 @@ class Homing:
             if same and isinstance(then, int) and abs(there - then) <= self._tolerance(axis):
                 self.known.add(axis)
 
+    def doubt(self, node_ids: Collection[int]) -> None:
+        """Take the zeros of drives as lost that may have been without power, whatever they report.
+
+        Raises:
+            CanprobeError: the record cannot be written.
+        """
+        for axis in self.order:
+            if self._drives[axis].node_id in node_ids:
+                self.known.discard(axis)
+                if axis in self._recorded:
+                    self._record.put(self._drives[axis].node_id, None)
+
     def refuse_unhomed(self) -> None:
         """Refuse to go on where a zero is not known.
 
         Raises:
-            NodeError: a drive has to be homed; with the command to type.
+            UnhomedError: a drive has to be homed; with the command to type.
         """
         lacking = [axis for axis in self.order if axis not in self.known]
         if lacking:
             others = ", ".join(f"{self._drives[axis].node_id} ({self._setups[axis].name})" for axis in lacking[1:])
             too = f"; nor are {others}" if others else ""
-            raise NodeError(
+            raise UnhomedError(
                 self._drives[lacking[0]].node_id,
                 f"({self._setups[lacking[0]].name}) is not homed, or was switched off or moved since{too}; type:"
                 f" canprobe up {self._scene} --home --bus {self._bus.interface} --channel {self._bus.channel}",

@@ -13,16 +13,53 @@ from numpy.typing import NDArray
 from canprobe.cell.master.array import make_patch_reader, make_tactile
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.drives import drive_axes, feedback_frames
+from canprobe.cell.master.notes import nodes_text
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.bus.port import TimedFrame
-from canprobe.fieldbus.protocol.cia402 import describe_state
+from canprobe.fieldbus.protocol.cia402 import DriveState, describe_state
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
+from canprobe.fieldbus.protocol.frames import (
+    CLASSIC_BYTES,
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    NMT_ID,
+    SYNC_ID,
+    NmtCommand,
+    NmtState,
+    unpack_heartbeat,
+)
 from canprobe.mechanics.robot.model import units_to_joints
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 
 SECOND_NS = 1_000_000_000
+LATE_HEARTBEAT_S = 0.25
+"""A heartbeat older than that is late."""
+EVENTS_KEPT = 16
+TOGETHER_NS = 50_000_000
+"""Time in which the same event of several nodes is one."""
+_ENABLED = DriveState.OPERATION_ENABLED.name
+
+
+@dataclass(slots=True)
+class NodeEvent:
+    """Something that happened to nodes.
+
+    Attributes:
+        t_ns: time of the first of them.
+        what: what happened.
+        nodes: the nodes; 0 stands for all.
+    """
+
+    t_ns: int
+    what: str
+    nodes: set[int]
+
+    def text(self, first_ns: int) -> str:
+        """The event in words, with its time since the first frame."""
+        who = "all nodes" if 0 in self.nodes else nodes_text(self.nodes)
+        return f"{(self.t_ns - first_ns) * 1e-9:8.1f} s   {who}: {self.what}"
 
 
 @dataclass(slots=True)
@@ -62,6 +99,8 @@ class CellView:
         sync_hz: SYNCs in the last second.
         sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
         torn_frames: tactile frames that were not whole.
+        events: last changes of nodes and drives, and commands to them, each with its time.
+        array: how the array is not as its calibration says, by its images alone; None where it is.
     """
 
     channel: str
@@ -76,6 +115,8 @@ class CellView:
     sync_hz: float = 0.0
     sync_jitter_us: tuple[float, float] | None = None
     torn_frames: int = 0
+    events: list[str] = field(default_factory=list)
+    array: str | None = None
 
     def as_document(self) -> dict[str, Any]:
         """The state as `--json` prints it."""
@@ -105,10 +146,16 @@ class Monitor:
         self._counts: list[int | None] = [None] * len(axes)
         self._tactile = make_tactile(plan)
         self._reader = make_patch_reader(plan.setup)
+        array = plan.setup.array
+        self._check: CalibrationCheck | None = None
+        if array is not None:
+            self._check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
         self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
         self._syncs: deque[int] = deque()
+        self._events: deque[NodeEvent] = deque(maxlen=EVENTS_KEPT)
+        self._silent: set[int] = set()
 
     def push(self, frames: Iterable[TimedFrame], channel: str | None = None) -> None:
         """Take the frames of a bus, by default of the first. The SYNC is timed on the first bus; all buses have it."""
@@ -134,23 +181,42 @@ class Monitor:
     def _take(self, can_id: int, data: bytes, t_ns: int) -> None:
         node = self._nodes.get(can_id & 0x7F)
         if can_id in self._feedback:
-            self._take_feedback(can_id, data)
+            self._take_feedback(can_id, data, t_ns)
         elif self._tactile is not None and can_id in self._tactile.cob_ids:
             self._take_taxels(can_id, data, t_ns)
         elif node is not None and can_id == HEARTBEAT_BASE + node.node_id:
             self._take_heartbeat(node, data, t_ns)
+        elif can_id == NMT_ID and len(data) == 2:
+            self._take_nmt(data[0], data[1], t_ns)
         elif node is not None and can_id == EMCY_BASE + node.node_id and len(data) == CLASSIC_BYTES:
             emcy = Emcy.unpack(data)
             node.emcy = None if is_no_error(emcy.code) else f"{emcy.code:04X}h, {describe(emcy.code)}"
+            if node.emcy is not None:
+                self._note(t_ns, node.node_id, f"EMCY {node.emcy}")
 
-    def _take_feedback(self, can_id: int, data: bytes) -> None:
+    def _note(self, t_ns: int, node_id: int, what: str) -> None:
+        """Note an event; what several nodes do together is one."""
+        for event in reversed(self._events):
+            if event.what == what and t_ns - event.t_ns < TOGETHER_NS:
+                event.nodes.add(node_id)
+                return
+        self._events.append(NodeEvent(t_ns, what, {node_id}))
+
+    def _take_nmt(self, command: int, node_id: int, t_ns: int) -> None:
+        if command in set(NmtCommand):
+            self._note(t_ns, node_id, f"NMT command {NmtCommand(command).name.replace('_', ' ').lower()}")
+
+    def _take_feedback(self, can_id: int, data: bytes, t_ns: int) -> None:
         node_id, frame = self._feedback[can_id]
         try:
             values = frame.unpack(data)
         except ProtocolError:
             return
         if frame.word is not None:
-            self._nodes[node_id].drive = describe_state(values[frame.word])
+            before, state = self._nodes[node_id].drive, describe_state(values[frame.word])
+            self._nodes[node_id].drive = state
+            if state != before and _ENABLED in (before, state):
+                self._note(t_ns, node_id, "enabled" if state == _ENABLED else f"no longer enabled: {state}")
         if frame.counts is not None:
             self._counts[frame.axis] = values[frame.counts]
 
@@ -161,12 +227,22 @@ class Monitor:
             self._view.taxels = frame.taxels
             patch = self._reader.read(TactileSample(frame, t_ns, 0)) if self._reader is not None else None
             self._view.force_n = patch.force if patch is not None else None
+            if patch is not None and self._check is not None:
+                self._check.see(t_ns * 1e-9, frame.taxels, frame.window, patch)
+                if self._check.work():
+                    self._view.array = self._check.finding
 
     def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:
         try:
-            node.state = unpack_heartbeat(data).name
+            state = unpack_heartbeat(data)
         except ProtocolError:
             return
+        if state is NmtState.INITIALISING:
+            self._note(t_ns, node.node_id, "booted")
+        elif node.state != state.name:
+            self._note(t_ns, node.node_id, f"is {state.name}")
+        node.state = state.name
+        self._silent.discard(node.node_id)
         self._heard[node.node_id] = t_ns
 
     def view(self, now_ns: int) -> CellView:
@@ -175,6 +251,10 @@ class Monitor:
         view.t_s = (now_ns - self._first_ns) * 1e-9 if self._first_ns is not None else 0.0
         for node_id, node in self._nodes.items():
             node.heard_s = (now_ns - self._heard[node_id]) * 1e-9 if node_id in self._heard else None
+            if node.heard_s is not None and node.heard_s > LATE_HEARTBEAT_S and node_id not in self._silent:
+                self._silent.add(node_id)
+                self._note(now_ns, node_id, "is silent")
+        view.events = [event.text(self._first_ns or 0) for event in self._events]
         view.nodes = list(self._nodes.values())
         counts = [c for c in self._counts if c is not None]
         if self._model is not None and len(counts) == len(self._counts):

@@ -7,12 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.monitor import CellView, NodeView
+from canprobe.cell.master.monitor import LATE_HEARTBEAT_S, CellView, NodeView
 
 HOME, CLEAR_LINE, CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 SHADES = " ·░▒▓█"
-LATE_HEARTBEAT_S = 0.25
-"""A heartbeat older than that is late."""
 
 
 def screen(view: CellView) -> str:
@@ -34,6 +32,9 @@ def lines(view: CellView) -> Iterator[str]:
     yield ""
     for node in view.nodes:
         yield _node_line(node)
+    if view.events:
+        yield ""
+        yield from view.events
     if view.q is not None:
         yield ""
         yield "joints  " + "  ".join(f"{q:8.2f} {unit}" for q, unit in zip(view.q, view.units, strict=True))
@@ -41,6 +42,8 @@ def lines(view: CellView) -> Iterator[str]:
         force = "–" if view.force_n is None else f"{view.force_n:.2f} N"
         yield ""
         yield f"force   {force}   torn frames {view.torn_frames}"
+        if view.array is not None:
+            yield f"array   {view.array}"
         yield from image_lines(view.taxels)
 
 

@@ -118,6 +118,10 @@ class PositionTrack:
             return float(self.counts)
         return self.counts + self._carried(t_ns - self._t_ns)
 
+    def way(self, time_ns: int) -> float:
+        """Way of the motor in a time at its last rate, counts."""
+        return abs(self._rate) * time_ns
+
     def _followed(self, periods: float) -> float:
         """Largest motion of a drive towards its last targets after so many periods, counts."""
         return min(periods, FOLLOWED_CYCLES) * self._asked

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Sequence
 
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
-from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS
 from canprobe.mechanics.touch.patch.force_creep import decades_after, late_decades_after
 from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
 
@@ -27,12 +26,11 @@ def force_sigma_of(array: Array, probe: Probe, force: float, seconds: float) -> 
         seconds: time since the touch, s.
     """
     errors, calibration = array.calibration.force, array.calibration
-    level_pa = array.pad.full_scale_pa * (THRESHOLD_COUNTS + 1) / COUNTS_MAX
     # pressure k δ on a plane; a flat array has no such layer, and its light touches are not known
     peak_pa = probe.stiffness * math.sqrt(force / (math.pi * probe.stiffness * probe.radius))
     return errors.sigma(
         force,
-        min(level_pa / peak_pa, 1.0),
+        array.pad.lightness(peak_pa),
         force * (decades_after(seconds) - errors.creep_decades),
         late_decades_after(seconds),
         reference=0.0 if calibration.nominal else calibration.force_sigma,

@@ -41,7 +41,7 @@ _EFFECTS = {
 _BY_ARRAY = f'sensor.mode = "features": {MODES["features"]}'
 IMAGE, OWN_WINDOW = "full image (32 PDOs)", "window (8 PDOs)"
 ARRAY_NODE_PARTS = "node of the array, its PDOs and its supervision by heartbeat"
-ESTIMATOR, FIGURE, PAGE = "surface estimator", "figure", "replay to share (report.html)"
+ESTIMATOR, FIGURE = "surface estimator", "figure"
 BUS_PARTS = "bus, bring-up by SDO and their log (bus.log)"
 TRUTH_PARTS = "truth and scores against it"
 
@@ -102,14 +102,9 @@ def _not_emulated(setup: Setup) -> Iterator[tuple[str, str]]:
 
 def _not_shown(setup: Setup) -> Iterator[tuple[str, str]]:
     if not setup.figures:
-        yield from ((what, "scene.figures = false") for what in (FIGURE, PAGE))
-    else:
-        if importlib.util.find_spec("matplotlib") is None:
-            yield FIGURE, f"the study extra is not installed: {install_line('study')}"
-        if setup.kind == "listen":
-            yield PAGE, 'task.kind = "listen": nothing moves'
-        elif importlib.util.find_spec("viser") is None:
-            yield PAGE, f"the view extra is not installed: {install_line('view')}"
+        yield FIGURE, "scene.figures = false"
+    elif importlib.util.find_spec("matplotlib") is None:
+        yield FIGURE, f"the study extra is not installed: {install_line('study')}"
     if not setup.bridge.use:
         yield "bridges to other tools", "no [bridge]: no other tool is fed"
 
@@ -143,7 +138,6 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
         "surface.npz": ESTIMATOR not in absent,
         "report.png": FIGURE not in absent,
         "surface.png": FIGURE not in absent and ESTIMATOR not in absent,
-        "report.html": PAGE not in absent,
     }
     return (*(file for file, is_written in written.items() if is_written), *bridge_outputs(setup))
 

@@ -21,6 +21,7 @@ from canprobe.cell.results.summary import finite_or_none, summarise_shape
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.offers import find_offer
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.from_plan import estimates_of
@@ -304,6 +305,6 @@ def _methods(scene: Scene, method: str | Sequence[str] | None) -> tuple[str, ...
         return (scene.shape.method, *scene.shape.also)
     names = (method,) if isinstance(method, str) else tuple(method)
     for name in names:
-        if name not in METHODS:
+        if name not in METHODS and find_offer("estimator", name) is None:
             raise unknown_method(name)
     return names or (scene.shape.method,)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from canprobe.cell.results.scores import ShapeScore, score_shape
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, make_shape_estimator
+from canprobe.cell.tasks.own_estimators import OwnEstimator, RenewedEstimator
 from canprobe.cell.tasks.shape import replay_samples
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.online import Dropped, Estimator, Gate
+from canprobe.mechanics.touch.estimate.online import Estimator, Gate
 from canprobe.mechanics.types import Floats
 
 ESTIMATE_PERIOD_S = 0.1
@@ -83,29 +83,6 @@ def contacts_of(samples: Sequence[ContactSample], task: Touch, start_s: float) -
     )
 
 
-class OwnEstimator(Protocol):
-    """Methods that an estimator of your own needs."""
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The shape at the last contact; None before there is an answer."""
-
-
-class _Renewed:
-    """A user's estimator in the loop: a new one is made after each loss of contact; dropped samples are not counted."""
-
-    def __init__(self, make: Callable[[], OwnEstimator]) -> None:
-        self._make = make
-        self.dropped = Dropped()
-        self.reset()
-
-    def reset(self) -> None:
-        inner = self._make()
-        self.add, self.estimate = inner.add, inner.estimate
-
-
 class Scores(dict[str, dict[str, Any]]):
     """Errors of estimators on the same contacts, by name: the fields of `ShapeScore`, and ``us_per_contact``."""
 
@@ -151,7 +128,7 @@ def score_estimators(
     """
     every, clock, scores = max(1, round(ESTIMATE_PERIOD_S * task.array.rate_hz)), MonotonicClock(), Scores()
     for name, what in estimators.items():
-        estimator: Estimator = make_shape_estimator(task, what) if isinstance(what, str) else _Renewed(what)
+        estimator: Estimator = make_shape_estimator(task, what) if isinstance(what, str) else RenewedEstimator(what)
         before_ns = clock.now_ns()
         records = replay_samples(estimator, samples, every)
         cost_us = 1e-3 * (clock.now_ns() - before_ns) / max(len(samples), 1)

@@ -16,7 +16,7 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.master.observers import Observers
-from canprobe.cell.master.options import RunOptions, Say
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
@@ -166,6 +166,18 @@ class OpenCell:
         self.session.run(runs, progress)
         return self._result
 
+    def resume(self) -> None:
+        """Ask for motion in a cell that was opened with ``recover=True`` and has come back from a loss.
+
+        A controller that is held goes on in the next cycle. May be called from any thread, an observer, or `progress`.
+        Where no controller is held, as after one that the loss has ended, the cell is brought up again for the next.
+
+        Raises:
+            UsageError: the cell was not opened with ``recover=True``, or is closed.
+            BusError, SafetyStop: the cell cannot be brought up again.
+        """
+        self.session.resume()
+
     def open_to_requests(self, task: Controller) -> Controller:
         """The task, which other tools may start, stop and change where the scene allows it."""
         return self._bridges.open_to_requests(task)
@@ -193,7 +205,7 @@ class OpenCell:
         summary["bridges"] = self._bridges.end(summary)
         self._write(lambda out: write_summary(summary, out))
         if self._out is not None:
-            for name, draw in _drawings(data, self._out, self._say).items():
+            for name, draw in _drawings(data, self._out).items():
                 self._say(f"draw {name}")
                 if (why := _draw(name, draw)) is not None:
                     self.session.note_unwritten(why)
@@ -281,8 +293,8 @@ class OpenCell:
         return contacts_of(record.shape.samples, task, start_s)
 
 
-def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None]]:
-    """Functions that draw the pictures of a run of at least one cycle; the page is last, as it takes longest."""
+def _drawings(data: RunData, out: Path) -> dict[str, Callable[[], None]]:
+    """Functions that draw the pictures of a run of at least one cycle."""
 
     def report() -> None:
         from canprobe.cell.results.figures import draw_run
@@ -294,16 +306,8 @@ def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None
 
         draw_surface(data, out / "surface.png")
 
-    def page() -> None:
-        from canprobe.cell.results.page import write_page_of
-
-        try:
-            write_page_of(out, data.plan.setup, say)
-        except UsageError as error:  # a controller's column has the name of one of ours and another content
-            say(f"report.html is left out: {error}")
-
     outputs = data.plan.outputs if len(data.log["t_s"]) else ()
-    known = {"report.png": report, "surface.png": surface, "report.html": page}
+    known = {"report.png": report, "surface.png": surface}
     return {name: draw for name, draw in known.items() if name in outputs}
 
 

@@ -7,7 +7,6 @@ import importlib
 import os
 import sys
 import webbrowser
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,20 +30,19 @@ class Page:
         return f'<iframe srcdoc="{text}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
 
-def write_page_of(folder: Path, setup: Setup, say: Callable[[str], None]) -> None:
+def write_page_of(folder: Path, setup: Setup) -> None:
     """Write ``report.html`` into a run's folder.
 
     Args:
         folder: folder with the files of the run.
         setup: setup of the run.
-        say: called with a line for each part that cannot be drawn.
 
     Raises:
         UsageError: a controller's column has the name of one of ours.
     """
     page = importlib.import_module("canprobe.lab.bridge.view.page")
     recorded = importlib.import_module("canprobe.lab.bridge.view.recorded")
-    page.write_page(recorded.read_run(folder, setup), folder / "report.html", say)
+    page.write_page(recorded.read_run(folder, setup), folder / "report.html", quiet)
 
 
 def page_of(folder: Path, setup: Setup) -> Page:
@@ -56,7 +54,7 @@ def page_of(folder: Path, setup: Setup) -> Page:
     page = Page(folder / "report.html")
     if not page.path.is_file():
         check_bridges(["view"], "")
-        write_page_of(folder, setup, quiet)
+        write_page_of(folder, setup)
     if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.path.resolve().as_uri())
     return page

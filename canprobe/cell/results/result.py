@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-    from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
+    from canprobe.cell.results.contacts import Contacts, Scores
     from canprobe.cell.results.page import Page
+    from canprobe.cell.tasks.own_estimators import OwnEstimator
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 _FIELDS = frozenset(field.name for field in fields(RunData))

@@ -16,7 +16,6 @@ from canprobe.cell.scene.checks import OneOf, Range
 from canprobe.cell.scene.load import (
     Reader,
     find_file,
-    packaged_files,
     read_toml,
     toml_value,
     with_writer,
@@ -200,10 +199,7 @@ def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
     Raises:
         SceneError: the file has problems; the error has all of them.
     """
-    name = str(name_or_path)
-    packaged = packaged_files("calibrations")
-    path = find_file(name, packaged, "calibration")
-    file = path.name if name in packaged else name
+    path, file = find_file(str(name_or_path), "calibration")
     document, file = with_writer(read_toml(path, file), file)
     reader = Reader(path.parent)
     needed = [field.name for field in dataclasses.fields(CalibrationFile) if field.default is dataclasses.MISSING]

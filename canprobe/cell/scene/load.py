@@ -13,7 +13,9 @@ import difflib
 import re
 import tomllib
 import typing
-from collections.abc import Iterable, Mapping
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from os.path import isfile  # False where the system refuses a name, as `Path.is_file` does not promise
 from pathlib import Path
@@ -22,7 +24,8 @@ from typing import Any
 from canprobe import __version__
 from canprobe.cell.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
-from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, CellFile, Scene
+from canprobe.cell.scene.model import DEFAULT_ARRAY, RENAMED_KEYS, TOUCH_KINDS, ArrayFile, CellFile, Scene
+from canprobe.cell.scene.offers import find_offer, offers
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
 from canprobe.errors import PlanError, SceneError, UsageError, regular_file
 from canprobe.mechanics.robot.urdf import from_urdf
@@ -99,16 +102,34 @@ def written_by_line() -> str:
 
 
 def with_writer(document: Mapping[str, Any], file: str) -> tuple[dict[str, Any], str]:
-    """A document without `WRITTEN_BY_KEY`, and the name of its file in messages, with a writer of another version.
+    """A document with present keys without `WRITTEN_BY_KEY`, and the name of its file in messages, with its writer.
 
     Raises:
-        SceneError: the writer is no text.
+        SceneError: the writer is no text, or a key stands under its former name and its present one.
     """
     writer = document.get(WRITTEN_BY_KEY, f"canprobe {__version__}")
     if not isinstance(writer, str):
         raise SceneError([f"{file}: {WRITTEN_BY_KEY}: expected text, got {toml_value(writer)}; remove the line"])
     rest = {name: value for name, value in document.items() if name != WRITTEN_BY_KEY}
+    for (section, former), present in RENAMED_KEYS.items():
+        table, where = rest.get(section), f"{file}: {section}"
+        if section == "joints" and isinstance(table, dict):
+            rest[section] = {name: _renamed(one, former, present, f"{where}.{name}") for name, one in table.items()}
+        elif section in rest:
+            rest[section] = _renamed(table, former, present, where)
     return rest, f"{file}{written_by_other(writer)}"
+
+
+def _renamed(table: object, former: str, present: str, where: str) -> object:
+    """A table with a key under its present name, with a warning."""
+    if not isinstance(table, dict) or former not in table:
+        return table
+    if present in table:
+        raise SceneError([f"{where}.{former}: it is now {present}, which stands there too; remove {former}"])
+    warnings.warn(
+        f"{where}.{former} is now {present}; the next minor version refuses {former}", FutureWarning, stacklevel=2
+    )
+    return {present if key == former else key: value for key, value in table.items()}
 
 
 def written_by_other(writer: object) -> str:
@@ -213,12 +234,8 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
         whole = isinstance(overrides, Mapping) and all(path.partition(".")[0] != "sensor" for path in overrides)
         own, file, folder = _document(scene), scene.name, None
     elif isinstance(scene, str | Path):
-        name = str(scene)
-        packaged = packaged_files("scenes")
-        if name not in packaged and name in packaged_files("cells"):
-            packaged = packaged_files("cells")
-        path = find_file(name, packaged, "scene")
-        file, folder = path.name if name in packaged else name, path.parent
+        path, file = find_file(str(scene), "scene", "cell")
+        folder = path.parent
         own = _as_scene(read_toml(path, file, "; `canprobe scenes` lists the packaged ones"))
     else:
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
@@ -302,10 +319,7 @@ def _read_cell(name_or_path: str | Path) -> tuple[CellFile, dict[str, Any]]:
 
 def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The sections of a cell or array file, and its document with the paths of the files beside it."""
-    name = str(name_or_path)
-    packaged = packaged_files(f"{what}s")
-    path = find_file(name, packaged, what)
-    file = path.name if name in packaged else name
+    path, file = find_file(str(name_or_path), what)
     document, file = with_writer(read_toml(path, file), file)
     reader = Reader(path.parent)
     sections = reader.read(kind, document, (what,))
@@ -341,17 +355,34 @@ def load_array(name_or_path: str | Path) -> dict[str, Any]:
     return document
 
 
-def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
-    """The packaged file of a name, or the path that the name is.
+def find_file(name: str, *kinds: str) -> tuple[Path, str]:
+    """The packaged file of a name, the path that the name is, or the file that another package offers.
+
+    Args:
+        name: name or path.
+        kinds: kinds of file that it may be: ``scene``, ``cell``, ``array``, ``calibration``; the first one is that of
+            messages.
+
+    Returns:
+        Path of the file, and its name in messages.
 
     Raises:
-        SceneError: there is no such file; with the nearest packaged name.
+        SceneError: there is no such file, with the nearest name; two packages offer one; or a package is broken.
     """
-    path = packaged.get(name, Path(name))
-    if not isfile(path) and not name.endswith(".toml") and "/" not in name:
-        hint = _did_you_mean(name, packaged)
-        raise SceneError([f"{name}: no such {what} or file{hint}; packaged {what}s: {', '.join(packaged)}"])
-    return path
+    for kind in kinds:
+        if (own := packaged_files(f"{kind}s").get(name.removeprefix("canprobe:"))) is not None:
+            return own, own.name
+    if isfile(name) or name.endswith(".toml") or "/" in name:
+        return Path(name), name
+    for kind in kinds:
+        if (offer := find_offer(kind, name)) is not None:
+            return offer.path(), name
+    packaged, others = [*packaged_files(f"{kinds[0]}s")], [offer.name for offer in offers(kinds[0])]
+    hint = _did_you_mean(name, packaged + others)
+    of_others = f"; of other packages: {', '.join(others)}" if others else ""
+    raise SceneError(
+        [f"{name}: no such {kinds[0]} or file{hint}; packaged {kinds[0]}s: {', '.join(packaged)}{of_others}"]
+    )
 
 
 def scenes_folder() -> Path:
@@ -377,6 +408,30 @@ def packaged_arrays() -> list[tuple[str, str]]:
 def _titles(folder: str, section: str) -> list[tuple[str, str]]:
     files = packaged_files(folder)
     return [(name, read_toml(path, path.name)[section].get("title", "")) for name, path in files.items()]
+
+
+def offered(kind: str, warn: Callable[[str], None]) -> list[dict[str, str]]:
+    """Name, title, path and package of the scenes, cells or arrays that other packages offer.
+
+    A name that canprobe or another package has too is given with its package.
+
+    Args:
+        kind: ``scene``, ``cell`` or ``array``.
+        warn: called with a line for each that cannot be read; the others are given.
+    """
+    found, own = offers(kind), packaged_files(f"{kind}s")
+    taken = Counter([*own, *(offer.name for offer in found)])
+    rows = []
+    for offer in found:
+        name = offer.name if taken[offer.name] == 1 else offer.whole_name
+        try:
+            path = offer.path()
+            title = read_toml(path, str(path)).get(kind, {}).get("title", "")
+        except SceneError as error:
+            warn(f"warning: {offer.package}: {error}")
+            continue
+        rows.append({"name": name, "title": str(title), "path": str(path), "package": offer.package})
+    return rows
 
 
 def packaged_files(folder: str) -> dict[str, Path]:
@@ -522,7 +577,10 @@ def _with_array(document: dict[str, Any], folder: Path | None) -> dict[str, Any]
     if not isinstance(named, str):
         return document  # said when the section is read
     path = folder / named if folder is not None and isfile(folder / named) else named
-    return _merged({name: table for name, table in load_array(path).items() if name != "array"}, document)
+    below = {name: table for name, table in load_array(path).items() if name != "array"}
+    if not isfile(path) and (found := find_file(named, "array")[0]).parent != scenes_folder().parent / "arrays":
+        document = _merged(document, {"sensor": {"array": str(found)}})  # that of another package, taken along
+    return _merged(below, document)
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

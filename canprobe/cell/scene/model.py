@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from canprobe.cell.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, OneOf, Only, Pattern, Range, ScenePath
+from canprobe.cell.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, Check, OneOf, Only, Pattern, Range, ScenePath
 from canprobe.cell.scene.hardware import (
     ArmSettings,
     Auto,
@@ -27,11 +27,13 @@ from canprobe.cell.scene.hardware import (
     TactileModeName,
     Vec3,
 )
+from canprobe.cell.scene.offers import find_offer
 from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
-ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
+OFFERED_ESTIMATOR = Check("that another package offers", lambda name: find_offer("estimator", name) is not None)
+ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"] | Annotated[str, OFFERED_ESTIMATOR]
 ObjectKind = Literal[
     "plane",
     "sphere",
@@ -48,6 +50,10 @@ ObjectKind = Literal[
 ]
 Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
+
+RENAMED_KEYS: dict[tuple[str, str], str] = {}
+"""Present name of a key by its section and former name. A file with the former one is read with a warning for one minor
+version of canprobe."""
 
 Vec2 = tuple[float, float]
 Row4 = tuple[float, float, float, float]
@@ -81,7 +87,7 @@ class SceneInfo:
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random numbers. In lockstep the same seed gives the same `bus.log`."""
     figures: bool = True
-    """Draw `report.png`, `surface.png` and `report.html` after a run. false saves seconds."""
+    """Draw `report.png` and `surface.png` after a run. false saves a second."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,6 +45,7 @@ class BusRecord:
         self._out = out
         self._observers = observers
         self._candump: CandumpWriter | None = None
+        self._writers: dict[str, Write] = {}
         self._time_ns = 0
         self._stack = ExitStack()
 
@@ -57,7 +58,12 @@ class BusRecord:
         self._stack.close()
 
     def writer(self, channel: str) -> Write:
-        """Make the function that takes each frame of a bus."""
+        """Make the function that takes each frame of a bus; a bus that is opened again has the same one."""
+        if channel not in self._writers:
+            self._writers[channel] = self._make_writer(channel)
+        return self._writers[channel]
+
+    def _make_writer(self, channel: str) -> Write:
         bus = self._plan.scene.bus
         if bus.interface == LOCKSTEP:
             self.traffic[channel] = self.meters[channel] = TrafficMeter(self._plan, channel, exact=False)

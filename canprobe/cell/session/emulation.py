@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.npz import write_npz
@@ -28,7 +28,7 @@ from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.presence import answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.bus.real.memory import reserve_memory
+from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
 from canprobe.fieldbus.eds.packaged import check_eds
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
@@ -37,6 +37,19 @@ from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.virtual.lockstep import Participant
     from canprobe.fieldbus.node.slave_node import SlaveNode
+
+
+class Onlooker(Protocol):
+    """Somebody who looks on while nodes are served, and says when that ends."""
+
+    def tap(self, port: Port) -> Port:
+        """A port in the place of the port of the nodes."""
+
+    def begin(self, nodes: FaultyNodes, now_ns: int) -> None:
+        """The nodes are about to be served."""
+
+    def look(self, now_ns: int) -> bool:
+        """Look after each wait; whether serving ends."""
 
 
 def emulate(
@@ -51,7 +64,9 @@ def emulate(
     without_id: tuple[int, ...] = (),
     homed: bool = False,
     faults: Sequence[str] = (),
+    onlooker: Onlooker | None = None,
     say: Say = quiet,
+    outlasts: bool = False,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
@@ -66,7 +81,9 @@ def emulate(
         without_id: ids of the nodes that start without a node id and wait for LSS.
         homed: whether drives that need homing start with their zeros, and keep them.
         faults: faults, as `canprobe.fieldbus.tools.faults.parse_fault` reads them; their times count from the start.
+        onlooker: looks on, and may end the serving.
         say: called when the nodes are about to be served.
+        outlasts: whether the nodes outlast an interface that is down for a while.
 
     Raises:
         UsageError: when the scene does not fit, a fault is wrong, or a file of `store_folder` belongs to another node.
@@ -109,9 +126,11 @@ def emulate(
                 [(on[channel], port) for channel, port in ports.items()],
                 faulty,
                 faults,
+                onlooker,
                 say=say,
                 in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
+                outlasts=outlasts,
             )
         finally:
             if truth_path is not None and world.recorder is not None:
@@ -124,8 +143,10 @@ def emulate_eds(
     *,
     store_folder: Path | None = None,
     serial_numbers: Sequence[int | None] = (),
+    positions: Sequence[int] = (),
     in_realtime: bool = False,
     faults: Sequence[str] = (),
+    onlooker: Onlooker | None = None,
     say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
@@ -135,8 +156,9 @@ def emulate_eds(
         target: the bus.
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
+        positions: place of the motor of each drive at first, counts; left out: 0.
         in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
-        faults: as for :func:`emulate`.
+        faults, onlooker: as for :func:`emulate`.
         say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:
@@ -153,11 +175,13 @@ def emulate_eds(
     if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
         raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
     nodes: list[SlaveNode] = []
-    for (name, node_id), serial in zip_longest(files, serial_numbers):
+    for (name, node_id), serial, position in zip_longest(files, serial_numbers, positions):
         reading = check_eds(name, 1 if node_id == UNCONFIGURED_ID else node_id)
         od = reading.usable()
         speaks_lss = node_id == UNCONFIGURED_ID or od.device_information.LSS_supported
-        nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
+        nodes.append(
+            make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial, position=position or 0)
+        )
         if warnings := len(reading.warnings):
             check = f"canprobe eds check {name} --node-id {od.node_id}"
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` lists them")
@@ -170,7 +194,7 @@ def emulate_eds(
                 node.lss.bitrate = target.bitrate
         _keep(nodes, store_folder)
         faulty = FaultyNodes(map(FaultyNode, nodes))
-        _serve([(faulty.nodes, port)], faulty, faults, say=say, in_realtime=in_realtime)
+        _serve([(faulty.nodes, port)], faulty, faults, onlooker, say=say, in_realtime=in_realtime)
 
 
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
@@ -222,10 +246,12 @@ def _serve(
     buses: Sequence[tuple[Sequence[Participant], Port]],
     faulty: FaultyNodes,
     faults: Sequence[str],
+    onlooker: Onlooker | None,
     *,
     say: Say,
     in_realtime: bool,
     cycles_kept: int = 0,
+    outlasts: bool = False,
 ) -> None:
     """Serve nodes until interrupted, and throw the faults that are given and those that come by the control channel."""
     from canprobe.fieldbus.node.serve import serve
@@ -253,9 +279,13 @@ def _serve(
         def look() -> bool:
             for server in servers:
                 server.poll(clock.now_ns())
-            return False
+            return onlooker is not None and onlooker.look(clock.now_ns())
 
-        serve(buses, look)
+        if onlooker is not None:
+            buses = [(nodes, onlooker.tap(port)) for nodes, port in buses]
+            onlooker.begin(faulty, start_ns)
+        with garbage_collection_paused():
+            serve(buses, look, outlasts=outlasts)
 
 
 def _named(nodes: Sequence[SlaveNode]) -> str:

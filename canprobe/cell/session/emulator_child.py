@@ -96,8 +96,7 @@ class EmulatorChild(ChildProcess):
         report = start + round(REPORT_EVERY_S * 1e9)
         while waiting or not self._serves():
             now = clock.now_ns()
-            if self.process.poll() is not None:
-                raise BusError(self.last_words() or f"the emulated nodes ended with status {self.process.returncode}")
+            self.raise_ended()
             if now >= deadline:
                 self._raise_late(min(waiting, default=0))
             if now >= report:
@@ -109,6 +108,15 @@ class EmulatorChild(ChildProcess):
             for can_id, data, _ in frames:
                 if data == b"\0":
                     waiting.discard(can_id - HEARTBEAT_BASE)
+
+    def raise_ended(self) -> None:
+        """Raise the error with which the process ended; nothing where it runs.
+
+        Raises:
+            BusError: it ended.
+        """
+        if self.process.poll() is not None:
+            raise BusError(self.last_words() or f"the emulated nodes ended with status {self.process.returncode}")
 
     def _serves(self) -> bool:
         """Whether an array of raw frames is served: it sends no boot-up, and the process says so."""

@@ -10,7 +10,10 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
 
+STEPS = "steps.log"
+"""File of the steps of a run that comes back from losses."""
 LEFT_BY_RUNS = (
+    STEPS,
     *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
     *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
 )

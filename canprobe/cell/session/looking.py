@@ -41,7 +41,7 @@ def scan(target: Target, *, timeout_s: float | None = None, say: Say = quiet) ->
     Raises:
         InterfaceError: when there is no such interface, or the CAN controller's state explains that no node answers.
     """
-    with _open(target, say) as port:
+    with open_bus(target, say) as port:
         nodes = scan_nodes(port, timeout_s or BringUpSettings().sdo_s)
     if not nodes:
         need_controllers(target.interface, {target.channel: port})
@@ -77,7 +77,7 @@ def commission(
         on_interface = replace(Target.over(scene), interface=target.interface)
         wanted = wanted_by(make_plan(resolve(on_interface.applied_to(scene))))
     answer_s = timeout_s or (BringUpSettings() if scene is None else scene.bring_up).sdo_s
-    with _open(target, say) as port:
+    with open_bus(target, say) as port:
         done = commission_nodes(port, wanted, must=scene is None, store=store, timeout_s=answer_s)
     if not done.nodes and not done.unconfigured:
         need_controllers(target.interface, {target.channel: port})
@@ -85,13 +85,13 @@ def commission(
 
 
 @contextlib.contextmanager
-def _open(target: Target, say: Say) -> Iterator[Port]:
-    """A port of a bus without a scene; a wrong setting is only a warning."""
+def open_bus(target: Target, say: Say, data_bitrate: int | None = None) -> Iterator[Port]:
+    """A port of a bus without a scene, of CAN FD where a data bit rate is given; a wrong setting is only a warning."""
     from canprobe.fieldbus.bus.real.opening import open_port
 
     interface, channel = target.interface, target.channel
     check_links(interface, {channel: ExpectedLink(target.bitrate, of_scene=False)}, say, must=False)
-    port = open_port(interface, channel, target.bitrate, MonotonicClock())
+    port = open_port(interface, channel, target.bitrate, MonotonicClock(), data_bitrate=data_bitrate)
     try:
         yield port
     except BusError as error:

@@ -6,6 +6,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -20,7 +21,7 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.observers import Observers
-from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
+from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions, quiet
 from canprobe.cell.npz import read_npz, write_npz
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.make import make_plan
@@ -31,15 +32,18 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.bus_record import BusRecord
 from canprobe.cell.session.buses import channel_routes, lockstep_bus, open_ports
 from canprobe.cell.session.emulator_child import EmulatorChild
-from canprobe.cell.session.folder import prepare_folder, zeros_file
+from canprobe.cell.session.first_second import FirstSecond
+from canprobe.cell.session.folder import STEPS, prepare_folder, zeros_file
 from canprobe.cell.session.link_faults import expected_of
 from canprobe.cell.session.links import check_links, need_controllers
+from canprobe.cell.session.recovery import VIRTUAL_WAIT_S, Recovery
 from canprobe.cell.session.rehearsal import shortened
+from canprobe.cell.session.step_log import StepLog
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.candump import RecordingPort
-from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
+from canprobe.fieldbus.bus.clock import Clock, MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.port import Port, Reports
@@ -73,11 +77,13 @@ class Session:
 
     Attributes:
         record: record of the buses, from the entry on; every time in the files of the run counts from its `origin_ns`.
+        around: puts something round the cell's port, such as a meter; set before the session is entered.
         unwritten: files that could not be written, each with the reason; the cell's faults list them too.
     """
 
     def __init__(self, scene: Scene | Plan, options: RunOptions = DEFAULT_OPTIONS) -> None:
-        self.options = options
+        self.steps = StepLog(options.say, options.out / STEPS if options.recover and options.out else None)
+        self.options = options = replace(options, say=self.steps)
         self.plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
         self.scene = self.plan.scene
         self.out = options.out
@@ -90,9 +96,13 @@ class Session:
         self.observers = Observers(options.observers) if options.observers else None
         self._say = options.say
         self._stack = ExitStack()
+        self._open_buses = self._stack.enter_context(ExitStack())  # left last, also those that were opened again
         self._entered = self._left = False
         self._cell: Cell | None = None
         self._direct: Callable[..., Cycle] | None = None
+        self._recovery: Recovery | None = None
+        self._child: EmulatorChild | None = None
+        self.around: Callable[[Port], Port] = lambda port: port
 
     @cached_property
     def world(self) -> World:
@@ -107,7 +117,7 @@ class Session:
         """The cell, while the session is open or afterwards."""
         if self._cell is None:
             raise UsageError("the cell is not open: use `with canprobe.open_cell(scene) as cell:`")
-        return self._cell
+        return self._cell if self._recovery is None else self._recovery.cell
 
     @property
     def started(self) -> bool:
@@ -117,7 +127,7 @@ class Session:
     @property
     def opened(self) -> bool:
         """Whether the nodes were brought up."""
-        return self._cell is not None and self._cell.cycle is not None
+        return self._cell is not None and self.cell.cycle is not None
 
     @property
     def virtual(self) -> bool:
@@ -142,23 +152,21 @@ class Session:
             self._say(f"warning: {warning}")
         self.record = self._stack.enter_context(BusRecord(self.plan, self.out, self.observers))
         try:
-            port = self._open()
-            self._cell = Cell(
-                self.plan,
-                port,
-                self.options,
-                observers=self.observers,
-                log_failure=self.record.failure,
-                direct=self._direct,
-                origin_ns=self.record.origin_ns,
-                zeros=zeros_file(self.plan),
-            )
+            port = self.around(self._open())
+            self.steps.time_s = lambda: (port.clock.now_ns() - self.record.origin_ns) * 1e-9
+            self._cell = self._make_cell(port)
             if not self.virtual:
                 self._get_ready(port)
             self._stack.enter_context(self.record.timed(port.clock))
             self._stack.enter_context(garbage_collection_paused(collect=not self.virtual))
             self._stack.callback(self._observe_frames, port)
-            self._stack.enter_context(self._cell)
+            if self.options.recover:
+                self._stack.callback(port.close)
+                self._cell.__enter__()
+                self._recovery = self._make_recovery(port, self._cell)
+                self._stack.callback(self._recovery.close)
+            else:
+                self._stack.enter_context(self._cell)
             self._observe_frames(port)
         except BaseException as error:
             self._close()
@@ -179,7 +187,68 @@ class Session:
         """Run a controller until it is done; see :meth:`canprobe.cell.master.cell.Cell.run`."""
         if self._left:
             raise UsageError("the cell is closed: open another one with `with canprobe.open_cell(scene) as cell:`")
-        self.cell.run(controller, progress)
+        first_second = None if self.virtual else FirstSecond(self.cell, self.plan, self._say)
+
+        def after_cycle(measurement: Measurement) -> None:
+            if first_second is not None:
+                first_second(measurement)
+            progress(measurement)
+
+        after = progress if first_second is None else after_cycle
+        if self._recovery is not None:
+            self._recovery.run(controller, after)
+        else:
+            self.cell.run(controller, after)
+
+    def resume(self) -> None:
+        """Ask for motion after a loss; see `canprobe.cell.session.recovery`.
+
+        Raises:
+            UsageError: the cell was not opened with ``recover``, or is closed.
+        """
+        if self._recovery is None or self._left:
+            raise UsageError("resume: the cell is closed, or was not opened with recover=True")
+        self._recovery.resume()
+
+    def _make_cell(self, port: Port, before: Cell | None = None) -> Cell:
+        return Cell(
+            self.plan,
+            port,
+            self.options,
+            observers=self.observers,
+            log_failure=self.record.failure,
+            direct=self._direct,
+            origin_ns=self.record.origin_ns,
+            zeros=zeros_file(self.plan),
+            before=before,
+        )
+
+    def _make_recovery(self, port: Port, cell: Cell) -> Recovery:
+        def alive() -> None:
+            if self._child is not None:
+                self._child.raise_ended()
+
+        return Recovery(
+            self.plan,
+            cell,
+            port,
+            make_cell=self._make_cell,
+            reopen=lambda: self._reopen(port),
+            alive=alive,
+            say=self._say,
+            longest_s=VIRTUAL_WAIT_S if self.virtual else math.inf,
+        )
+
+    def _reopen(self, port: Port) -> Port:
+        """Open the interfaces again; in virtual time there is nothing to open.
+
+        Raises:
+            InterfaceError: one is missing, down or bus-off.
+        """
+        if self.virtual:
+            return port
+        check_links(self.scene.bus.interface, expected_of(self.plan), quiet)
+        return self._join(self._open_ports(port.clock))
 
     def _close(self) -> None:
         try:
@@ -188,6 +257,7 @@ class Session:
             self._left = True
             self.wall_ns = elapsed_ns() - self.started_ns
             self.note_unwritten(self.record.failure())
+            self.note_unwritten(self.steps.failure)
 
     def note_unwritten(self, failure: str | None) -> None:
         """Note that a file could not be written, and why; None notes nothing."""
@@ -287,10 +357,18 @@ class Session:
         check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
         self.record.origin_ns = clock.now_ns()
-        real = self._ports = self._stack.enter_context(
-            open_ports(self.plan, clock, lambda channel: Reports(self.record.error_writer(channel), self._note))
-        )
-        return self._join({name: RecordingPort(port, self.record.writer(name)) for name, port in real.items()})
+        return self._join(self._open_ports(clock))
+
+    def _open_ports(self, clock: Clock) -> dict[str, Port]:
+        """Open the ports of all buses, in the place of those that were open; their counters go on."""
+        before = self._ports
+        for port in before.values():
+            port.close()
+        ports = open_ports(self.plan, clock, lambda channel: Reports(self.record.error_writer(channel), self._note))
+        self._ports = self._open_buses.enter_context(ports)
+        for name, port in before.items():
+            self._ports[name].counters.add(port.counters)
+        return {name: RecordingPort(port, self.record.writer(name)) for name, port in self._ports.items()}
 
     def _get_ready(self, port: Port) -> None:
         """Get ready for real time: start the emulated nodes, rehearse, reserve memory, ask for priority."""
@@ -302,6 +380,7 @@ class Session:
             child = EmulatorChild(self.plan, self.out, channels, truth=self.keeps_all, origin_ns=self.record.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()
+            self._child = child
         self._say("rehearse in lockstep")
         rehearse(self.plan)
         reserve_memory(self.plan.cycles if self.keeps_all else self.options.rows_kept)

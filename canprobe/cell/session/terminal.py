@@ -35,7 +35,7 @@ def painted(text: str, colour: str, stream: TextIO) -> str:
     return f"\x1b[{COLOURS[colour]}m{text}\x1b[0m"
 
 
-class Report:
+class StepReport:
     """Reports of a command while it works: its steps, and one bar.
 
     Args:

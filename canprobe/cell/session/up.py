@@ -19,13 +19,22 @@ ROWS_OF_UP = 4000
 """Number of cycles whose rows are kept: `up` runs for days."""
 
 
-def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
+def up(
+    scene: Scene,
+    *,
+    bridge: Sequence[str] = (),
+    say: Say = quiet,
+    recover: bool = False,
+    asked: Callable[[], bool] = lambda: False,
+) -> None:
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
 
     Args:
         scene: a scene on a bus that other processes can reach.
         bridge: names of bridges to other tools, besides those of the scene.
         say: called with each step, with each new kind of fault, and at the end with the number of each.
+        recover: come back after a node or the bus was lost; see `canprobe.cell.session.recovery`.
+        asked: called in each cycle; after a loss, True lets motion go on.
 
     Raises:
         UsageError: when the scene does not fit or is on a lockstep bus.
@@ -34,10 +43,18 @@ def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
     need_real_bus(scene, "up")
     plan = make_plan(resolve(with_bridges(scene, bridge)))
     with Bridges(plan, None, virtual=False, say=say) as bridges:
-        session = Session(plan, RunOptions(None, say, bridges.observers, ROWS_OF_UP))
+        session = Session(plan, RunOptions(None, say, bridges.observers, ROWS_OF_UP, recover=recover))
         with reporting_notes(session, say) as report_news:
-            say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
-            session.run(bridges.open_to_requests(None, lambda: make_task(plan)), report_news)
+            resume = "; after a loss, r and Enter let motion go on" if recover else ""
+            say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it{resume}")
+
+            def after_cycle(measurement: Measurement) -> None:
+                report_news(measurement)
+                if asked():
+                    session.resume()
+
+            task = bridges.open_to_requests(None, lambda: make_task(plan))
+            session.run(task, after_cycle if recover else report_news)
 
 
 @contextlib.contextmanager

@@ -55,12 +55,19 @@ class ListenTask(Task):
         period_s: period of the cycle.
     """
 
+    can_go_on = True
+
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
         self._reader = PatchReader(calibration)
         self._left = duration_s
         self._period = period_s
         self.taxels: NDArray[np.uint8] | None = None
         self._columns: dict[str, float | Floats] = {}
+
+    @property
+    def reader(self) -> PatchReader:
+        """The reader of its samples."""
+        return self._reader
 
     def record(self) -> TaskRecord:
         """The results so far."""
@@ -83,6 +90,8 @@ class ListenTask(Task):
 
 class HoldTask(Task):
     """Stay where the drives are."""
+
+    can_go_on = True
 
     def step(self, _: Measurement) -> Command:
         """Do nothing."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.offers import find_offer
 from canprobe.cell.scene.setup import Array, Calibrate, Free, Probe, Setup, Touch
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
@@ -15,6 +16,7 @@ from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:
@@ -68,20 +70,24 @@ def contact_correlation(array: Array) -> Correlation:
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
     """An estimator by its name, with the settings of a scan."""
-    from canprobe.mechanics.touch.estimate.fit import make_estimator  # only where a shape is asked for
+    from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator  # only where a shape is asked for
 
     assert task.shape is not None and task.scan is not None
     memory = task.shape.memory
     window = max(8, round(memory / task.scan.speed * task.array.rate_hz))
-    estimator = make_estimator(
-        method,
-        sigma_point=_typical_sigma(task),
-        sigma_normal=SIGMA_NORMAL_RAD,
-        memory_m=memory,
-        window=window,
-        correlation=contact_correlation(task.array),
-        coupling=centroid_coupling(task.probe),
-    )
+    settings: dict[str, Any] = {
+        "sigma_point": _typical_sigma(task),
+        "sigma_normal": SIGMA_NORMAL_RAD,
+        "memory_m": memory,
+        "window": window,
+        "correlation": contact_correlation(task.array),
+        "coupling": centroid_coupling(task.probe),
+    }
+    if method not in METHODS and (offer := find_offer("estimator", method)) is not None:
+        from canprobe.cell.tasks.own_estimators import OfferedEstimator, RenewedEstimator
+
+        return RenewedEstimator(lambda: OfferedEstimator(offer, settings))
+    estimator = make_estimator(method, **settings)
     if method not in PATCH_METHODS:
         return estimator
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
@@ -100,8 +106,7 @@ def _typical_sigma(task: Touch) -> float:
     """Standard deviation of a contact at the wanted force on a plane, m, for contacts that state none."""
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
-    level_pa = MomentImage(make_patch_calibration(task.array.calibration, task.array.pad)).level_pa
-    return task.array.calibration.noise.lateral(level_pa / (probe.stiffness * float(depth)))
+    return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
 
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
@@ -172,7 +177,9 @@ def make_task(plan: Plan) -> Controller:
     """The controller of the plan's task; what the task does not need is not even imported."""
     period_s, task = plan.sync.period_ns * 1e-9, plan.setup.task
     if isinstance(task, Touch):
-        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup))
+        array = task.array
+        check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
+        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup), check)
     if isinstance(task, Calibrate):
         from canprobe.cell.tasks.calibrate import CalibrateTask
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import force_columns
+from canprobe.cell.master.array import PatchReader, force_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.supervision import TouchState, limits_of
@@ -83,6 +83,11 @@ class ProbingTask(Task):
             Phase.DONE: self._stay,
             Phase.REGAIN: self._regain,
         }
+
+    @property
+    def reader(self) -> PatchReader:
+        """The reader of its sensing."""
+        return self.sensing.reader
 
     def record(self) -> TaskRecord:
         """The results so far."""

@@ -32,6 +32,7 @@ def _is_way(value: object) -> bool:
 _VALUES: dict[str, Callable[[object], bool]] = {
     "start": lambda value: value is None,
     "stop": lambda value: value is None,
+    "resume": lambda value: value is None,
     "target_force_n": _is_number,
     "speed_m_s": _is_number,
     "trajectory": _is_way,
@@ -44,8 +45,9 @@ class Request:
     """A request of another tool to a running task; other kinds and values are refused.
 
     Args:
-        kind: start, stop, target_force_n, speed_m_s or trajectory.
-        value: None for start and stop; N or m/s, finite; the arguments `points` and `velocities` of a `Trajectory`.
+        kind: start, stop, resume, target_force_n, speed_m_s or trajectory.
+        value: None for start, stop and resume; N or m/s, finite; the arguments `points` and `velocities` of a
+            `Trajectory`.
 
     Raises:
         UsageError: the kind is unknown, or the value has another type.
@@ -128,6 +130,27 @@ class RequestedTask(Controller):
         """Let the task do its work once its commands are sent."""
         if self._task is not None:
             self._task.update()
+
+    @property
+    def can_go_on(self) -> bool:  # type: ignore[override]
+        """Whether there is something to do after a loss: the next task that is asked for, or what goes on itself."""
+        return self._task is None or self._make is not None or self._task.can_go_on
+
+    def asks_to_go_on(self) -> bool:
+        """Whether a request asks for motion after a loss; the others are refused meanwhile: they came too early."""
+        kinds = [request.kind for queue in self._requests for request in queue]
+        for queue in self._requests:
+            queue.clear()
+        return "resume" in kinds
+
+    def go_on(self, measurement: Measurement) -> None:
+        """Wait for the next start, or let the task go on that can."""
+        self._targets, self._stopping = [], False
+        self._time = MotionTime(round(1e9 * self._period_s))
+        if self._task is not None and not self._task.can_go_on:
+            self._task = None
+        elif self._task is not None:
+            self._task.go_on(measurement)
 
     @property
     def lets_go(self) -> bool:  # type: ignore[override]

@@ -121,7 +121,7 @@ class ContactSensing:
         self.dropped = 0
         self.reader = PatchReader(calibration)
         self._noise = noise
-        self._level_pa = MomentImage(calibration).level_pa
+        self._pad = calibration.pad
         self._moment_image = moment_image
         self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
@@ -160,6 +160,11 @@ class ContactSensing:
         """Place contacts as another sensing did that had this depth at 1 N, m."""
         self._depth_at_1_n = depth
 
+    @property
+    def slope(self) -> Slope | None:
+        """Slope that the last touch showed; None before."""
+        return self._slope
+
     def set_slope(self, slope: Slope) -> None:
         """Take the slope that a touch showed; depths follow from it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
@@ -186,8 +191,7 @@ class ContactSensing:
             return None
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         depth = self.depth(patch.force)
-        # level that is taken off the image, over the peak pressure of the contact
-        lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
+        lightness = self._pad.lightness(patch.peak_pa)
         image_sigma = 0.0 if self._noise is None else self._noise.image(lightness)
         found = contact_sample(
             t_s=t_s,

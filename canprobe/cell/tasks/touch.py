@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
 from canprobe.mechanics.touch.contact import ContactSample, Slope
 from canprobe.mechanics.touch.layer_stiffness import PushFit
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, SETTLE_S, LineMotion, smooth_step
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
@@ -42,6 +44,10 @@ RETREAT_WAY = 6e-3
 """Way off the object, m."""
 RAMP_S = 0.05
 """Time to reach the scan's speed."""
+CALIBRATE = (
+    ": forces and regions are stated wider from here on; type `canprobe calibrate array CELL` and name its file as"
+    " sensor.calibration"
+)
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
@@ -53,11 +59,21 @@ class TouchTask(ProbingTask):
         task: settings of the touch.
         sensing: contacts from measurements.
         shape: the estimator in the loop; None where no shape is asked for.
+        check: compares the array with its calibration; None where nothing can be compared.
     """
 
-    def __init__(self, plan: Plan, task: Touch, sensing: ContactSensing, shape: ShapeTracker | None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        task: Touch,
+        sensing: ContactSensing,
+        shape: ShapeTracker | None,
+        check: CalibrationCheck | None = None,
+    ) -> None:
         super().__init__(plan, task.lag_s, sensing)
         self.shape = shape
+        self._check = check
+        self._remarks: list[str] = []
         self._scan_start: int | None = None
         self._scan_end: int | None = None
         self._task = task
@@ -83,6 +99,11 @@ class TouchTask(ProbingTask):
     def restarts(self) -> int:
         """How often its estimator diverged and started afresh."""
         return self.shape.restarts if self.shape is not None else 0
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """That the calibration is another array's, once."""
+        return self._remarks
 
     def record(self) -> TaskRecord:
         """The results so far."""
@@ -126,7 +147,19 @@ class TouchTask(ProbingTask):
         """The estimator's work after a step, once: when the commands are out, or else before the next step."""
         if not self._updated and self.shape is not None and (estimate := self.shape.work()) is not None:
             self._follow(estimate)
+        if not self._updated and self._check is not None:
+            self._doubt(self._check)
         self._updated = True
+
+    def _doubt(self, check: CalibrationCheck) -> None:
+        """Answer with less certainty where the array is not as its calibration says."""
+        if not check.work() or (finding := check.finding) is None:
+            return
+        self.sensing.reader.widen(check.force_spread)
+        if self.shape is not None:
+            self.shape.doubted = True
+        if not self._remarks:
+            self._remarks.append(finding + CALIBRATE)
 
     # sensing and supervision
 
@@ -150,6 +183,8 @@ class TouchTask(ProbingTask):
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self.shape.add(contact)
+            if self.phase is Phase.SCAN and self._check is not None:
+                self._check.see(contact.t_s, self.sensing.reader.image, sample.frame.window, patch)
         felt_columns = self._felt_columns(sample, patch, contact)
         self._columns = felt_columns | self._shape_columns | {"depth_at_1n_mm": depth_at_1n_mm}
 
@@ -171,6 +206,8 @@ class TouchTask(ProbingTask):
 
     def _follow(self, estimate: SurfaceEstimate) -> None:
         """Go by an estimate from now on."""
+        if self._check is not None:
+            self._check.take(estimate, self.sensing.slope)
         contact = self._contact
         if contact is None or self._servo is None:
             return

@@ -11,7 +11,7 @@ Source: Linux include/uapi/linux/can/error.h (error classes).
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Protocol
 
@@ -87,6 +87,11 @@ class PortCounters:
     transmit_full: int = 0
     ignored: int = 0
     clock_steps: int = 0
+
+    def add(self, other: PortCounters) -> None:
+        """Add the counters of a port that was open before on the same bus."""
+        for field in fields(self):
+            setattr(self, field.name, getattr(self, field.name) + getattr(other, field.name))
 
     def note_error(self, can_id: int, data: bytes) -> None:
         """Count an error frame by its class; an overflow is one lost frame, received or sent."""

@@ -22,7 +22,12 @@ def set_serial_number(node: SlaveNode, serial: int) -> None:
 
 
 def make_eds_node(
-    od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
+    od: ObjectDictionary,
+    node_id: int,
+    *,
+    eds: str | Path | None = None,
+    serial: int | None = None,
+    position: int = 0,
 ) -> SlaveNode:
     """Make a conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
 
@@ -31,10 +36,12 @@ def make_eds_node(
         node_id: node id, 1–127; with 255 the node waits for LSS to give it one.
         eds: name or path of the EDS, for a node that speaks LSS; None for one that does not.
         serial: serial number for 1018h:04, in the place of that of the file.
+        position: place of the motor of a drive at first, counts.
     """
     od_of = None if eds is None else partial(load_eds, eds)
     drive = is_drive(od)
-    node = make_drive_node(od, node_id, 0, IdealAxis(), od_of) if drive else SlaveNode(od, node_id, od_of=od_of)
+    axis = IdealAxis(position)
+    node = make_drive_node(od, node_id, 0, axis, od_of) if drive else SlaveNode(od, node_id, od_of=od_of)
     if serial is not None:
         set_serial_number(node, serial)
     return node

@@ -13,10 +13,14 @@ from canprobe.fieldbus.drive.reference import AxisPlant
 
 
 class IdealAxis(AxisPlant):
-    """Follows straight references without a lag. The axis number in calls has no meaning here."""
+    """Follows straight references without a lag. The axis number in calls has no meaning here.
 
-    def __init__(self) -> None:
-        self._start = self._end = 0.0
+    Args:
+        position: place of the motor at first, counts.
+    """
+
+    def __init__(self, position: float = 0.0) -> None:
+        self._start = self._end = position
         self._t0 = self._t1 = self._now = 0
 
     def begin(self, t_ns: int) -> None:

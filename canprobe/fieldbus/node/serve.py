@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 
+from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.joined import wait_for_any
 from canprobe.fieldbus.bus.port import Port, TimedFrame
-from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 
 _MAX_WAIT_NS = 100_000_000
+_DOWN_NS = 20_000_000
+"""Time between two looks at an interface that is down."""
 
 
 class Exchange(LockstepBus):
@@ -146,29 +148,46 @@ class _Served:
             self.port.send_batch(frames)
 
 
-def serve(buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[], bool]) -> None:
+def serve(
+    buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[], bool], *, outlasts: bool = False
+) -> None:
     """Power on the nodes and serve them until `stop()` is true.
 
-    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other.
+    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other. A process that
+    only serves does better with `garbage_collection_paused` round it.
 
     Args:
         buses: participants, for example `SlaveNode`s, and port of each bus; the participants live on the ports' clock.
         stop: function that ends the loop by True; it is called after every wait, which lasts 100 ms at most.
+        outlasts: whether the nodes outlast an interface that is down for a while, as devices with power do.
+
+    Raises:
+        InterfaceError: an interface is down or lost, unless the nodes outlast it.
     """
-    ports = [port for _, port in buses]
-    clock = ports[0].clock
-    with garbage_collection_paused():
-        now_ns = clock.now_ns()
-        served = [_Served(nodes, port, now_ns) for nodes, port in buses]
-        while not stop():
-            until_ns = min([now_ns + _MAX_WAIT_NS, *(due for one in served if (due := one.get_ready()) is not None)])
-            if len(ports) == 1:
-                received = [ports[0].wait_and_drain(until_ns)]
-            else:
-                wait_for_any(ports, until_ns)
-                received = [port.drain() for port in ports]
-            # The last arrival serves as present time, which saves a reading of the clock before the answers leave.
-            arrivals_ns = [frames[-1][2] for frames in received if frames]
-            now_ns = max(now_ns, *arrivals_ns) if arrivals_ns else clock.now_ns()
-            for one, frames in zip(served, received, strict=True):
-                one.step(frames, now_ns)
+    clock = buses[0][1].clock
+    now_ns = clock.now_ns()
+    served = [_Served(nodes, port, now_ns) for nodes, port in buses]
+    while not stop():
+        try:
+            now_ns = _turn(served, now_ns)
+        except InterfaceError:
+            if not outlasts:
+                raise
+            clock.sleep_until_ns(clock.now_ns() + _DOWN_NS)
+
+
+def _turn(served: Sequence[_Served], now_ns: int) -> int:
+    """Wait for frames or until a node is due, and let the nodes answer; the present time."""
+    ports = [one.port for one in served]
+    until_ns = min([now_ns + _MAX_WAIT_NS, *(due for one in served if (due := one.get_ready()) is not None)])
+    if len(ports) == 1:
+        received = [ports[0].wait_and_drain(until_ns)]
+    else:
+        wait_for_any(ports, until_ns)
+        received = [port.drain() for port in ports]
+    # The last arrival serves as present time, which saves a reading of the clock before the answers leave.
+    arrivals_ns = [frames[-1][2] for frames in received if frames]
+    now_ns = max(now_ns, *arrivals_ns) if arrivals_ns else ports[0].clock.now_ns()
+    for one, frames in zip(served, received, strict=True):
+        one.step(frames, now_ns)
+    return now_ns

@@ -14,9 +14,11 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
 Estimators: `estimators` (error against run time) and `bound` (error and coverage over the Cramér–Rao bound) stand on
 `ground`, `bound` also on `bound_cases`, `bound_scores` and `bound_figure`; `regions` measures coverage with the whole
 sensor on `random_scenes`, with `region_scores` and `region_figure`; `shapes` compares whole surfaces with those of
-other methods; `arrays` calibrates unseen arrays, and with `array_forces` scores their force.
+other methods; `arrays` calibrates unseen arrays, and with `array_forces` scores their force; `calibrations`
+counts the scans that notice a calibration of another array.
 Plant and loop: `workprec`, with `workprec_cell` (`workprec_cell_choice`, `workprec_cell_figure`) on `no_bus`;
 `stability` with `stability_runs`, `stability_extremes` and `linear_loop`.
 Robustness: `faults` with `fault_cases`, `fault_runs`, `fault_scenes`, `fault_scores`, `witnessed_run`; `faults_vcan`.
+Link: `link` with `link_setups`; `recover` with `recover_runs`.
 Real time: `realtime` with `realtime_cases`, `cycle_times` and `plain_canopen`; `realtime_soak`.
 """

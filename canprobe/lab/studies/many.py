@@ -28,7 +28,7 @@ from canprobe.cell.scene.load import dump_scene, gathered, load_scene, parse_sce
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.target import VIRTUAL, Target
-from canprobe.cell.session.terminal import Report
+from canprobe.cell.session.terminal import StepReport
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
 from canprobe.fieldbus.bus.files import make_folder, whole_file
 from canprobe.lab.studies.cell_store import model_digest
@@ -166,7 +166,7 @@ def run_many(
         cases += [RunCase(text, digest, seed, tuple(series), float(every_ms)) for seed in wanted]
         rows += [{**change, "seed": seed} for seed in wanted]
     where: dict[str, Any] = {"dask": workers} if isinstance(workers, str) else {"workers": workers}
-    bar = Report().bar(".0f runs") if progress else None
+    bar = StepReport().bar(".0f runs") if progress else None
     with open_sweep(folder, fresh=fresh, say=say, progress=bar, **where) as sweep:
         outcomes = sweep.map(measure, cases)
     return Runs(base, tuple(keys), tuple(rows), tuple(outcomes), tuple(series), every_ms * 1e-3)

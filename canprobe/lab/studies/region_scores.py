@@ -48,6 +48,7 @@ class ScoredScan(NamedTuple):
         scores: (n, 5) of those that observe all of K: time (s), squared error and stated variance (Frobenius), squared
             length of the error in the region's, and the logarithm of the density at the truth.
         behind_late, behind: the same of those behind a jump.
+        noticed: whether the cell found the array not to be as its calibration says.
     """
 
     seed: int
@@ -65,6 +66,7 @@ class ScoredScan(NamedTuple):
     scores: Floats
     behind_late: int
     behind: Floats
+    noticed: bool = False
 
     @property
     def share(self) -> float:
@@ -103,7 +105,7 @@ def measure(seed: int) -> ScoredScan:
                 session.run(task)
         except SafetyStop as stop:
             ended = f"stopped: {stop.reason}"
-    return as_scan(drawn, ended, *scores_of(session, task.shape.records))
+    return as_scan(drawn, ended, *scores_of(session, task.shape.records))._replace(noticed=bool(task.remarks))
 
 
 def open_scan(drawn: DrawnScene) -> tuple[Session, Any]:

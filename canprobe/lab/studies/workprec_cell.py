@@ -177,7 +177,7 @@ def measure(case: CellCase) -> dict[str, Any]:
         scene,
         scene=replace(scene.scene, seed=case.seed),
         task=replace(scene.task, duration_s=case.duration_s),
-        shape=replace(scene.shape, method=case.method),  # type: ignore[arg-type]
+        shape=replace(scene.shape, method=case.method),
         plant=replace(
             scene.plant or PlantSettings(),
             fidelity=case.fidelity,  # type: ignore[arg-type]

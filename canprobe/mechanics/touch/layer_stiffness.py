@@ -1,6 +1,7 @@
-"""The layer's compliance from a touch: how the force grows while the probe is pushed into an object that stands still.
+"""The stiffness of the probe's layer: from the push of a touch, and as a state of a scan.
 
-On a Winkler layer `F = π k δ² / (2 √(AB))`, so the root of the force is a straight line over the push, whatever the
+A touch shows the layer's compliance: how the force grows while the probe is pushed into an object that stands still. On
+a Winkler layer `F = π k δ² / (2 √(AB))`, so the root of the force is a straight line over the push, whatever the
 curvatures: its slope b is what the servo needs, `δ = √F / b`; with the curvatures known it gives `k = 2 √(AB) b² /
 π`. Stops being true where the patch is cut by the pad's edge or the object slides away.
 """
@@ -12,6 +13,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from canprobe.mechanics.touch.linear_algebra import positive
+
 ROOT_FORCE_SIGMA = 0.03
 """Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""
 MAX_SCATTER_RATIO = 3.3
@@ -20,6 +23,9 @@ MIN_FORCE_N = 0.1
 """Least force of a sample, N: below it threshold and noise of the array bend the line."""
 MIN_PUSH_SAMPLES = 6
 """Least number of samples that give a slope."""
+COMMON_SIGMA = 0.035
+"""Standard deviation of ln k that no number of images averages: the errors of an array's calibration are common to all
+its images. Touch and images together err by −5 to +4 % over 59 scenes."""
 
 
 class PushFit:
@@ -101,3 +107,47 @@ def stiffness_from_slope(slope: float, radius: float, kappa: ArrayLike) -> float
     """
     k1, k2 = (float(k) for k in np.asarray(kappa, dtype=np.float64))
     return 2.0 * math.sqrt(0.25 * (1.0 / radius + k1) * (1.0 / radius + k2)) * slope * slope / math.pi
+
+
+class ScanStiffness:
+    """Stiffness k of the layer as a state of a scan: ln k and its standard deviation.
+
+    It begins with what is stated. The touch settles it as far as the curvature there is known; every answer of the scan
+    adds what its images say at the curvature that is known by then. Why a state, and not the k of each answer: a
+    contact's depth follows from k, and with a k that moves along the path the heights of contacts would bend.
+
+    Args:
+        stated: stiffness K/h that is stated, N/m³.
+        sigma: standard deviation of its logarithm.
+    """
+
+    def __init__(self, stated: float, sigma: float) -> None:
+        self._log = math.log(positive("stated", stated))
+        self._information = positive("sigma", sigma) ** -2
+
+    @property
+    def value(self) -> float:
+        """Stiffness K/h, N/m³."""
+        return math.exp(self._log)
+
+    @property
+    def log(self) -> float:
+        """Logarithm of `value`."""
+        return self._log
+
+    @property
+    def information(self) -> float:
+        """Inverse variance of `log`."""
+        return self._information
+
+    def take(self, log: float, information: float, share: float = 1.0) -> None:
+        """Take ln k of an answer that used this state as its prior.
+
+        Args:
+            log: ln k of the answer.
+            information: its inverse variance, that of this state included.
+            share: share of the answer's contacts that no earlier answer had.
+        """
+        kept = self._information + share * max(information - self._information, 0.0)
+        self._log += share * information / kept * (log - self._log)
+        self._information = max(min(kept, COMMON_SIGMA**-2), self._information)

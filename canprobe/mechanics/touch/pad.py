@@ -57,6 +57,14 @@ class Pad:
             if given is not None and np.shape(given) != (self.taxels, 3):
                 raise UsageError(f"{name}: expected {self.taxels} points of 3 coordinates, got shape {np.shape(given)}")
 
+    def lightness(self, peak_pa: float) -> float:
+        """Level over the peak pressure of an image (Pa), at most 1: a light touch presses few taxels.
+
+        The level is the first count above the threshold. Errors of force, moments and place grow with the lightness.
+        """
+        level_pa = self.full_scale_pa * (THRESHOLD_COUNTS + 1) / COUNTS_MAX
+        return level_pa / peak_pa if peak_pa > level_pa else 1.0
+
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of its images."""

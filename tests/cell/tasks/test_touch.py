@@ -58,7 +58,7 @@ def test_a_loss_is_summed_up_in_the_units_of_the_summary():
     ],
 )
 def test_what_is_no_command_cannot_be_requested(kind, value):
-    with pytest.raises(UsageError, match="expected one of start, stop, target_force_n"):
+    with pytest.raises(UsageError, match="expected one of start, stop, resume, target_force_n"):
         Request(kind, value)
 
 

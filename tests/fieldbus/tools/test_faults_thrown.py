@@ -7,12 +7,8 @@ import threading
 import pytest
 
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
-from canprobe.fieldbus.drive.from_eds import make_eds_node
-from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
-from canprobe.fieldbus.tools.faults import BUS_FAULTS, FaultyNode, FaultyNodes, inject, parse_fault
+from canprobe.fieldbus.tools.faults import BUS_FAULTS, inject, parse_fault
 from canprobe.fieldbus.tools.faults.control import ControlServer, request_faults
 
 MS, S = 1_000_000, 1_000_000_000
@@ -21,14 +17,8 @@ MS, S = 1_000_000, 1_000_000_000
 class Line:
     """Drive 5 on a lockstep bus, and a port that sends and hears hex."""
 
-    def __init__(self):
-        self.clock = VirtualClock()
-        bus = LockstepBus(self.clock)
-        self.node = FaultyNode(make_eds_node(load_eds("puma260_joint", 5), 5))
-        self.nodes = FaultyNodes([self.node])
-        self.port = bus.port()
-        bus.attach(self.node)
-        assert self.heard(1) == [(0x705, "00")]
+    def __init__(self, bus, node):
+        self.clock, self.port, self.nodes, self.node = bus.clock, bus.port(), bus.faulty, node
 
     def heard(self, ms):
         self.clock.sleep_until_ns(self.clock.now_ns() + round(ms * MS))
@@ -49,8 +39,9 @@ class Line:
 
 
 @pytest.fixture
-def line():
-    return Line()
+def line(emulated_bus, emulated_nodes):
+    (node,) = emulated_nodes("puma260_joint", first_id=5)
+    return Line(emulated_bus, node)
 
 
 def test_a_fault_as_people_write_it():
@@ -226,9 +217,8 @@ def test_on_an_event_and_the_same_again_by_its_seed(line):
     assert len(line.ask(0x605, READ_1000)) == 1
 
     def answered(seed):
-        other = Line()
-        other.nodes.inject(f"node 5: drop share=0.5 seed={seed}")
-        return [len(other.ask(0x605, READ_1000)) for _ in range(20)]
+        with inject(line.nodes, f"node 5: drop share=0.5 seed={seed}"):
+            return [len(line.ask(0x605, READ_1000)) for _ in range(20)]
 
     assert answered(1) == answered(1) != answered(2)
 

@@ -213,11 +213,12 @@ class SocketCanPort:
     def _take(self, wait: bool) -> list[TimedFrame]:
         try:
             rows = self._frames.receive(wait)
+            patient = self._patient_frames.receive() if self._patient_frames is not None else None
         except OSError as error:
             raise self._failed(error) from error
         if rows:
             self._count_drops(0, rows)
-        if self._patient_frames is not None and (patient := self._patient_frames.receive()):
+        if patient:
             self._count_drops(1, patient)
             rows = patient + rows
         if not rows:

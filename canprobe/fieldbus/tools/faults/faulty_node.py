@@ -29,12 +29,14 @@ class FaultyNode(WrappedNode):
     Attributes:
         hits: number of frames that were changed, lost, moved or made up, and of reboots.
         now_ns: time of the last frame or deadline.
+        history: what happened: (time in ns, ``begins`` or ``ends``, fault).
     """
 
     def __init__(self, node: SlaveNode, faults: Iterable[Fault] = ()) -> None:
         super().__init__(node)
         self.hits = 0
         self.now_ns = 0
+        self.history: list[tuple[int, str, Fault]] = []
         self._pending: list[Fault] = []
         self._effects: list[Effect] = []
         self._later: list[tuple[int, int, bool, Frame]] = []
@@ -64,7 +66,12 @@ class FaultyNode(WrappedNode):
     @property
     def faults(self) -> list[Fault]:
         """Faults that hold, and those that are to come."""
-        return [*(effect.fault for effect in self._effects), *self._pending]
+        return [*self.holding, *self._pending]
+
+    @property
+    def holding(self) -> list[Fault]:
+        """Faults that hold."""
+        return [effect.fault for effect in self._effects]
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -145,10 +152,12 @@ class FaultyNode(WrappedNode):
             out += self._begin(fault, t_ns)
         for effect in [one for one in self._effects if one.end_ns <= t_ns or one.left <= 0]:
             self._effects.remove(effect)
+            self.history.append((t_ns, "ends", effect.fault))
             out += effect.end(t_ns)
         return [] if self._is_dark() else out
 
     def _begin(self, fault: Fault, t_ns: int) -> Sequence[Frame]:
+        self.history.append((t_ns, "begins", fault))
         effect = fault.kind.effect(fault, self)
         effect.end_ns = t_ns + fault.duration_ns
         self._effects.append(effect)

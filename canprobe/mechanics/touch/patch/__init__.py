@@ -14,6 +14,8 @@ From an image:
     force_reading       the force of each image in its order, without creep, with its standard deviation
     force_creep         corrects the creep of the force by two relaxations
     force_errors        the errors of the force that a calibration states
+    blur_fit            the blur of the array, by one image
+    calibration_check   whether the array behaves as its calibration says
     creep               traces of earlier places of the patch in the image of an array that creeps
 
 Curvature:

@@ -6,8 +6,9 @@ moments of a patch that rolls over the pad are larger than those of one at rest,
 earlier places. The share is calibrated (`ImageParameters.memory`); with it images at rest and in motion give the same
 curvature.
 
-Model: traces that fade exponentially, with time constants a decade apart and of equal strength. It stops being true
-where the patch has been further away than its own size.
+Model: traces that fade exponentially, with time constants a decade apart and of equal strength. A trace is so faint
+that it shows only where it overlaps the patch: one further away lies below the level that is taken off an image. So the
+traces' share in the moments stops growing with their distance (`overlapping`).
 
 Source: logarithmic creep as a sum of exponentials a decade apart: Findley, Lai and Onaran, "Creep and relaxation of
 nonlinear viscoelastic materials", ch. 5.
@@ -21,6 +22,16 @@ from canprobe.mechanics.touch.patch.moments import Moments
 
 TIME_CONSTANTS_S = (0.3, 3.0, 30.0)
 """Time constants of the traces, s."""
+OVERLAP_RATIO = 1.0
+"""Moments of the traces, over those of the patch, up to which they overlap it. On random scenes in which the contact
+runs over the pad they stay at 3.5 % of the image's moments while the squared distance of the places grows 40-fold."""
+
+
+def overlapping(traces: Moments, moments: Moments) -> Moments:
+    """The part of the traces (xx, xy, yy, m²) that shows in an image of these moments: no larger than the patch."""
+    apart = (traces[0] + traces[2]) / (OVERLAP_RATIO * (moments[0] + moments[2]))
+    shown = 1.0 / math.hypot(1.0, apart)
+    return shown * traces[0], shown * traces[1], shown * traces[2]
 
 
 class PadMemory:

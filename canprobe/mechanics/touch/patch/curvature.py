@@ -6,10 +6,11 @@ many images are averaged, the information never exceeds that of the calibration 
 
 Motion and patch are fused as measurements: their informations are added, each with its whole covariance. So the patch
 has little weight where a path excites all of K, and much where it does not. The stiffness of the layer is a fourth
-unknown beside q. Why not a constant: an error of it looks like isotropic curvature. It is known from the scene at
-first, then from the slope of a touch together with the first images, and in every answer from the motion too. Outside
-the calibrated range the patch counts less and less. Where patch and motion contradict each other both count less, by χ²
-over its 95 % point; where that lasts, nothing is called observed.
+unknown beside q. Why not a constant: an error of it looks like isotropic curvature. Its prior is the state of the scan
+(`ScanStiffness`): stated at first, then found from the slope of a touch together with the first images, and improved by
+every answer in which the motion knows curvature. Outside the calibrated range the patch counts less and less. Where
+patch and motion contradict each other both count less, by χ² over its 95 % point; where that lasts, nothing is called
+observed.
 
 Where the curvature changes along the path, a mean over some millimetres belongs to an earlier place. A second, shorter
 mean shows it: the difference of the two, extrapolated to now, counts as an error of the longer one.
@@ -27,9 +28,9 @@ from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformati
 from canprobe.mechanics.touch.estimate.noise import CHI2_999
 from canprobe.mechanics.touch.estimate.observed import turned
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
-from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
+from canprobe.mechanics.touch.layer_stiffness import ScanStiffness, stiffness_from_slope
 from canprobe.mechanics.touch.linear_algebra import inverted, positive, principal_of, solved
-from canprobe.mechanics.touch.patch.creep import PadMemory
+from canprobe.mechanics.touch.patch.creep import PadMemory, overlapping
 from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.touch.patch.moments import Moments
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation, transported
@@ -52,6 +53,8 @@ MAX_ROUNDS = 6
 SLOPE_SIGMA = 0.08
 """Standard deviation of ln(stiffness) from the slope of a touch, by the error of the force; that of the slope comes on
 top."""
+TRACE_ERROR_SHARE = 0.5
+"""Standard deviation of what traces of earlier places do to the moments (`creep`), over what is taken off for them."""
 _STIFFNESS_STEP = 0.01
 _ROOT2 = math.sqrt(2.0)
 SETTLED_STEP, MAX_LAST_STEP = 0.002, 0.05
@@ -65,13 +68,20 @@ class Fused(NamedTuple):
         q: (3,) value of (K11, √2 K12, K22), 1/m.
         patch: (3, 3) the patch's part of the information, with the layer's stiffness unknown, m².
         cost: χ² of patch, motion and stiffness against the answer.
-        stiffness: stiffness K/h of the layer, N/m³.
+        log_stiffness: logarithm of the layer's stiffness K/h in N/m³.
+        stiffness_information: its inverse variance.
     """
 
     q: Floats
     patch: Floats
     cost: float
-    stiffness: float
+    log_stiffness: float
+    stiffness_information: float
+
+    @property
+    def stiffness(self) -> float:
+        """Stiffness K/h of the layer, N/m³."""
+        return math.exp(self.log_stiffness)
 
     @property
     def contradicted(self) -> bool:
@@ -79,18 +89,11 @@ class Fused(NamedTuple):
         return self.cost > CHI2_999
 
 
-class LayerStiffness(NamedTuple):
-    """Logarithm of the layer's stiffness over the stated one, and its standard deviation."""
-
-    mean: float
-    sigma: float
-
-
 class _Seen(NamedTuple):
-    """Moments in their principal axes, and their error by a change along the path, m²."""
+    """Moments in their principal axes, and errors of unknown sign: a change along the path, traces of the past, m²."""
 
     moments: Moments
-    drift: Moments
+    errors: tuple[Moments, Moments]
 
 
 class _Mean:
@@ -120,7 +123,7 @@ class _Mean:
                 self.moments, self.age, self.frames, self._apart = (xx, xy, yy), 0.0, 1, 0
                 return 1.0
             share *= min(1.0, nearness)
-        self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
+        self.moments = _mixed(self.moments, (xx, xy, yy), share)
         self.age = (1.0 - share) * (self.age + 1.0)
         return share
 
@@ -142,6 +145,7 @@ class PatchCurvature:
         sigma_stiffness: standard deviation of the logarithm of the model's stiffness, before any touch.
 
     Attributes:
+        stiffness: stiffness of the layer, the state of the scan; a loss of contact does not reset it.
         frames: number of frames in the mean, at most `MAX_FRAMES`.
         force: mean force over these frames, N.
         refused: number of contacts without moments (saturated, at the pad's edge, hardly any taxel, or none sent).
@@ -149,8 +153,9 @@ class PatchCurvature:
 
     def __init__(self, model: ImageModel, sigma_stiffness: float = 1e-3) -> None:
         self.model = model
-        self._stiffness = LayerStiffness(0.0, positive("sigma_stiffness", sigma_stiffness))
+        self.stiffness = ScanStiffness(model.stiffness, positive("sigma_stiffness", sigma_stiffness))
         self.refused = 0
+        self._used: Slope | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -162,12 +167,15 @@ class PatchCurvature:
         self._last: Floats | None = None
         self._slope: Slope | None = None
         self._touched = False
+        self._traces: Moments = (0.0, 0.0, 0.0)
         self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(MAX_RECENT_FRAMES, RECENT_OUTLIER_SHARE)
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
         if not self._touched:
-            self._slope, self._touched = sample.slope, True
+            self._touched = True
+            if sample.slope != self._used:  # contact that is regained has the slope of an earlier touch
+                self._slope = sample.slope
         x, y, z = sample.r_probe.tolist()
         k = 1.0 / math.sqrt(x * x + y * y + z * z)
         direction = k * x, k * y, k * z
@@ -180,10 +188,12 @@ class PatchCurvature:
         x_axis = self._axes[0] if self.frames else tangent_rotation(inward)[:, 0].tolist()
         self._axes = transported(x_axis, inward)
         (uu, uv, vv), memory = sample.moments, self.model.memory
-        uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
-        xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
-        self._recent.add(xx, xy, yy)
-        share = self._mean.add(xx, xy, yy)
+        tuu, tuv, tvv = (memory * trace for trace in overlapping(was, sample.moments))
+        axis = self._pad_axis(direction, sample.T_base_probe)
+        moments = _turned(uu - tuu, uv - tuv, vv - tvv, *axis)
+        self._recent.add(*moments)
+        share = self._mean.add(*moments)
+        self._traces = _mixed(self._traces, _turned(tuu, tuv, tvv, *axis), share)
         self.frames = self._mean.frames
         self.force += share * (sample.force_n - self.force)
 
@@ -205,22 +215,29 @@ class PatchCurvature:
     def fuse(self, T_base_contact: Floats, motion: CurvatureInformation | None = None) -> Fused | None:
         """Curvature by the patch and the motion's evidence about q, in a contact frame (4, 4), m.
 
-        None where the patch has too few frames, or the iteration does not settle.
+        None where the patch has too few frames, is no ellipse without the traces of earlier places (`creep`), or the
+        iteration does not settle.
         """
         if self.frames < MIN_FRAMES:
             return None
         c, s = self._in_axes(T_base_contact[:3, 0].tolist())
         xx, xy, yy = _turned(*self._mean.moments, c, -s)
         mean, half, angle = principal_of(xx, xy, yy)
-        drift = _turned(*_turned(*self._mean.drift_from(self._recent), c, -s), math.cos(angle), -math.sin(angle))
+        if not mean > half:
+            return None
+        along = math.cos(angle), -math.sin(angle)
+        drift, (txx, txy, tyy) = (
+            _turned(*_turned(*error, c, -s), *along) for error in (self._mean.drift_from(self._recent), self._traces)
+        )
+        traces = TRACE_ERROR_SHARE * txx, TRACE_ERROR_SHARE * txy, TRACE_ERROR_SHARE * tyy
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
         known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
         known = CurvatureInformation(turn.dot(known.q), turn.dot(known.information).dot(turn.T))
-        found = self._solve(_Seen((mean + half, 0.0, mean - half), drift), known)
+        found = self._solve(_Seen((mean + half, 0.0, mean - half), (drift, traces)), known)
         if found is None:
             return None
         q, patch = turn.T.dot(found.q), turn.T.dot(found.patch).dot(turn)
-        return Fused(q, patch, found.cost, found.stiffness)
+        return found._replace(q=q, patch=patch)
 
     def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
         """Solve from the last answer, and where that fails from that of the ideal layer."""
@@ -232,37 +249,37 @@ class PatchCurvature:
                 found = self._iterated(np.array([*(TO_Q * start), guess]), seen, motion)
         if found is None:
             return None
-        self._last, fused, stiffness = found
+        self._last, fused = found
         if self._slope is not None:
             # the slope belongs to the place of the touch and is used once; the stiffness that it gave is kept
-            self._slope, self._stiffness = None, stiffness
+            self._used, self._slope = self._slope, None
+            self.stiffness.take(fused.log_stiffness, fused.stiffness_information)
         return fused
 
-    def _iterated(
-        self, x: Floats, seen: _Seen, motion: CurvatureInformation
-    ) -> tuple[Floats, Fused, LayerStiffness] | None:
-        """Gauss–Newton from x (4,) = (q, ln of the stiffness over the stated one).
+    def _iterated(self, x: Floats, seen: _Seen, motion: CurvatureInformation) -> tuple[Floats, Fused] | None:
+        """Gauss–Newton from x (4,) = (q, ln of the stiffness).
 
         Returns:
-            The last x, the answer, and the stiffness with its σ; None where the steps do not settle.
+            The last x, and the answer; None where the steps do not settle.
         """
-        known, mean = np.zeros((4, 4)), np.array([*motion.q, self._stiffness.mean])
-        known[:3, :3], known[3, 3] = motion.information, self._stiffness.sigma**-2
+        known, mean = np.zeros((4, 4)), np.array([*motion.q, self.stiffness.log])
+        known[:3, :3], known[3, 3] = motion.information, self.stiffness.information
         J = np.empty((3, 4))
         xx, _, yy = seen.moments
         scale = np.array([xx, math.sqrt(xx * yy), yy])
         step = math.inf
         try:
             for round_ in range(MAX_ROUNDS):
-                q1, q2, q3, stiffer = x.tolist()
+                q1, q2, q3, log_stiffness = x.tolist()
                 k: Moments = q1, q2 / _ROOT2, q3
-                model = self._model(stiffer)
+                model = self._model(log_stiffness)
                 J[:, :3], r, W = model.linearised(seen.moments, self.force, self.frames, k)
                 if round_ == 0:  # it hardly changes from step to step
                     here = np.array(seen.moments) - scale * r
-                    there = self._model(stiffer + _STIFFNESS_STEP).moments(k, self.force)
+                    there = self._model(log_stiffness + _STIFFNESS_STEP).moments(k, self.force)
                     J[:, 3] = (there - here) / scale / _STIFFNESS_STEP
-                W = _less_certain(W, seen)
+                for error in seen.errors:
+                    W = _less_certain(W, seen.moments, error)
                 W *= model.trust(k, self.force)
                 JW = J.T.dot(W)
                 information, pull, cost = JW.dot(J), JW.dot(r), float(r.dot(W).dot(r))
@@ -286,37 +303,43 @@ class PatchCurvature:
             return None
         if step > MAX_LAST_STEP / self.model.radius:
             return None
-        stiffness = LayerStiffness(float(x[3]), math.sqrt(float(inverted(information + known)[3, 3])))
+        of_stiffness = 1.0 / float(inverted(information + known)[3, 3])
         patch = information[:3, :3] - information[:3, 3, None] * information[3, :3] / (information[3, 3] + known[3, 3])
-        return x, Fused(x[:3], patch, cost, self.model.stiffness * math.exp(x[3])), stiffness
+        return x, Fused(x[:3], patch, cost, float(x[3]), of_stiffness)
 
     def _guesses(self) -> tuple[float, ...]:
-        """Starting values of ln(stiffness over the stated one): the known one, and that of the touch on a plane."""
-        known, slope = self._stiffness.mean, self._slope
+        """Starting values of ln(stiffness): the known one, and that of the touch on a plane."""
+        known, slope = self.stiffness.log, self._slope
         if slope is None:
             return (known,)
-        return known, math.log(stiffness_from_slope(slope.value, self.model.radius, (0.0, 0.0)) / self.model.stiffness)
+        return known, math.log(stiffness_from_slope(slope.value, self.model.radius, (0.0, 0.0)))
 
-    def _model(self, stiffer: float) -> ImageModel:
-        return self.model.with_stiffness(self.model.stiffness * math.exp(stiffer))
+    def _model(self, log_stiffness: float) -> ImageModel:
+        return self.model.with_stiffness(math.exp(log_stiffness))
 
     def _push(self, x: Floats, k: Moments, slope: Slope) -> tuple[Floats, float, float]:
         """Row (4,) of a touch's slope at x, its residual in ln(stiffness), and its information."""
         K = np.array([[k[0], k[1]], [k[1], k[2]]])
         half = 0.5 * inverted(np.eye(2) / self.model.radius + K)
         kappa = np.linalg.eigvalsh(K)
-        off = math.log(stiffness_from_slope(slope.value, self.model.radius, kappa) / self.model.stiffness) - x[3]
+        off = math.log(stiffness_from_slope(slope.value, self.model.radius, kappa)) - x[3]
         row = np.array([-half[0, 0], -2.0 * half[0, 1] / TO_Q[1], -half[1, 1], 1.0])
         return row, off, 1.0 / ((2.0 * slope.sigma / slope.value) ** 2 + SLOPE_SIGMA**2)
 
 
-def _less_certain(W: Floats, seen: _Seen) -> Floats:
-    """Information (3, 3) of relative moments that are also off by a drift of unknown sign."""
-    (v1, _, v2), (xx, xy, yy) = seen.moments, seen.drift
+def _less_certain(W: Floats, moments: Moments, error: Moments) -> Floats:
+    """Information (3, 3) of relative moments, with one more error of unknown sign."""
+    (v1, _, v2), (xx, xy, yy) = moments, error
     relative = np.array([xx / v1, xy / math.sqrt(v1 * v2), yy / v2])
     b = W.dot(relative)
     result: Floats = W - b[:, None] * b / (1.0 + float(b.dot(relative)))
     return result
+
+
+def _mixed(mean: Moments, new: Moments, share: float) -> Moments:
+    """A running mean that a new value enters with a share."""
+    (a, b, c), (x, y, z) = mean, new
+    return a + share * (x - a), b + share * (y - b), c + share * (z - c)
 
 
 def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float, float, float]:

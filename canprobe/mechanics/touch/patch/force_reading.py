@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
-from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.force_creep import ForceCreep
 from canprobe.mechanics.touch.patch.force_errors import ForceSigma
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
@@ -20,9 +20,12 @@ class ForceReading:
 
     def __init__(self, calibration: PatchCalibration) -> None:
         self._errors, self._reference = calibration.force_errors, calibration.reference_sigma
-        self._full_pa = calibration.full_scale_pa
-        self._level_pa = self._full_pa * (calibration.threshold_counts + 1) / COUNTS_MAX
+        self._pad = calibration.pad
         self._creep = ForceCreep(self._errors.creep)
+
+    def widen(self, spread: float) -> None:
+        """State forces with this relative standard deviation between arrays from now on, where it is the larger one."""
+        self._errors = replace(self._errors, spread=max(spread, self._errors.spread))
 
     def step(self, t_s: float, patch: Patch) -> Patch:
         """The patch of an image with its force and the standard deviation of it.
@@ -36,11 +39,11 @@ class ForceReading:
         force = shown * (1.0 + errors.creep * errors.creep_decades)
         sigma = errors.sigma(
             force,
-            min(self._level_pa / patch.peak_pa, 1.0) if patch.peak_pa > 0.0 else 1.0,
+            self._pad.lightness(patch.peak_pa),
             creep.decades_n - errors.creep_decades * shown,
             creep.late_decades,
             reference=self._reference,
-            peak=patch.peak_pa / self._full_pa,
+            peak=patch.peak_pa / self._pad.full_scale_pa,
             bridged=patch.bridged,
             cut=patch.cut_by_pad,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -63,14 +64,19 @@ class PatchedEstimator:
         if motion.evidence is None:
             return motion
         found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
+        moved = 0.0 if self._place is None else float(np.linalg.norm(motion.point - self._place))
+        self._place = motion.point
         if found is None or not found.contradicted:
             self._contradicted = 0.0
-        elif self._place is not None:
-            self._contradicted += float(np.linalg.norm(motion.point - self._place))
-        self._place = motion.point
+        else:
+            self._contradicted += moved
         if found is None:
             return motion
-        return with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWAL_SHARE * self._length)
+        if not found.contradicted:
+            new = min(moved / self._length, 1.0)
+            self.patch.stiffness.take(found.log_stiffness, found.stiffness_information, new)
+        answer = with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWAL_SHARE * self._length)
+        return replace(answer, stiffness=self.patch.stiffness.value)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
@@ -142,7 +148,7 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
         samples=float(patch.frames),
         method="patch",
         prior="none",
-        stiffness=found.stiffness,
+        stiffness=patch.stiffness.value,
     )
 
 

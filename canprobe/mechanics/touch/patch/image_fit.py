@@ -23,7 +23,7 @@ from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.dead_taxels import Image
 from canprobe.mechanics.touch.patch.force_errors import STRAIGHT_SHARE
 from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
-from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
+from canprobe.mechanics.touch.patch.moments import MomentImage
 from canprobe.mechanics.types import Floats
 
 BLUR_PRIOR_PITCH = (0.7, 0.2)
@@ -158,7 +158,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         moments=turn @ V.mean(axis=0),
         remembered=turn @ np.mean(ways, axis=0),
         frame_sigma=float(steps.std() / math.sqrt(2.0)),
-        lightness=LEVEL_COUNTS * plain.full_scale_pa / 255 / peak,
+        lightness=plain.pad.lightness(peak),
         off=raw - dwell.expected[kept],
         way=dwell.expected[kept],
         t_s=dwell.t_s[kept],

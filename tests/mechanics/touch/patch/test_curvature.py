@@ -244,7 +244,7 @@ def test_what_the_pad_remembers_is_taken_off():
     K = base_tensor(tensor(27.8, -6.0, 0.5))
     memory, patch = PadMemory(), PatchCurvature(model())
     for i in range(120):
-        off = (0.06 * math.sin(0.05 * i), 0.03 * math.sin(0.09 * i))
+        off = (0.02 * math.sin(0.05 * i), 0.01 * math.sin(0.09 * i))
         touch = replace(samples(K, NORMAL, FORCE, exact, 1, off_pole=off)[0], t_s=0.04 * i)
         d = touch.r_probe / np.linalg.norm(touch.r_probe)
         ways = memory.add(touch.t_s, *direction_to_pad(d, RADIUS))
@@ -253,6 +253,32 @@ def test_what_the_pad_remembers_is_taken_off():
         )
     found = patch_estimate(touch, patch, 0.02)
     np.testing.assert_allclose(found.kappa, [27.8, -6.0], atol=0.02)
+
+
+def moved_from(away, K, patch):
+    """The last answer about a contact that rested 20 s at a place `away` · R from the pole, then 0.2 s at the pole."""
+    for off, start, period in ((away, 0.0, 0.5), (0.0, 20.0, 5e-3)):
+        for i, touch in enumerate(samples(K, NORMAL, FORCE, exact, 40, off_pole=(off, 0.0))):
+            patch.add(replace(touch, t_s=start + period * i))
+            found = patch_estimate(touch, patch, 0.02)
+    return found
+
+
+@pytest.mark.parametrize("away", [0.1, 0.2, 0.3])
+def test_a_place_beyond_the_patch_leaves_no_trace_in_its_moments(away):
+    """It is 4 to 12 mm away: an image here shows nothing of it, as its trace is below the level."""
+    K = base_tensor(tensor(27.8, -6.0, 0.5))
+    patch = PatchCurvature(model())
+    found = moved_from(away, K, patch)
+    P = found.T_frame_contact[:3, :2]
+    off = np.array(entries(found.K - P.T @ K @ P))
+    assert off @ np.linalg.solve(found.covariance, off) < 3.0  # of χ² of 3
+    assert np.abs(off).max() < 0.15 * (1.0 / RADIUS + 27.8)
+
+
+def test_traces_larger_than_the_image_give_no_answer_and_no_error():
+    K, patch = base_tensor(tensor(27.8, -6.0, 0.5)), PatchCurvature(model(replace(PARAMETERS, memory=3.0)))
+    assert moved_from(0.1, K, patch) is None
 
 
 def test_fewer_than_eight_frames_say_nothing_and_a_reset_forgets():
@@ -642,6 +668,33 @@ def test_a_layer_of_another_stiffness_than_stated_is_found_from_the_touch(ratio)
         assert np.abs(off).max() < 0.7
         assert off @ found.patch @ off < 1.0
         assert found.stiffness == pytest.approx(STIFFNESS, rel=0.04)
+
+
+def test_a_slope_counts_for_the_place_of_its_touch_alone():
+    """Contact is lost and found again where the surface is less curved: the slope there is that of the first touch."""
+    slope = Slope(1.0 / indentation_from_force(1.0, STIFFNESS, RADIUS, (27.8, 0.0)), 30.0)
+    patch = PatchCurvature(model(), 0.6)
+    T = homogeneous(tangent_rotation(-NORMAL), np.zeros(3))
+    for kappa in ([27.8, 0.0], [5.0, -5.0]):
+        patch.reset()
+        for touch in samples(base_tensor(np.diag(kappa)), NORMAL, FORCE, exact, 64):
+            patch.add(replace(touch, slope=slope))
+        assert patch.fuse(T).stiffness == pytest.approx(STIFFNESS, rel=0.02)
+        assert patch.stiffness.value == pytest.approx(STIFFNESS, rel=0.02)
+
+
+def test_stiffness_follows_from_the_images_where_the_motion_knows_curvature():
+    """The slope of the touch is 10 % off. Along a weave k gets better, and it does not jump from answer to answer."""
+    slope = Slope(1.1 / indentation_from_force(1.0, STIFFNESS, RADIUS, (27.8, 0.0)), 30.0)
+    motion = make_estimator("recursive", sigma_point=3e-5, sigma_normal=2e-3, memory_m=0.02)
+    one, found = PatchedEstimator(motion, PatchCurvature(model(), 0.6), 0.02), []
+    for i, (x, y) in enumerate(WEAVE + WEAVE[::-1]):
+        one.add(replace(cylinder_touch(x, y, i * 5e-3, True), slope=slope))
+        if i % 20 == 19:
+            found.append(math.log(one.estimate().stiffness / STIFFNESS))
+    assert found[0] > 0.08
+    assert abs(found[-1]) < 0.4 * found[0]
+    assert np.abs(np.diff(found)).max() < 0.02
 
 
 def test_where_the_surface_bends_the_mean_of_the_images_counts_less():

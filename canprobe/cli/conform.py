@@ -1,0 +1,296 @@
+"""Examine a CANopen device of any maker: CiA 301, CiA 305, CiA 402, and what its EDS promises.
+
+Safe by default. Everything is read; in 1000h to 1FFFh only what can be restored is written, and it is restored and read
+back after each point. Nothing from 2000h on is written, unless --write names it, and a power stage stays off, unless
+--motion is given. What 1010h, 1011h and the objects of program and configuration hold is never touched. A snapshot is
+on disk before the first write; --restore puts it back after an examination that was cut off.
+
+Beside another master, another SYNC producer or other nodes, what could disturb them is left out. With --bus lockstep
+the emulated node of the EDS is examined.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.cli.argument_types import channel, seconds, whole, word
+from canprobe.cli.common_arguments import OPTIONS, add_options, add_verbosity
+from canprobe.cli.output import print_json, print_table
+from canprobe.cli.parser import Parser
+from canprobe.cli.progress import say
+from canprobe.cli.target import real_target
+from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.fieldbus.bus.port import Port
+    from canprobe.fieldbus.eds.description import Description
+    from canprobe.fieldbus.tools.conform import Examination, Point
+    from canprobe.fieldbus.tools.reports import Report
+
+HELP = "examine a device of any maker for conformance"
+EXAMPLE = """\
+verdicts: PASS; FAIL; NOT APPLICABLE, with the reason; ERROR: the bench failed, not the device
+
+exit status: 0 no point failed, 1 a point failed, 2 wrong usage, 3 the bench failed or the device does not answer
+
+examples:
+  canprobe conform --node 5 --eds drive.eds --channel can0
+  canprobe conform --node 5 --eds drive.eds --channel can0 --junit conform.xml --html conform.html
+  canprobe conform --node 5 --eds drive.eds --channel can0 --write 2000h-20FFh,6081h --points sdo,28
+  canprobe conform --node 5 --channel can0 --json > before.json
+  canprobe conform --node 5 --channel can0 --baseline before.json
+  canprobe conform --node 5 --channel can0 --restore conform-node5.snapshot.json
+  canprobe conform --node 5 --eds puma260_joint --bus lockstep
+  canprobe conform --list
+"""
+_REAL_SLACK_S = 0.05
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("--node", metavar="N", type=whole(1, 127), help="node id of the device")
+    parser.add_argument("--eds", metavar="FILE", type=word, help="EDS or DCF file of the device, or a packaged name")
+    parser.add_argument(
+        "--bus",
+        **OPTIONS["--bus"]
+        | {"help": "python-can interface, or lockstep [that of python-can's configuration, else socketcan]"},
+    )
+    parser.add_argument("--channel", metavar="CH", type=channel, default=(None, None), help="channel [can0]")
+    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(50_000, 1_000_000), help="bit rate [1000000]")
+    parser.add_argument(
+        "--data-bitrate",
+        metavar="BIT/S",
+        type=whole(50_000, 8_000_000),
+        help="the bus carries CAN FD: bit rate of the data phase [classical CAN]",
+    )
+    parser.add_argument("--points", metavar="LIST", type=word, help="groups, numbers or points [all]")
+    parser.add_argument(
+        "--write",
+        metavar="LIST",
+        default="",
+        help="objects that may be written, as 2000h-20FFh,6081h,60C2h:01; and the words reset (NMT reset node), history"
+        " (clear 1003h)",
+    )
+    parser.add_argument("--motion", action="store_true", help="also switch the power stage on and move the axis")
+    parser.add_argument("--yes", action="store_true", help="with --motion: do not ask whether the axis may move")
+    parser.add_argument("--own", metavar="FILE", type=Path, help="a TOML file with points of your own")
+    parser.add_argument("--timeout", metavar="S", type=seconds, default=1.0, help="longest time to an SDO answer [1]")
+    parser.add_argument("--listen", metavar="S", type=seconds, default=1.5, help="time to hear the bus before [1.5]")
+    parser.add_argument(
+        "--snapshot",
+        metavar="FILE",
+        type=Path,
+        help="keep the snapshot in this file [conform-node<N>.snapshot.json, removed when all is put back]",
+    )
+    parser.add_argument("--restore", metavar="FILE", type=Path, help="put back a snapshot, and end")
+    parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
+    parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
+    parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
+    parser.add_argument("--log", metavar="FILE", type=Path, help="record all frames as a candump log")
+    parser.add_argument("--list", action="store_true", help="list the points, and end")
+    add_options(parser, "--json")
+    add_verbosity(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Examine the device, and print what was found."""
+    if args.list:
+        return _list(args)
+    if args.node is None:
+        raise UsageError("conform: --node N names the device; `canprobe scan` lists the nodes on a bus")
+    from canprobe.fieldbus.tools.conform import ExaminationSettings, WriteList, restore_snapshot
+    from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
+    from canprobe.fieldbus.tools.reports import read_json
+
+    points, description = _points(args), _description(args)
+    baseline = read_json(args.baseline) if args.baseline is not None else None
+    times = BenchTimes(sdo_s=args.timeout, slack_s=_REAL_SLACK_S)
+    if args.motion:
+        _confirm(args)
+    with _port(args) as port:
+        if args.restore is not None:
+            return _print_restored(args, restore_snapshot(port, args.node, args.restore, times))
+        virtual = args.bus == "lockstep"
+        settings = ExaminationSettings(
+            written=WriteList.parse(args.write),
+            motion=args.motion,
+            snapshot=args.snapshot or (None if virtual else Path(f"conform-node{args.node}.snapshot.json")),
+            keep_snapshot=args.snapshot is not None,
+            listen_s=args.listen,
+            bitrate=args.bitrate or 1_000_000,
+            fd=virtual or args.data_bitrate is not None,
+            times=BenchTimes() if virtual else times,
+            ask=_ask if sys.stdin.isatty() else None,
+        )
+        from canprobe.fieldbus.tools.conform import Examination
+
+        report = _examine(args, Examination(port, args.node, description, settings), points)
+    return _finish(args, report, baseline)
+
+
+def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> Report:
+    """Run the examination, with its progress on stderr or its rows on stdout."""
+    from canprobe.fieldbus.tools.reports import row_text
+
+    bar = args.report.bar(".0f points") if args.json else None
+
+    def show(row: object, number: int, total: int) -> None:
+        if bar is not None:
+            bar(number, total)
+        elif not args.json:
+            print(row_text(row), flush=True)  # type: ignore[arg-type]
+
+    examination.report.facts.update(_bench_facts(args))
+    report = examination.run(points, show)
+    report.log = None if args.log is None else str(args.log)
+    if "warning" in report.facts:
+        args.report.say(f"warning: {report.facts['warning']}")
+    return report
+
+
+def _finish(args: argparse.Namespace, report: Report, baseline: Report | None) -> int:
+    from canprobe.fieldbus.tools.reports import (
+        append_step_summary,
+        closing_text,
+        compare,
+        report_document,
+        write_html,
+        write_junit,
+    )
+
+    change = None if baseline is None else compare(report, baseline)
+    if args.junit is not None:
+        write_junit(report, args.junit)
+    if args.html is not None:
+        write_html(report, args.html, change)
+    append_step_summary(report, os.environ, change)
+    if args.json:
+        print_json(report_document(report))
+    else:
+        print(closing_text(report, change))
+    return report.exit_status
+
+
+def _points(args: argparse.Namespace) -> tuple[Point, ...]:
+    from canprobe.fieldbus.tools.conform.own_points import read_points
+    from canprobe.fieldbus.tools.conform.registry import POINTS, chosen_points
+
+    own = () if args.own is None else read_points(args.own)
+    return chosen_points((*POINTS, *own), (args.points or "").split(","))
+
+
+def _description(args: argparse.Namespace) -> Description | None:
+    if args.eds is None:
+        return None
+    from canprobe.fieldbus.eds.description import Description
+    from canprobe.fieldbus.eds.packaged import eds_file
+    from canprobe.fieldbus.eds.reading import read_eds
+
+    return Description(read_eds(eds_file(args.eds), args.node, serving=False).usable())
+
+
+@contextlib.contextmanager
+def _port(args: argparse.Namespace) -> Iterator[Port]:
+    """The bus of the command; with --log its frames are recorded."""
+    from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
+
+    with contextlib.ExitStack() as stack:
+        if args.bus == "lockstep":
+            port = _emulated(args)
+        else:
+            from canprobe.cell.session.looking import open_bus
+            from canprobe.cell.session.target import refuse_virtual
+
+            refuse_virtual(args.bus, "conform")
+            target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
+            port = stack.enter_context(open_bus(target, args.report.say, args.data_bitrate))
+        if args.log is not None:
+            writer = stack.enter_context(CandumpWriter(args.log, port.channel, port.clock.now_ns()))
+            port = RecordingPort(port, writer.on(port.channel))
+        yield port
+
+
+def _emulated(args: argparse.Namespace) -> Port:
+    """A port of a bus in virtual time with the emulated node of the EDS."""
+    if args.eds is None:
+        raise UsageError("conform: --bus lockstep examines the emulated node of an EDS: name it with --eds")
+    from canprobe.fieldbus.bus.clock import VirtualClock
+    from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+    from canprobe.fieldbus.drive.from_eds import make_eds_node
+    from canprobe.fieldbus.eds.packaged import load_eds
+
+    bus = LockstepBus(VirtualClock(), "lockstep", fd=True)
+    bus.attach(make_eds_node(load_eds(args.eds, args.node), args.node, eds=args.eds))
+    return bus.port()
+
+
+def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
+    """What the report says of the bench."""
+    import hashlib
+    import platform
+
+    import canprobe
+
+    facts = {
+        "command": shlex.join(["canprobe", *sys.argv[1:]]),
+        "adapter": args.bus or "socketcan",
+        "bit rate": f"{args.bitrate or 1_000_000} bit/s" if args.bus != "lockstep" else "virtual time",
+        "versions": f"canprobe {canprobe.__version__}, Python {platform.python_version()}, {platform.platform()}",
+        "permitted": ", ".join(filter(None, [args.write, "motion" if args.motion else ""]))
+        or "nothing beyond the default",
+    }
+    if args.eds is not None:
+        from canprobe.fieldbus.eds.packaged import eds_file
+
+        path = eds_file(args.eds)
+        facts["EDS"] = f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    return facts
+
+
+def _confirm(args: argparse.Namespace) -> None:
+    """Let somebody confirm that the axis may move.
+
+    Raises:
+        UsageError: nobody did.
+    """
+    if args.yes or args.bus == "lockstep":
+        return
+    if not _ask(f"node {args.node} will be switched on and its axis will move: is everybody out of its way?"):
+        raise UsageError("conform: --motion needs a yes at the terminal, or --yes")
+
+
+def _ask(question: str) -> bool:
+    """Ask at the terminal; only yes is yes."""
+    say(f"{question} [yes or no]")
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _print_restored(args: argparse.Namespace, lines: list[str]) -> int:
+    if args.json:
+        print_json({"restored": lines})
+    else:
+        print("\n".join(lines))
+    return 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    points = _points(args)
+    if args.json:
+        print_json(
+            [
+                {"group": p.group, "number": p.number, "name": p.name, "clause": p.clause, "expected": p.expected}
+                | {"needs": sorted(p.needs)}
+                for p in points
+            ]
+        )
+        return 0
+    rows = [(point.group, point.title, point.clause, point.expected, " ".join(sorted(point.needs))) for point in points]
+    print_table([("group", "point", "clause", "accepted", "needs"), *rows])
+    return 0

@@ -1,0 +1,342 @@
+"""Judge a CANopen master by what it sends: known faults of masters, each a rule on the frames of the bus.
+
+With --eds each file is an emulated node, with a SCENE or a cell its nodes are; COMMAND is your master, which is started
+once they are served, with no input, and its output goes into a file. Without COMMAND a master that runs elsewhere is
+awaited, and Ctrl-C ends the judgement. With --record a candump log is judged for what can be seen in it.
+
+Once a drive has been enabled for two seconds, faults are thrown at it, one after the other, and the reaction is judged:
+slow SDO answers, a lost heartbeat, a mute node, a fault of the drive, a reboot. --inject names others, and --passive
+throws none. Your master never drives anything real here, as long as no real node is on the same bus.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.cli.argument_types import node_id, seconds, word
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.emulate import eds_files, scene_target
+from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
+from canprobe.cli.output import print_json, print_table
+from canprobe.cli.parser import Parser
+from canprobe.cli.progress import say
+from canprobe.cli.target import loaded, real_target
+from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.cell.session.target import Target
+    from canprobe.fieldbus.eds.description import Description
+    from canprobe.fieldbus.tools.judge import Judge, MasterBench
+    from canprobe.fieldbus.tools.reports import Report, ReportRow
+
+HELP = "judge a CANopen master by what it sends"
+EXAMPLE = """\
+exit status: 0 nothing found, 1 a rule was raised, 2 wrong usage, 3 COMMAND failed without a finding or the bus did,
+124 COMMAND was still running after --seconds
+
+examples:
+  canprobe judge --eds drive.eds --node-id 5 --channel vcan0 -- python my_master.py
+  canprobe judge free --channel vcan0 --passive --seconds 60 -- ./bring_up --can vcan0
+  canprobe judge puma560 --channel vcan0 --inject "node 3: mute on enabled for 2 s" -- ./bring_up
+  canprobe judge --eds drive.eds --node-id 5 --record candump.log --html judge.html
+  canprobe judge free --record runs/free/bus.log
+  canprobe judge --list
+"""
+_TIMED_OUT = 124
+_SHOWN_FRAMES = 6
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
+    parser.takes_command = True
+    parser.usage = "canprobe judge [SCENE | --eds FILE --node-id N ...] [--record FILE] [options] [-- COMMAND...]"
+    add_scene(parser, optional=True)
+    add_options(parser, *BUS)
+    parser.add_argument(
+        "--eds",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="EDS or DCF file of a node; may be repeated, each with its --node-id",
+    )
+    parser.add_argument(
+        "--node-id",
+        metavar="N",
+        action="append",
+        default=[],
+        type=node_id,
+        help="node id for the --eds at the same position",
+    )
+    parser.add_argument("--record", metavar="FILE", type=Path, help="judge a candump log, and serve nothing")
+    parser.add_argument(
+        "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"
+    )
+    parser.add_argument(
+        "--inject",
+        metavar="FAULT",
+        action="append",
+        default=[],
+        type=word,
+        help="throw this fault in the place of the sequence; may be repeated; `canprobe inject --list` lists them",
+    )
+    parser.add_argument("--passive", action="store_true", help="throw no faults")
+    parser.add_argument(
+        "--without",
+        metavar="RULES",
+        type=rule_numbers,
+        default=(),
+        help="leave out rules, such as 32,33,34 on a machine that keeps no time",
+    )
+    parser.add_argument("--output", metavar="FILE", type=Path, help="file for the output of COMMAND [a temporary one]")
+    parser.add_argument("--log", metavar="FILE", type=Path, help="write the frames as a candump log")
+    parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
+    parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
+    parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
+    parser.add_argument("--list", action="store_true", help="list the rules, and end")
+    add_options(parser, "--json")
+    add_verbosity(parser)
+
+
+def rule_numbers(text: str) -> tuple[int, ...]:
+    """An argument type: numbers of rules."""
+    from canprobe.fieldbus.tools.judge import RULES
+
+    known = {rule.number for rule in RULES}
+    words = [word.strip() for word in text.split(",")]
+    if wrong := [word for word in words if not word.isdecimal() or int(word) not in known]:
+        raise argparse.ArgumentTypeError(f"expected numbers of rules, got {wrong[0]!r}; `canprobe judge --list`")
+    return tuple(map(int, words))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Judge a log, or a master on served nodes."""
+    if args.list:
+        return _list(args)
+    args.bus_yml = None
+    args.serial = ()
+    if (args.scene is None) is not bool(args.eds):
+        raise UsageError("judge: name a SCENE or a cell, or else --eds FILE --node-id N")
+    if args.inject and args.passive:
+        raise UsageError("judge: --inject throws faults, and --passive throws none; choose one")
+    from canprobe.fieldbus.tools.reports import read_json
+
+    args.older = read_json(args.baseline) if args.baseline is not None else None
+    if args.record is not None:
+        return _judge_record(args)
+    return _judge_served(args)
+
+
+def _judge_record(args: argparse.Namespace) -> int:
+    for option in ("command", "inject", "seconds", "log", "output"):
+        if getattr(args, option):
+            name = "COMMAND" if option == "command" else f"--{option}"
+            raise UsageError(f"judge: {name} belongs to served nodes, not to --record")
+    from canprobe.fieldbus.tools.judge import judge_frames, read_record
+
+    named = [name for _, name in args.channel or ()]
+    if len(named) > 1:
+        raise UsageError("judge: a log is judged for one channel: --channel CH")
+    frames = read_record(args.record, named[0] if named else None)
+    nodes = _descriptions(args, named[0] if named else None)
+    judge = judge_frames(frames, nodes, bitrate=args.bitrate or 1_000_000, without=args.without)
+    if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
+        ids = ", ".join(map(str, nodes))
+        raise UsageError(f"judge: {args.record} has no frame of node {ids} or to it: which nodes does the log have?")
+    facts = {**_facts(args), "frames": str(judge.frame_count)}
+    report = judge.report(f"the master in {args.record}", facts, log=str(args.record))
+    _print(args, report)
+    return report.exit_status
+
+
+def _judge_served(args: argparse.Namespace) -> int:
+    from canprobe.fieldbus.tools.judge import MasterBench, write_log
+
+    nodes = _descriptions(args)
+    output = args.output or Path(tempfile.mkstemp(prefix="canprobe-judge-", suffix=".txt")[1])
+    bench = MasterBench(args.command, args.seconds, () if args.passive else args.inject or None, output)
+    try:
+        target, serve = _server(args, bench, nodes)
+        with left_by_ctrl_c(), first_ctrl_c(bench.ask):
+            serve()
+    finally:
+        bench.close()
+        if args.output is None and not output.stat().st_size:
+            output.unlink()
+    if bench.command is not None and output.exists():
+        args.report.say(f"output of {args.command[0]}: {output}")
+    judge = bench.judged(nodes, target.bitrate, args.without)
+    if args.log is not None:
+        write_log(bench.record(), args.log, target.channel)
+    report = _report_of(args, bench, judge, nodes, target)
+    _print(args, report)
+    if report.exit_status:
+        return report.exit_status
+    if not any(frame.from_node is False for frame in bench.frames):
+        say(f"judge: no master was heard on {target.channel}: does it use this channel and bit rate?")
+        return max(3, _TIMED_OUT if bench.timed_out else _status_of_command(bench))
+    return _TIMED_OUT if bench.timed_out else _status_of_command(bench)
+
+
+def _server(
+    args: argparse.Namespace, bench: MasterBench, nodes: Mapping[int, Description]
+) -> tuple[Target, Callable[[], None]]:
+    """The bus, and the function that serves the nodes on it; drives stand away from 0, where a jump to 0 is seen."""
+    from canprobe import api
+    from canprobe.fieldbus.tools.judge import start_position
+
+    channels = args.channel or [(None, None)]
+    if len(channels) > 1 or channels[0][0] is not None:
+        raise UsageError("judge: the nodes are served on one channel, without a name: --channel CH")
+    if args.scene is None:
+        target = real_target(args.bus, channels[0][1], args.bitrate)
+        files = eds_files(args, "judge")
+        positions = [start_position(node) for node in nodes.values()]
+        return target, lambda: api.emulate_eds(files, target, positions=positions, onlooker=bench, say=args.report.say)
+    scene = loaded(args)
+    target = scene_target(args, scene)
+    node_ids = (*scene.drives, *([scene.sensor.node_id] if scene.sensor and scene.array_is_node else ()))
+    return target, lambda: api.emulate(scene, target, node_ids=node_ids, onlooker=bench, say=args.report.say)
+
+
+def _status_of_command(bench: MasterBench) -> int:
+    """Status where nothing was found: 3 where the command failed, and no fault of ours can be the reason."""
+    if not bench.status or bench.thrown():
+        return 0
+    assert bench.command is not None
+    end = f"status {bench.status}" if bench.status > 0 else f"signal {-bench.status}"
+    say(f"judge: {bench.command.words[0]} ended with {end}; its last lines, of {bench.command.output}:")
+    for line in bench.command.last_lines():
+        say(f"  {line}")
+    return 3
+
+
+def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mapping[int, Description]:
+    """What is known of each node, by its id; of a scene with several channels, those on one of them."""
+    from canprobe.fieldbus.eds.description import Description
+    from canprobe.fieldbus.eds.packaged import load_eds
+
+    if args.scene is None:
+        files = eds_files(args, "judge")
+        if any(one == 255 for _, one in files):
+            raise UsageError("judge: nodes without an id (255) are not judged")
+    else:
+        from canprobe.cell.planning.make import make_plan
+        from canprobe.cell.scene.resolve import resolve
+
+        planned = make_plan(resolve(loaded(args))).nodes
+        several = len({node.channel for node in planned}) > 1
+        files = [(node.eds, node.node_id) for node in planned if not several or channel in (None, node.channel)]
+    return {one: Description(load_eds(name, one)) for name, one in files}
+
+
+def _report_of(
+    args: argparse.Namespace, bench: MasterBench, judge: Judge, nodes: Mapping[int, Description], target: Target
+) -> Report:
+    from canprobe.fieldbus.tools.judge import first_answers
+
+    facts = {
+        **_facts(args),
+        "adapter": f"{target.interface} {target.channel}",
+        "frames": str(judge.frame_count),
+    }
+    if bench.command is not None:
+        status = "ended by us" if bench.status is None else f"status {bench.status}"
+        facts["master"] = f"{shlex.join(bench.command.words)}: {status}"
+        if bench.command.output.exists():
+            facts["output of the master"] = str(bench.command.output)
+    thrown = bench.thrown()
+    times = []
+    for number, (one, answer) in enumerate(zip(thrown, first_answers(bench.record(), thrown, nodes), strict=True), 1):
+        text = "no answer"
+        if answer is not None:
+            times.append((answer.t_ns - one.begin_ns) * 1e-6)
+            text = f"first answer {times[-1]:.1f} ms later: {answer}"
+        span = f"from {one.begin_ns * 1e-9:.3f} to {one.end_ns * 1e-9:.3f} s"
+        facts[f"fault {number}"] = f"{one.text} {span}; {text}"
+    report = judge.report("the master", facts, log=None if args.log is None else str(args.log))
+    if times:
+        report.distributions["first answer to a fault"] = tuple(times)
+    left = bench.injections.not_thrown if bench.injections is not None else []
+    report.left_out += [(f"fault {text}", "no drive was enabled for two seconds before the end") for text in left]
+    return report
+
+
+def _facts(args: argparse.Namespace) -> dict[str, str]:
+    """What the report says of the bench."""
+    import hashlib
+    import platform
+
+    import canprobe
+    from canprobe.fieldbus.eds.packaged import eds_file
+
+    facts = {
+        "command": shlex.join(["canprobe", *sys.argv[1:]]),
+        "bit rate": f"{args.bitrate or 1_000_000} bit/s",
+        "versions": f"canprobe {canprobe.__version__}, Python {platform.python_version()}, {platform.platform()}",
+    }
+    for name, one in zip(args.eds, args.node_id, strict=False):
+        path = eds_file(name)
+        facts[f"EDS of node {one}"] = f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    return facts
+
+
+def _print(args: argparse.Namespace, report: Report) -> None:
+    """Write the files, and print the findings and the closing table."""
+    from canprobe.fieldbus.tools.reports import (
+        Verdict,
+        append_step_summary,
+        closing_text,
+        compare,
+        report_document,
+        row_text,
+        write_html,
+        write_junit,
+    )
+
+    change = None if args.older is None else compare(report, args.older)
+    if args.junit is not None:
+        write_junit(report, args.junit)
+    if args.html is not None:
+        write_html(report, args.html, change)
+    append_step_summary(report, os.environ, change)
+    if args.json:
+        print_json(report_document(report))
+        return
+    for row in report.rows:
+        if row.verdict is Verdict.FAIL:
+            print(row_text(row))
+            _print_finding(row)
+        elif args.report.verbosity > 0:
+            print(row_text(row))
+    for name, fact in report.facts.items():
+        if name.startswith("fault "):
+            print(f"{name}: {fact}")
+    print(closing_text(report, change))
+
+
+def _print_finding(row: ReportRow) -> None:
+    """The lines of a finding below its first."""
+    print(f"       severity: {row.severity}")
+    print(f"       expected: {row.expected}")
+    print(f"       hint: {row.hint}")
+    for frame in row.came[:_SHOWN_FRAMES]:
+        print(f"       {frame}")
+
+
+def _list(args: argparse.Namespace) -> int:
+    from canprobe.fieldbus.tools.judge import RULES
+
+    if args.json:
+        keys = ("number", "name", "group", "severity", "source", "expected", "hint")
+        print_json([{key: getattr(rule, key) for key in keys} for rule in RULES])
+        return 0
+    rows = [(f"{r.number:02}", r.group, r.name, r.severity.value, r.expected) for r in RULES]
+    print_table([("rule", "family", "fault of a master", "severity", "what a good one does"), *rows])
+    return 0

@@ -1,0 +1,199 @@
+"""The bench as points use it: entries by value, NMT states, EMCY that must come, SYNC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NoReturn
+
+from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NMT_ID, RTR_FLAG, SYNC_ID, NmtCommand, NmtState
+from canprobe.fieldbus.tools.conform.device import ExaminedDevice
+from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
+from canprobe.fieldbus.tools.conform.frame_text import place_text
+from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
+from canprobe.fieldbus.tools.conform.permits import Permits
+from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
+
+HEARTBEAT_MS = 50
+"""Period of the heartbeat by which points see the NMT state."""
+COMMANDS = {
+    NmtState.PRE_OPERATIONAL: NmtCommand.PRE_OPERATIONAL,
+    NmtState.OPERATIONAL: NmtCommand.START,
+    NmtState.STOPPED: NmtCommand.STOP,
+}
+_QUEUED_NS = 5_000_000
+"""Time in which frames may still come that were queued before a change of the state."""
+
+
+class Bench(SdoClient):
+    """The bench.
+
+    Args:
+        port: connection to the bus.
+        device: the device.
+        permits: gate for what is sent.
+        times: how long is waited.
+        bitrate: bit rate of the bus, bit/s.
+        fd: whether the bus carries CAN FD frames.
+
+    Attributes:
+        distributions: measured times by name, ms.
+        first_answer: answer to the first read of 1000h, by which is seen that the device serves.
+        by_hand: function that asks a person to do something, and returns whether it was done.
+        asked: codes of EMCY messages that the point provoked; others fail it.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        device: ExaminedDevice,
+        permits: Permits,
+        times: BenchTimes,
+        *,
+        bitrate: int = 1_000_000,
+        fd: bool = False,
+    ) -> None:
+        super().__init__(port, device.node_id, permits, times)
+        self.device, self.bitrate, self.fd = device, bitrate, fd
+        self.notes = []
+        self.asked: set[int] = set()
+        self.distributions: dict[str, tuple[float, ...]] = {}
+        self.first_answer = b""
+        self.by_hand: Callable[[str], bool] = lambda _: False
+        self._changed_ns = 0
+
+    def number(self, index: int, subindex: int = 0) -> int:
+        """Read an entry as an unsigned number. Raises Deviation where the device refuses."""
+        try:
+            return int.from_bytes(self.upload(index, subindex), "little")
+        except SdoRefused as refused:
+            raise Deviation(f"reading {refused}") from refused
+
+    def put(self, index: int, subindex: int, value: int, size: int = 0) -> None:
+        """Write a number in the size of the entry. Raises Deviation where the device refuses."""
+        try:
+            self.download(index, subindex, self.packed(index, subindex, value, size))
+        except SdoRefused as refused:
+            raise Deviation(f"writing {value:#x} to {refused}") from refused
+
+    def takes(self, index: int, subindex: int, value: int) -> bool:
+        """Whether the device takes a number."""
+        try:
+            self.download(index, subindex, self.packed(index, subindex, value))
+        except SdoRefused:
+            return False
+        return True
+
+    def packed(self, index: int, subindex: int, value: int, size: int = 0) -> bytes:
+        """A number in the size of an entry that the device has."""
+        size = size or len(self.device.values.get((index, subindex), b""))
+        if not size:
+            raise PointNotApplicable(f"the device has no {place_text(index, subindex)}")
+        return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+
+    def need(self, *places: tuple[int, int], written: bool = True) -> None:
+        """Check that the device has entries, and lets them be written. Raises PointNotApplicable."""
+        for place in places:
+            if not self.device.has(*place):
+                raise PointNotApplicable(f"the device has no {place_text(*place)}")
+            if written and not self.device.writable(*place):
+                raise PointNotApplicable(f"{place_text(*place)} cannot be written, says the EDS")
+
+    def serves(self, what: str) -> None:
+        """Check that a read of 1000h is answered as ever. Raises Deviation."""
+        if (answer := self.request(0x40, 0x1000)) != self.first_answer:
+            self.deviates(f"1000h is answered with {answer.hex(' ')} after {what}")
+
+    def deviates(self, text: str) -> NoReturn:
+        """Fail the point."""
+        raise Deviation(text)
+
+    def nmt(self, command: int) -> int:
+        """Send an NMT command to the device; return when."""
+        self._changed_ns = self.send(NMT_ID, bytes((command, self.node_id)))
+        return self._changed_ns
+
+    def watch_state(self) -> None:
+        """Let the device report its state: by heartbeat, or where it has none by guarding.
+
+        Raises:
+            PointNotApplicable: it has neither.
+        """
+        if self.device.writable(0x1017):
+            self.put(0x1017, 0, HEARTBEAT_MS)
+        elif not self.device.number(0x1017) and self._guarded() is None:
+            raise PointNotApplicable("the device reports its state neither by heartbeat nor by guarding")
+
+    def state(self) -> int:
+        """NMT state as the device reports it now; call `watch_state` before."""
+        period_ms = HEARTBEAT_MS if self.device.writable(0x1017) else self.device.number(0x1017)
+        if not period_ms:
+            state = self._guarded()
+            return self.deviates("no answer to guarding") if state is None else state
+        can_id, until_ns = (
+            HEARTBEAT_BASE + self.node_id,
+            self.now_ns + round((3e-3 * period_ms + self.times.slack_s) * 1e9),
+        )
+        self.taken(can_id)
+        while (frame := self.next(can_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+            if len(frame.data) == 1 and frame.data[0] and frame.t_ns > self._changed_ns + _QUEUED_NS:
+                return frame.data[0]
+        self.deviates(f"no heartbeat within three periods of {period_ms} ms")
+
+    def _guarded(self) -> int | None:
+        can_id = HEARTBEAT_BASE + self.node_id
+        self.taken(can_id)
+        self.send(can_id | RTR_FLAG)
+        frame = self.next(can_id, self.times.silence_s + self.times.slack_s)
+        return frame.data[0] & 0x7F if frame is not None and len(frame.data) == 1 else None
+
+    def go(self, state: NmtState) -> None:
+        """Command a state, and check that the device reports it; call `watch_state` before."""
+        self.nmt(COMMANDS[state])
+        if (found := self.state()) != state:
+            self.deviates(f"NMT {COMMANDS[state].name.lower()} leads to state {found:02X}h, expected {state:02X}h")
+
+    def settle(self, state: NmtState) -> int:
+        """Command a state without looking at it; what was queued before has come when this returns the time of it."""
+        t_ns = self.nmt(COMMANDS[state])
+        self.pass_time(2 * _QUEUED_NS * 1e-9)
+        return t_ns
+
+    def reset(self, command: NmtCommand = NmtCommand.RESET_COMMUNICATION) -> int:
+        """Reset the device, and wait for its boot-up message; return when it came. Raises Deviation."""
+        can_id = HEARTBEAT_BASE + self.node_id
+        self.taken(can_id)
+        until_ns = self.nmt(command) + round(self.times.boot_s * 1e9)
+        while (frame := self.next(can_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+            if frame.data == b"\0":
+                return frame.t_ns
+        self.deviates(f"no boot-up message within {self.times.boot_s:g} s of {command.name.lower().replace('_', ' ')}")
+
+    def emcy(self, code: int, within_s: float = 0.0) -> tuple[Emcy, int]:
+        """An EMCY message that must come; return it and its time. Raises Deviation."""
+        self.asked.add(code)
+        until_ns = self.now_ns + round((within_s + self.times.slack_s) * 1e9)
+        while True:
+            for found in self.emergencies:
+                if found[0].code == code:
+                    self.emergencies.remove(found)
+                    return found
+            if self.now_ns >= until_ns:
+                self.deviates(f"no EMCY {code:04X}h ({describe(code)}) came")
+            self.pass_time(min(0.005, (until_ns - self.now_ns) * 1e-9))
+
+    def errors(self) -> list[Emcy]:
+        """EMCY messages that have come and report an error."""
+        self.pass_time(0)
+        return [emcy for emcy, _ in self.emergencies if not is_no_error(emcy.code)]
+
+    def unasked(self) -> list[Emcy]:
+        """EMCY messages that report an error nobody asked for; all are taken."""
+        found = [emcy for emcy in self.errors() if emcy.code not in self.asked]
+        self.emergencies.clear()
+        return found
+
+    def sync(self, counter: int | None = None) -> int:
+        """Send a SYNC, with a counter or without one; return when."""
+        return self.send(SYNC_ID, b"" if counter is None else bytes((counter,)))

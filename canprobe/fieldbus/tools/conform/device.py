@@ -1,0 +1,164 @@
+"""What is known of the device under examination: its description, and what it answered before the first point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from canprobe.fieldbus.bus.sdo import decode_text
+from canprobe.fieldbus.eds.description import DescribedEntry, Description
+from canprobe.fieldbus.eds.reading import is_drive
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.tools.conform.outcome import Deviation
+from canprobe.fieldbus.tools.conform.permits import Place, WriteList
+from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
+
+RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
+DRIVE_PROFILE = 402
+CONTROLWORD, STATUSWORD = 0x6040, 0x6041
+_AXIS_STEP = 0x800
+_VARIABLES = (0x1000, 0x1001, 0x1002, 0x1005, 0x1006, 0x1007, 0x1008, 0x1009, 0x100A, 0x100C, 0x100D, 0x1012, 0x1014)
+_MORE_VARIABLES = (0x1015, 0x1017, 0x1019)
+_RECORDS = (0x1003, 0x1016, 0x1018, 0x1020, 0x1028, 0x1029, 0x1200, 0x1201)
+_MAX_ENTRIES = 64
+_UNDESCRIBED_PDOS = 32
+"""PDOs of each direction that are looked for where no EDS names them."""
+_FACTS = {
+    "vendor": (0x1018, 1),
+    "product": (0x1018, 2),
+    "revision": (0x1018, 3),
+    "serial": (0x1018, 4),
+    "device name": (0x1008, 0),
+    "hardware version": (0x1009, 0),
+    "firmware": (0x100A, 0),
+}
+
+
+@dataclass(slots=True)
+class ExaminedDevice:
+    """The device.
+
+    Attributes:
+        node_id: its id.
+        description: statements of its EDS; None without one.
+        values: bytes of the entries that it gave, by entry.
+        refused: abort codes of the entries that it refused.
+        statuswords: indices of the statuswords of all axes, where it is a CiA 402 drive.
+    """
+
+    node_id: int
+    description: Description | None = None
+    values: dict[Place, bytes] = field(default_factory=dict)
+    refused: dict[Place, int] = field(default_factory=dict)
+    statuswords: list[int] = field(default_factory=list)
+
+    def read_all(self, bench: SdoClient, written: WriteList) -> None:
+        """Read the communication objects that the standard or the EDS names, and what the user lets be written."""
+        for index in (*_VARIABLES, *_MORE_VARIABLES):
+            self._read(bench, (index, 0))
+        for index in (*_RECORDS, *self._pdo_indices()):
+            self._read_record(bench, index)
+        for entry in self.entries():
+            place = entry.index, entry.subindex
+            if entry.readable and place not in self.values and (entry.index < 0x2000 or written.permits(place)):
+                self._read(bench, place)
+        if self.profile == DRIVE_PROFILE or (self.description is not None and is_drive(self.description.od)):
+            for axis in range(8):
+                index = STATUSWORD + axis * _AXIS_STEP
+                if self._read(bench, (index, 0)) is None:
+                    break
+                self.statuswords.append(index)
+
+    def _pdo_indices(self) -> list[int]:
+        if self.description is not None:
+            comm = [0x13FF + n for n in self.description.rpdos] + [0x17FF + n for n in self.description.tpdos]
+        else:
+            comm = [area[n] for area in (RPDOS, TPDOS) for n in range(_UNDESCRIBED_PDOS)]
+        return [index for pdo in comm for index in (pdo, pdo + 0x200)]
+
+    def _read_record(self, bench: SdoClient, index: int) -> None:
+        if not (count := self._read(bench, (index, 0))):
+            return
+        if (
+            0x1600 <= index < 0x1800 or index >= 0x1A00
+        ):  # sub-index 0 counts the entries in use, of which there are more
+            for subindex in range(1, _MAX_ENTRIES + 1):
+                if self._read(bench, (index, subindex)) is None:
+                    return
+        for subindex in range(1, min(count[0], _MAX_ENTRIES) + 1):
+            self._read(bench, (index, subindex))
+
+    def _read(self, bench: SdoClient, place: Place) -> bytes | None:
+        if place in self.values:
+            return self.values[place]
+        try:
+            value = self.values[place] = bench.upload(*place)
+        except SdoRefused as refused:
+            self.refused[place] = refused.code
+            return None
+        except Deviation:
+            return None
+        entry = self.described(*place)
+        size = 0 if entry is None else -(-entry.bits // 8)
+        if size and len(value) > size and not any(value[size:]):  # an answer without a size has four bytes
+            self.values[place] = value[:size]
+        return self.values[place]
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """Whether the device gave this entry."""
+        return (index, subindex) in self.values
+
+    def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
+        """The value that the device gave, as an unsigned number; the default where it gave none."""
+        value = self.values.get((index, subindex))
+        return default if value is None else int.from_bytes(value, "little")
+
+    def entries(self) -> Iterator[DescribedEntry]:
+        """The entries that the EDS describes, without dummies; none without an EDS."""
+        if self.description is not None:
+            yield from (entry for entry in self.description.entries() if entry.index >= 0x1000)
+
+    def described(self, index: int, subindex: int = 0) -> DescribedEntry | None:
+        """Description of an entry; None where there is no EDS or it does not describe it."""
+        return None if self.description is None else self.description.entry(index, subindex)
+
+    def writable(self, index: int, subindex: int = 0) -> bool:
+        """Whether the entry is there and the EDS, if there is one, lets it be written."""
+        entry = self.described(index, subindex)
+        return self.has(index, subindex) and (entry is None or entry.writable)
+
+    @property
+    def profile(self) -> int:
+        """Number of the device profile in 1000h, such as 402."""
+        return self.number(0x1000) & 0xFFFF
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it is a CiA 402 drive."""
+        return bool(self.statuswords)
+
+    def pdos(self, area: range) -> list[int]:
+        """Indices of the communication parameters of the PDOs in an area."""
+        return sorted(index for index, subindex in self.values if subindex == 1 and index in area)
+
+    def mapping(self, pdo: int) -> list[int]:
+        """Mapped entries of a PDO, each index << 16 | subindex << 8 | bits."""
+        return [self.number(pdo + 0x200, n) for n in range(1, self.number(pdo + 0x200) + 1)]
+
+    def cob_id(self, pdo: int) -> int | None:
+        """Identifier of a PDO; None while it is not valid."""
+        value = self.number(pdo, 1, INVALID_FLAG)
+        return None if value & INVALID_FLAG else value & 0x7FF
+
+    def facts(self) -> dict[str, str]:
+        """Identity of the device, as reports name it."""
+        found = {name: self.values[place] for name, place in _FACTS.items() if place in self.values}
+        return {
+            name: f"{int.from_bytes(value, 'little'):#x}" if _FACTS[name][0] == 0x1018 else decode_text(value)
+            for name, value in found.items()
+        }
+
+    @property
+    def identity(self) -> str:
+        """The numbers of 1018h as one text."""
+        return ":".join(f"{self.number(0x1018, n):#x}" for n in (1, 2, 3, 4))

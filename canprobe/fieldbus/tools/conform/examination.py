@@ -1,0 +1,360 @@
+"""An examination: every point in its turn, what it wrote put back after it, its verdict in the report.
+
+    hear the bus → read the device → snapshot → for each point: 6041h, run, put back, 6041h, EMCY → put all of it back
+
+It goes on after a point that fails. It ends where the power stage is on without permission, where the device no longer
+answers, and where the bus is gone; whatever ends it, an exception and Ctrl-C too, what was written is put back first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from canprobe.errors import CanprobeError, NodeError
+from canprobe.fieldbus.bus.port import ControllerState, Port, nothing
+from canprobe.fieldbus.bus.real.interrupts import interrupts_held
+from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, describe_state, known_state
+from canprobe.fieldbus.protocol.emcy import describe
+from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import CONTROLWORD, RPDOS, ExaminedDevice
+from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
+from canprobe.fieldbus.tools.conform.frame_text import frame_text
+from canprobe.fieldbus.tools.conform.journal import Journal, restorable
+from canprobe.fieldbus.tools.conform.outcome import (
+    BenchFailure,
+    Deviation,
+    NotPermitted,
+    PointNotApplicable,
+    PowerStageOn,
+)
+from canprobe.fieldbus.tools.conform.permits import Permits, WriteList
+from canprobe.fieldbus.tools.conform.point import Point
+from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
+from canprobe.fieldbus.tools.conform.surroundings import hear
+from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
+
+_BACK_ON_BUS_S = 5.0
+_WAY_OUT = "type: canprobe conform --restore {path} --node {node_id}"
+
+
+@dataclass(frozen=True, slots=True)
+class ExaminationSettings:
+    """Settings of an examination.
+
+    Attributes:
+        written: what the user permits to be written.
+        motion: whether the power stage of a drive may be switched on.
+        snapshot: file of the snapshot; None: it is kept in memory.
+        keep_snapshot: whether that file stays when all is put back.
+        listen_s: time in which the bus is heard first, s.
+        times: how long the bench waits.
+        bitrate: bit rate of the bus, bit/s, for the background load.
+        fd: whether the bus carries CAN FD frames.
+        ask: function that asks a person to do something by hand, and returns whether it was done; None: nobody is
+            there.
+    """
+
+    written: WriteList = field(default_factory=WriteList)
+    motion: bool = False
+    snapshot: Path | None = None
+    keep_snapshot: bool = False
+    listen_s: float = 1.0
+    times: BenchTimes = field(default_factory=BenchTimes)
+    bitrate: int = 1_000_000
+    fd: bool = False
+    ask: Callable[[str], bool] | None = None
+
+
+class Examination:
+    """An examination of one device.
+
+    Args:
+        port: connection to the bus; it is not closed.
+        node_id: id of the device.
+        description: statements of its EDS; None without one.
+        settings: settings.
+
+    Attributes:
+        report: the report so far.
+        bench: the bench; it is there once the bus was heard.
+        journal: the snapshot; it is there once the device was read.
+    """
+
+    bench: Bench
+    journal: Journal
+
+    def __init__(
+        self,
+        port: Port,
+        node_id: int,
+        description: Description | None = None,
+        settings: ExaminationSettings | None = None,
+    ) -> None:
+        self.settings = settings or ExaminationSettings()
+        self.report = Report("conform", f"node {node_id} on {port.channel}")
+        self._port, self._node_id, self._description = port, node_id, description
+        self._boots = 0
+        self._ended = ""
+        self._frames: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+
+    def run(
+        self, points: Sequence[Point] = POINTS, on_row: Callable[[ReportRow, int, int], object] = nothing
+    ) -> Report:
+        """Examine the device.
+
+        Args:
+            points: the points.
+            on_row: function that is called with each row, its number, and the number of all.
+
+        Raises:
+            NodeError: the device does not answer.
+            BenchFailure: something else ended the examination, and what was written could not be put back.
+        """
+        self._meet()
+        try:
+            self._put_back()
+            for number, point in enumerate(points, start=1):
+                row = self._examine(point)
+                self.report.rows.append(row)
+                on_row(row, number, len(points))
+        except BaseException:
+            with interrupts_held():
+                self._leave()
+            raise
+        with interrupts_held():
+            try:
+                self._leave()
+            except BenchFailure as error:
+                self.report.rows.append(ReportRow("bench", "put back", Verdict.ERROR, detail=str(error)))
+        self.report.left_out += LEFT_OUT
+        self.report.distributions.update(self.bench.distributions)
+        return self.report
+
+    def _meet(self) -> None:
+        """Hear the bus, read the device, and make the snapshot."""
+        settings = self.settings
+        surroundings = hear(self._port, self._node_id, settings.listen_s)
+        if surroundings.master.endswith(f" {self._node_id}"):
+            raise NodeError(
+                self._node_id, "another master talks to it over SDO; two clients on one channel disturb each other"
+            )
+        written = settings.written.with_motion() if settings.motion else settings.written
+        permits = Permits(self._node_id, surroundings, written)
+        device = ExaminedDevice(self._node_id, self._description)
+        self.bench = bench = Bench(
+            self._port, device, permits, settings.times, bitrate=settings.bitrate, fd=settings.fd
+        )
+        bench.by_hand = self._by_hand
+        try:
+            bench.first_answer = bench.request(0x40, 0x1000)
+        except CanprobeError as error:
+            raise NodeError(self._node_id, f"it cannot be examined: {error}") from error
+        device.read_all(bench, written)
+        self.journal = Journal(
+            restorable(device.values, [p for p in device.values if written.permits(p) and p[0] != CONTROLWORD]),
+            settings.snapshot,
+            device.identity,
+            temporary=not settings.keep_snapshot,
+        )
+        permits.values, bench.noted = device.values, self.journal.note
+        permits.rpdo_ids = {c for pdo in device.pdos(RPDOS) if (c := device.cob_id(pdo)) is not None}
+        if (emcy_id := device.number(0x1014)) and not emcy_id >> 31:
+            bench.emcy_id = emcy_id & 0x7FF
+        self._boots = bench.boots
+        self.report.title = (
+            f"{device.facts().get('device name', 'device')}, node {self._node_id} on {self._port.channel}"
+        )
+        history = [f"{device.number(0x1003, n):08X}h" for n in range(1, device.number(0x1003) + 1)]
+        self.report.facts.update(device.facts())
+        self.report.facts["error history (1003h) before"] = ", ".join(history) or "empty"
+        self.report.facts["bus"] = f"{self._port.channel}, beside the device: {surroundings.text()}"
+        if surroundings.lacks("nmt") and device.has(0x1017):
+            self.report.facts["warning"] = "another master may watch the heartbeat of the device, which points change"
+
+    def _examine(self, point: Point) -> ReportRow:
+        """One point: run it, put back what it wrote, look for what it left behind."""
+        bench, began_ns = self.bench, self.bench.now_ns
+        verdict, detail, written = Verdict.PASS, "", list[str]()
+        self._frames = ((), ())
+        if self._ended:
+            return self._row(point, Verdict.ERROR, self._ended, [], 0.0)
+        if why := self._lacks(point):
+            return self._row(point, Verdict.NOT_APPLICABLE, why, [], 0.0)
+        bench.notes.clear()
+        try:
+            self._prepare()
+            point.run(bench)
+        except PowerStageOn as error:
+            verdict, detail = Verdict.ERROR, str(error)
+            self._ended = f"not examined: {error}"
+        except NotPermitted as error:
+            verdict, detail = Verdict.NOT_APPLICABLE, str(error)
+            self.report.left_out.append((f"{point.group} {point.title}", str(error)))
+        except PointNotApplicable as error:
+            verdict, detail = Verdict.NOT_APPLICABLE, str(error)
+        except (Deviation, SdoRefused) as error:
+            verdict, detail = Verdict.FAIL, str(error)
+        except CanprobeError as error:
+            verdict, detail = Verdict.ERROR, str(error)
+        sent, came = (
+            tuple(frame_text(*frame, self._node_id) for frame in frames) for frames in (bench.sent, bench.came)
+        )
+        self._frames = sent, came
+        if not self._ended:
+            try:
+                with interrupts_held():
+                    written = self._put_back()
+                self._check_power()
+                unasked = bench.unasked()
+                if unasked and verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE):
+                    code = unasked[0].code
+                    verdict, detail = Verdict.FAIL, f"EMCY {code:04X}h ({describe(code)}) that nobody asked for"
+            except PowerStageOn as error:
+                verdict, detail, self._ended = Verdict.ERROR, str(error), f"not examined: {error}"
+            except CanprobeError as error:
+                detail = f"{detail}; then {error}" if verdict is Verdict.FAIL else str(error)
+                verdict = verdict if verdict is Verdict.FAIL else Verdict.ERROR
+        if verdict is Verdict.PASS:
+            detail = "; ".join(bench.notes)
+        return self._row(point, verdict, detail, written, (bench.now_ns - began_ns) * 1e-9)
+
+    def _by_hand(self, step: str) -> bool:
+        """Let a person do something, and let the report list it."""
+        done = self.settings.ask is not None and self.settings.ask(step)
+        self.report.manual.append(f"{step}: {'done' if done else 'not done, as nobody confirmed it'}")
+        return done
+
+    def _lacks(self, point: Point) -> str:
+        """Why a point does not apply; empty where it does."""
+        if "eds" in point.needs and self._description is None:
+            return "no EDS was given; --eds FILE names it"
+        if "drive" in point.needs and not self.bench.device.is_drive:
+            return "the device is no CiA 402 drive"
+        if "motion" in point.needs and not self.settings.motion:
+            return "it switches the power stage on; --motion permits it"
+        for need in ("nmt", "sync", "alone"):
+            if need in point.needs and (why := self.bench.permits.surroundings.lacks(need)):
+                self.report.left_out.append((f"{point.group} {point.title}", why))
+                return why
+        return ""
+
+    def _prepare(self) -> None:
+        """See that the device answers and that its power stage is off."""
+        bench = self.bench
+        bench.asked.clear()
+        bench.forget()
+        bench.emergencies.clear()
+        try:
+            bench.request(0x40, 0x1000)
+        except CanprobeError as error:
+            raise BenchFailure(f"the device does not answer before the point begins: {error}") from error
+        self._check_power()
+        bench.forget()
+
+    def _check_power(self) -> None:
+        for index in self.bench.device.statuswords:
+            word = self.bench.number(index)
+            if known_state(word) in POWERED_STATES:
+                raise PowerStageOn(f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)")
+
+    def _put_back(self) -> list[str]:
+        """Put back what the point wrote, and all of it where the device booted; it is pre-operational afterwards."""
+        bench = self.bench
+        until_ns = bench.now_ns + round(_BACK_ON_BUS_S * 1e9)
+        while self._port.state is ControllerState.BUS_OFF and bench.now_ns < until_ns:
+            self._port.wait(bench.now_ns + 100_000_000)
+            self._port.drain()
+        bench.load = None
+        bench.permits.harmless.clear()
+        commanded = not bench.permits.surroundings.lacks("nmt")
+        if commanded:
+            bench.settle(NmtState.PRE_OPERATIONAL)
+        try:
+            written = self.journal.restore(bench, all_of_it=bench.boots != self._boots)
+        except BenchFailure as error:
+            if not commanded:
+                raise
+            try:  # a device may have values at power on that it does not take back
+                bench.reset()
+            except Deviation:
+                raise error from None
+            written = self.journal.restore(bench, all_of_it=True)
+        if commanded and bench.asked and not self._is_well():
+            bench.reset()  # an error that was provoked and stays would fail the points that follow
+            written += self.journal.restore(bench, all_of_it=True)
+        self._boots = bench.boots
+        return written
+
+    def _is_well(self) -> bool:
+        """Whether 1001h shows no error that was not there before."""
+        return not self.bench.number(0x1001) & ~self.bench.device.number(0x1001)
+
+    def _leave(self) -> None:
+        """Put back everything, and bring the device into the state that it had.
+
+        Raises:
+            BenchFailure: something was not restored; the message says what to type.
+        """
+        bench, surroundings = self.bench, self.bench.permits.surroundings
+        try:
+            self._put_back()
+            self.journal.close()
+            if surroundings.state_of(self._node_id) == NmtState.OPERATIONAL and not surroundings.lacks("nmt"):
+                bench.settle(NmtState.OPERATIONAL)
+        except CanprobeError as error:
+            path = self.journal.path
+            way = "" if path is None else "; " + _WAY_OUT.format(path=path, node_id=self._node_id)
+            raise BenchFailure(f"node {self._node_id}: not everything was put back: {error}{way}") from error
+
+    def _row(
+        self,
+        point: Point,
+        verdict: Verdict,
+        detail: str,
+        written: Sequence[str],
+        seconds: float,
+    ) -> ReportRow:
+        return ReportRow(
+            group=point.group,
+            name=point.title,
+            verdict=verdict,
+            clause=point.clause,
+            expected=point.expected,
+            sent=self._frames[0],
+            came=self._frames[1],
+            detail=detail,
+            hint=point.hint if verdict is Verdict.FAIL else "",
+            severity="wrong" if verdict is Verdict.FAIL else "",
+            written=tuple(written),
+            seconds=seconds,
+        )
+
+
+def restore_snapshot(port: Port, node_id: int, path: Path, times: BenchTimes | None = None) -> list[str]:
+    """Put back what a snapshot holds, as after an examination that was cut off.
+
+    Raises:
+        UsageError: the file is no snapshot.
+        NodeError: the device does not answer, is another one, or its power stage is on.
+        BenchFailure: something was not restored.
+    """
+    journal = Journal.load(path)
+    examination = Examination(port, node_id, settings=ExaminationSettings(times=times or BenchTimes()))
+    examination._meet()
+    bench, identity = examination.bench, examination.bench.device.identity
+    if identity != journal.identity:
+        raise NodeError(node_id, f"it is {identity} (1018h), the snapshot is of {journal.identity}")
+    try:
+        examination._check_power()
+    except PowerStageOn as error:
+        raise NodeError(node_id, str(error)) from error
+    bench.permits.values = journal.values
+    bench.permits.written = WriteList(places=frozenset(journal.values))
+    if not bench.permits.surroundings.lacks("nmt"):
+        bench.settle(NmtState.PRE_OPERATIONAL)
+    return journal.restore(bench, all_of_it=True)

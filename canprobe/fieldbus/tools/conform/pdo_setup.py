@@ -1,0 +1,141 @@
+"""PDOs of the device, taken out of use, changed and put to work for a point."""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.eds.description import DescribedEntry
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
+from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
+from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS
+
+EVENT_TYPE = 255
+_DUMMY_WORDS = (0x00070020, 0x00060010, 0x00050008)
+"""UNSIGNED32, UNSIGNED16, UNSIGNED8 as dummy entries."""
+_TYPE, _INHIBIT, _EVENT, _START = 2, 3, 5, 6
+
+
+def changeable_pdo(bench: Bench, area: range, *, mapping: bool = False) -> int:
+    """A PDO whose identifier can be written, with a mapping; with `mapping` one whose mapping can be written, too.
+
+    Raises:
+        PointNotApplicable: there is none.
+    """
+    what = "TPDO" if area is TPDOS else "RPDO"
+    for pdo in bench.device.pdos(area):
+        writable = bench.device.writable(pdo, 1)
+        if mapping:
+            writable = writable and bench.device.writable(pdo + 0x200, 0) and bench.device.writable(pdo + 0x200, 1)
+        if writable and (area is RPDOS or bench.device.mapping(pdo)):
+            return pdo
+    raise PointNotApplicable(f"the device has no {what} {'with a mapping that' if mapping else 'that'} can be changed")
+
+
+def switch_off(bench: Bench, pdo: int) -> None:
+    """Take a PDO out of use."""
+    bench.put(pdo, 1, bench.device.number(pdo, 1) | INVALID_FLAG, 4)
+
+
+def switch_on(bench: Bench, pdo: int) -> int:
+    """Put a PDO to work under its own identifier, or the pre-defined one; return the identifier."""
+    word = bench.device.number(pdo, 1) & ~INVALID_FLAG
+    if not word & 0x7FF:
+        area, base = (RPDOS, 0x200) if pdo in RPDOS else (TPDOS, 0x180)
+        word |= base + 0x100 * (area.index(pdo) % 4) + bench.node_id
+    bench.put(pdo, 1, word, 4)
+    return word & 0x7FF
+
+
+def map_entries(bench: Bench, pdo: int, words: list[int]) -> None:
+    """Map entries to a PDO that is out of use. Raises Deviation where the device refuses."""
+    bench.put(pdo + 0x200, 0, 0)
+    for subindex, word in enumerate(words, start=1):
+        bench.put(pdo + 0x200, subindex, word, 4)
+    bench.put(pdo + 0x200, 0, len(words))
+
+
+def set_parameters(
+    bench: Bench, pdo: int, kind: int, *, inhibit: int = 0, event_ms: int = 0, start: int | None = None
+) -> None:
+    """Set transmission type and times of a PDO that is out of use.
+
+    Raises:
+        PointNotApplicable: the device has not all of them, or does not take the transmission type.
+    """
+    if bench.device.number(pdo, _TYPE) != kind and not bench.takes(pdo, _TYPE, kind):
+        raise PointNotApplicable(f"the device does not take transmission type {kind}")
+    for subindex, value in ((_INHIBIT, inhibit), (_EVENT, event_ms), (_START, start)):
+        if value is not None and (value or bench.device.number(pdo, subindex)):
+            bench.need((pdo, subindex))
+            bench.put(pdo, subindex, value)
+
+
+def synchronous_tpdo(bench: Bench, every: int = 1, start: int | None = None) -> int:
+    """A TPDO that is sent at every n-th SYNC; return its identifier. SYNC has no counter, unless a start is given."""
+    pdo = changeable_pdo(bench, TPDOS)
+    if start is None:
+        plain_sync(bench)
+    switch_off(bench, pdo)
+    set_parameters(bench, pdo, every, start=start)
+    return switch_on(bench, pdo)
+
+
+def plain_sync(bench: Bench) -> None:
+    """Let the device expect SYNC without a counter, and not watch its period."""
+    if bench.device.number(0x1006):
+        bench.put(0x1006, 0, 0)
+    if bench.device.number(0x1019):
+        bench.put(0x1019, 0, 0)
+
+
+def permitted_entry(bench: Bench, *, transmits: bool) -> DescribedEntry:
+    """An entry that the user lets be written and that such a PDO may map.
+
+    Raises:
+        PointNotApplicable: there is none.
+    """
+    for entry in bench.device.entries():
+        place = entry.index, entry.subindex
+        mappable = entry.in_tpdo and entry.writable if transmits else entry.in_rpdo and entry.readable
+        of_motion = entry.index >= 0x6000 and 0x6000 | entry.index & 0x7FF in MOTION_OBJECTS  # of any axis
+        if of_motion or entry.index < 0x2000 or not entry.is_integer:
+            continue
+        if mappable and bench.permits.written.permits(place):
+            return entry
+    way = "a TPDO" if transmits else "an RPDO"
+    raise PointNotApplicable(f"--write names no entry that {way} may map, and whose value can be read and written")
+
+
+def word_of(entry: DescribedEntry) -> int:
+    """A described entry as a mapping entry."""
+    return entry.index << 16 | entry.subindex << 8 | entry.bits
+
+
+def rpdo_of_dummies(bench: Bench, kind: int = EVENT_TYPE, *, event_ms: int = 0) -> tuple[int, int, int]:
+    """An RPDO that carries nothing; return its index, identifier and length.
+
+    Raises:
+        PointNotApplicable: no mapping can be changed, or none takes a dummy.
+    """
+    pdo = changeable_pdo(bench, RPDOS, mapping=True)
+    switch_off(bench, pdo)
+    bench.put(pdo + 0x200, 0, 0)
+    word = next((word for word in _DUMMY_WORDS if bench.takes(pdo + 0x200, 1, word)), 0)
+    if not word or not bench.takes(pdo + 0x200, 0, 1):
+        raise PointNotApplicable("no RPDO takes a dummy entry, so none can be sent without changing something")
+    return pdo, _started(bench, pdo, kind, event_ms), (word & 0xFF) // 8
+
+
+def rpdo_of(bench: Bench, entry: DescribedEntry, kind: int) -> tuple[int, int]:
+    """An RPDO that carries one entry that the user lets be written; return its index and identifier."""
+    pdo = changeable_pdo(bench, RPDOS, mapping=True)
+    switch_off(bench, pdo)
+    map_entries(bench, pdo, [word_of(entry)])
+    return pdo, _started(bench, pdo, kind, 0)
+
+
+def _started(bench: Bench, pdo: int, kind: int, event_ms: int) -> int:
+    set_parameters(bench, pdo, kind, event_ms=event_ms)
+    cob_id = switch_on(bench, pdo)
+    bench.permits.harmless.add(cob_id)
+    return cob_id

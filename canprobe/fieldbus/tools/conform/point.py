@@ -1,0 +1,50 @@
+"""A point of the examination."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from canprobe.fieldbus.tools.conform.bench import Bench
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Point:
+    """One point of the examination.
+
+    Attributes:
+        number: number in the list of points; several points of one subject may share it.
+        group: service that it examines, such as ``sdo``.
+        name: short name, the same from run to run.
+        clause: clause of the standard.
+        expected: what is accepted, in words.
+        run: function that examines it: it returns where the device conforms, else raises an error of `outcome`.
+        needs: what must be there: ``eds``, ``nmt`` (no other master), ``sync`` (no other SYNC producer), ``alone`` (no
+            other node), ``drive``, ``motion`` (permission to switch the power stage on).
+        hint: what the author of a firmware can look at.
+    """
+
+    number: int
+    group: str
+    name: str
+    clause: str
+    expected: str
+    run: Callable[[Bench], None]
+    needs: frozenset[str] = frozenset()
+    hint: str = ""
+
+    @property
+    def title(self) -> str:
+        """Number and name, by which reports know the point."""
+        return f"{self.number} {self.name}"
+
+
+def conformance_point(
+    number: int, group: str, name: str, clause: str, expected: str, *, needs: str = "", hint: str = ""
+) -> Callable[[Callable[[Bench], None]], Point]:
+    """Make a `Point` of the function below; `needs` are words with blanks between them."""
+
+    def make(run: Callable[[Bench], None]) -> Point:
+        return Point(number, group, name, clause, expected, run, frozenset(needs.split()), hint)
+
+    return make

@@ -1,0 +1,242 @@
+"""Points 48 to 55: CiA 402 drives. Source: CiA 402-2, "Finite state automaton", "Modes of operation".
+
+Without `--motion` the power stage stays off: 6041h and 6502h are read. With it the automaton is walked through with the
+target at the actual position, so that the axis holds; homing takes the present position as home.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from canprobe.fieldbus.protocol.cia402 import (
+    HOMING_ATTAINED_BIT,
+    HOMING_ERROR_BIT,
+    SETPOINT_ACKNOWLEDGE_BIT,
+    TRANSITIONS,
+    DriveCommand,
+    DriveState,
+    describe_state,
+    known_state,
+)
+from canprobe.fieldbus.tools.conform import accepted
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import CONTROLWORD, STATUSWORD
+from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
+from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused, pack_write
+
+AUTOMATON = "CiA 402-2, finite state automaton"
+_WORDS = {
+    DriveCommand.SHUTDOWN: 0x06,
+    DriveCommand.SWITCH_ON: 0x07,
+    DriveCommand.ENABLE_OPERATION: 0x0F,
+    DriveCommand.DISABLE_VOLTAGE: 0x00,
+    DriveCommand.QUICK_STOP: 0x02,
+}
+_WAYS = {
+    DriveState.SWITCH_ON_DISABLED: (),
+    DriveState.READY_TO_SWITCH_ON: (DriveCommand.SHUTDOWN,),
+    DriveState.SWITCHED_ON: (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON),
+    DriveState.OPERATION_ENABLED: (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION),
+}
+_REACH_S = 2.0
+_MODE, _MODE_DISPLAY, _MODES, _TARGET, _ACTUAL, _METHOD = 0x6060, 0x6061, 0x6502, 0x607A, 0x6064, 0x6098
+_PROFILE_POSITION, _HOMING = 1, 6
+_PRESENT_POSITION = (37, 35)
+"""Homing methods that take the present position as home."""
+
+
+def _reach(bench: Bench, state: DriveState, what: str) -> None:
+    """Wait for a state of the drive. Raises Deviation."""
+    until_ns = bench.now_ns + round(_REACH_S * 1e9)
+    while known_state(word := bench.number(STATUSWORD)) is not state:
+        if bench.now_ns >= until_ns:
+            bench.deviates(f"{what}: the drive is {describe_state(word)}, expected {state.name}")
+        bench.pass_time(0.01)
+
+
+def _command(bench: Bench, command: DriveCommand) -> None:
+    bench.put(CONTROLWORD, 0, _WORDS[command], 2)
+
+
+@contextmanager
+def _at_rest(bench: Bench, mode: int = 0) -> Iterator[None]:
+    """The drive switched off in a mode, with its target where it is; switched off afterwards, whatever happens."""
+    modes = _supported(bench)
+    mode = mode or next((m for m in (_PROFILE_POSITION, 8, 9, 10, 3, 7) if modes >> m - 1 & 1), 0)
+    if not mode or (modes and not modes >> mode - 1 & 1):
+        raise PointNotApplicable(f"6502h does not list mode {mode}")
+    _off(bench)
+    bench.put(_MODE, 0, mode, 1)
+    bench.put(_TARGET, 0, bench.number(_ACTUAL), 4)
+    try:
+        yield
+    finally:
+        _off(bench)
+
+
+def _supported(bench: Bench) -> int:
+    """6502h; 0 where the drive has none."""
+    try:
+        return int.from_bytes(bench.upload(_MODES), "little")
+    except SdoRefused:
+        return 0
+
+
+def _off(bench: Bench) -> None:
+    """Disable the voltage, and reset a fault that is there."""
+    bench.put(CONTROLWORD, 0, 0, 2)
+    if known_state(bench.number(STATUSWORD)) is DriveState.FAULT:
+        raise PointNotApplicable("the drive is in FAULT; reset it first")
+    _reach(bench, DriveState.SWITCH_ON_DISABLED, "disable voltage")
+
+
+def _go(bench: Bench, state: DriveState) -> None:
+    _off(bench)
+    for command in _WAYS[state]:
+        _command(bench, command)
+    _reach(bench, state, "on the way up")
+
+
+@conformance_point(
+    48, "drive402", "statusword", "CiA 402-2, 6041h", "the bits of a state, the power stage off", needs="drive"
+)
+def statusword(bench: Bench) -> None:
+    """The bits of 6041h are those of a state."""
+    word = bench.number(STATUSWORD)
+    if known_state(word) is None:
+        bench.deviates(f"6041h is {word:04X}h, which is no state")
+
+
+@conformance_point(
+    53,
+    "drive402",
+    "supported modes",
+    "CiA 402-2, 6502h",
+    "6061h shows one of them or 0; what differs from the EDS is noted",
+    needs="drive",
+)
+def supported_modes(bench: Bench) -> None:
+    """6502h beside the EDS, and the mode that 6061h shows."""
+    entry = bench.device.described(_MODES)
+    if bench.device.description is not None and entry is None:
+        raise PointNotApplicable("the EDS describes no 6502h")
+    modes = bench.number(_MODES)
+    if entry is not None and isinstance(entry.default, int) and entry.default and entry.default != modes:
+        bench.notes.append(f"6502h is {modes:08X}h, the EDS says {entry.default:08X}h")
+    mode = bench.number(_MODE_DISPLAY)
+    if 0 < mode < 33 and not modes >> mode - 1 & 1:
+        bench.deviates(f"6061h shows mode {mode}, which 6502h does not list")
+
+
+@conformance_point(
+    53,
+    "drive402",
+    "mode display",
+    "CiA 402-2, 6060h 6061h",
+    "6061h follows 6060h; other modes are refused",
+    needs="drive motion",
+)
+def mode_display(bench: Bench) -> None:
+    """Every mode from 1 to 10, with the power stage off."""
+    modes = _supported(bench)
+    _off(bench)
+    for mode in range(1, 11):
+        request = pack_write(_MODE, 0, bytes((mode,)))
+        if not modes >> mode - 1 & 1:
+            bench.must_refuse(
+                request, (*accepted.VALUE, 0x06040043, 0x06010000), f"mode {mode}, which 6502h does not list"
+            )
+            continue
+        bench.put(_MODE, 0, mode, 1)
+        bench.pass_time(0.05)
+        if (shown := bench.number(_MODE_DISPLAY)) != mode:
+            bench.deviates(f"6061h is {shown} after mode {mode}")
+
+
+@conformance_point(
+    49, "drive402", "transitions", AUTOMATON, "every command leads where the table says", needs="drive motion"
+)
+def transitions(bench: Bench) -> None:
+    """Every command that does something, in every state up to operation enabled; quick stop is point 51."""
+    with _at_rest(bench):
+        for (source, command), goal in TRANSITIONS.items():
+            if source not in _WAYS or command not in _WORDS or goal is DriveState.QUICK_STOP_ACTIVE:
+                continue
+            _go(bench, source)
+            _command(bench, command)
+            if (source, command) == (DriveState.READY_TO_SWITCH_ON, DriveCommand.ENABLE_OPERATION):
+                goal = DriveState.OPERATION_ENABLED  # noqa: PLW2901 - through switched on, by itself
+            _reach(bench, goal, f"{command.name} in {source.name}")
+
+
+@conformance_point(
+    50, "drive402", "illegal commands", AUTOMATON, "commands without a transition change nothing", needs="drive motion"
+)
+def illegal_commands(bench: Bench) -> None:
+    """Commands that have no transition, in the states below operation enabled."""
+    with _at_rest(bench):
+        for source in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON):
+            for command in _WORDS:
+                if (source, command) in TRANSITIONS:
+                    continue
+                _go(bench, source)
+                _command(bench, command)
+                bench.pass_time(0.05)
+                _reach(bench, source, f"{command.name} in {source.name}")
+
+
+@conformance_point(
+    51,
+    "drive402",
+    "quick stop",
+    "CiA 402-2, 605Ah",
+    "5 to 8 stay in quick stop active, others switch off",
+    needs="drive motion",
+)
+def quick_stop(bench: Bench) -> None:
+    """Quick stop at rest, with the option that the drive has."""
+    option = bench.number(0x605A) if bench.device.described(0x605A) is not None else 2
+    stays = option in (5, 6, 7, 8)
+    with _at_rest(bench):
+        _go(bench, DriveState.OPERATION_ENABLED)
+        _command(bench, DriveCommand.QUICK_STOP)
+        goal = DriveState.QUICK_STOP_ACTIVE if stays else DriveState.SWITCH_ON_DISABLED
+        _reach(bench, goal, f"quick stop with 605Ah = {option}")
+
+
+@conformance_point(
+    54,
+    "drive402",
+    "handshake of profile position",
+    "CiA 402-2, profile position",
+    "bit 12 follows bit 4 of 6040h",
+    needs="drive motion",
+)
+def handshake(bench: Bench) -> None:
+    """A set-point where the axis is: it is acknowledged, and the acknowledgement goes with bit 4."""
+    with _at_rest(bench, _PROFILE_POSITION):
+        _go(bench, DriveState.OPERATION_ENABLED)
+        for word, acknowledged in ((0x1F, 1), (0x0F, 0)):
+            bench.put(CONTROLWORD, 0, word, 2)
+            bench.pass_time(0.05)
+            if (found := bench.number(STATUSWORD) >> SETPOINT_ACKNOWLEDGE_BIT & 1) != acknowledged:
+                bench.deviates(f"bit 12 of 6041h is {found} after controlword {word:04X}h")
+
+
+@conformance_point(55, "drive402", "homing", "CiA 402-2, homing", "bit 12 comes, bit 13 does not", needs="drive motion")
+def homing(bench: Bench) -> None:
+    """Method 37 or 35, which takes the present position as home."""
+    with _at_rest(bench, _HOMING):
+        if not any(bench.takes(_METHOD, 0, method) for method in _PRESENT_POSITION):
+            raise PointNotApplicable("the drive has no homing method that takes the present position")
+        _go(bench, DriveState.OPERATION_ENABLED)
+        bench.put(CONTROLWORD, 0, 0x1F, 2)
+        until_ns = bench.now_ns + round(_REACH_S * 1e9)
+        while not (word := bench.number(STATUSWORD)) >> HOMING_ATTAINED_BIT & 1:
+            if word >> HOMING_ERROR_BIT & 1 or bench.now_ns >= until_ns:
+                bench.deviates(f"homing is not attained: 6041h is {word:04X}h")
+            bench.pass_time(0.01)
+        if word >> HOMING_ERROR_BIT & 1:
+            bench.deviates(f"homing is attained with an error: 6041h is {word:04X}h")

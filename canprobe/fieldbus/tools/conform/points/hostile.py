@@ -1,0 +1,162 @@
+"""Points 93 to 98: frames that are no service of the device. It ignores them, and works on.
+
+Source: CiA 301, "Service data object" (eight bytes), "Restricted CAN-IDs"; ISO 11898-1 (formats).
+"""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.protocol.frames import (
+    EFF_FLAG,
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    NMT_ID,
+    RTR_FLAG,
+    SDO_RX_BASE,
+    SDO_TX_BASE,
+    NmtCommand,
+    NmtState,
+)
+from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
+from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request
+
+_READ_TYPE = pack_request(0x40, 0x1000, 0)
+_FD_BYTES = 12
+_PACE_S = 0.02
+
+
+@conformance_point(93, "hostile", "SDO of every length", "CiA 301, SDO: eight bytes", "0 to 7 bytes are not answered")
+def sdo_lengths(bench: Bench) -> None:
+    """A request cut to 0 to 7 bytes. Some devices answer shorter requests on purpose, which is noted."""
+    answer_id = SDO_TX_BASE + bench.node_id
+    answered = []
+    for length in range(8):
+        bench.taken(answer_id)
+        bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE[:length])
+        if not bench.is_silent():
+            answered.append(length)
+    if any(length < 4 for length in answered):
+        bench.deviates(f"requests of {answered} bytes are answered")
+    if answered:
+        bench.notes.append(f"requests of {answered} bytes are answered, as for old PLCs")
+    bench.serves("short requests")
+
+
+@conformance_point(
+    94, "hostile", "remote requests", "CiA 301, CAN data frames", "remote requests for SDO and EMCY are ignored"
+)
+def remote_requests(bench: Bench) -> None:
+    """Remote requests under every identifier of the device but guarding and TPDOs."""
+    answer_id = SDO_TX_BASE + bench.node_id
+    for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE):
+        bench.taken(answer_id)
+        bench.send((base + bench.node_id) | RTR_FLAG)
+        if not bench.is_silent():
+            bench.deviates(f"a remote request for {base + bench.node_id:03X}h is answered")
+    bench.serves("remote requests")
+
+
+@conformance_point(
+    95,
+    "hostile",
+    "29-bit frames",
+    "CiA 301, CAN base frames",
+    "frames with 29 bits are another device's",
+    needs="alone nmt",
+)
+def extended_frames(bench: Bench) -> None:
+    """The identifiers of SDO and NMT in 29 bits, as they are and above the 11 bits."""
+    answer_id = SDO_TX_BASE + bench.node_id
+    bench.watch_state()
+    for shift in (0, 18):
+        can_id = (SDO_RX_BASE + bench.node_id) << shift | EFF_FLAG
+        bench.taken(answer_id)
+        bench.send(can_id, _READ_TYPE)
+        if not bench.is_silent():
+            bench.deviates(f"an SDO request with identifier {can_id & ~EFF_FLAG:08X}h is answered")
+        bench.send(NMT_ID << shift | EFF_FLAG, bytes((NmtCommand.STOP, bench.node_id)))
+        if (state := bench.state()) != NmtState.PRE_OPERATIONAL:
+            bench.deviates(f"an NMT command in 29 bits leads to state {state:02X}h")
+    bench.serves("29-bit frames")
+
+
+@conformance_point(
+    96,
+    "hostile",
+    "every SDO command",
+    "CiA 301, SDO command specifiers",
+    "an answer of eight bytes or none; then it serves",
+)
+def every_command(bench: Bench) -> None:
+    """All 256 command bytes with 1000h, which cannot be written; what may begin a transfer is aborted."""
+    answer_id = SDO_TX_BASE + bench.node_id
+    value = bench.device.values.get((0x1000, 0), bytes(4))
+    for command in range(256):
+        bench.taken(answer_id)
+        if command >> 5 == 1 and command & 2 and (4 - (command >> 2 & 3) if command & 1 else 4) != len(value):
+            continue  # a value that is shorter than that of 1000h
+        bench.send(SDO_RX_BASE + bench.node_id, pack_request(command, 0x1000, 0, value))
+        frame = bench.next(answer_id, _PACE_S)
+        if frame is not None and len(frame.data) != 8:
+            bench.deviates(f"command {command:02X}h is answered with {len(frame.data)} bytes")
+    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, 0x1000, 0, bytes.fromhex("00000008")))
+    while not bench.is_silent():
+        pass  # answers that come late
+    bench.serves("all command bytes")
+
+
+@conformance_point(
+    97, "hostile", "CAN FD frames", "ISO 11898-1, FD format", "an FD frame is no SDO request", needs="alone"
+)
+def fd_frames(bench: Bench) -> None:
+    """A request in a frame of twelve bytes, where the bus carries such frames."""
+    if not bench.fd:
+        raise PointNotApplicable("the bus carries no CAN FD frames")
+    bench.taken(SDO_TX_BASE + bench.node_id)
+    bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE.ljust(_FD_BYTES, b"\0"))
+    if not bench.is_silent():
+        bench.deviates("an SDO request of twelve bytes is answered")
+    bench.serves("CAN FD frames")
+
+
+@conformance_point(
+    99, "hostile", "own frames", "CiA 301, CAN base frames", "data frames with 11 bits only", needs="alone"
+)
+def own_frames(bench: Bench) -> None:
+    """What came so far, where nobody else is on the bus."""
+    if bench.odd_ids:
+        texts = [f"{can_id:08X}h" for can_id in sorted(bench.odd_ids)]
+        bench.deviates(f"remote requests or frames with 29 bits come: {', '.join(texts[:4])} (with flags)")
+
+
+@conformance_point(
+    98,
+    "hostile",
+    "identifiers of nobody",
+    "CiA 301, CAN identifiers",
+    "frames of every length under other identifiers are ignored",
+    needs="alone nmt",
+)
+def other_identifiers(bench: Bench) -> None:
+    """Every 16th identifier that is no service of the device, with 0 to 8 bytes."""
+    bench.watch_state()
+    own = {
+        bench.device.cob_id(pdo)
+        for area in (range(0x1400, 0x1600), range(0x1800, 0x1A00))
+        for pdo in bench.device.pdos(area)
+    }
+    lengths = 0
+    for can_id in range(0x103, 0x7E0, 16):
+        services = can_id & 0x7F == bench.node_id or HEARTBEAT_BASE <= can_id < HEARTBEAT_BASE + 128 or can_id in own
+        if services or SDO_RX_BASE < can_id < SDO_RX_BASE + 128:
+            continue
+        bench.send(can_id, bytes(range(lengths % 9)))
+        lengths += 1
+    for length in range(8):
+        bench.send(LSS_REQUEST_ID, bytes(length))
+    bench.pass_time(0.01)
+    if (state := bench.state()) != NmtState.PRE_OPERATIONAL:
+        bench.deviates(f"state {state:02X}h after frames under identifiers of nobody")
+    bench.serves("frames under identifiers of nobody")

@@ -1,0 +1,200 @@
+"""Points 1 to 7: NMT. Source: CiA 301, "Network management"."""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.protocol.frames import (
+    HEARTBEAT_BASE,
+    NMT_ID,
+    RTR_FLAG,
+    SDO_RX_BASE,
+    SDO_TX_BASE,
+    NmtCommand,
+    NmtState,
+)
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import TPDOS
+from canprobe.fieldbus.tools.conform.frame_link import CameFrame
+from canprobe.fieldbus.tools.conform.outcome import NotPermitted, PointNotApplicable
+from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.sdo_client import pack_request
+
+_STATES = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
+_READ_TYPE = pack_request(0x40, 0x1000, 0)
+_QUEUED_NS = 5_000_000
+_PACE_S = 0.02
+_NO_RTR = 1 << 30
+
+
+@conformance_point(1, "nmt", "boot-up", "CiA 301, NMT boot-up", "700h+id with 00h, then pre-operational", needs="nmt")
+def boot_up(bench: Bench) -> None:
+    """After a reset the device announces itself once, and is pre-operational."""
+    before = bench.boots
+    bench.reset()
+    bench.watch_state()
+    state = bench.state()
+    if state == NmtState.OPERATIONAL and not bench.device.number(0x1F80) & 4:
+        bench.notes.append("the device starts by itself (1F80h)")
+    elif state != NmtState.PRE_OPERATIONAL:
+        bench.deviates(f"state {state:02X}h after the boot-up, expected 7Fh")
+    if bench.boots != before + 1:
+        bench.deviates(f"{bench.boots - before} boot-up messages after one reset")
+
+
+@conformance_point(
+    1, "nmt", "power on", "CiA 301, NMT boot-up", "700h+id with 00h after the power came back", needs="nmt"
+)
+def power_on(bench: Bench) -> None:
+    """The device announces itself when it gets its power, which a person switches."""
+    before = bench.boots
+    if not bench.by_hand(f"switch node {bench.node_id} off and on, then confirm"):
+        raise PointNotApplicable("it needs somebody who switches the device off and on")
+    bench.pass_time(bench.times.boot_s)
+    if bench.boots == before:
+        bench.deviates("no boot-up message after the power came back")
+
+
+@conformance_point(
+    2,
+    "nmt",
+    "reset communication",
+    "CiA 301, NMT node control",
+    "82h boots again from every state, and 1017h has its power-on value",
+    needs="nmt",
+)
+def reset_communication(bench: Bench) -> None:
+    """82h from pre-operational, operational and stopped."""
+    bench.reset()
+    default = bench.number(0x1017) if bench.device.has(0x1017) else 0
+    for state in _STATES:
+        bench.watch_state()
+        bench.go(state)
+        bench.reset()
+        if bench.device.writable(0x1017) and (found := bench.number(0x1017)) != default:
+            bench.deviates(f"1017h is {found} after the reset, {default} after the one before")
+
+
+@conformance_point(2, "nmt", "reset node", "CiA 301, NMT node control", "81h boots again from every state", needs="nmt")
+def reset_node(bench: Bench) -> None:
+    """81h, where the user permits that application objects are reset."""
+    for state in _STATES:
+        if state is not NmtState.PRE_OPERATIONAL:
+            bench.watch_state()
+            bench.go(state)
+        bench.reset(NmtCommand.RESET_NODE)
+
+
+@conformance_point(
+    3,
+    "nmt",
+    "wrong commands",
+    "CiA 301, NMT node control",
+    "commands that do not exist, or of another length, change nothing",
+    needs="nmt",
+)
+def wrong_commands(bench: Bench) -> None:
+    """In each state: unknown specifiers, and valid ones with a byte too many or too few."""
+    wrong = [bytes((specifier, bench.node_id)) for specifier in (0x00, 0x03, 0x7F, 0x83, 0xFF)]
+    wrong += [bytes((specifier, bench.node_id, 0)) for specifier in (0x01, 0x02, 0x80, 0x82)]
+    short = [b"", b"\x01", b"\x02", b"\x80"] if bench.permits.surroundings.alone else []
+    bench.watch_state()
+    for state in _STATES:
+        bench.go(state)
+        for data in (*wrong, *short):
+            bench.send(NMT_ID, data)
+        bench.pass_time(2 * _QUEUED_NS * 1e-9)
+        if (found := bench.state()) != state:
+            bench.deviates(f"state {found:02X}h after wrong commands in state {state:02X}h")
+
+
+@conformance_point(
+    4, "nmt", "initialisation", "CiA 301, NMT initialisation", "nothing is served before the boot-up", needs="nmt"
+)
+def initialisation(bench: Bench) -> None:
+    """SDO requests from the reset on: none is answered before the boot-up message."""
+    beat_id, answer_id = HEARTBEAT_BASE + bench.node_id, SDO_TX_BASE + bench.node_id
+    bench.taken(beat_id)
+    bench.taken(answer_id)
+    started_ns = bench.nmt(NmtCommand.RESET_COMMUNICATION)
+    frames: list[CameFrame] = []
+    until_ns = started_ns + round(bench.times.boot_s * 1e9)
+    while not any(frame.can_id == beat_id for frame in frames) and bench.now_ns < until_ns:
+        bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE)
+        bench.pass_time(_PACE_S)
+        frames += [*bench.taken(answer_id), *(frame for frame in bench.taken(beat_id) if frame.data == b"\0")]
+    booted_ns = next((frame.t_ns for frame in frames if frame.can_id == beat_id), None)
+    if booted_ns is None:
+        bench.deviates(f"no boot-up message within {bench.times.boot_s:g} s")
+    early = [frame for frame in frames if frame.can_id == answer_id and frame.t_ns < booted_ns - _QUEUED_NS]
+    if early:  # an answer right before it may have won the arbitration
+        ms = (booted_ns - early[0].t_ns) * 1e-6
+        bench.deviates(f"an SDO request is answered {ms:.0f} ms before the boot-up message")
+
+
+@conformance_point(5, "nmt", "stopped", "CiA 301, NMT stopped", "SDO requests are not answered in stopped", needs="nmt")
+def stopped(bench: Bench) -> None:
+    """SDO is silent in stopped, and served again in pre-operational."""
+    bench.watch_state()
+    bench.go(NmtState.STOPPED)
+    bench.taken(SDO_TX_BASE + bench.node_id)
+    bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE)
+    if not bench.is_silent():
+        bench.deviates("an SDO request is answered in stopped")
+    bench.go(NmtState.PRE_OPERATIONAL)
+    bench.serves("the return to pre-operational")
+
+
+@conformance_point(
+    6,
+    "nmt",
+    "PDOs",
+    "CiA 301, NMT states",
+    "TPDOs come in operational only: neither SYNC nor a remote request brings one elsewhere",
+    needs="nmt",
+)
+def pdos_in_operational(bench: Bench) -> None:
+    """SYNC and remote requests in pre-operational and stopped; frames that were queued before may still come."""
+    ids = [cob_id for pdo in bench.device.pdos(TPDOS) if (cob_id := bench.device.cob_id(pdo)) is not None]
+    if not ids:
+        raise PointNotApplicable("the device has no valid TPDO")
+    for state in (NmtState.PRE_OPERATIONAL, NmtState.STOPPED):
+        bench.nmt(NmtCommand.START)
+        changed_ns = bench.settle(state)
+        with_sync = not bench.permits.surroundings.lacks("sync")
+        for _ in range(2):
+            if with_sync:
+                bench.sync()
+            for pdo in bench.device.pdos(TPDOS):
+                cob_id = bench.device.cob_id(pdo)
+                if cob_id is not None and not bench.device.number(pdo, 1) & _NO_RTR:
+                    request_pdo(bench, cob_id)
+        bench.pass_time(bench.times.silence_s)
+        frames = [frame for can_id in ids for frame in bench.taken(can_id) if frame.t_ns > changed_ns + _QUEUED_NS]
+        if frames:
+            bench.deviates(f"TPDO {frames[0].can_id:03X}h comes in {state.name.lower().replace('_', '-')}")
+    bench.nmt(NmtCommand.PRE_OPERATIONAL)
+
+
+def request_pdo(bench: Bench, cob_id: int) -> None:
+    """Send a remote request for a TPDO, where it may be sent."""
+    try:
+        bench.send(cob_id | RTR_FLAG)
+    except NotPermitted:
+        bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
+
+
+@conformance_point(
+    7,
+    "nmt",
+    "transitions",
+    "CiA 301, NMT state machine",
+    "01h, 02h and 80h lead to their states from every state, and error control reports them",
+    needs="nmt",
+)
+def transitions(bench: Bench) -> None:
+    """Every transition between the three states."""
+    bench.watch_state()
+    for before in _STATES:
+        for after in _STATES:
+            bench.go(before)
+            bench.go(after)
+    bench.go(NmtState.PRE_OPERATIONAL)

@@ -1,0 +1,193 @@
+"""Points 77 to 92: what the EDS promises, entry by entry. Source: CiA 306-1; CiA 301, "Object dictionary"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from canprobe.fieldbus.eds.description import DescribedEntry
+from canprobe.fieldbus.tools.conform import accepted
+from canprobe.fieldbus.tools.conform.accepted import accepted_text
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
+from canprobe.fieldbus.tools.conform.frame_text import place_text
+from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
+from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
+from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_request, pack_write
+
+_MANDATORY = ((0x1000, 0), (0x1001, 0), (0x1018, 1))
+_SHOWN = 5
+"""Entries that a verdict names."""
+_MAY_HAVE_NOTHING = (0x08000024, 0x08000022, 0x08000021)
+"""Codes of an entry that is there and has no value now."""
+_RESTRICTED = (0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x780, 0x7FF)
+
+
+def _named(entries: list[str]) -> str:
+    more = f" and {len(entries) - _SHOWN} more" if len(entries) > _SHOWN else ""
+    return "; ".join(entries[:_SHOWN]) + more
+
+
+@conformance_point(
+    77,
+    "objects",
+    "read all",
+    "CiA 306-1, AccessType, DataType",
+    "every entry that can be read, in its length",
+    needs="eds",
+)
+def read_all(bench: Bench) -> None:
+    """Every readable entry of the EDS: it is there, and as long as its type."""
+    wrong = []
+    for entry in bench.device.entries():
+        mandatory = (entry.index, entry.subindex) in _MANDATORY  # which point 92 reads
+        if not entry.readable or mandatory or rule_of(entry.index) is WriteRule.HISTORY:
+            continue
+        place, size = place_text(entry.index, entry.subindex), -(-entry.bits // 8) if entry.is_integer else 0
+        try:
+            value = bench.upload(entry.index, entry.subindex)
+        except SdoRefused as refused:
+            if refused.code not in _MAY_HAVE_NOTHING:
+                wrong.append(str(refused))
+            continue
+        if size and len(value) != size and not (len(value) == 4 > size):
+            wrong.append(f"{place} has {len(value)} bytes, its type {size}")
+    if wrong:
+        bench.deviates(_named(wrong))
+
+
+@conformance_point(
+    78, "objects", "write every ro", "CiA 306-1, AccessType", accepted_text(accepted.READ_ONLY), needs="eds"
+)
+def write_every_read_only(bench: Bench) -> None:
+    """Every ro and const entry of the EDS gets its own value: 1000h is point 10, the application area needs --write."""
+    tried = 0
+    for entry in bench.device.entries():
+        place = entry.index, entry.subindex
+        value = bench.device.values.get(place, b"")
+        allowed = rule_of(entry.index) in (WriteRule.REFUSED, WriteRule.CHANGED, WriteRule.SAME)
+        if entry.writable or entry.index == 0x1000 or not 0 < len(value) <= 4:
+            continue
+        if allowed or bench.permits.written.permits(place):
+            tried += 1
+            bench.must_refuse(pack_write(*place, value), accepted.READ_ONLY, f"write to {place_text(*place)}")
+    if not tried:
+        raise PointNotApplicable("the EDS describes no further entry as ro in the communication area")
+
+
+@conformance_point(
+    79,
+    "objects",
+    "sub-index FFh",
+    "CiA 301, structure of an object",
+    "four bytes, or " + accepted_text(accepted.NO_ENTRY),
+)
+def structure(bench: Bench) -> None:
+    """Sub-index FFh of the identity."""
+    answer = bench.ask(pack_request(0x40, 0x1018, 0xFF))
+    if answer[0] == ABORT:
+        bench.check_abort(answer, accepted.NO_ENTRY, "read of 1018h:FF")
+    elif answer[0] not in (0x43, 0x42):
+        bench.deviates(f"1018h:FF is answered with {answer.hex(' ')}")
+
+
+def _compared(bench: Bench) -> Iterator[tuple[DescribedEntry, int]]:
+    """Entries of the communication area with a default of the EDS, and the value that the device has."""
+    for entry in bench.device.entries():
+        place = entry.index, entry.subindex
+        if isinstance(entry.default, int) and place in bench.device.values and entry.bits:
+            yield entry, bench.device.number(*place)
+
+
+@conformance_point(
+    81, "objects", "defaults", "CiA 306-1, DefaultValue", "for information: what differs is noted", needs="eds"
+)
+def defaults(bench: Bench) -> None:
+    """Values that differ from the EDS: a device that was configured has others."""
+    differing = [
+        f"{place_text(entry.index, entry.subindex)} is {value:#x}, EDS {entry.default:#x}"
+        for entry, value in _compared(bench)
+        if isinstance(entry.default, int)
+        and value != entry.default & (1 << entry.bits) - 1
+        and rule_of(entry.index) is not WriteRule.NEVER
+        and entry.index not in (0x1001, 0x1003)
+    ]
+    if differing:
+        bench.notes.append(_named(differing))
+
+
+@conformance_point(
+    82,
+    "objects",
+    "PDOs of the EDS",
+    "CiA 306-1; CiA 301, 14xxh 18xxh",
+    "those that the EDS names, and no others",
+    needs="eds",
+)
+def pdos_of_the_eds(bench: Bench) -> None:
+    """Each PDO that the EDS names is there; the one behind the last is not."""
+    description = bench.device.description
+    assert description is not None
+    for area, numbers in ((RPDOS, description.rpdos), (TPDOS, description.tpdos)):
+        for number in numbers:
+            index = area[number - 1]
+            for place in ((index, 1), (index, 2), (index + 0x200, 0)):
+                if bench.device.described(*place) is not None and not bench.device.has(*place):
+                    bench.deviates(f"the device has no {place_text(*place)}, which the EDS describes")
+        beyond = area[max(numbers, default=0)]
+        bench.must_refuse(pack_request(0x40, beyond, 1), accepted.NO_OBJECT, f"read of {beyond:04X}h:01")
+
+
+@conformance_point(86, "objects", "SYNC identifier", "CiA 301, 1005h", "080h, bit 30 as it may be")
+def sync_identifier(bench: Bench) -> None:
+    """1005h names the identifier of SYNC."""
+    bench.need((0x1005, 0), written=False)
+    if (value := bench.number(0x1005)) & 0x7FF != 0x80:
+        if bench.device.described(0x1005) is None or value & 0x7FF in _RESTRICTED:
+            bench.deviates(f"1005h is {value:08X}h")
+        bench.notes.append(f"SYNC has identifier {value & 0x7FF:03X}h")
+
+
+@conformance_point(
+    87, "objects", "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE)
+)
+def restricted_identifiers(bench: Bench) -> None:
+    """1005h, 1012h and 1014h with restricted identifiers; one that is accepted is put back."""
+    found = False
+    for index in (0x1005, 0x1012, 0x1014):
+        if not bench.device.writable(index):
+            continue
+        found = True
+        for cob_id in _RESTRICTED:
+            request = pack_write(index, 0, cob_id.to_bytes(4, "little"))
+            bench.must_refuse(request, accepted.VALUE, f"{cob_id:03X}h for {index:04X}h")
+    if not found:
+        raise PointNotApplicable("none of 1005h, 1012h and 1014h can be written")
+
+
+@conformance_point(
+    90, "objects", "identity", "CiA 306-1, DeviceInfo; CiA 301, 1018h", "the numbers of the EDS", needs="eds"
+)
+def identity(bench: Bench) -> None:
+    """1000h and 1018h:01 and :02 as the EDS names them; a revision that differs is noted."""
+    for place in ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3)):
+        entry = bench.device.described(*place)
+        if entry is None or not isinstance(entry.default, int) or place not in bench.device.values:
+            continue
+        if (found := bench.device.number(*place)) == entry.default:
+            continue
+        text = f"{place_text(*place)} is {found:#x}, the EDS says {entry.default:#x}"
+        if place == (0x1018, 3) and found >> 16 == entry.default >> 16:
+            bench.notes.append(text)
+        elif entry.default or place == (0x1000, 0):
+            bench.deviates(text)
+
+
+@conformance_point(92, "objects", "mandatory objects", "CiA 301, object dictionary", "1000h, 1001h, 1018h:01")
+def mandatory_objects(bench: Bench) -> None:
+    """The objects that every device has."""
+    for place in _MANDATORY:
+        try:
+            bench.upload(*place)
+        except SdoRefused as refused:
+            bench.deviates(str(refused))

@@ -1,0 +1,327 @@
+"""Points 30 to 37: PDOs at work. Source: CiA 301, "Process data object"."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
+from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import TPDOS
+from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
+from canprobe.fieldbus.tools.conform.pdo_setup import (
+    EVENT_TYPE,
+    changeable_pdo,
+    map_entries,
+    permitted_entry,
+    plain_sync,
+    rpdo_of,
+    rpdo_of_dummies,
+    set_parameters,
+    switch_off,
+    switch_on,
+    synchronous_tpdo,
+    word_of,
+)
+from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
+
+TRANSMISSION = "CiA 301, PDO transmission types"
+_NO_RTR = 1 << 30
+_EVENT_MS, _INHIBIT_MS, _WATCHED_MS = 50, 100, 200
+_WINDOW_US = 100_000
+_SHARE = 0.1
+_NO_EVENT = "a value that is written over SDO is no event for this device, which CiA 301 leaves open"
+
+
+def syncs(bench: Bench, cob_id: int, counters: list[int | None]) -> list[int]:
+    """Send SYNCs one by one; return how many frames of a TPDO each brings."""
+    found = []
+    for counter in counters:
+        bench.taken(cob_id)
+        bench.sync(counter)
+        bench.pass_time(bench.times.slack_s)
+        found.append(len(bench.taken(cob_id)))
+    return found
+
+
+def _start(bench: Bench) -> None:
+    bench.nmt(NmtCommand.START)
+    bench.pass_time(0.01)
+
+
+@conformance_point(30, "pdo", "type 1", TRANSMISSION, "one TPDO a SYNC, as long as its mapping", needs="nmt sync")
+def type_1(bench: Bench) -> None:
+    """Five SYNCs bring five TPDOs."""
+    cob_id = synchronous_tpdo(bench)
+    pdo = changeable_pdo(bench, TPDOS)
+    _start(bench)
+    if (found := syncs(bench, cob_id, [None] * 5)) != [1] * 5:
+        bench.deviates(f"five SYNCs bring {found} TPDOs, expected one each")
+    bench.sync()
+    frame = bench.next(cob_id, bench.times.slack_s)
+    length = -(-sum(word & 0xFF for word in bench.device.mapping(pdo)) // 8)
+    if frame is None or len(frame.data) != length:
+        bench.deviates(f"the TPDO has {len(frame.data) if frame else 0} bytes, its mapping {length}")
+
+
+@conformance_point(30, "pdo", "type n", TRANSMISSION, "one TPDO at every n-th SYNC", needs="nmt sync")
+def type_n(bench: Bench) -> None:
+    """Type 3, nine SYNCs."""
+    cob_id = synchronous_tpdo(bench, every=3)
+    _start(bench)
+    found = syncs(bench, cob_id, [None] * 9)
+    if sum(found) != 3 or found[:3] != found[3:6] or found[:3] != found[6:]:
+        bench.deviates(f"with type 3 nine SYNCs bring {found} TPDOs")
+
+
+@conformance_point(30, "pdo", "type 0", TRANSMISSION, "after an event one TPDO, at the next SYNC", needs="nmt sync eds")
+def type_0(bench: Bench) -> None:
+    """An entry that the user lets be written changes between SYNCs."""
+    entry, pdo = permitted_entry(bench, transmits=True), changeable_pdo(bench, TPDOS, mapping=True)
+    plain_sync(bench)
+    switch_off(bench, pdo)
+    map_entries(bench, pdo, [word_of(entry)])
+    set_parameters(bench, pdo, 0)
+    cob_id = switch_on(bench, pdo)
+    _start(bench)
+    syncs(bench, cob_id, [None])
+    quiet = syncs(bench, cob_id, [None, None])
+    bench.put(entry.index, entry.subindex, bench.number(entry.index, entry.subindex) ^ 1)
+    if (found := quiet + syncs(bench, cob_id, [None, None])) == [0, 0, 0, 0]:
+        raise PointNotApplicable(_NO_EVENT)
+    if found != [0, 0, 1, 0]:
+        bench.deviates(f"two SYNCs, an event and two SYNCs bring {found} TPDOs, expected [0, 0, 1, 0]")
+
+
+@conformance_point(
+    30, "pdo", "type 255", TRANSMISSION, "an event brings a TPDO at once, SYNC brings none", needs="nmt sync eds"
+)
+def type_255(bench: Bench) -> None:
+    """An entry that the user lets be written changes; then a SYNC."""
+    entry, pdo = permitted_entry(bench, transmits=True), changeable_pdo(bench, TPDOS, mapping=True)
+    plain_sync(bench)
+    switch_off(bench, pdo)
+    map_entries(bench, pdo, [word_of(entry)])
+    set_parameters(bench, pdo, EVENT_TYPE)
+    cob_id = switch_on(bench, pdo)
+    _start(bench)
+    bench.taken(cob_id)
+    bench.put(entry.index, entry.subindex, bench.number(entry.index, entry.subindex) ^ 1)
+    at_once = bench.next(cob_id, bench.times.slack_s)
+    if syncs(bench, cob_id, [None]) != [0]:
+        bench.deviates("SYNC brings a TPDO of type 255")
+    if at_once is None:
+        raise PointNotApplicable(_NO_EVENT)
+
+
+@conformance_point(
+    30, "pdo", "remote request", TRANSMISSION, "type 253 answers a remote request, and no SYNC", needs="nmt"
+)
+def remote_request(bench: Bench) -> None:
+    """A remote request for a TPDO whose bit 30 permits it."""
+    pdo = changeable_pdo(bench, TPDOS)
+    if bench.device.number(pdo, 1) & _NO_RTR:
+        raise PointNotApplicable("bit 30 of the COB-ID permits no remote request")
+    switch_off(bench, pdo)
+    set_parameters(bench, pdo, 253)
+    cob_id = switch_on(bench, pdo)
+    _start(bench)
+    bench.taken(cob_id)
+    request_pdo(bench, cob_id)
+    if bench.next(cob_id, bench.times.slack_s) is None:
+        bench.deviates("a remote request for a TPDO of type 253 is not answered")
+
+
+def _event_driven(bench: Bench, event_ms: int, inhibit: int = 0) -> list[int]:
+    """A TPDO of type 255 with its times; return when it came in half a second."""
+    pdo = changeable_pdo(bench, TPDOS)
+    switch_off(bench, pdo)
+    set_parameters(bench, pdo, EVENT_TYPE, inhibit=inhibit, event_ms=event_ms)
+    cob_id = switch_on(bench, pdo)
+    _start(bench)
+    return [frame.t_ns for frame in bench.during(0.5, [cob_id])]
+
+
+@conformance_point(
+    31, "pdo", "event timer", "CiA 301, 18xxh:05", "the TPDO repeats within 10 % of its event time", needs="nmt"
+)
+def event_timer(bench: Bench) -> None:
+    """50 ms, for half a second: an event may bring more frames, none less."""
+    times = _event_driven(bench, _EVENT_MS)
+    gaps = [(after - before) * 1e-6 for before, after in pairwise(times)]
+    if not gaps or max(gaps) > (1 + _SHARE) * _EVENT_MS + bench.times.slack_s * 1e3:
+        longest = f", the longest gap is {max(gaps):.0f} ms" if gaps else ""
+        bench.deviates(f"{len(times)} TPDOs in 0.5 s with an event time of {_EVENT_MS} ms{longest}")
+
+
+@conformance_point(31, "pdo", "inhibit time", "CiA 301, 18xxh:03", "no two TPDOs within the inhibit time", needs="nmt")
+def inhibit_time(bench: Bench) -> None:
+    """An event time of 20 ms within an inhibit time of 100 ms."""
+    times = _event_driven(bench, 20, inhibit=_INHIBIT_MS * 10)
+    gaps = [(after - before) * 1e-6 for before, after in pairwise(times)]
+    if gaps and min(gaps) < (1 - _SHARE) * _INHIBIT_MS:
+        bench.deviates(f"two TPDOs within {min(gaps):.0f} ms, the inhibit time is {_INHIBIT_MS} ms")
+    if not gaps:
+        bench.deviates("no TPDOs come with an event time of 20 ms")
+
+
+@conformance_point(
+    32,
+    "pdo",
+    "synchronous RPDO",
+    "CiA 301, synchronous RPDO",
+    "applied at the next SYNC, not before",
+    needs="nmt sync eds",
+)
+def synchronous_rpdo(bench: Bench) -> None:
+    """An entry that the user lets be written, by an RPDO of type 1."""
+    entry = permitted_entry(bench, transmits=False)
+    plain_sync(bench)
+    _, cob_id = rpdo_of(bench, entry, 1)
+    _start(bench)
+    before = bench.number(entry.index, entry.subindex)
+    _send_value(bench, cob_id, before ^ 1, entry.bits)
+    if bench.number(entry.index, entry.subindex) != before:
+        bench.deviates("a synchronous RPDO is applied before SYNC")
+    bench.sync()
+    bench.pass_time(bench.times.slack_s)
+    if bench.number(entry.index, entry.subindex) != before ^ 1:
+        bench.deviates("a synchronous RPDO is not applied at SYNC")
+
+
+def _send_value(bench: Bench, cob_id: int, value: int, bits: int) -> None:
+    """Send an RPDO with a value, and let the device take it."""
+    bench.send(cob_id, value.to_bytes(bits // 8, "little"))
+    bench.pass_time(0.005)
+
+
+@conformance_point(33, "pdo", "short RPDO", "CiA 301, RPDO length", "EMCY 8210h", needs="nmt")
+def short_rpdo(bench: Bench) -> None:
+    """A dummy RPDO without a byte; a whole one ends the error."""
+    _, cob_id, length = rpdo_of_dummies(bench)
+    _start(bench)
+    bench.send(cob_id, bytes(length))
+    bench.pass_time(bench.times.slack_s)
+    if bench.errors():
+        bench.deviates("EMCY after an RPDO of the right length")
+    bench.send(cob_id, bytes(length - 1))
+    bench.emcy(PDO_TOO_SHORT_CODE)
+    bench.send(cob_id, bytes(length))
+    bench.pass_time(bench.times.slack_s)
+
+
+@conformance_point(
+    33, "pdo", "short RPDO applied", "CiA 301, RPDO length", "a short RPDO is not applied", needs="nmt eds"
+)
+def short_rpdo_applied(bench: Bench) -> None:
+    """An entry that the user lets be written keeps its value."""
+    entry = permitted_entry(bench, transmits=False)
+    if entry.bits < 16:
+        raise PointNotApplicable("the entry has one byte only")
+    _, cob_id = rpdo_of(bench, entry, EVENT_TYPE)
+    _start(bench)
+    before = bench.number(entry.index, entry.subindex)
+    bench.asked.add(PDO_TOO_SHORT_CODE)
+    bench.send(cob_id, bytes((before & 0xFF ^ 1,)))
+    bench.pass_time(bench.times.slack_s)
+    if bench.number(entry.index, entry.subindex) != before:
+        bench.deviates("a short RPDO is applied")
+    _send_value(bench, cob_id, before, entry.bits)
+
+
+@conformance_point(
+    34, "pdo", "long RPDO", "CiA 301, RPDO length", "its first bytes are used; EMCY 8220h is optional", needs="nmt eds"
+)
+def long_rpdo(bench: Bench) -> None:
+    """An entry that the user lets be written, by an RPDO with a byte too many."""
+    entry = permitted_entry(bench, transmits=False)
+    _, cob_id = rpdo_of(bench, entry, EVENT_TYPE)
+    _start(bench)
+    if entry.bits >= 64:
+        raise PointNotApplicable("the entry fills a whole frame")
+    bench.asked.add(PDO_TOO_LONG_CODE)
+    before = bench.number(entry.index, entry.subindex)
+    _send_value(bench, cob_id, before ^ 1, entry.bits + 8)
+    if bench.number(entry.index, entry.subindex) != before ^ 1:
+        bench.deviates("the first bytes of a long RPDO are not used")
+    _send_value(bench, cob_id, before, entry.bits)
+
+
+@conformance_point(
+    35,
+    "pdo",
+    "RPDO event timer",
+    "CiA 301, 14xxh:05",
+    "EMCY 8250h after the time, not before the first RPDO",
+    needs="nmt",
+)
+def rpdo_event_timer(bench: Bench) -> None:
+    """A dummy RPDO with 200 ms, sent twice and then no more."""
+    pdo, cob_id, length = rpdo_of_dummies(bench)
+    bench.need((pdo, 5))
+    switch_off(bench, pdo)
+    set_parameters(bench, pdo, EVENT_TYPE, event_ms=_WATCHED_MS)
+    switch_on(bench, pdo)
+    _start(bench)
+    bench.pass_time(1.5e-3 * _WATCHED_MS)
+    for _ in range(2):
+        last_ns = bench.send(cob_id, bytes(length))
+        bench.pass_time(0.5e-3 * _WATCHED_MS)
+    if bench.errors():
+        bench.deviates("EMCY before the first RPDO, or while they come in time")
+    try:
+        _, t_ns = bench.emcy(RPDO_TIMEOUT_CODE, 1e-3 * _WATCHED_MS)
+    except Deviation as error:
+        raise PointNotApplicable("the device does not report it; CiA 301 leaves that open") from error
+    if (t_ns - last_ns) * 1e-6 < (1 - _SHARE) * _WATCHED_MS:
+        bench.deviates(f"EMCY 8250h {(t_ns - last_ns) * 1e-6:.0f} ms after the last RPDO, the time is {_WATCHED_MS} ms")
+    bench.send(cob_id, bytes(length))
+    bench.pass_time(bench.times.slack_s)
+
+
+@conformance_point(
+    36,
+    "pdo",
+    "synchronous window",
+    "CiA 301, 1007h",
+    "an RPDO within the window is applied; one behind may be dropped",
+    needs="nmt sync eds",
+)
+def synchronous_window(bench: Bench) -> None:
+    """An RPDO within 100 ms of a SYNC, and one behind."""
+    entry = permitted_entry(bench, transmits=False)
+    bench.need((0x1007, 0))
+    plain_sync(bench)
+    _, cob_id = rpdo_of(bench, entry, 1)
+    bench.put(0x1007, 0, _WINDOW_US)
+    _start(bench)
+    before, seen = bench.number(entry.index, entry.subindex), []
+    for wait_s in (0.0, 1.5e-6 * _WINDOW_US):
+        bench.sync()
+        bench.pass_time(wait_s)
+        _send_value(bench, cob_id, before ^ (2 if wait_s else 1), entry.bits)
+        bench.sync()
+        bench.pass_time(bench.times.slack_s)
+        seen.append(bench.number(entry.index, entry.subindex) ^ before)
+    if seen[0] != 1:
+        bench.deviates("an RPDO within the window is not applied at the next SYNC")
+    if seen[1] != 1:
+        bench.notes.append("an RPDO behind the window is applied; it may be dropped")
+
+
+@conformance_point(
+    37, "pdo", "SYNC start value", "CiA 301, 18xxh:06", "the first TPDO at the SYNC with this counter", needs="nmt sync"
+)
+def sync_start_value(bench: Bench) -> None:
+    """Type 2 with start value 3, SYNC counters 1 to 8 with overflow 10."""
+    pdo = changeable_pdo(bench, TPDOS)
+    bench.need((0x1019, 0), (pdo, 6))
+    if bench.device.number(0x1006):
+        bench.put(0x1006, 0, 0)
+    bench.put(0x1019, 0, 10)
+    cob_id = synchronous_tpdo(bench, every=2, start=3)
+    _start(bench)
+    found = syncs(bench, cob_id, list(range(1, 9)))
+    if found != [0, 0, 1, 0, 1, 0, 1, 0]:
+        bench.deviates(f"SYNCs 1 to 8 bring {found} TPDOs; type 2 from 3 on is [0, 0, 1, 0, 1, 0, 1, 0]")

@@ -1,0 +1,268 @@
+"""Points 25 to 29, 38 and 83 to 85: how PDOs are set. Source: CiA 301, "PDO mapping", objects 1400h to 1BFFh."""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.tools.conform import accepted
+from canprobe.fieldbus.tools.conform.accepted import accepted_text
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
+from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
+from canprobe.fieldbus.tools.conform.pdo_setup import (
+    changeable_pdo,
+    map_entries,
+    rpdo_of_dummies,
+    switch_off,
+    switch_on,
+)
+from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_write
+
+MAPPING = "CiA 301, PDO mapping"
+_ABSENT_WORD, _IDENTITY_WORD, _DUMMY_WORD = 0x1FF00020, 0x10180120, 0x00070020
+_INHIBIT, _START = 3, 6
+_RESERVED_TYPES = {"RPDO": (0xF1, 0xF8, 0xFD), "TPDO": (0xF1, 0xF6, 0xFB)}
+_RESTRICTED = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x601, 0x6E0, 0x701, 0x77F, 0x7FF)
+_LONG_ENTRIES = 9
+_CHANGED_BIT = 0x08
+
+
+def _valid(bench: Bench, area: range, *, mapping: bool = False) -> int:
+    """A PDO that can be changed, at work."""
+    pdo = changeable_pdo(bench, area, mapping=mapping)
+    if bench.device.cob_id(pdo) is None:
+        cob_id = switch_on(bench, pdo)
+        bench.permits.rpdo_ids.add(cob_id)
+    return pdo
+
+
+@conformance_point(25, "pdo", "mapping while valid", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
+def mapping_while_valid(bench: Bench) -> None:
+    """An entry of a PDO in use gets another value, and its count 0."""
+    pdo = _valid(bench, TPDOS, mapping=True)
+    first = bench.number(pdo + 0x200, 1)
+    other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
+    request = pack_write(pdo + 0x200, 1, other.to_bytes(4, "little"))
+    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), "an entry of a PDO in use")
+    if bench.number(pdo + 0x200, 1) != first:
+        bench.deviates("a mapping entry has changed although the write was refused")
+
+
+@conformance_point(
+    25,
+    "pdo",
+    "count while valid",
+    MAPPING,
+    "the count stays, or is refused with " + accepted_text(accepted.MAPPING_LOCKED),
+    needs="nmt",
+)
+def count_while_valid(bench: Bench) -> None:
+    """The count of a PDO in use gets 0."""
+    pdo = _valid(bench, TPDOS, mapping=True)
+    bench.must_refuse(pack_write(pdo + 0x200, 0, b"\0"), accepted.MAPPING_LOCKED, "the count of a PDO in use")
+
+
+@conformance_point(25, "pdo", "mapping while counted", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
+def mapping_while_counted(bench: Bench) -> None:
+    """An entry of a PDO out of use, whose count is not 0."""
+    pdo = changeable_pdo(bench, TPDOS, mapping=True)
+    switch_off(bench, pdo)
+    first = bench.number(pdo + 0x200, 1)
+    request = pack_write(
+        pdo + 0x200, 1, (_IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD).to_bytes(4, "little")
+    )
+    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), "an entry while the count is not 0")
+
+
+def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.AbortSet, what: str) -> None:
+    """Map entries to a PDO out of use: one of the writes must be refused."""
+    bench.put(pdo + 0x200, 0, 0)
+    requests = [pack_write(pdo + 0x200, n, word.to_bytes(4, "little")) for n, word in enumerate(words, start=1)]
+    for request in (*requests, pack_write(pdo + 0x200, 0, bytes((len(words),)))):
+        answer = bench.ask(request)
+        if answer[0] == ABORT:
+            bench.check_abort(answer, codes, what)
+            return
+    bench.deviates(f"{what}: all writes are accepted")
+
+
+@conformance_point(26, "pdo", "mapping too long", MAPPING, accepted_text(accepted.MAPPING_LENGTH), needs="nmt")
+def mapping_too_long(bench: Bench) -> None:
+    """More than eight bytes: the first entry of a TPDO again and again."""
+    pdo = changeable_pdo(bench, TPDOS, mapping=True)
+    switch_off(bench, pdo)
+    word = bench.device.mapping(pdo)[0]
+    places = sum(bench.device.has(pdo + 0x200, n) for n in range(1, 65))
+    count = min(64 // max(word & 0xFF, 1) + 1, _LONG_ENTRIES)
+    if count > max(places, bench.device.number(pdo + 0x200)):
+        _refused_at_last(
+            bench, pdo, [word] * count, (*accepted.MAPPING_LENGTH, *accepted.NO_ENTRY), "more than the places"
+        )
+    else:
+        _refused_at_last(bench, pdo, [word] * count, accepted.MAPPING_LENGTH, f"{count} entries of {word & 0xFF} bits")
+
+
+@conformance_point(27, "pdo", "absent object", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+def map_absent(bench: Bench) -> None:
+    """An object that the device does not have."""
+    pdo = changeable_pdo(bench, TPDOS, mapping=True)
+    switch_off(bench, pdo)
+    _refused_at_last(bench, pdo, [_ABSENT_WORD], accepted.NOT_MAPPABLE, "mapping of an absent object")
+
+
+@conformance_point(27, "pdo", "not mappable", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt eds")
+def map_unmappable(bench: Bench) -> None:
+    """An entry that the EDS does not let be mapped, in a TPDO; one that is ro, in an RPDO."""
+    tried = 0
+    for area in (TPDOS, RPDOS):
+        try:
+            pdo = changeable_pdo(bench, area, mapping=True)
+        except PointNotApplicable:
+            continue
+        entry = next(
+            (
+                entry
+                for entry in bench.device.entries()
+                if entry.bits and not (entry.in_tpdo if area is TPDOS else entry.in_rpdo) and entry.is_integer
+                if area is TPDOS or entry.in_tpdo
+            ),
+            None,
+        )
+        if entry is None:
+            continue
+        tried += 1
+        switch_off(bench, pdo)
+        word = entry.index << 16 | entry.subindex << 8 | entry.bits
+        _refused_at_last(bench, pdo, [word], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
+    if not tried:
+        raise PointNotApplicable("no mapping can be changed, or the EDS lets everything be mapped")
+
+
+@conformance_point(
+    28, "pdo", "identifier while valid", "CiA 301, 14xxh 18xxh", accepted_text(accepted.PDO_LOCKED), needs="nmt"
+)
+def identifier_while_valid(bench: Bench) -> None:
+    """Another identifier for a PDO in use."""
+    for area in (RPDOS, TPDOS):
+        if not bench.device.pdos(area):
+            continue
+        pdo = _valid(bench, area)
+        word = bench.number(pdo, 1) ^ _CHANGED_BIT
+        bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
+
+
+@conformance_point(
+    28, "pdo", "times while valid", "CiA 301, 18xxh:03, :06", accepted_text(accepted.PDO_LOCKED), needs="nmt"
+)
+def times_while_valid(bench: Bench) -> None:
+    """Inhibit time and SYNC start value of a TPDO in use."""
+    pdo, tried = _valid(bench, TPDOS), 0
+    for subindex in (_INHIBIT, _START):
+        if bench.device.writable(pdo, subindex):
+            tried += 1
+            value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
+            bench.must_refuse(pack_write(pdo, subindex, value), accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
+    if not tried:
+        raise PointNotApplicable("the TPDOs have neither inhibit time nor start value")
+
+
+@conformance_point(
+    28, "pdo", "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE), needs="nmt"
+)
+def restricted_identifiers_of_pdos(bench: Bench) -> None:
+    """Restricted identifiers for a PDO out of use."""
+    for area in (RPDOS, TPDOS):
+        if not bench.device.pdos(area):
+            continue
+        pdo = changeable_pdo(bench, area)
+        switch_off(bench, pdo)
+        for cob_id in _RESTRICTED:
+            request = pack_write(pdo, 1, cob_id.to_bytes(4, "little"))
+            bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
+
+
+@conformance_point(
+    29, "pdo", "reserved types", "CiA 301, transmission type", accepted_text(accepted.VALUE), needs="nmt"
+)
+def reserved_types(bench: Bench) -> None:
+    """Reserved transmission types for a PDO out of use."""
+    for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):
+        if not bench.device.pdos(area):
+            continue
+        pdo = changeable_pdo(bench, area)
+        bench.need((pdo, 2))
+        switch_off(bench, pdo)
+        for kind in _RESERVED_TYPES[what]:
+            bench.must_refuse(pack_write(pdo, 2, bytes((kind,))), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
+
+
+@conformance_point(38, "pdo", "dummies", MAPPING, "an RPDO takes the dummies that the EDS allows", needs="nmt eds")
+def dummies(bench: Bench) -> None:
+    """A dummy entry in an RPDO."""
+    description = bench.device.description
+    assert description is not None
+    allowed = sorted(description.dummies & {0x0005, 0x0006, 0x0007})
+    if not allowed:
+        raise PointNotApplicable("the EDS allows no dummy")
+    pdo = changeable_pdo(bench, RPDOS, mapping=True)
+    switch_off(bench, pdo)
+    for data_type in allowed:
+        map_entries(bench, pdo, [data_type << 16 | 8 << data_type - 5])
+    rpdo_of_dummies(bench)
+
+
+@conformance_point(38, "pdo", "dummies in a TPDO", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+def dummies_in_tpdo(bench: Bench) -> None:
+    """A dummy entry in a TPDO."""
+    pdo = changeable_pdo(bench, TPDOS, mapping=True)
+    switch_off(bench, pdo)
+    _refused_at_last(bench, pdo, [_DUMMY_WORD], accepted.NOT_MAPPABLE, "a dummy in a TPDO")
+
+
+@conformance_point(83, "pdo", "mapped entries", MAPPING, "every mapped entry is there, in the mapped length")
+def mapped_entries(bench: Bench) -> None:
+    """Every entry of every mapping: it can be read, or the EDS says that it is wo."""
+    for area in (RPDOS, TPDOS):
+        for pdo in bench.device.pdos(area):
+            for word in bench.device.mapping(pdo):
+                index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
+                entry = bench.device.described(index, subindex)
+                if index <= 0x1F or (entry is not None and not entry.readable):
+                    continue
+                try:
+                    value = bench.upload(index, subindex)
+                except SdoRefused as refused:
+                    bench.deviates(f"{pdo:04X}h maps {refused}")
+                if len(value) * 8 != bits and len(value) != 4 and bits >= 8:
+                    bench.deviates(f"{pdo:04X}h maps {bits} bits of {index:04X}h, which has {len(value)} bytes")
+
+
+@conformance_point(
+    84, "pdo", "mapped anew", MAPPING, "out of use, 0, entries, count, in use: all writes are accepted", needs="nmt"
+)
+def mapped_anew(bench: Bench) -> None:
+    """The own mapping of a TPDO, in the order that the standard demands."""
+    pdo = changeable_pdo(bench, TPDOS, mapping=True)
+    words = bench.device.mapping(pdo)
+    switch_off(bench, pdo)
+    map_entries(bench, pdo, words)
+    switch_on(bench, pdo)
+    if (found := [bench.number(pdo + 0x200, n) for n in range(1, len(words) + 1)]) != words:
+        bench.deviates(f"the mapping is {found}, written was {words}")
+
+
+@conformance_point(
+    85, "pdo", "what the EDS lets map", MAPPING, "a ro entry in a TPDO, a wo or rww entry in an RPDO", needs="nmt eds"
+)
+def mappable(bench: Bench) -> None:
+    """One entry of each access that the EDS lets be mapped."""
+    for area, accesses in ((TPDOS, ("ro", "rw", "rwr")), (RPDOS, ("wo", "rw", "rww"))):
+        entries = {e.access: e for e in bench.device.entries() if e.mappable and e.is_integer and e.access in accesses}
+        if not entries:
+            continue
+        try:
+            pdo = changeable_pdo(bench, area, mapping=True)
+        except PointNotApplicable:
+            continue
+        switch_off(bench, pdo)
+        for entry in entries.values():
+            map_entries(bench, pdo, [entry.index << 16 | entry.subindex << 8 | entry.bits])

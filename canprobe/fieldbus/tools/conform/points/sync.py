@@ -1,0 +1,78 @@
+"""Points 39 to 41: SYNC. Source: CiA 301, "Synchronization object", objects 1005h, 1006h, 1019h."""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
+from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.tools.conform import accepted
+from canprobe.fieldbus.tools.conform.accepted import accepted_text
+from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
+from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync, synchronous_tpdo
+from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.points.pdo import syncs
+from canprobe.fieldbus.tools.conform.sdo_client import pack_write
+
+_PERIOD_US = 100_000
+_RESERVED = (1, 241, 248, 255)
+
+
+@conformance_point(39, "sync", "reserved overflow", "CiA 301, 1019h", accepted_text(accepted.VALUE))
+def reserved_overflow(bench: Bench) -> None:
+    """1019h with 1 and with 241 to 255."""
+    bench.need((0x1019, 0))
+    if bench.device.number(0x1006):
+        bench.put(0x1006, 0, 0)
+    for value in _RESERVED:
+        bench.must_refuse(pack_write(0x1019, 0, bytes((value,))), accepted.VALUE, f"{value} for 1019h")
+
+
+@conformance_point(
+    39, "sync", "overflow while a period is set", "CiA 301, 1019h", accepted_text(accepted.SYNC_LOCKED), needs="sync"
+)
+def overflow_while_period(bench: Bench) -> None:
+    """1019h while 1006h is not 0, and again while it is."""
+    bench.need((0x1019, 0), (0x1006, 0))
+    bench.put(0x1006, 0, _PERIOD_US)
+    value = bytes((10 if bench.device.number(0x1019) != 10 else 20,))
+    bench.must_refuse(pack_write(0x1019, 0, value), accepted.SYNC_LOCKED, "1019h while 1006h is not 0")
+    bench.put(0x1006, 0, 0)
+    bench.put(0x1019, 0, value[0])
+
+
+@conformance_point(40, "sync", "wrong length", "CiA 301, SYNC; 8240h", "EMCY 8240h, and no TPDO", needs="nmt sync")
+def wrong_length(bench: Bench) -> None:
+    """A SYNC with a byte while 1019h is 0; a right one ends the error."""
+    cob_id = synchronous_tpdo(bench)
+    bench.nmt(NmtCommand.START)
+    bench.pass_time(0.01)
+    syncs(bench, cob_id, [None])
+    if syncs(bench, cob_id, [1]) != [0]:
+        bench.deviates("a SYNC with a byte too many brings a TPDO")
+    bench.emcy(SYNC_LENGTH_CODE)
+    syncs(bench, cob_id, [None])
+
+
+@conformance_point(
+    41, "sync", "lost SYNC", "CiA 301, 1006h", "in time no EMCY; 8100h after the period, if at all", needs="nmt sync"
+)
+def lost_sync(bench: Bench) -> None:
+    """1006h is 100 ms: SYNCs in time, then none."""
+    bench.need((0x1006, 0))
+    plain_sync(bench)
+    bench.put(0x1006, 0, _PERIOD_US)
+    bench.nmt(NmtCommand.START)
+    last_ns = 0
+    for _ in range(5):
+        last_ns = bench.sync()
+        bench.pass_time(_PERIOD_US * 1e-6)
+    if bench.errors():
+        bench.deviates("EMCY although SYNC comes in its period")
+    try:
+        _, t_ns = bench.emcy(SYNC_LOST_CODE, 3e-6 * _PERIOD_US)
+    except Deviation as error:
+        raise PointNotApplicable("the device does not report it; CiA 301 leaves that open") from error
+    if (t_ns - last_ns) * 1e-3 < 1.1 * _PERIOD_US:
+        bench.deviates(f"EMCY 8100h {(t_ns - last_ns) * 1e-6:.0f} ms after a SYNC, the period is 100 ms")
+    bench.sync()
+    bench.pass_time(bench.times.slack_s)

@@ -1,0 +1,42 @@
+"""Judges CANopen masters by what they send: known faults of masters, each a rule on the frames of a bus.
+
+Frames come in, of a log or of nodes that are served here; findings go out, each with the frames that show it.
+
+    bus_frame   a frame, with its time
+    events      what a frame means, such as `ControlSeen`, a controlword
+    seen_node   what is known of one node, from frames and its EDS
+    sdo_channel which SDO transfer is open, and what it carried
+    bus_state   frames → events; nothing that was not on the bus
+    rule        what a rule is; one module for each family of rules: enable, targets, pdo_rules, nmt_rules, sync_rules,
+                sdo_rules, homing_rules, reactions, supervision
+    rules       the table of all rules
+    judging     `Judge`: events to rules, findings to a report
+    record      a candump log as frames
+    bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile
+
+Guards against false alarms: a node is judged after its state was seen; three SYNCs after an NMT start and frames that
+may have waited in a queue are passed over; what is wrong counts when it is wrong twice in a row, but for faults that
+move an axis at once; limits come from values that were read or from the EDS; after a fault that was thrown at a node
+only reactions to it are judged for a second. A rule that had nothing to judge is not passed but not applicable.
+Several axes in one node (objects from 6800h on) are not known.
+
+Start reading at `bus_state`, then `rule`, then `enable`.
+"""
+
+from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, start_position, write_log
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
+from canprobe.fieldbus.tools.judge.judging import Judge, judge_frames
+from canprobe.fieldbus.tools.judge.record import read_record
+from canprobe.fieldbus.tools.judge.rules import RULES
+
+__all__ = [
+    "RULES",
+    "BusFrame",
+    "Judge",
+    "MasterBench",
+    "first_answers",
+    "judge_frames",
+    "read_record",
+    "start_position",
+    "write_log",
+]

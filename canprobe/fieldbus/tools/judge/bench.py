@@ -1,0 +1,214 @@
+"""Looks on while emulated nodes are served to a master: keeps the frames, runs its command, throws faults."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from operator import attrgetter
+from pathlib import Path
+
+from canprobe.fieldbus.bus.candump import CandumpWriter
+from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
+from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, command_of
+from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.tools.faults import FaultyNodes
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
+from canprobe.fieldbus.tools.judge.bus_state import BusState
+from canprobe.fieldbus.tools.judge.command import MasterCommand
+from canprobe.fieldbus.tools.judge.events import BusEvent, ControlSeen, NmtSeen, RequestSeen
+from canprobe.fieldbus.tools.judge.injections import Injections, Thrown
+from canprobe.fieldbus.tools.judge.judging import Judge
+
+_AFTER_NS = 500_000_000
+"""Time for which the nodes are served after the end of the command."""
+_ANSWER_NS = 5_000_000_000
+"""Time after the end of a fault up to which the master may answer it."""
+_START = 100_000
+"""Place of a drive at first, counts, where its limits do not ask for less."""
+
+
+class HeardPort(PlainPort):
+    """The port of served nodes, whose frames are kept with their direction.
+
+    Args:
+        port: port to use.
+        frames: list that takes the frames.
+    """
+
+    def __init__(self, port: Port, frames: list[BusFrame]) -> None:
+        self._port = port
+        self._frames = frames
+        self.clock, self.channel, self.counters = port.clock, port.channel, port.counters
+        self.stamps_arrival, self.wait, self.close = port.stamps_arrival, port.wait, port.close
+
+    @property
+    def state(self) -> ControllerState:
+        """State of the port's controller."""
+        return self._port.state
+
+    @property
+    def descriptor(self) -> int | None:
+        """Descriptor of the port."""
+        return self._port.descriptor
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send frames of nodes, and keep them."""
+        sent_ns = self.clock.now_ns()
+        self._port.send_batch(frames)
+        self._frames += [BusFrame(sent_ns, can_id, data, True) for can_id, data in frames]
+
+    def drain(self) -> list[TimedFrame]:
+        """Return what arrived, and keep it."""
+        frames = self._port.drain()
+        self._frames += [BusFrame(t_ns, can_id, data, False) for can_id, data, t_ns in frames]
+        return frames
+
+
+class MasterBench:
+    """Judges a master on nodes that are served meanwhile.
+
+    Args:
+        command: the master; empty: it is waited for.
+        seconds: time after which the bench ends; None: when the command does, or at Ctrl-C.
+        faults: faults to throw; None for the standard sequence.
+        output: file for the output of the command.
+
+    Attributes:
+        frames: frames of the bus.
+        asked: whether somebody has asked for the end; the nodes are served until the command has ended.
+        timed_out: whether the command was still running after `seconds`.
+        status: exit status of the command; None where it was ended by us, or there is none.
+    """
+
+    def __init__(
+        self, command: Sequence[str], seconds: float | None, faults: Sequence[str] | None, output: Path
+    ) -> None:
+        self.frames: list[BusFrame] = []
+        self.asked = self.timed_out = False
+        self.status: int | None = None
+        self.command: MasterCommand | None = None
+        self.injections: Injections | None = None
+        self._words, self._seconds, self._faults, self._output = command, seconds, faults, output
+        self._begin_ns = self._last_ns = 0
+        self._ended_ns: int | None = None
+
+    def tap(self, port: Port) -> Port:
+        """The port in whose place the nodes' frames are kept."""
+        return HeardPort(port, self.frames)
+
+    def begin(self, nodes: FaultyNodes, now_ns: int) -> None:
+        """Start the command and the faults."""
+        self._begin_ns = now_ns
+        self.injections = Injections(nodes, self._faults, now_ns)
+        if self._words:
+            self.command = MasterCommand(self._words, self._output)
+
+    def look(self, now_ns: int) -> bool:
+        """Throw faults, look at the command, and end the bench when its time has come."""
+        assert self.injections is not None
+        self.injections.look(now_ns)
+        self._last_ns = now_ns
+        if self._ended_ns is not None:
+            return now_ns - self._ended_ns > _AFTER_NS
+        over = self._seconds is not None and now_ns - self._begin_ns > self._seconds * 1e9
+        if self.command is None:
+            return over or self.asked
+        if not (over or self.asked or self.timed_out):
+            self.status = self.command.status
+            self._ended_ns = None if self.status is None else now_ns
+            return False
+        self.timed_out = self.timed_out or not self.asked
+        if self.command.press_on():
+            self._ended_ns = now_ns
+        return False
+
+    def ask(self) -> None:
+        """Ask for the end."""
+        self.asked = True
+
+    def close(self) -> None:
+        """End the command."""
+        if self.command is not None:
+            self.command.close()
+
+    def record(self) -> list[BusFrame]:
+        """The frames in the order of their times, which count from the beginning."""
+        ordered = sorted(self.frames, key=attrgetter("t_ns"))
+        return [replace(frame, t_ns=frame.t_ns - self._begin_ns) for frame in ordered]
+
+    def thrown(self) -> list[Thrown]:
+        """The faults that held, with times from the beginning."""
+        found = self.injections.thrown if self.injections is not None else []
+        return [
+            replace(one, begin_ns=one.begin_ns - self._begin_ns, end_ns=one.end_ns - self._begin_ns) for one in found
+        ]
+
+    def judged(self, nodes: Mapping[int, Description], bitrate: int, without: Collection[int] = ()) -> Judge:
+        """The frames, judged."""
+        spans = [(one.begin_ns, one.end_ns) for one in self.thrown()]
+        judge = Judge(nodes, served=True, bitrate=bitrate, charges_ns=spans, without=without)
+        for frame in self.record():
+            judge.take(frame)
+        judge.finish(self._last_ns - self._begin_ns)
+        return judge
+
+
+def start_position(description: Description) -> int:
+    """Place of a served drive at first, counts: away from 0, and within its software limits (607Dh)."""
+    limit = description.entry(0x607D, 2)
+    high = limit.initial if limit is not None else None
+    return min(high // 10, _START) if isinstance(high, int) and high > 0 else _START
+
+
+def write_log(frames: Sequence[BusFrame], path: Path, channel: str) -> None:
+    """Write frames as a candump log.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    with CandumpWriter(path, channel) as writer:
+        for frame in frames:
+            writer.write(frame.can_id, frame.data, max(frame.t_ns, 0))
+
+
+def first_answers(
+    frames: Sequence[BusFrame], thrown: Sequence[Thrown], nodes: Mapping[int, Description]
+) -> list[BusFrame | None]:
+    """The first frame after each fault by which the master does something else than before; None without one.
+
+    It counts up to the next fault, and up to five seconds after the fault's end: an NMT command, a controlword with
+    another command, or an SDO request to a node that had none for a second.
+    """
+    bus = BusState(nodes, served=True)
+    answers: list[BusFrame | None] = [None] * len(thrown)
+    habits = _Habits()
+    for frame in frames:
+        for event in bus.take(frame):
+            if not habits.is_new(event):
+                continue
+            before = [number for number, one in enumerate(thrown) if one.begin_ns <= frame.t_ns]
+            if before and answers[before[-1]] is None and frame.t_ns < thrown[before[-1]].end_ns + _ANSWER_NS:
+                answers[before[-1]] = event.frame
+    return answers
+
+
+class _Habits:
+    """What the master did last: its command to each node, and when it asked each."""
+
+    def __init__(self) -> None:
+        self._commands: dict[int, DriveCommand | None] = {}
+        self._asked_ns: dict[int, int] = {}
+
+    def is_new(self, event: BusEvent) -> bool:
+        """Take an event; whether the master does something else than before."""
+        if isinstance(event, RequestSeen):
+            before_ns = self._asked_ns.get(event.node.node_id)
+            self._asked_ns[event.node.node_id] = event.frame.t_ns
+            return before_ns is None or event.frame.t_ns - before_ns > 1_000_000_000
+        if isinstance(event, ControlSeen):
+            command = command_of(event.word)
+            before = self._commands.get(event.node.node_id)
+            self._commands[event.node.node_id] = command
+            return command is not before
+        return isinstance(event, NmtSeen)

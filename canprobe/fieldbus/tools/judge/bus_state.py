@@ -1,0 +1,262 @@
+"""The state of a bus as its frames show it: frames in, events out. It knows nothing that was not on the bus."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from statistics import median
+
+from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.protocol.frames import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    NMT_ID,
+    RTR_FLAG,
+    SDO_RX_BASE,
+    SDO_TX_BASE,
+    SYNC_ID,
+    NmtCommand,
+    NmtState,
+)
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.tools.judge.events import (
+    AnswerSeen,
+    BusEvent,
+    ControlSeen,
+    EmcySeen,
+    ForgedSeen,
+    HeartbeatSeen,
+    ModeSeen,
+    NmtSeen,
+    OtherHeartbeatSeen,
+    RemoteSeen,
+    RequestSeen,
+    RpdoSeen,
+    StatusSeen,
+    SyncSeen,
+    TargetSeen,
+)
+from canprobe.fieldbus.tools.judge.sdo_channel import SdoChannel
+from canprobe.fieldbus.tools.judge.seen_node import (
+    CONTROLWORD,
+    INTERPOLATION_DATA,
+    MODE,
+    STATUSWORD,
+    TARGETS,
+    PdoView,
+    SeenNode,
+)
+
+_STATE_AFTER = {
+    NmtCommand.START: NmtState.OPERATIONAL,
+    NmtCommand.STOP: NmtState.STOPPED,
+    NmtCommand.PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
+}
+_STORE = 0x1010
+_ARBITRATION_BITS = 135
+"""Length of the longest frame, for which another has to wait."""
+
+
+class BusState:
+    """Follows a bus.
+
+    Args:
+        nodes: description of each node by its id.
+        served: whether the nodes are emulated ones that are served here.
+        bitrate: bit rate, bit/s.
+
+    Attributes:
+        nodes: nodes by id.
+        now_ns: time of the last frame.
+        syncs_ns: times of the last SYNCs.
+        sync_count: number of SYNCs so far.
+        others_ns: time of the last heartbeat of each id that is no node here.
+        arbitration_ns: time for which a frame may have to wait for another.
+    """
+
+    def __init__(self, nodes: Mapping[int, Description], *, served: bool = False, bitrate: int = 1_000_000) -> None:
+        self.nodes = {node_id: SeenNode(node_id, what, served=served) for node_id, what in nodes.items()}
+        self._channels = {node_id: SdoChannel(node) for node_id, node in self.nodes.items()}
+        self.now_ns = 0
+        self.syncs_ns: deque[int] = deque(maxlen=33)
+        self.sync_count = 0
+        self.others_ns: dict[int, int] = {}
+        self.arbitration_ns = _ARBITRATION_BITS * 1_000_000_000 // bitrate
+
+    @property
+    def period_ns(self) -> int:
+        """Period of SYNC: that of 1006h where it was seen, or else the median of the last ones; 0 where unknown."""
+        for node in self.nodes.values():
+            if period_us := node.number(0x1006):
+                return period_us * 1000
+        if len(self.syncs_ns) < 3:
+            return 0
+        times = list(self.syncs_ns)
+        return round(median(b - a for a, b in pairwise(times)))
+
+    @property
+    def some_enabled(self) -> bool:
+        """Whether a drive is in operation enabled."""
+        return any(node.enabled for node in self.nodes.values())
+
+    def take(self, frame: BusFrame) -> Iterator[BusEvent]:
+        """Take a frame and yield what it means, all of which must be consumed before the next one.
+
+        The state has changed when an event comes; NMT commands and boot-ups change the nodes afterwards.
+        """
+        self.now_ns = frame.t_ns
+        can_id, data = frame.can_id, frame.data
+        if can_id & RTR_FLAG and can_id & 0x3FFFFFFF <= 0x7FF:
+            yield RemoteSeen(frame)
+        elif can_id <= 0x7FF:
+            yield from self._events(frame, can_id, data)
+
+    def _events(self, frame: BusFrame, can_id: int, data: bytes) -> Iterator[BusEvent]:
+        node = self.nodes.get(can_id & 0x7F)
+        base = can_id - (can_id & 0x7F)
+        if can_id == NMT_ID:
+            yield from self._nmt(frame)
+        elif can_id == SYNC_ID and len(data) <= 1:
+            self.syncs_ns.append(frame.t_ns)
+            self.sync_count += 1
+            for one in self.nodes.values():
+                one.syncs += one.started_ns is not None
+            yield SyncSeen(frame, data[0] if data else None)
+        elif base == HEARTBEAT_BASE and can_id > base:
+            yield from self._heartbeat(frame, can_id - base)
+        elif node is not None and base in (EMCY_BASE, SDO_TX_BASE, SDO_RX_BASE):
+            yield from self._service(frame, node, base)
+        else:
+            yield from self._pdos(frame)
+
+    def _service(self, frame: BusFrame, node: SeenNode, base: int) -> Iterator[BusEvent]:
+        """EMCY or SDO of a node."""
+        if base == SDO_RX_BASE:
+            node.addressed = True
+            yield from map(self._requested, self._channels[node.node_id].from_client(frame))
+            return
+        yield from self._sent_by(node, frame)
+        if base == SDO_TX_BASE:
+            for event in self._channels[node.node_id].from_server(frame):
+                yield from self._transferred(event)
+        elif len(frame.data) == 8:
+            yield EmcySeen(frame, node, int.from_bytes(frame.data[:2], "little"))
+
+    def _pdos(self, frame: BusFrame) -> Iterator[BusEvent]:
+        for node in self.nodes.values():
+            received, sent = node.rpdos.get(frame.can_id), node.tpdos.get(frame.can_id)
+            if received is not None:
+                yield from self._rpdo(frame, node, received)
+            if sent is not None and frame.from_node is not False:
+                yield from self._tpdo(frame, node, sent)
+            elif sent is not None and sent.certain and received is None:
+                yield ForgedSeen(frame, node)
+
+    def _sent_by(self, node: SeenNode, frame: BusFrame) -> Iterator[BusEvent]:
+        node.seen = True
+        node.answers = node.answers or frame.can_id != HEARTBEAT_BASE + node.node_id or frame.data != b"\0"
+        if frame.from_node is False:
+            yield ForgedSeen(frame, node)
+
+    def _nmt(self, frame: BusFrame) -> Iterator[BusEvent]:
+        if len(frame.data) != 2 or frame.data[0] not in NmtCommand.__members__.values():
+            return
+        command, node_id = NmtCommand(frame.data[0]), frame.data[1]
+        nodes = tuple(node for node in self.nodes.values() if node_id in (0, node.node_id))
+        yield NmtSeen(frame, command, nodes, node_id == 0)  # the nodes are as they were before it
+        for node in nodes:
+            node.addressed = True
+            node.nmt, node.nmt_ns = _STATE_AFTER.get(command, NmtState.INITIALISING), frame.t_ns
+            node.started_ns = frame.t_ns if command is NmtCommand.START else None
+            node.syncs = 0
+
+    def _heartbeat(self, frame: BusFrame, node_id: int) -> Iterator[BusEvent]:
+        node = self.nodes.get(node_id)
+        if node is None:
+            yield OtherHeartbeatSeen(frame, node_id)
+            self.others_ns[node_id] = frame.t_ns
+            return
+        yield from self._sent_by(node, frame)
+        state = frame.data[0] & 0x7F if len(frame.data) == 1 else -1
+        if state not in NmtState.__members__.values() or frame.from_node is False:
+            return
+        before, node.nmt = node.nmt, NmtState(state)
+        if node.nmt is not before:
+            node.nmt_ns = frame.t_ns
+            if node.nmt is not NmtState.OPERATIONAL:
+                node.started_ns = None
+        if node.nmt is NmtState.INITIALISING:
+            self._channels[node_id].reset()
+        yield HeartbeatSeen(frame, node, node.nmt, before)  # the values are those before a boot-up
+        if node.nmt is NmtState.INITIALISING:
+            node.boot()
+            node.heartbeats_ns.clear()
+        else:
+            node.heartbeats_ns.append(frame.t_ns)
+            if node.nmt is NmtState.OPERATIONAL and node.started_ns is None:
+                node.started_ns, node.syncs = frame.t_ns, 0
+
+    def _requested(self, event: BusEvent) -> BusEvent:
+        if isinstance(event, RequestSeen):
+            event.node.asked = True
+            event.node.touch(event.place[0])
+        return event
+
+    def _transferred(self, event: BusEvent) -> Iterator[BusEvent]:
+        """The end of a transfer, and what its value means."""
+        yield event
+        if not isinstance(event, AnswerSeen) or event.late:
+            return
+        node = event.node
+        if event.writes and event.place[0] == _STORE:
+            node.stored = True
+        if event.writes:
+            node.configured = True
+        if event.value is None:
+            return
+        shown = event.request if event.writes else event.frame
+        yield from self._valued(node, {event.place: event.value}, shown, None, written=event.writes)
+
+    def _rpdo(self, frame: BusFrame, node: SeenNode, pdo: PdoView) -> Iterator[BusEvent]:
+        node.addressed = True
+        node.rpdo_counts[pdo.number] = node.rpdo_counts.get(pdo.number, 0) + 1
+        values = _unpacked(pdo, frame)
+        before = {place: node.value(*place) if node.is_sure(place[0]) else node.number(*place) for place in values}
+        yield RpdoSeen(frame, node, pdo, values, before)
+        yield from self._valued(node, values, frame, pdo, written=True)
+
+    def _tpdo(self, frame: BusFrame, node: SeenNode, pdo: PdoView) -> Iterator[BusEvent]:
+        node.seen = node.answers = True
+        yield from self._valued(node, _unpacked(pdo, frame), frame, pdo, written=False)
+
+    def _valued(
+        self, node: SeenNode, values: Mapping[Place, int], frame: BusFrame, pdo: PdoView | None, *, written: bool
+    ) -> Iterator[BusEvent]:
+        """Take values of objects; targets come before the mode, and the controlword comes last."""
+        before = {place: node.known(*place) for place in values}
+        for place, value in values.items():
+            node.take(place, value, frame)
+        for place in sorted(values, key=lambda place: (place[0] == CONTROLWORD, place[0] == MODE, place)):
+            index, subindex = place
+            known = before[place]
+            value, old = values[place], known.value if known is not None else None
+            if index == STATUSWORD and not written:
+                yield StatusSeen(frame, node, value, old)
+            elif not written:
+                continue
+            elif index == CONTROLWORD:
+                yield ControlSeen(frame, node, value, old, pdo)
+            elif index == MODE:
+                yield ModeSeen(frame, node, value, old)
+            elif index in TARGETS and subindex == (1 if index == INTERPOLATION_DATA else 0):
+                yield TargetSeen(frame, node, index, value, old, known.t_ns if known is not None else 0, pdo)
+
+
+def _unpacked(pdo: PdoView, frame: BusFrame) -> dict[Place, int]:
+    """The values in a PDO by object; empty where it is shorter than its mapping, or longer while that is uncertain."""
+    length = len(frame.data)
+    if length < pdo.layout.length or (length > pdo.layout.length and not pdo.certain):
+        return {}
+    numbers = pdo.layout.unpack(frame.data[: pdo.layout.length])
+    return {(entry.index, entry.subindex): number for entry, number in zip(pdo.layout.signals, numbers, strict=True)}

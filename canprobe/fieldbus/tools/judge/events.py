@@ -1,0 +1,159 @@
+"""What a frame on the bus means to the one who judges the master: one event each, after the state has taken it in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.tools.judge.seen_node import PdoView, SeenNode
+
+
+@dataclass(frozen=True, slots=True)
+class BusEvent:
+    """Base of all events.
+
+    Attributes:
+        frame: the frame.
+    """
+
+    frame: BusFrame
+
+
+@dataclass(frozen=True, slots=True)
+class SyncSeen(BusEvent):
+    """A SYNC, with its counter, or None."""
+
+    counter: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class NmtSeen(BusEvent):
+    """An NMT command to nodes that are judged; `to_all` where it names node 0."""
+
+    command: NmtCommand
+    nodes: tuple[SeenNode, ...]
+    to_all: bool
+
+
+@dataclass(frozen=True, slots=True)
+class HeartbeatSeen(BusEvent):
+    """A heartbeat of a node that is judged; a boot-up is the state INITIALISING."""
+
+    node: SeenNode
+    state: NmtState
+    before: NmtState | None
+
+
+@dataclass(frozen=True, slots=True)
+class OtherHeartbeatSeen(BusEvent):
+    """A heartbeat of somebody else, as of the master."""
+
+    node_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class EmcySeen(BusEvent):
+    """An emergency message."""
+
+    node: SeenNode
+    code: int
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteSeen(BusEvent):
+    """A remote request."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForgedSeen(BusEvent):
+    """A frame from outside under an identifier that belongs to a served node."""
+
+    node: SeenNode
+
+
+@dataclass(frozen=True, slots=True)
+class RpdoSeen(BusEvent):
+    """A frame for an RPDO of a node; `before` has what the objects in it were; empty where its length does not fit."""
+
+    node: SeenNode
+    pdo: PdoView
+    values: Mapping[Place, int]
+    before: Mapping[Place, int | None]
+
+
+@dataclass(frozen=True, slots=True)
+class ControlSeen(BusEvent):
+    """A controlword, by RPDO or by an SDO write that was confirmed."""
+
+    node: SeenNode
+    word: int
+    before: int | None
+    pdo: PdoView | None
+
+
+@dataclass(frozen=True, slots=True)
+class TargetSeen(BusEvent):
+    """A target: 607Ah, 60C1h:01, 60FFh or 6071h."""
+
+    node: SeenNode
+    index: int
+    value: int
+    before: int | None
+    before_ns: int
+    pdo: PdoView | None
+
+
+@dataclass(frozen=True, slots=True)
+class ModeSeen(BusEvent):
+    """A mode of operation that the master asked for (6060h)."""
+
+    node: SeenNode
+    mode: int
+    before: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class StatusSeen(BusEvent):
+    """A statusword."""
+
+    node: SeenNode
+    word: int
+    before: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class RequestSeen(BusEvent):
+    """The first frame of an SDO transfer; `pending` is a request on this channel that has no answer yet."""
+
+    node: SeenNode
+    writes: bool
+    place: Place
+    value: int | None
+    pending: BusFrame | None
+
+
+@dataclass(frozen=True, slots=True)
+class AnswerSeen(BusEvent):
+    """The end of an SDO transfer without an abort; `late`: after the client had aborted it."""
+
+    node: SeenNode
+    writes: bool
+    place: Place
+    value: int | None
+    request: BusFrame
+    late: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AbortSeen(BusEvent):
+    """An SDO abort; `place` is that of the transfer, `named` that in the abort."""
+
+    node: SeenNode
+    writes: bool
+    place: Place | None
+    named: Place
+    code: int
+    by_client: bool
+    request: BusFrame | None

@@ -1,0 +1,124 @@
+"""Frames in, a report out: the rules on one bus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+
+from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
+from canprobe.fieldbus.tools.judge.bus_state import BusState
+from canprobe.fieldbus.tools.judge.events import BusEvent
+from canprobe.fieldbus.tools.judge.rule import Charges, Rule
+from canprobe.fieldbus.tools.judge.rules import NO_RULES, RULES
+from canprobe.fieldbus.tools.judge.sync_rules import IrregularSync
+from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
+
+
+class Judge:
+    """Judges the master on one bus.
+
+    Args:
+        nodes: description of each node by its id.
+        served: whether the nodes are emulated ones that are served here.
+        bitrate: bit rate, bit/s.
+        charges_ns: begin and end of each fault that was thrown at the nodes.
+        without: numbers of rules that are left out.
+
+    Attributes:
+        bus: state of the bus.
+        rules: the rules.
+        frame_count: number of frames taken.
+    """
+
+    def __init__(
+        self,
+        nodes: Mapping[int, Description],
+        *,
+        served: bool = False,
+        bitrate: int = 1_000_000,
+        charges_ns: Iterable[tuple[int, int]] = (),
+        without: Collection[int] = (),
+    ) -> None:
+        self.bus = BusState(nodes, served=served, bitrate=bitrate)
+        charges = Charges(list(charges_ns))
+        self.rules: list[Rule] = [rule(self.bus, charges) for rule in RULES if rule.number not in without]
+        self._left_out = [(f"{r.number:02} {r.name}", "left out on request") for r in RULES if r.number in without]
+        self.frame_count = 0
+        self._ears: dict[type[BusEvent], list[Callable[[BusEvent], None]]] = {}
+        for rule in self.rules:
+            for kind in rule.hears:
+                self._ears.setdefault(kind, []).append(rule.see)
+
+    def take(self, frame: BusFrame) -> None:
+        """Take the next frame."""
+        self.frame_count += 1
+        for event in self.bus.take(frame):
+            for see in self._ears.get(type(event), ()):
+                see(event)
+
+    def finish(self, end_ns: int = 0) -> list[Rule]:
+        """End the bus; return the rules that found something.
+
+        Args:
+            end_ns: time up to which the bus was heard, where that is later than its last frame.
+        """
+        self.bus.now_ns = max(self.bus.now_ns, end_ns)
+        for rule in self.rules:
+            rule.end()
+        return [rule for rule in self.rules if rule.count]
+
+    def report(self, title: str, facts: Mapping[str, str], log: str | None = None) -> Report:
+        """The report, after `finish`.
+
+        Args:
+            title: what was judged.
+            facts: facts on bench and command.
+            log: path of the recorded frames; None where they were not kept.
+        """
+        report = Report("judge", title, dict(facts), [_row(rule) for rule in self.rules], log=log)
+        report.left_out += [*NO_RULES, *self._left_out]
+        for rule in self.rules:
+            if isinstance(rule, IrregularSync) and rule.intervals_ns:
+                report.distributions["SYNC interval"] = tuple(ns * 1e-6 for ns in rule.intervals_ns)
+        return report
+
+
+def _row(rule: Rule) -> ReportRow:
+    """A row of the report for one rule."""
+    name = f"{rule.number:02} {rule.name}"
+    if not rule.count:
+        verdict = Verdict.PASS if rule.looked else Verdict.NOT_APPLICABLE
+        detail = "" if rule.looked else "the bus gave nothing to judge it by"
+        return ReportRow(rule.group, name, verdict, rule.source, rule.expected, detail=detail)
+    first = rule.findings[0]
+    node = f"node {first.node_id}: " if first.node_id is not None else ""
+    more = f" ({rule.count} times)" if rule.count > 1 else ""
+    frames = tuple(str(frame) for finding in rule.findings for frame in finding.frames)
+    return ReportRow(
+        rule.group,
+        name,
+        Verdict.FAIL,
+        rule.source,
+        rule.expected,
+        came=frames,
+        detail=f"{node}{first.what} at {first.t_ns * 1e-9:.6f} s{more}",
+        hint=rule.hint,
+        severity=rule.severity.value,
+    )
+
+
+def judge_frames(
+    frames: Iterable[BusFrame],
+    nodes: Mapping[int, Description],
+    *,
+    served: bool = False,
+    bitrate: int = 1_000_000,
+    charges_ns: Iterable[tuple[int, int]] = (),
+    without: Collection[int] = (),
+) -> Judge:
+    """Judge frames that were recorded; the arguments are those of `Judge`."""
+    judge = Judge(nodes, served=served, bitrate=bitrate, charges_ns=charges_ns, without=without)
+    for frame in frames:
+        judge.take(frame)
+    judge.finish()
+    return judge

@@ -1,0 +1,154 @@
+"""A report as one HTML file for people. It loads nothing from anywhere, so it can be kept and mailed."""
+
+from __future__ import annotations
+
+import html
+import statistics
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from canprobe.fieldbus.bus.files import write_text
+from canprobe.fieldbus.tools.reports.baseline import ReportChange
+from canprobe.fieldbus.tools.reports.report import Report, ReportRow, Verdict, printable
+
+NO_CERTIFICATE = (
+    "This is a report of canprobe. It is no CiA certificate, and no proof of safety: it states what was sent, what"
+    " came, and what the cited clauses accept."
+)
+_CLASSES = {Verdict.PASS: "pass", Verdict.FAIL: "fail", Verdict.NOT_APPLICABLE: "na", Verdict.ERROR: "error"}
+_STYLE = """
+:root { color-scheme: light dark; --line: #8884; --pass: #1a7f37; --fail: #cf222e; --na: #6e7781; --error: #9a6700 }
+@media (prefers-color-scheme: dark) { :root { --pass: #3fb950; --fail: #ff7b72; --na: #8d96a0; --error: #d29922 } }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
+h1 { font-size: 1.5rem; margin-bottom: 0 } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem }
+table { border-collapse: collapse; width: 100% }
+th, td { text-align: left; vertical-align: top; padding: .2rem .8rem .2rem 0 }
+tr { border-bottom: 1px solid var(--line) } th { font-weight: 600; white-space: nowrap } td { overflow-wrap: anywhere }
+table.facts th { width: 9.5rem; white-space: normal }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums }
+.pass { color: var(--pass) } .fail { color: var(--fail) } .na { color: var(--na) } .error { color: var(--error) }
+.counts span { font-size: 1.1rem; font-weight: 600; margin-right: 1.5rem }
+details { border-bottom: 1px solid var(--line); padding: .25rem 0 } summary { cursor: pointer }
+summary b { display: inline-block; min-width: 9.5rem } summary small { opacity: .75 }
+details table { margin: .3rem 0 .6rem 1.1rem; width: calc(100% - 1.1rem) } details tr { border: 0 }
+pre { margin: 0; white-space: pre-wrap; overflow-wrap: anywhere; font-size: 13px }
+footer { margin-top: 2rem; opacity: .75 } svg { display: block } svg rect { fill: var(--na) }
+@media print { body { max-width: none } details { break-inside: avoid } }
+"""
+_BARS = 40
+"""Number of bars of a distribution."""
+
+
+def write_html(report: Report, path: Path, change: ReportChange | None = None) -> None:
+    """Write a report as one HTML file; rows that failed are open.
+
+    Args:
+        report: the report.
+        path: path of the file.
+        change: what changed since the baseline; None where there is none.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    title = _text(f"canprobe {report.tool}: {report.title}")
+    counts = "".join(
+        f'<span class="{_CLASSES[verdict]}">{number} {_text(verdict.lower())}</span>'
+        for verdict, number in report.counts().items()
+    )
+    facts = [(name, _text(value)) for name, value in report.facts.items()]
+    facts += [("log", _text(report.log))] if report.log is not None else []
+    changes = [] if change is None else ["<h2>Since the baseline</h2>", _list(change.lines())]
+    body = [
+        f'<h1>{title}</h1><p class="counts">{counts}</p>',
+        *(["<h2>Device and bench</h2>", _facts(facts)] if facts else []),
+        *changes,
+        *(line for group, rows in report.groups().items() for line in _group(group, rows)),
+        *_section("Measured times", [_times(report.distributions)] if report.distributions else []),
+        *_section(
+            "Left out", [_facts([(what, _text(why)) for what, why in report.left_out])] if report.left_out else []
+        ),
+        *_section("Steps by hand", [_list(report.manual)] if report.manual else []),
+        f"<footer>{_text(NO_CERTIFICATE)}</footer>",
+    ]
+    head = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{_STYLE}</style></head><body>"
+    )
+    write_text(path, "\n".join([head, *body, "</body></html>\n"]))
+
+
+def _group(group: str, rows: Sequence[ReportRow]) -> Iterable[str]:
+    """One group: a line for each row, which opens."""
+    yield f"<h2>{_text(group)}</h2>"
+    for row in rows:
+        opened = " open" if row.verdict in (Verdict.FAIL, Verdict.ERROR) else ""
+        mark = f'<b class="{_CLASSES[row.verdict]}">{_text(row.verdict)}</b>'
+        beside = row.detail if row.verdict is Verdict.NOT_APPLICABLE else row.severity
+        entries = [
+            ("found", _text(row.detail)),
+            ("expected", _text(row.expected)),
+            ("clause", _text(row.clause)),
+            ("sent", _pre(row.sent)),
+            ("came", _pre(row.came)),
+            ("written", _pre(row.written)),
+            ("hint", _text(row.hint)),
+            ("time", f"{row.seconds:.3f} s"),
+        ]
+        table = _facts([(name, value) for name, value in entries if value])
+        summary = f"<summary>{mark} {_text(row.name)} <small>{_text(beside)}</small></summary>"
+        yield f"<details{opened}>{summary}{table}</details>"
+
+
+def _section(name: str, content: Sequence[str]) -> list[str]:
+    return [f"<h2>{name}</h2>", *content] if content else []
+
+
+def _times(distributions: dict[str, tuple[float, ...]]) -> str:
+    """A table of distributions: quantiles, and bars from the least to the greatest time."""
+    names = ("count", "least", "median", "95 %", "99 %", "greatest")
+    header = "".join(f'<th class="number">{name}</th>' for name in names)
+    lines = [f"<table><tr><th>ms</th>{header}<th>from least to greatest</th></tr>"]
+    for name, times in distributions.items():
+        if not times:
+            continue
+        cuts = statistics.quantiles(times, n=100, method="inclusive") if len(times) > 1 else [times[0]] * 99
+        figures = (min(times), cuts[49], cuts[94], cuts[98], max(times))
+        cells = "".join(f'<td class="number">{one:.3f}</td>' for one in figures)
+        lines.append(
+            f'<tr><th>{_text(name)}</th><td class="number">{len(times)}</td>{cells}<td>{_histogram(times)}</td></tr>'
+        )
+    return "\n".join([*lines, "</table>"])
+
+
+def _histogram(times: Sequence[float]) -> str:
+    """Bars of how often each time came."""
+    least, span = min(times), max(times) - min(times)
+    bars = [0] * _BARS
+    for one in times:
+        bars[min(int((one - least) / span * _BARS), _BARS - 1) if span > 0 else 0] += 1
+    height = 28 / max(bars)
+    rects = "".join(
+        f'<rect x="{4 * number}" y="{30 - height * bar:.1f}" width="3" height="{height * bar:.1f}"/>'
+        for number, bar in enumerate(bars)
+        if bar
+    )
+    return f'<svg width="{4 * _BARS}" height="30" role="img" aria-label="histogram">{rects}</svg>'
+
+
+def _facts(entries: Iterable[tuple[str, str]]) -> str:
+    """A table of two columns; the values are HTML."""
+    rows = "".join(f"<tr><th>{_text(name)}</th><td>{value}</td></tr>" for name, value in entries)
+    return f'<table class="facts">{rows}</table>'
+
+
+def _list(lines: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>"
+
+
+def _pre(lines: Sequence[str]) -> str:
+    return f"<pre>{_text(chr(10).join(lines))}</pre>" if lines else ""
+
+
+def _text(text: str) -> str:
+    return html.escape(printable(text))

@@ -1,0 +1,110 @@
+"""A report: its rows, and what stands round them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """Verdict on one point or rule."""
+
+    PASS = "PASS"
+    FAIL = "FAIL"
+    NOT_APPLICABLE = "NOT APPLICABLE"
+    ERROR = "ERROR"
+
+
+SEVERITIES = ("", "unsafe", "wrong", "refused", "minor")
+"""Severities of a finding, worst first; the empty one is that of a row without a finding."""
+IDENTITY = ("vendor", "product", "revision", "serial", "device name", "hardware version", "firmware")
+"""Facts of a report that name the device: 1018h:01 to :04, 1008h, 1009h, 100Ah."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportRow:
+    """One point or rule, and what came of it.
+
+    Attributes:
+        group: group of the point, such as ``sdo``.
+        name: number and name, such as ``10 write ro``; the same from run to run.
+        verdict: the verdict.
+        clause: clause of the standard, or source of the rule.
+        expected: what is accepted, in words.
+        sent: frames that were sent, decoded and in hex.
+        came: frames that came, decoded and in hex.
+        detail: what was wrong, or why the point does not apply, in one sentence.
+        hint: what the reader can do about it.
+        severity: one of `SEVERITIES`.
+        written: objects that were written, and whether they were restored.
+        seconds: time that the point took, s.
+    """
+
+    group: str
+    name: str
+    verdict: Verdict
+    clause: str = ""
+    expected: str = ""
+    sent: tuple[str, ...] = ()
+    came: tuple[str, ...] = ()
+    detail: str = ""
+    hint: str = ""
+    severity: str = ""
+    written: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+
+@dataclass(slots=True)
+class Report:
+    """A report, which grows while its tool works.
+
+    Attributes:
+        tool: ``conform`` or ``judge``.
+        title: what was examined, in one line.
+        facts: device (the names of `IDENTITY`), hash of the EDS, and bench: adapter, bit rate, versions, seed, command.
+        rows: the rows in the order of their verdicts.
+        left_out: what was not examined, and why.
+        manual: steps for a person.
+        distributions: measured times by name, ms.
+        log: path of the recorded frames; None where they were not kept.
+    """
+
+    tool: str
+    title: str
+    facts: dict[str, str] = field(default_factory=dict)
+    rows: list[ReportRow] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+    manual: list[str] = field(default_factory=list)
+    distributions: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    log: str | None = None
+
+    def counts(self) -> dict[Verdict, int]:
+        """Number of rows of each verdict, zeros included."""
+        counted = Counter(row.verdict for row in self.rows)
+        return {verdict: counted[verdict] for verdict in Verdict}
+
+    def groups(self) -> dict[str, list[ReportRow]]:
+        """Rows by group, both in the order in which they came."""
+        groups: dict[str, list[ReportRow]] = {}
+        for row in self.rows:
+            groups.setdefault(row.group, []).append(row)
+        return groups
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the tool: 1 where a row failed, else 3 where one could not be examined, else 0."""
+        counts = self.counts()
+        return 1 if counts[Verdict.FAIL] else 3 if counts[Verdict.ERROR] else 0
+
+
+def printable(text: str) -> str:
+    """The text with its control characters and lone surrogates escaped; line ends and tabs stay.
+
+    A device may report any byte as its name: XML refuses most control characters, and a terminal obeys them.
+    """
+    return "".join(char if char in "\n\t" or char.isprintable() else _escaped(char) for char in text)
+
+
+def _escaped(char: str) -> str:
+    return char.encode("unicode_escape").decode("ascii")

@@ -1,0 +1,78 @@
+"""A report as text: lines of a terminal, and the step summary of GitHub."""
+
+from __future__ import annotations
+
+import html
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+from canprobe.fieldbus.bus.files import writing
+from canprobe.fieldbus.tools.reports.baseline import ReportChange
+from canprobe.fieldbus.tools.reports.report import Report, ReportRow, Verdict, printable
+
+MARKS = {Verdict.PASS: "pass", Verdict.FAIL: "FAIL", Verdict.NOT_APPLICABLE: "n/a", Verdict.ERROR: "ERROR"}
+"""Mark of a row on a terminal."""
+_MAX_SUMMARY_ROWS = 200
+"""Rows of a step summary; GitHub refuses summaries of more than 1 MiB."""
+
+
+def row_text(row: ReportRow) -> str:
+    """One row for a terminal: mark and name, and a line of detail where it did not pass."""
+    head = f"{MARKS[row.verdict]:5}  {row.group:9} {row.name}"
+    detail = f"{row.detail} [{row.clause}]" if row.clause and row.verdict is not Verdict.NOT_APPLICABLE else row.detail
+    lines = [head] if row.verdict is Verdict.PASS or not row.detail else [head, f"       {' '.join(detail.split())}"]
+    return printable("\n".join(lines))
+
+
+def closing_text(report: Report, change: ReportChange | None = None) -> str:
+    """The closing table: a line for each group with its counts, their sum, and what changed since the baseline."""
+    counts = {group: Counter(row.verdict for row in rows) for group, rows in report.groups().items()}
+    total: Counter[Verdict] = sum(counts.values(), Counter())
+    cells = [["", *MARKS.values()]]
+    cells += [[group, *(str(row[verdict] or "-") for verdict in MARKS)] for group, row in counts.items()]
+    cells.append(["in all", *(str(total[verdict]) for verdict in MARKS)])
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = [
+        "  ".join([name.ljust(widths[0]), *(one.rjust(width) for one, width in zip(numbers, widths[1:], strict=True))])
+        for name, *numbers in cells
+    ]
+    lines += [f"left out: {what}: {why}" for what, why in report.left_out]
+    lines += [f"by hand: {step}" for step in report.manual]
+    lines += [f"baseline: {line}" for line in change.lines()] if change is not None else []
+    lines += [f"log: {report.log}"] if report.log is not None else []
+    return printable("\n".join(line.rstrip() for line in lines))
+
+
+def append_step_summary(report: Report, environ: Mapping[str, str], change: ReportChange | None = None) -> None:
+    """Append a summary in Markdown to the file GITHUB_STEP_SUMMARY, where GitHub Actions names one.
+
+    Args:
+        report: the report.
+        environ: environment of the process.
+        change: what changed since the baseline.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    path = environ.get("GITHUB_STEP_SUMMARY")
+    if not path:
+        return
+    counts = ", ".join(f"{number} {MARKS[verdict]}" for verdict, number in report.counts().items() if number)
+    lines = [f"### canprobe {report.tool}: {_cell(report.title)}", "", counts or "nothing was examined", ""]
+    lines += [f"- baseline: {_cell(line)}" for line in change.lines()] if change is not None else []
+    bad = [row for row in report.rows if row.verdict in (Verdict.FAIL, Verdict.ERROR)]
+    if bad:
+        lines += ["", "| | point | what was wrong | clause |", "| --- | --- | --- | --- |"]
+    for row in bad[:_MAX_SUMMARY_ROWS]:
+        texts = (MARKS[row.verdict], f"{row.group} {row.name}", row.detail, row.clause)
+        lines.append(f"| {' | '.join(map(_cell, texts))} |")
+    if len(bad) > _MAX_SUMMARY_ROWS:
+        lines += ["", f"{len(bad) - _MAX_SUMMARY_ROWS} more, which the files of the report have"]
+    with writing(Path(path)), open(path, "a", encoding="utf-8") as file:
+        file.write("\n".join(lines) + "\n\n")
+
+
+def _cell(text: str) -> str:
+    """The text in one cell of a table in Markdown."""
+    return html.escape(printable(" ".join(text.split())), quote=False).replace("|", "\\|")

@@ -1,0 +1,61 @@
+"""A cell whose array has the calibration of another one: it says so once, and is less certain from there on."""
+
+import re
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.mechanics.touch.pad import Pad
+
+SCAN = {"task.duration_s": 5.0, "shape.also": [], "scene.figures": False, "bus.interface": "direct"}
+SAID = "the array is not as its calibration says"
+
+
+def said(faults):
+    return [fault for fault in faults if fault.startswith(SAID)]
+
+
+def test_a_harder_layer_is_said_once_and_widens_force_and_regions():
+    result = canprobe.run(load_scene("cylinder", SCAN | {"plant.stiffness_n_m3": 1.9e8}), files=False)
+    (line,) = said(result.summary["faults"])
+    assert "its layer has 1.9" in line and "(calibration: 1.24e+08)" in line
+    assert "type `canprobe calibrate array CELL`" in line and result.text().count(SAID) == 1
+    sigma, force = result.log["force_sigma_n"], result.log["force_n"]
+    scan = np.flatnonzero(result.log["phase"] == 3)
+    first, last = scan[: len(scan) // 10], scan[-len(scan) // 10 :]
+    assert np.nanmedian(sigma[first] / force[first]) < 0.03
+    assert np.nanmedian(sigma[last] / force[last]) == pytest.approx(0.22, abs=0.04)  # ½ ln 1.53, and 5 %
+    covariance = np.array([record.estimate.covariance for record in result.estimates["recursive"]])
+    steps = covariance[1:, 0, 0] / covariance[:-1, 0, 0]
+    assert np.nanmax(steps[len(steps) // 4 :]) == pytest.approx(4.0, rel=0.2)
+
+
+def test_its_own_calibration_is_not_doubted():
+    result = canprobe.run(load_scene("cylinder", SCAN), files=False)
+    assert said(result.summary["faults"]) == []
+
+
+@pytest.mark.parametrize(
+    ("config", "pad", "sign"),
+    [
+        (TaxelConfig(blur_pitch=1.0), Pad(), r"blurred by 1\.[5-8]. mm"),
+        (TaxelConfig(full_scale_pa=150e3), Pad(), "its layer has"),  # gains of 2/3
+        (TaxelConfig(), Pad(pitch_m=1.75e-3), "its images show a layer of"),
+    ],
+    ids=["more blur", "other gains", "other pitch"],
+)
+def test_another_array_is_noticed(config, pad, sign):
+    plan = make_plan(resolve(load_scene("cylinder", SCAN)))
+    session, task = Session(plan), make_task(plan)
+    session.world.plant.array = TaxelArray(config, np.random.default_rng(3), pad=pad)
+    with session:
+        session.run(task)
+    (line,) = said(session.cell.faults)
+    assert re.search(sign, line)

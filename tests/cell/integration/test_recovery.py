@@ -1,0 +1,186 @@
+"""A cell that lost a node or its bus comes back: it waits, is brought up again, and holds until motion is asked for."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recovering import HELD_CYCLES, LOSS_CYCLE, Returning, Way
+
+import canprobe
+from canprobe.cell.master.conditions import BY_KEY
+from canprobe.cell.master.controller import Command, Controller
+from canprobe.cell.master.monitor import Monitor
+from canprobe.cell.npz import read_npz
+from canprobe.cell.session.recovery import PASSING, TRIES
+from canprobe.cli import main
+from canprobe.errors import InterfaceError, NodeError, SafetyStop, UsageError
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.protocol.frames import NmtCommand, pack_nmt
+
+
+def test_losses_are_conditions_of_the_table():
+    assert set(BY_KEY) >= PASSING
+
+
+def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_path):
+    run = Returning("node 3: reboot for 2500 ms", out=tmp_path).assert_came_back()
+    assert run.steps("wait: node 3 not there")
+    log = read_npz(tmp_path / "log.npz")
+    times, rows = np.asarray(log["t_s"]), run.summary["cycle"]["cycles"]
+    assert (np.diff(times) > 0.0).all() and len(times) >= rows - 2
+    assert run.controllers[0].went_on[0] > LOSS_CYCLE + HELD_CYCLES
+    stamps = np.array([line[0] for line in read_candump(tmp_path / "bus.log")])
+    longest_s = np.diff(stamps[stamps > 1e9]).max() * 1e-9
+    assert longest_s <= 0.101, "the nodes that stayed are heard all the time, every 100 ms"
+    assert run.summary["completed"] and run.summary["sim_time_s"] == pytest.approx(times[-1] - times[0], abs=0.01)
+    steps = (tmp_path / "steps.log").read_text().splitlines()
+    assert [line[14:] for line in steps] == [line for line in run.said if not line.startswith("draw")]
+    told = [float(line[:12]) for line in steps]
+    assert told == sorted(told) and told[-1] > 2.5
+    monitor = Monitor(run.opened.plan)
+    monitor.push((can_id, data, t_ns) for t_ns, _, can_id, data in read_candump(tmp_path / "bus.log"))
+    events = [line.split("s   ")[1] for line in monitor.view(int(stamps[-1])).events]
+    there = events[events.index("nodes 1, 2, 4-6: is PRE_OPERATIONAL") :]
+    steps = ("node 3: booted", "nodes 1-6: NMT command reset node", "nodes 1-6: enabled")
+    assert [there.index(step) for step in steps] == sorted(there.index(step) for step in steps)
+    kinds = "\n".join(run.summary["faults"])
+    for words in ("node 3: lost: no usable TPDO", "the cell came back, at", "motion was asked for, and went on, at"):
+        assert words in kinds
+
+
+def somebody_resets(run):
+    run.session.lockstep.port().send_batch([pack_nmt(NmtCommand.RESET_NODE, 3)])
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        "node 3: bus-off for 400 ms",
+        "node 2: freeze for 900 ms",
+        "node 5: sync-lost for 300 ms",
+        "node 1: heartbeat-off for 400 ms",
+        "node 4: nmt command=129",
+        "node 3: reboot for 100 ms;node 6: bus-off for 1200 ms",
+        somebody_resets,
+    ],
+)
+def test_whatever_was_lost_comes_back(action):
+    Returning(action).assert_came_back()
+
+
+def test_an_interface_that_was_down_comes_back():
+    def cut(run):
+        port, until_ns = run.session.cell._port, run.now() + 1_700_000_000
+
+        def failing(method):
+            def call(*arguments):
+                if run.now() < until_ns:
+                    raise InterfaceError("can0: interface is down; type: sudo ip link set can0 up")
+                return method(*arguments)
+
+            return call
+
+        for name in ("send_batch", "drain", "wait"):
+            setattr(port, name, failing(getattr(port, name)))
+
+    run = Returning(cut).assert_came_back()
+    assert run.steps("wait: can0: interface is down; type:")
+
+
+class Nod(Controller):
+    """Ends a little after the loss; it does not say that it can go on."""
+
+    went_on = ()
+
+    def step(self, measurement):
+        return Command(done=measurement.cycle > LOSS_CYCLE + 200)
+
+
+def test_a_controller_that_cannot_go_on_ends_and_the_next_one_finds_the_cell_up():
+    run = Returning("node 3: reboot for 500 ms", controller=Nod, again=True)
+    (error,) = run.errors
+    assert isinstance(error, NodeError) and error.node_id == 3
+    lost, back = run.said.index(run.steps("lost: ")[0]), run.said.index(run.steps("the cell is back")[0])
+    assert lost < back and run.said[back - 1] == "enable the drives"
+    assert max(distance for (_, time), distance in run.enabled.distances.items() if time > 1) <= 1
+
+
+def test_an_array_that_was_switched_off_comes_back():
+    class Listen(Way):
+        def step(self, measurement):
+            self.left -= measurement.cycle >= LOSS_CYCLE
+            return Command(done=self.left <= 0)
+
+    run = Returning("node 16: reboot for 800 ms", "listen", controller=Listen)
+    assert not run.errors and len(run.controllers[0].went_on) == 1
+    assert run.steps("lost: no tactile frame for 13 cycles") and run.steps("wait: node 16 not there")
+    ages = np.asarray(run.session.cell.log.arrays()["tactile_age"])
+    assert ages.max() == 12
+
+
+def homed_scene():
+    """A scene whose third joint has no absolute encoder."""
+    scene = canprobe.load_scene("free")
+    name = list(scene.joints)[2]
+    joint = replace(scene.joints[name], zero="homing", homing_method=37, home_deg=0.0)
+    return replace(scene, joints={**scene.joints, name: joint})
+
+
+def test_a_drive_that_counts_increments_is_homed_again_after_it_was_without_power():
+    run = Returning("node 3: reboot for 300 ms", homed_scene())
+    (error,) = run.errors
+    assert "node 3: (joint 3) is not homed" in str(error)
+    assert "type: canprobe up free --home --bus lockstep --channel can0" in str(error)
+    assert {time for _, time in run.enabled.distances} == {1}, "no drive was enabled after it"
+
+
+def test_a_drive_that_counts_increments_and_kept_its_power_keeps_its_zero():
+    Returning("node 3: bus-off for 900 ms", homed_scene()).assert_came_back()
+
+
+def test_an_arm_that_reports_another_place_is_not_enabled():
+    run = Returning("node 3: reboot for 300 ms;node 3: zero-shift on operational")
+    (error,) = run.errors
+    assert isinstance(error, SafetyStop)
+    assert re.match(r"joint 3 reports -\d+\.\d\d deg, and reported 1\d\.\d\d deg before the loss", str(error))
+    assert {time for _, time in run.enabled.distances} == {1}
+
+
+def test_a_device_error_waits_for_somebody_to_switch_the_drive_off_and_on():
+    run = Returning("node 3: drive-fault;node 3: reboot at 5 s for 500 ms").assert_came_back()
+    assert run.steps("wait: node 3 reported an error of the device: see to it, then switch it off and on")
+
+
+def test_a_drive_whose_torque_was_taken_off_ends_the_run_as_ever():
+    run = Returning("node 3: sto for 100 ms")
+    assert "left operation enabled: SWITCH_ON_DISABLED" in str(run.errors[0]) and not run.steps("lost: ")
+
+
+def test_a_node_that_never_returns_ends_the_wait_with_the_loss():
+    run = Returning("node 3: reboot for 1000 s")
+    assert "node 3: lost: no usable TPDO" in str(run.errors[0]) and not run.steps("the cell is back")
+
+
+def test_a_node_that_is_lost_again_and_again_ends_it():
+    class Flapping(Returning):
+        def say(self, text):
+            super().say(text)
+            if text == "enable the drives" and self.steps("lost: "):
+                self.inject("node 3: reboot at 50 ms for 30 ms")
+
+    run = Flapping("node 3: reboot for 100 ms")
+    assert isinstance(run.errors[0], NodeError) and run.errors[0].node_id == 3
+    assert len(run.steps("not back yet: ")) == TRIES - 1
+
+
+def test_resume_needs_a_cell_that_recovers():
+    with canprobe.open_cell("free") as cell, pytest.raises(UsageError, match="not opened with recover=True"):
+        cell.resume()
+
+
+def test_homing_needs_somebody_beside_it(capsys):
+    assert main(["up", "free", "--home", "--yes", "--recover"]) == 2
+    assert "leave out --recover" in capsys.readouterr().err

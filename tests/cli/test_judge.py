@@ -1,0 +1,121 @@
+"""`canprobe judge`: a log, and a master that is started beside served nodes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from network_buses import group  # noqa: F401
+from scripted_masters import Master, TargetElsewhere
+
+import canprobe
+from canprobe.cli import main
+from canprobe.fieldbus.bus.candump import CandumpWriter
+
+SMALL = Path(__file__).parents[1] / "support" / "small_master.py"
+NODE = ("--eds", "puma260_joint", "--node-id", "1")
+
+
+def log_of(master, path):
+    with CandumpWriter(path, "can0") as writer:
+        for t_ns, can_id, data, _ in master.run():
+            writer.write(can_id, data, t_ns)
+    return str(path)
+
+
+def test_a_log_of_a_bad_master(tmp_path, capsys):
+    log = log_of(TargetElsewhere(), tmp_path / "bus.log")
+    files = ("--junit", str(tmp_path / "j.xml"), "--html", str(tmp_path / "j.html"))
+    assert main(["judge", *NODE, "--record", log, *files]) == 1
+    told = capsys.readouterr().out
+    assert "FAIL   enable    01 target at enable" in told
+    assert "target 15000 while the axis is at 5000: 10000 off, 2000 allowed" in told
+    assert "201#0F00983A0000" in told and "hint: read 6064h" in told
+    assert main(["judge", *NODE, "--record", log, "--without", "1"]) == 0
+    assert "left out: 01 target at enable: left out on request" in capsys.readouterr().out
+    failed = ElementTree.parse(tmp_path / "j.xml").findall(".//testcase[failure]")
+    assert [(case.get("classname"), case.get("name")) for case in failed] == [
+        ("canprobe.judge.enable", "01 target at enable")
+    ]
+    assert "201#0F00983A0000" in (tmp_path / "j.html").read_text()
+
+
+def test_a_log_of_a_good_master_and_what_became_better(tmp_path, capsys):
+    bad, good = log_of(TargetElsewhere(), tmp_path / "bad.log"), log_of(Master(), tmp_path / "good.log")
+    assert main(["judge", *NODE, "--record", bad, "--json"]) == 1
+    (tmp_path / "bad.json").write_text(capsys.readouterr().out)
+    assert main(["judge", *NODE, "--record", good, "--baseline", str(tmp_path / "bad.json")]) == 0
+    assert "01 target at enable" in capsys.readouterr().out
+
+
+def test_a_log_of_other_nodes(tmp_path, capsys):
+    log = log_of(Master(), tmp_path / "good.log")
+    assert main(["judge", "--eds", "puma260_joint", "--node-id", "9", "--record", log]) == 2
+    assert "has no frame of node 9 or to it" in capsys.readouterr().err
+
+
+def test_the_log_of_a_run_has_nothing_to_blame(tmp_path, capsys):
+    canprobe.run("free", duration_s=0.5, out=tmp_path / "run")
+    assert main(["judge", "free", "--record", str(tmp_path / "run" / "bus.log"), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert sum(row["verdict"] == "PASS" for row in rows) > 15
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--record", "x.log"], "name a SCENE or a cell, or else --eds FILE"),
+        ([*NODE, "--record", "x.log", "--passive", "--", "true"], "COMMAND belongs to served nodes"),
+        (["--eds", "puma260_joint", "--channel", "x"], "judge: 1 --eds, but 0 --node-id"),
+        ([*NODE, "--passive", "--inject", "node 1: mute"], "choose one"),
+        ([*NODE, "--record", "x.log", "--without", "32,99"], "expected numbers of rules, got '99'"),
+        ([*NODE, "--record", "/nowhere/x.log"], "/nowhere/x.log: No such file"),
+        ([*NODE, "--bus", "lockstep", "--channel", "x"], "lockstep"),
+    ],
+)
+def test_wrong_usage(words, told, capsys):
+    assert main(["judge", *words]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_command_is_started_and_judged(group, tmp_path, capsys):
+    words = ["--passive", "--output", str(tmp_path / "out.txt"), "--log", str(tmp_path / "bus.log"), "--json"]
+    assert main(["judge", *NODE, *words, "--seconds", "20", "--", sys.executable, str(SMALL), "1"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    found = {row["name"] for row in document["rows"] if row["verdict"] == "FAIL"}
+    assert {"01 target at enable", "06 first RPDO zero-filled"} <= found
+    assert (tmp_path / "out.txt").read_text() == "done\n"
+    assert main(["judge", *NODE, "--record", str(tmp_path / "bus.log")]) == 1
+
+
+def test_a_command_that_fails_and_one_that_never_ends(group, tmp_path, capsys):
+    out = ("--passive", "--output", str(tmp_path / "out.txt"))
+    assert main(["judge", *NODE, *out, "--", "sh", "-c", "echo no adapter; exit 7"]) == 3
+    assert "ended with status 7" in (told := capsys.readouterr().err) and "no adapter" in told
+    assert "no master was heard" in told
+    assert main(["judge", *NODE, *out, "--seconds", "0.2", "--", "sleep", "30"]) == 124
+    assert main(["judge", *NODE, *out, "--seconds", "0.2"]) == 3, "nobody came"
+    assert main(["judge", *NODE, *out, "--", "/nowhere/master"]) == 2
+    assert "/nowhere/master: cannot be started: No such file" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_the_command_while_the_nodes_are_served(group, tmp_path, capsys):
+    master = "import can, time\nbus = can.Bus()\nbus.send(can.Message(arbitration_id=0x80, is_extended_id=False))\n"
+    master += "try:\n    time.sleep(30)\nfinally:\n    bus.shutdown()\n    print('in order')"
+    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    out = tmp_path / "out.txt"
+    assert main(["judge", *NODE, "--passive", "--output", str(out), "--", sys.executable, "-c", master]) == 0
+    assert "in order" in out.read_text() and "KeyboardInterrupt" in out.read_text()
+
+
+def test_the_nodes_of_a_scene_are_served(group, capsys):
+    assert main(["judge", "free", "--passive", "--seconds", "0.3", "-v"]) == 3
+    told = capsys.readouterr()
+    assert "serving nodes 1, 2, 3, 4, 5, 6" in told.err and "no master was heard" in told.err
+    assert "n/a    enable    01 target at enable" in told.out
