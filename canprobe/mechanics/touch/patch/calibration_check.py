@@ -3,7 +3,8 @@
 - **Blur.** Each image shows how far the cover blurs it (`blur_fit`), whatever is touched.
 - **Stiffness.** The slope of the touch, the images' moments and the motion show the stiffness of the layer, and
   estimators know it as `SurfaceEstimate.stiffness`. Another layer and other gains change it alike, as images alone do
-  not show newtons. So does an object that gives way, which the message says.
+  not show newtons. So does an object or an arm that gives way, which the
+  message says.
 - **Disagreement.** On a surface that is known, the slope of the touch gives a stiffness, and so does the bend of the
   pressure in an image. Another pitch makes one of them smaller and the other larger, each by its square.
 
@@ -175,7 +176,8 @@ class CalibrationCheck:
             found.append(f"its images show a layer of {shown:.3g} N/m³ and its touch one of {by_touch:.3g}")
         if not found:
             return None
-        soft = "; or the object gives way" if len(found) == 1 and self.stiffness_off < 0.0 else ""
+        softer = (self.stiffness_off < 0.0 or self.disagreement > 0.0) and not self.blur_off
+        soft = "; or the object or the arm gives way" if softer else ""
         return f"the array is not as its calibration says: {', and '.join(found)}{soft}"
 
     @property
