@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from canprobe.fieldbus.tools.emulated_bus import EmulatedBus
     from canprobe.fieldbus.tools.faults import FaultyNode
     from canprobe.fieldbus.tools.faults.planned import PlannedFaults
+    from canprobe.fieldbus.tools.judged_bus import JudgedBus
 
 LOCKSTEP, VCAN = "lockstep", "vcan"
 EMULATED_INTERFACES = (LOCKSTEP, VCAN, "virtual", "udp_multicast")
@@ -223,6 +224,19 @@ def faults(request: pytest.FixtureRequest, canprobe_seed: int) -> Iterator[Plann
     yield thrown
     if thrown.waiting:
         pytest.fail(f"never thrown, as no such node was powered on: {'; '.join(thrown.waiting)}", pytrace=False)
+
+
+@pytest.fixture
+def judge(request: pytest.FixtureRequest, emulated_bus: EmulatedBus) -> Iterator[JudgedBus]:
+    """Judges the master on the bus of the test by the rules of ``canprobe judge``; what they find fails the test."""
+    from canprobe.fieldbus.tools.judged_bus import JudgedBus
+    from canprobe.fieldbus.tools.reports import row_text
+
+    judged = JudgedBus(emulated_bus, _chosen_number(request.config, "bitrate"))
+    yield judged
+    if found := judged.findings():
+        lines = [line for row in found for line in (row_text(row), f"       hint: {row.hint}", *row.came)]
+        pytest.fail("\n".join(["rules that the master broke:", *lines]), pytrace=False)
 
 
 @pytest.fixture

@@ -144,7 +144,7 @@ def pages() -> Iterator[tuple[Path, str]]:
     yield DOCS / "gallery.md", gallery(measured)
     yield DOCS / "scene-keys.md", scene_keys()
     page = DOCS / "conform.md"
-    yield page, conform_page(page.read_text(encoding="utf-8"))
+    yield page, conform_page(page.read_text(encoding="utf-8"), measured)
     for file in FILES:
         yield SCHEMAS / f"{file}.json", json.dumps(schema_of(file), ensure_ascii=False, indent=1) + "\n"
     yield DOCS / "img" / "imports.svg", imports_svg()

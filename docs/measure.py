@@ -1,7 +1,8 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
-`growth`, `gym`, `learning`, `bridges`, `local_node`. Without names everything is measured but what takes more than
+`growth`, `gym`, `learning`, `bridges`, `local_node`,
+`canopen_node`. Without names everything is measured but what takes more than
 half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has
 its own command, date, commit and machine, so that one can be measured anew without the others. Then
 `python docs/generate.py` writes the pages.
@@ -38,7 +39,7 @@ SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
 IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
-LONG = ("faults", "soak", "growth")
+LONG = ("faults", "soak", "growth", "canopen_node")
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
 """Of a picture in the documentation."""
@@ -256,6 +257,13 @@ def bridges() -> Entry:
     return {"command": command} | _found("bridges", json.loads(printed(f"{command} --json")))
 
 
+def canopen_node() -> Entry:
+    """What `canprobe conform` finds in CANopenNode's demo device; CANOPEN_NODE names the two clones."""
+    node, demo = os.environ["CANOPEN_NODE"].split()
+    entry = json.loads(printed(f"python tests/support/canopen_node.py {shlex.quote(node)} {shlex.quote(demo)}"))
+    return {"command": "python tests/support/canopen_node.py CANopenNode CANopenDemo"} | entry
+
+
 def local_node() -> Entry:
     """What `canprobe conform` finds in canopen-python's LocalNode."""
     command = "python tests/support/local_node.py"
@@ -264,6 +272,7 @@ def local_node() -> Entry:
 
 OTHERS: Mapping[str, Callable[[], Entry]] = {
     "local_node": local_node,
+    "canopen_node": canopen_node,
     "one_scan": one_scan,
     "vcan0": vcan0,
     "pace": partial(bench_table, "pace"),

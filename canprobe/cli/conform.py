@@ -64,6 +64,12 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--channel", metavar="CH", type=channel, default=(None, None), help="channel [can0]")
     parser.add_argument("--bitrate", metavar="BIT/S", type=whole(50_000, 1_000_000), help="bit rate [1000000]")
+    parser.add_argument(
+        "--data-bitrate",
+        metavar="BIT/S",
+        type=whole(50_000, 8_000_000),
+        help="the bus carries CAN FD: bit rate of the data phase [classical CAN]",
+    )
     parser.add_argument("--points", metavar="LIST", type=word, help="groups, numbers or points [all]")
     parser.add_argument(
         "--write",
@@ -119,6 +125,7 @@ def run(args: argparse.Namespace) -> int:
             keep_snapshot=args.snapshot is not None,
             listen_s=args.listen,
             bitrate=args.bitrate or 1_000_000,
+            fd=virtual or args.data_bitrate is not None,
             times=BenchTimes() if virtual else times,
             ask=_ask if sys.stdin.isatty() else None,
         )
@@ -143,6 +150,8 @@ def _examine(args: argparse.Namespace, examination: Examination, points: Sequenc
     examination.report.facts.update(_bench_facts(args))
     report = examination.run(points, show)
     report.log = None if args.log is None else str(args.log)
+    if "warning" in report.facts:
+        args.report.say(f"warning: {report.facts['warning']}")
     return report
 
 
@@ -201,7 +210,7 @@ def _port(args: argparse.Namespace) -> Iterator[Port]:
 
             refuse_virtual(args.bus, "conform")
             target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
-            port = stack.enter_context(open_bus(target, args.report.say))
+            port = stack.enter_context(open_bus(target, args.report.say, args.data_bitrate))
         if args.log is not None:
             writer = stack.enter_context(CandumpWriter(args.log, port.channel, port.clock.now_ns()))
             port = RecordingPort(port, writer.on(port.channel))
@@ -217,7 +226,7 @@ def _emulated(args: argparse.Namespace) -> Port:
     from canprobe.fieldbus.drive.from_eds import make_eds_node
     from canprobe.fieldbus.eds.packaged import load_eds
 
-    bus = LockstepBus(VirtualClock(), "lockstep")
+    bus = LockstepBus(VirtualClock(), "lockstep", fd=True)
     bus.attach(make_eds_node(load_eds(args.eds, args.node), args.node, eds=args.eds))
     return bus.port()
 

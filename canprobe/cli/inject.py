@@ -67,6 +67,7 @@ def _list(args: argparse.Namespace) -> int:
             "clause": kind.clause,
             "reaction": kind.reaction,
             "conditions": sorted(kind.conditions),
+            "points": sorted(kind.points),
             "needs": kind.needs,
         }
         for kind in CELL_FAULTS.values()

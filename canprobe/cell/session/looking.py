@@ -85,13 +85,13 @@ def commission(
 
 
 @contextlib.contextmanager
-def open_bus(target: Target, say: Say) -> Iterator[Port]:
-    """A port of a bus without a scene; a wrong setting is only a warning."""
+def open_bus(target: Target, say: Say, data_bitrate: int | None = None) -> Iterator[Port]:
+    """A port of a bus without a scene, of CAN FD where a data bit rate is given; a wrong setting is only a warning."""
     from canprobe.fieldbus.bus.real.opening import open_port
 
     interface, channel = target.interface, target.channel
     check_links(interface, {channel: ExpectedLink(target.bitrate, of_scene=False)}, say, must=False)
-    port = open_port(interface, channel, target.bitrate, MonotonicClock())
+    port = open_port(interface, channel, target.bitrate, MonotonicClock(), data_bitrate=data_bitrate)
     try:
         yield port
     except BusError as error:

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from judged import rules_raised
 from makes import MAKES, changed, without, write_eds
 from scenes import change, reasons, with_joints
 
@@ -57,10 +58,14 @@ class Bench:
         self.bus = LockstepBus(VirtualClock(), "can0")
         self.world = make_world(self.plan, self.plan.node_ids, truth=False, homed=False)
         self.record = folder / "state" / "zeros.json"
-        self.frames, self.said = [], []
-        self.bus.recorder = lambda can_id, data, t_ns: self.frames.append((can_id, data))
+        self.heard, self.said = [], []
+        self.bus.recorder = lambda *frame: self.heard.append(frame)
         for node in self.world.nodes:
             self.bus.attach(FaultyNode(node, faults) if faults else around(node))
+
+    @property
+    def frames(self):
+        return [frame[:2] for frame in self.heard]
 
     def cell(self, *, to_home=False):
         return Cell(self.plan, self.bus.port(), RunOptions(say=self.said.append, to_home=to_home), zeros=self.record)
@@ -101,6 +106,7 @@ def test_a_homed_joint_is_where_the_cell_has_it_and_stays_known(tmp_path, method
     resets = {data for can_id, data in bench.frames if can_id == 0}
     assert {pack_nmt(NmtCommand.RESET_COMMUNICATION, 1)[1], pack_nmt(NmtCommand.RESET_NODE, 2)[1]} <= resets
     assert pack_nmt(NmtCommand.RESET_NODE, 1)[1] not in resets
+    assert rules_raised(bench.plan, bench.heard) == {}
 
 
 def test_the_index_pulse_behind_the_positive_switch(tmp_path):
@@ -221,6 +227,22 @@ def test_the_record_names_what_homing_wrote(tmp_path):
     ((node_id, entry),) = json.loads(bench.record.read_text())["nodes"].items()
     assert (node_id, entry["objects"]["6098h:00"]) == ("1", 35)
     assert entry["position"] == -entry["objects"]["607Ch:00"]
+
+
+def test_a_run_records_where_it_leaves_a_joint(tmp_path):
+    """Without it the next cell would take the motion of the run for one by hand."""
+    bench = Bench(scene_of([35]), tmp_path)
+    bench.home()
+
+    def move(measurement):
+        target = measurement.q + np.array([2e-3, 0, 0, 0, 0, 0])
+        return Command(q_target=target, done=measurement.cycle > 60)
+
+    with bench.cell() as cell:
+        cell.run(move)
+    before = json.loads(bench.record.read_text())["nodes"]["1"]
+    q, truth = bench.run()
+    assert q == pytest.approx(truth, abs=2e-4) and abs(before["position"] + before["objects"]["607Ch:00"]) > 40
 
 
 def test_emulated_drives_of_a_run_start_homed_and_can_be_homed(capsys):

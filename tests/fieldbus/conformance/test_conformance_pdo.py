@@ -77,38 +77,10 @@ def test_cia301_pdo_27_not_mappable(tiny, opened, index, word):
     refuses(tiny, opened, (index, 1, word, 4), 0x06040041)
 
 
-@pytest.mark.parametrize("order", [(0x1800, 1, 0x186, 4), (0x1400, 1, 0x206, 4), (0x1800, 3, 10, 2), (0x1800, 6, 2, 1)])
-def test_cia301_pdo_28_changed_while_valid(tiny, order):
-    refuses(tiny, [], order, 0x06090030)
-
-
-def test_cia301_pdo_28_restricted_identifiers(tiny):
-    for index in (0x1400, 0x1800):
-        tiny.set((index, 1, OFF | 0x222, 4))
-        for cob_id in (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x7FF):
-            refuses(tiny, [], (index, 1, cob_id, 4), 0x06090030)
-        tiny.set((index, 1, 0x333, 4))
-
-
 def test_cia301_pdo_29_reserved_transmission_types(tiny):
     for value in (0, 1, 240, 241, 251, 252, 253, 254, 255):
         assert tiny.write(0x1400, 2, value, 1) == (0x06090030 if 0xF1 <= value <= 0xFD else 0)
         assert tiny.write(0x1800, 2, value, 1) == (0x06090030 if 0xF1 <= value <= 0xFB else 0)
-
-
-def test_cia301_pdo_30_type_0_follows_an_event_at_the_next_sync(tiny):
-    tiny.set((0x1800, 2, 0, 1))
-    tiny.nmt(0x01)
-    assert syncs(tiny, None) == [[]]
-    tiny.set((0x2001, 0, 0xAA, 4))
-    assert syncs(tiny, None, None) == [[0x185], []]
-
-
-@pytest.mark.parametrize("every", [1, 2, 5])
-def test_cia301_pdo_30_every_nth_sync(tiny, every):
-    tiny.set((0x1800, 2, every, 1))
-    tiny.nmt(0x01)
-    assert syncs(tiny, *[None] * (2 * every)) == ([[]] * (every - 1) + [[0x185]]) * 2
 
 
 @pytest.mark.parametrize("kind", [254, 255])
@@ -171,65 +143,12 @@ def test_cia301_pdo_31_inhibit_time_holds_back_and_sends_the_latest(tiny):
     tiny.silence(350)
 
 
-def test_cia301_pdo_31_event_timer_repeats(tiny):
-    configure(tiny, 0x1800, cob_id=0x185, words=[0x20010020], type=254, event=60)
-    first = tiny.nmt(0x01)
-    tiny.expect((0x185, INITIAL[:8]))
-    for turn in (1, 2, 3):
-        tiny.assert_after(first, tiny.expect((0x185, INITIAL[:8]), within_ms=60), 60 * turn)
-    tiny.nmt(0x02)
-    tiny.silence(100)
-
-
-def test_cia301_pdo_32_applied_at_the_next_sync_only(tiny):
-    tiny.nmt(0x01)
-    tiny.send(0x205, "aabbccdd0100")
-    tiny.send(0x205, WRITTEN)
-    assert tiny.read(0x2001) == 0x01020304
-    tiny.send(0x80)
-    tiny.expect((0x185, WRITTEN))
-
-
-def test_cia301_pdo_33_short_is_reported_and_not_applied(tiny):
-    tiny.set((0x1400, 2, 255, 1))
-    tiny.nmt(0x01)
-    tiny.send(0x205, WRITTEN[:10])
-    tiny.expect((0x85, "1082110000000000"))
-    assert tiny.read(0x2001) == 0x01020304
-    tiny.send(0x205, WRITTEN)
-    tiny.expect((0x85, "0000000000000000"))
-
-
 def test_cia301_pdo_34_long_is_reported_and_applied(tiny):
     tiny.set((0x1400, 2, 255, 1))
     tiny.nmt(0x01)
     tiny.send(0x205, WRITTEN + "ff")
     tiny.expect((0x85, "2082110000000000"))
     assert (tiny.read(0x2001), tiny.read(0x2002)) == (0x44332211, 5)
-
-
-def test_cia301_pdo_35_event_timer_from_the_first_reception(tiny):
-    tiny.set((0x1400, 5, 200, 2))
-    tiny.nmt(0x01)
-    tiny.silence(250)
-    last = tiny.send(0x205, WRITTEN)
-    tiny.assert_after(last, tiny.expect((0x85, "5082110000000000"), within_ms=200), 200)
-    tiny.send(0x205, WRITTEN)
-    tiny.expect((0x85, "0000000000000000"))
-
-
-def test_cia301_pdo_36_synchronous_window(tiny):
-    tiny.set((0x1007, 0, 300_000, 4))
-    tiny.nmt(0x01)
-    tiny.send(0x80)
-    tiny.expect((0x185, INITIAL))
-    tiny.send(0x205, WRITTEN)
-    tiny.send(0x80)
-    tiny.expect((0x185, WRITTEN))
-    tiny.silence(320)
-    tiny.send(0x205, INITIAL)
-    tiny.send(0x80)
-    tiny.expect((0x185, WRITTEN))
 
 
 @pytest.mark.parametrize(

@@ -263,7 +263,13 @@ DEFECTS = {
     "pdo 30 type 1": rewrites(TPDO, "", lambda text: text + "00" if len(text) < 16 else text[:-2]),
     "pdo 30 type n": replaces("2f00180203", "2f00180202"),
     "pdo 30 type 0": replaces("2f00180200", "2f00180201"),
-    "pdo 30 type 255": drops(lambda d, i, text: i == TPDO and d.last[1].startswith("23012000")),
+    "pdo 30 type 255": hears(
+        lambda d, i, text: (
+            Changed(i, "2f00180201000000")
+            if i == REQUEST and text.startswith("2f001802ff") and d.number(0x1A00) == 1
+            else None
+        )
+    ),
     "pdo 30 remote request": drops(lambda d, i, text: i == TPDO and d.last[0] == TPDO | RTR_FLAG),
     "pdo 31 event timer": replaces("2b0018053200", "2b0018056400"),
     "pdo 31 inhibit time": replaces("2b001803e803", "2b0018030000"),
@@ -274,7 +280,7 @@ DEFECTS = {
     ),
     "pdo 34 long RPDO": hears(lambda d, i, text: [] if i == RPDO and len(text) == 10 else None),
     "pdo 35 RPDO event timer": hears(early_timeout),
-    "pdo 36 synchronous window": replaces("23071000a0", "23071000"),
+    "pdo 36 synchronous window": hears(lambda d, i, text: [] if i == RPDO and d.number(0x1007) else None),
     "pdo 37 SYNC start value": replaces("2f00180603", "2f00180600"),
     "sync 39 reserved overflow": accepts("2f191000f1"),
     "sync 39 overflow while a period is set": accepts("2f1910000a", when=lambda d: d.number(0x1006)),
@@ -307,6 +313,9 @@ DEFECTS = {
     ),
     "hostile 97 CAN FD frames": hears(
         lambda d, i, text: [(ANSWER, "4300100012000000")] if i == REQUEST and len(text) == 24 else None
+    ),
+    "hostile 99 own frames": says(
+        lambda d, i, text: [(i, text), *([(i | EFF_FLAG, text)] if (i, text) == (HEARTBEAT, "00") else [])]
     ),
     "hostile 98 identifiers of nobody": stopped_by(lambda i, text: i == LSS and len(text) < 16),
     "timing 100 SDO": hears(lost_answer),

@@ -22,6 +22,7 @@ from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import CONTROLWORD, RPDOS, ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
+from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
 from canprobe.fieldbus.tools.conform.outcome import (
     BenchFailure,
@@ -33,6 +34,7 @@ from canprobe.fieldbus.tools.conform.outcome import (
 from canprobe.fieldbus.tools.conform.permits import Permits, WriteList
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 from canprobe.fieldbus.tools.conform.surroundings import hear
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
@@ -111,7 +113,7 @@ class Examination:
 
         Raises:
             NodeError: the device does not answer.
-            InterfaceError: the interface failed, and what was written could not be put back.
+            BenchFailure: something else ended the examination, and what was written could not be put back.
         """
         self._meet()
         try:
@@ -120,9 +122,15 @@ class Examination:
                 row = self._examine(point)
                 self.report.rows.append(row)
                 on_row(row, number, len(points))
-        finally:
+        except BaseException:
             with interrupts_held():
                 self._leave()
+            raise
+        with interrupts_held():
+            try:
+                self._leave()
+            except BenchFailure as error:
+                self.report.rows.append(ReportRow("bench", "put back", Verdict.ERROR, detail=str(error)))
         self.report.left_out += LEFT_OUT
         self.report.distributions.update(self.bench.distributions)
         return self.report
@@ -166,7 +174,7 @@ class Examination:
         self.report.facts["error history (1003h) before"] = ", ".join(history) or "empty"
         self.report.facts["bus"] = f"{self._port.channel}, beside the device: {surroundings.text()}"
         if surroundings.lacks("nmt") and device.has(0x1017):
-            bench.notes.append("another master may watch the heartbeat that 1017h changes")
+            self.report.facts["warning"] = "another master may watch the heartbeat of the device, which points change"
 
     def _examine(self, point: Point) -> ReportRow:
         """One point: run it, put back what it wrote, look for what it left behind."""
@@ -189,11 +197,14 @@ class Examination:
             self.report.left_out.append((f"{point.group} {point.title}", str(error)))
         except PointNotApplicable as error:
             verdict, detail = Verdict.NOT_APPLICABLE, str(error)
-        except Deviation as error:
+        except (Deviation, SdoRefused) as error:
             verdict, detail = Verdict.FAIL, str(error)
         except CanprobeError as error:
             verdict, detail = Verdict.ERROR, str(error)
-        self._frames = tuple(bench.sent), tuple(bench.came)
+        sent, came = (
+            tuple(frame_text(*frame, self._node_id) for frame in frames) for frames in (bench.sent, bench.came)
+        )
+        self._frames = sent, came
         if not self._ended:
             try:
                 with interrupts_held():
@@ -273,8 +284,15 @@ class Examination:
             except Deviation:
                 raise error from None
             written = self.journal.restore(bench, all_of_it=True)
+        if commanded and bench.asked and not self._is_well():
+            bench.reset()  # an error that was provoked and stays would fail the points that follow
+            written += self.journal.restore(bench, all_of_it=True)
         self._boots = bench.boots
         return written
+
+    def _is_well(self) -> bool:
+        """Whether 1001h shows no error that was not there before."""
+        return not self.bench.number(0x1001) & ~self.bench.device.number(0x1001)
 
     def _leave(self) -> None:
         """Put back everything, and bring the device into the state that it had.

@@ -13,9 +13,9 @@ from typing import NamedTuple
 from canprobe.fieldbus.bus.port import ControllerState, Port, TimedFrame
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Frame
-from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.outcome import BenchFailure
 from canprobe.fieldbus.tools.conform.permits import Permits, Place
+from canprobe.fieldbus.tools.conform.surroundings import MAX_BASE_ID
 
 _KEPT_FRAMES = 12
 """Frames of each direction that the report of a point shows, the last ones."""
@@ -69,7 +69,9 @@ class FrameLink:
         emcy_id: identifier of the device's EMCY.
         emergencies: EMCY messages that nobody has taken yet, with their times.
         boots: number of boot-ups so far.
+        odd_ids: identifiers, with their flags, of remote requests and frames with 29 bits that came.
         noted: function that is called with each entry before it is written.
+        sent, came: last frames in each direction.
         load: frames of the background load and the time between two of them, ns; None: there is none.
     """
 
@@ -78,10 +80,11 @@ class FrameLink:
         self.emcy_id = EMCY_BASE + node_id
         self.emergencies: deque[tuple[Emcy, int]] = deque()
         self.boots = 0
+        self.odd_ids: set[int] = set()
         self.noted: Callable[[Place], None] = lambda _: None
         self.load: tuple[Sequence[Frame], int] | None = None
-        self.sent: deque[str] = deque(maxlen=_KEPT_FRAMES)
-        self.came: deque[str] = deque(maxlen=_KEPT_FRAMES)
+        self.sent: deque[Frame] = deque(maxlen=_KEPT_FRAMES)
+        self.came: deque[Frame] = deque(maxlen=_KEPT_FRAMES)
         self._inbox: dict[int, deque[CameFrame]] = {}
         self._came_count = 0
         self._next_load_ns = 0
@@ -107,7 +110,7 @@ class FrameLink:
         if place is not None:
             self.noted(place)
         t_ns = self.now_ns
-        self.sent.append(frame_text(can_id, data, self.node_id))
+        self.sent.append((can_id, data))
         self.port.send_batch([(can_id, data)])
         return t_ns
 
@@ -176,8 +179,10 @@ class FrameLink:
             self.emergencies.append((Emcy.unpack(data), t_ns))
         elif can_id == HEARTBEAT_BASE + self.node_id and data == b"\0":
             self.boots += 1
-        if can_id & 0x7F == self.node_id or can_id not in range(0x800):
-            self.came.append(frame_text(can_id, data, self.node_id))
+        if can_id > MAX_BASE_ID:
+            self.odd_ids.add(can_id)
+        if can_id & 0x7F == self.node_id or can_id > MAX_BASE_ID:
+            self.came.append((can_id, data))
         self._came_count += 1
         box = self._inbox.setdefault(can_id, deque(maxlen=_KEPT_INBOX))
         box.append(CameFrame(can_id, data, t_ns, self._came_count))

@@ -22,6 +22,9 @@ from canprobe.fieldbus.protocol.frames import (
 )
 from canprobe.fieldbus.protocol.lss import LSS_ANSWER_ID, LSS_REQUEST_ID
 
+MAX_BASE_ID = 0x7FF
+"""Highest identifier of 11 bits; with more the flags of a remote request or of 29 bits are set."""
+
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
@@ -105,8 +108,8 @@ def surroundings_of(frames: Iterable[TimedFrame], node_id: int, seconds: float) 
             others.add(number)
         elif base in (EMCY_BASE, SDO_TX_BASE) and number:
             others.add(number)
-        elif number == node_id and 0x180 <= base < 0x580 and base & 0x80:
-            pass  # a default TPDO of the device
+        elif number == node_id and ((0x180 <= base < 0x580 and base & 0x80) or can_id > MAX_BASE_ID):
+            pass  # a default TPDO of the device, or a frame that it should not send
         elif can_id not in (LSS_REQUEST_ID, LSS_ANSWER_ID):
             strangers.add(can_id)
         else:

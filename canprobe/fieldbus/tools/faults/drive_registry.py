@@ -28,6 +28,7 @@ DRIVE_KINDS = (
         trips="drive_fault",
         incoming=False,
         needs="drive",
+        fails="49 50 51 54 55",
     ),
     make_kind(
         "mode-refused",
@@ -37,6 +38,7 @@ DRIVE_KINDS = (
         "sends no targets",
         incoming=True,
         needs="drive",
+        fails="49 50 51 53 54 55",
     ),
     make_kind(
         "brake-stuck",

@@ -42,6 +42,8 @@ class FaultKind:
         reaction: what a conforming peer does.
         effect: class that makes it happen.
         conditions: keys of the supervision's conditions that it trips in a cell in motion, at full share.
+        points: numbers of the points of `conform` that a drive fails with it, thrown from the start with `--motion`;
+            or one of the words of `row`.
         parameters: its numbers by name.
         incoming: whether it hits frames that the node receives; None: either, as the fault says, else those it sends.
         needs: device that it needs: a node, a drive, or an array.
@@ -54,6 +56,7 @@ class FaultKind:
     reaction: str
     effect: Callable[[Fault, Host], Effect]
     conditions: frozenset[str] = frozenset()
+    points: frozenset[str] = frozenset()
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     incoming: bool | None = None
     needs: str = "node"

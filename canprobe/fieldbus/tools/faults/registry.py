@@ -1,7 +1,7 @@
 """The registry of faults: every kind with its clause, the reaction to it, and the conditions that it trips.
 
-The column of conditions is for a node of a cell in motion: node 3, a drive, of the packaged scene `free`. A test throws
-each kind and compares.
+The column of conditions is for a node of a cell in motion: node 3, a drive, of the packaged scene `free`; that of
+points for a drive that `conform` examines. A test throws each kind and compares.
 Source: CiA 301 (frames, services), CiA 402-2 (drives).
 """
 
@@ -14,7 +14,7 @@ from canprobe.fieldbus.tools.faults import frame_faults as link
 from canprobe.fieldbus.tools.faults import service_faults as service
 from canprobe.fieldbus.tools.faults.drive_registry import DRIVE_KINDS
 from canprobe.fieldbus.tools.faults.fault import FaultKind, Parameter
-from canprobe.fieldbus.tools.faults.row import LOST, SHORT_NS, error_code, in_ms, make_kind
+from canprobe.fieldbus.tools.faults.row import LOST, MOST, SHORT_NS, UNANSWERED, error_code, in_ms, make_kind
 
 _ROWS = (
     make_kind(
@@ -24,6 +24,7 @@ _ROWS = (
         "CiA 301, PDO",
         "misses them, then the node is lost",
         trips=LOST,
+        fails=UNANSWERED,
     ),
     make_kind(
         "delay",
@@ -40,6 +41,7 @@ _ROWS = (
         "ISO 11898-1, acknowledgement",
         "takes the first",
         n=Parameter(2, 2, 100, "number of frames for each"),
+        fails="1 8 19 23 30 31 37 102",
     ),
     make_kind(
         "corrupt",
@@ -48,6 +50,7 @@ _ROWS = (
         "ISO 11898-1, CRC",
         "drops what cannot be",
         trips="pdo_missed drive_late drive_fault",
+        fails=MOST,
     ),
     make_kind(
         "reorder",
@@ -56,9 +59,17 @@ _ROWS = (
         "CiA 301, PDO",
         "goes by the identifier, not by the order",
         trips=LOST,
+        fails=UNANSWERED,
     ),
     make_kind(
-        "mute", link.Drop, "the node sends nothing", "CiA 301, 1016h", "stops the others", trips=LOST, incoming=False
+        "mute",
+        link.Drop,
+        "the node sends nothing",
+        "CiA 301, 1016h",
+        "stops the others",
+        trips=LOST,
+        incoming=False,
+        fails=UNANSWERED,
     ),
     make_kind(
         "deaf",
@@ -68,6 +79,7 @@ _ROWS = (
         "the node stops by itself: 8130h, 8250h",
         trips=f"{LOST} emcy_communication",
         incoming=True,
+        fails=UNANSWERED,
     ),
     make_kind(
         "reboot",
@@ -78,6 +90,7 @@ _ROWS = (
         trips=f"{LOST} emcy_communication",
         incoming=False,
         lasts_ns=SHORT_NS,
+        fails=UNANSWERED,
     ),
     make_kind(
         "freeze",
@@ -87,6 +100,7 @@ _ROWS = (
         "stops the others",
         trips=f"{LOST} emcy_communication",
         incoming=False,
+        fails=UNANSWERED,
     ),
     make_kind(
         "babble",
@@ -97,6 +111,7 @@ _ROWS = (
         trips="drive_fault",
         incoming=False,
         gap_ms=in_ms(1, "time between two frames, ms"),
+        fails="6 30 31 37 40",
     ),
     make_kind(
         "wrong-data",
@@ -114,6 +129,7 @@ _ROWS = (
         "CiA 301, PDO length, 8210h",
         "does not apply them",
         trips=LOST,
+        fails="30",
     ),
     make_kind("long", link.Long, "PDOs have a byte too many", "CiA 301, PDO length, 8220h", "applies or drops them"),
     make_kind(
@@ -124,6 +140,7 @@ _ROWS = (
         "takes the first",
         trips=f"{LOST} emcy_communication",
         n=Parameter(10, 2, 100, "number of frames for each"),
+        fails="1 8 19 23 30 31 37 45 102",
     ),
     make_kind(
         "wrong-id",
@@ -133,6 +150,7 @@ _ROWS = (
         "misses them",
         trips=LOST,
         offset=Parameter(16, -0x180, 0x180, "distance of the identifiers"),
+        fails="30 31 37 101",
     ),
     make_kind(
         "odd-frames",
@@ -160,6 +178,7 @@ _ROWS = (
         "the node stops by itself: 8100h",
         trips=f"{LOST} emcy_communication",
         incoming=True,
+        fails="30 37 40 101",
     ),
     make_kind(
         "sync-double",
@@ -168,6 +187,7 @@ _ROWS = (
         "CiA 301, 1019h",
         "goes by the counter",
         incoming=True,
+        fails="30 37",
     ),
     make_kind(
         "bus-off",
@@ -178,6 +198,7 @@ _ROWS = (
         trips=LOST,
         incoming=True,
         lasts_ns=SHORT_NS,
+        fails=UNANSWERED,
     ),
     make_kind(
         "heartbeat-off",
@@ -187,6 +208,7 @@ _ROWS = (
         "stops the others",
         trips="heartbeat",
         incoming=False,
+        fails="1 2 3 5 7 8 9 45 89 95 98 102 103",
     ),
     make_kind(
         "heartbeat-state",
@@ -197,8 +219,17 @@ _ROWS = (
         trips="nmt_state",
         incoming=False,
         state=Parameter(4, 0, 127, "state: 4 stopped, 127 pre-operational"),
+        fails="1 2 3 5 7 9 45 95 98",
     ),
-    make_kind("no-boot-up", service.NoBootUp, "no boot-up message", "CiA 301, boot-up", "reads 1000h", incoming=False),
+    make_kind(
+        "no-boot-up",
+        service.NoBootUp,
+        "no boot-up message",
+        "CiA 301, boot-up",
+        "reads 1000h",
+        incoming=False,
+        fails="1 2 4",
+    ),
     make_kind(
         "nmt",
         service.Nmt,
@@ -208,6 +239,7 @@ _ROWS = (
         trips="nmt_state pdo_missed",
         incoming=False,
         command=Parameter(2, 1, 130, "command: 2 stop, 128 pre-operational, 129 reset"),
+        fails=UNANSWERED,
     ),
     make_kind(
         "sdo-abort",
@@ -218,6 +250,7 @@ _ROWS = (
         incoming=True,
         index=Parameter(0x1017, 0, 0xFFFF, "index of the object"),
         code=Parameter(0x08000020, 0, 0xFFFFFFFF, "abort code"),
+        fails="77",
     ),
     make_kind(
         "sdo-silent",
@@ -226,6 +259,7 @@ _ROWS = (
         "CiA 301, SDO, 05040000h",
         "times out",
         incoming=True,
+        fails=UNANSWERED,
     ),
     make_kind(
         "sdo-slow",
@@ -243,6 +277,7 @@ _ROWS = (
         "CiA 301, SDO, 05030000h",
         "aborts the transfer",
         incoming=False,
+        fails="23 77",
     ),
     make_kind(
         "sdo-wrong-object",
@@ -251,6 +286,7 @@ _ROWS = (
         "CiA 301, SDO",
         "drops them",
         incoming=False,
+        fails="47 77 82 92",
     ),
     make_kind(
         "sdo-size",
@@ -259,6 +295,7 @@ _ROWS = (
         "CiA 301, SDO, 06070010h",
         "refuses the value",
         incoming=False,
+        fails=MOST,
     ),
     make_kind(
         "emcy",
@@ -280,6 +317,7 @@ _ROWS = (
         incoming=False,
         gap_ms=in_ms(1, "time between two messages, ms"),
         code=error_code(0x8210, "emergency error code"),
+        fails=MOST,
     ),
     make_kind(
         "remapped",

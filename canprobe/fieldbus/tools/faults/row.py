@@ -8,6 +8,8 @@ from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Effect, Fault, Faul
 
 SHORT_NS = 100_000_000
 """Duration of a power failure and of bus-off where none is given."""
+UNANSWERED, MOST = "unanswered", "most"
+"""In the place of points: the device does not answer, so that none is examined; most of those examined fail."""
 LOST = "pdo_missed drive_late drive_silent"
 """Conditions of a drive whose TPDOs do not come."""
 
@@ -20,14 +22,15 @@ def make_kind(
     reaction: str,
     *,
     trips: str = "",
+    fails: str = "",
     incoming: bool | None = None,
     needs: str = "node",
     lasts_ns: int = FOREVER_NS,
     **parameters: Parameter,
 ) -> FaultKind:
-    """A row; `trips` are keys of conditions with blanks between them, `parameters` the kind's numbers."""
-    keys = frozenset(trips.split())
-    return FaultKind(name, what, clause, reaction, effect, keys, parameters, incoming, needs, lasts_ns)
+    """A row; `trips` are keys of conditions and `fails` points, with blanks; `parameters` are the kind's numbers."""
+    keys, points = frozenset(trips.split()), frozenset(fails.split())
+    return FaultKind(name, what, clause, reaction, effect, keys, points, parameters, incoming, needs, lasts_ns)
 
 
 def in_ms(default: float, what: str) -> Parameter:

@@ -122,6 +122,16 @@ def fd_frames(bench: Bench) -> None:
 
 
 @conformance_point(
+    99, "hostile", "own frames", "CiA 301, CAN base frames", "data frames with 11 bits only", needs="alone"
+)
+def own_frames(bench: Bench) -> None:
+    """What came so far, where nobody else is on the bus."""
+    if bench.odd_ids:
+        texts = [f"{can_id:08X}h" for can_id in sorted(bench.odd_ids)]
+        bench.deviates(f"remote requests or frames with 29 bits come: {', '.join(texts[:4])} (with flags)")
+
+
+@conformance_point(
     98,
     "hostile",
     "identifiers of nobody",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
+from canprobe.fieldbus.protocol.frames import SDO_RX_BASE
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -12,7 +13,7 @@ from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import pack_request, pack_write
+from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request, pack_write
 
 CODES = "CiA 301, SDO abort codes"
 _ABSENT = (0x1FF0, 0x5FFE, 0x9FFE)
@@ -137,5 +138,7 @@ def two_channels(bench: Bench) -> None:
     frame = bench.next(answer_id, bench.times.sdo_s)
     if frame is None or frame.data != bench.first_answer:
         bench.deviates("no answer with 1000h on the channel of 1201h")
-    if not answer[0] & 2 and bench.ask(bytes((0x60,)) + bytes(7))[1:8] != name[:7].ljust(7, b"\0"):
+    segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]
+    if segment and segment != name[:7].ljust(7, b"\0"):
         bench.deviates("a segment of 1008h is wrong after a transfer on the other channel")
+    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, 0x1008, 0, bytes.fromhex("00000008")))

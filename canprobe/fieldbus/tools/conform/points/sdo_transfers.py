@@ -138,6 +138,7 @@ def expedited(bench: Bench) -> None:
 def segmented_upload(bench: Bench) -> None:
     """A text in segments, twice the same."""
     _segmented_upload(bench)
+    _abort(bench)
     for index in (0x1008, 0x1009, 0x100A):
         value = bench.device.values.get((index, 0), b"")
         if len(value) > 4 and bench.upload(index) != value:
