@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image_model import ImageModel
 
 
-HEIGHT_CORRELATION = (2e-3, 0.2)
+HEIGHT_CORRELATION = (2e-3, 0.5)
 """Correlation length of the heights of contacts along the path, m, and the share of their variance that is correlated,
-over 90 random scenes: the depth follows the force of some images."""
+over 120 random scenes: the depth follows force and curvature of some images."""
 SIGMA_NORMAL_RAD = 0.3e-3
 """Error of a normal that does not come from its centroid: joint counts displace the probe by 11 µm, times 28 1/m."""
 SIGMA_STIFFNESS = 0.6
@@ -85,7 +85,9 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     if method not in PATCH_METHODS:
         return estimator
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
+    from canprobe.mechanics.touch.estimate.noise_level import LevelledEstimator
 
+    estimator = LevelledEstimator(estimator, memory)
     scale = SCALE_ERROR + ROLLING_SCALE_ERROR * task.scan.rolling_share
     return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, scale)
 
