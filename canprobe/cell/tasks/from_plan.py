@@ -141,7 +141,7 @@ def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
 def estimates_of(
     setup: Setup, tracker: ShapeTracker, methods: Iterable[str], most: int | None = None
 ) -> dict[str, list[ShapeRecord]]:
-    """The answers of ``methods`` on the tracker's contacts; those of its own estimator are taken from the tracker.
+    """The answers of ``methods`` on the tracker's settled contacts; those of its own estimator are the tracker's.
 
     Args:
         setup: of the scan.
@@ -154,10 +154,11 @@ def estimates_of(
     every = max(1, round(0.1 * task.array.rate_hz))
     if most is not None:
         every = max(every, math.ceil(len(tracker.samples) / most))
+    settled = tracker.settled(task.probe.radius)
     return {
         method: tracker.records
         if method == task.shape.method
-        else replay_samples(make_shape_estimator(task, method), tracker.samples, every)
+        else replay_samples(make_shape_estimator(task, method), settled, every)
         for method in dict.fromkeys(methods)
     }
 
