@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.surface import SurfaceMatrix
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 sys.meta_path.insert(0, MovedModules())
 

@@ -19,6 +19,7 @@ from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.check import check
 from canprobe.cell.session.check_joints import check_joints
 from canprobe.cell.session.emulation import emulate, emulate_eds
 from canprobe.cell.session.home import home
@@ -37,6 +38,7 @@ __all__ = [
     "OpenCell",
     "RunResult",
     "Target",
+    "check",
     "check_joints",
     "commission",
     "emulate",

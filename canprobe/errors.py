@@ -147,6 +147,27 @@ def regular_file(path: Path, most_bytes: int | None = None) -> Path:
     return path
 
 
+def check_schema(file: object, found: object, newest: int, remedy: str) -> None:
+    """Check the `schema` of a file that canprobe wrote: a reader takes its own version and those before.
+
+    It is here because every wing reads files.
+
+    Args:
+        file: name of the file in the message.
+        found: version that the file states.
+        newest: version that this canprobe writes.
+        remedy: what to do with another file.
+
+    Raises:
+        UsageError: the file is of a newer canprobe, or states no version.
+    """
+    if not isinstance(found, int) or isinstance(found, bool) or found < 1:
+        raise UsageError(f"{file}: schema: expected {newest}, got {found!r}; {remedy}")
+    if found > newest:
+        why = f"the file is of a newer canprobe: this one reads up to schema {newest}, got {found}"
+        raise UsageError(f"{file}: {why}; {remedy}, or use that canprobe")
+
+
 EXTRA_OF = {
     "matplotlib": "study",
     "distributed": "dask",
@@ -187,8 +208,13 @@ def install_line(extra: str) -> str:
     elif "url" in origin:  # a wheel, or a repository
         vcs = origin.get("vcs_info", {}).get("vcs")
         wanted += f" @ {f'{vcs}+' if vcs else ''}{origin['url']}"
-    by_pipx = os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json"))
-    return f"{'pipx runpip canprobe' if by_pipx else 'pip'} install {editable}'{wanted}'"
+    if os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json")):
+        tool = "pipx runpip canprobe"
+    elif os.path.exists(os.path.join(sys.prefix, "uv-receipt.toml")) or f"{os.sep}archive-v" in sys.prefix:
+        tool = "uv tool"  # also where uvx made an environment for one run, in its cache
+    else:
+        tool = "pip"
+    return f"{tool} install {editable}'{wanted}'"
 
 
 def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:

@@ -56,6 +56,8 @@ def test_the_line_that_installs_an_extra_is_for_where_canprobe_came_from(origin,
     (tmp_path / "pipx_metadata.json").touch()
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     assert install_line("view") == line.replace("pip", "pipx runpip canprobe", 1)
+    monkeypatch.setattr(sys, "prefix", "/home/me/.cache/uv/archive-v0/5bAs")
+    assert install_line("view") == line.replace("pip", "uv tool", 1)
 
 
 def test_a_package_that_a_command_misses_is_told_with_that_line(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from canopen.nmt import NmtError
 from plugin_arguments import ARGUMENTS
 
-import canprobe.fieldbus.tools.emulated_bus  # noqa: F401 - a pytest inside forgets what it imported
+import canprobe.fieldbus.tools.judged_bus  # noqa: F401 - a pytest inside forgets what it imported
 from canprobe.cell.master.controller import Command
 from canprobe.errors import BusError, InterfaceError, UsageError
 from canprobe.fieldbus.eds.packaged import eds_path, load_eds
@@ -121,7 +121,13 @@ def test_it(canprobe_seed, canprobe_bus): assert (canprobe_seed, canprobe_bus) =
     run_inside(text.format(seed=5, bus="virtual"), "--canprobe-seed", "3", outcomes={"passed": 1}, conftest=overridden)
 
 
-@pytest.mark.parametrize("canprobe_bus", ["lockstep", "virtual"])
+@pytest.fixture(scope="session")
+def vcan():
+    """All tests here share one, and come one after the other."""
+    return "vcan0"
+
+
+@pytest.mark.parametrize("canprobe_bus", ["lockstep", "virtual", pytest.param("vcan", marks=pytest.mark.vcan)])
 def test_the_same_test_on_each_bus_with_nodes_that_are_added_one_by_one(
     emulated_nodes, emulated_bus, canopen_network, faults
 ):
@@ -168,6 +174,42 @@ def test_what_canopen_waits_for_passes_virtual_time(emulated_nodes, canopen_netw
     faults.inject("sdo-slow", node=1, ms=350)
     with pytest.raises(canopen.SdoCommunicationError):
         node.sdo[0x1018][1].raw  # noqa: B018
+
+
+MASTER = """
+@pytest.fixture
+def move(emulated_nodes, canopen_network):
+    emulated_nodes(DRIVE)
+    sdo = canopen_network.add_node(1, str(eds_path(DRIVE))).sdo
+    def move(read_mode):
+        sdo[0x6060].raw = 1
+        if read_mode:
+            assert sdo[0x6061].raw == 1
+        for word in (0x06, 0x07, 0x0F):
+            sdo[0x6040].raw = word
+            sdo[0x6041].raw
+        canopen_network.pass_time(0.1)
+    return move
+"""
+
+
+def test_a_master_is_judged_where_a_test_asks_for_it(run_inside):
+    out = run_inside(
+        f"""{MASTER}
+def test_good(judge, move): move(True)
+def test_bad(judge, move): move(False)
+def test_not_judged(move): move(False)
+def test_allowed(judge, move):
+    judge.allow(4)
+    move(False)
+    assert [row.name[:2] for row in judge.report().rows if row.verdict == "FAIL"] == ["04"]
+""",
+        outcomes={"passed": 4, "errors": 1},
+    )
+    out.fnmatch_lines(
+        ["*rules that the master broke:*", "FAIL * 04 mode not confirmed", "* hint: *", "(0.000000) 601#*"]
+    )
+    out.fnmatch_lines(["ERROR *::test_bad*"])
 
 
 @pytest.mark.canprobe(scene="free", seed=3)
@@ -225,6 +267,8 @@ def test_a_vcan_of_each_worker_or_a_skip_that_says_what_to_type(run_inside, monk
         wanted.append(channel)
         raise InterfaceError(f"{channel}: no such interface; type: ip link add dev {channel} type vcan")
 
+    has_socketcan = "canprobe.fieldbus.bus.real.socketcan.has_socketcan"
+    monkeypatch.setattr(has_socketcan, lambda: True)
     monkeypatch.setattr("canprobe.fieldbus.bus.real.socketcan.check_interface", check_interface)
     text = """
 @pytest.mark.needs_vcan
@@ -232,9 +276,7 @@ def test_marked(): pass
 def test_asked(vcan): pass
 """
     out = run_inside(text, "-rs", outcomes={"skipped": 2})
-    out.fnmatch_lines(
-        ["*vcan0: no such interface; type: ip link add dev vcan0 type vcan; or run all *: canprobe vcan -- *"]
-    )
+    out.fnmatch_lines(["*vcan0: no such interface; type: ip link add dev vcan0 type vcan; or run the tests where *"])
     monkeypatch.setenv("PYTEST_XDIST_WORKER", "gw2")
     run_inside(text, "--canprobe-channel=vcan5", outcomes={"skipped": 2})
     assert wanted == ["vcan0", "vcan0", "vcan7", "vcan7"]
@@ -242,3 +284,7 @@ def test_asked(vcan): pass
     out.fnmatch_lines(["*can2 is no vcan; name one: --canprobe-channel vcan0*"])
     monkeypatch.setattr("canprobe.fieldbus.bus.real.socketcan.check_interface", lambda channel, setting=None: None)
     run_inside(text, outcomes={"passed": 2})
+    monkeypatch.setattr(has_socketcan, lambda: False)
+    with_fault = '@pytest.mark.fault("node 1: mute")\ndef test_bus(emulated_nodes): emulated_nodes(DRIVE)'
+    out = run_inside(with_fault, "-rs", "--canprobe-bus=vcan", outcomes={"skipped": 1})
+    out.fnmatch_lines(["*vcan2: this kernel has no SocketCAN; run the tests where there is one: canprobe vcan -- *"])

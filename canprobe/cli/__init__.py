@@ -36,6 +36,7 @@ COMMANDS = (
     "schema",
     "init",
     "plan",
+    "check",
     "run",
     "up",
     "emulate",

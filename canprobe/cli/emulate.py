@@ -167,7 +167,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     )
 
 
-def eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
+def eds_files(args: argparse.Namespace, command: str = "emulate") -> list[tuple[str | Path, int]]:
     """File and node id of each node without a scene."""
     if args.bus_yml is not None:
         from canprobe.lab.bridge.bus_yml import read_bus_yml
@@ -176,7 +176,9 @@ def eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
             raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
         return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml, args.report.say)]
     if len(args.eds) != len(args.node_id):
-        raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
+        raise UsageError(
+            f"{command}: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own"
+        )
     if len(args.serial) > len(args.eds):
         raise UsageError(f"emulate: {len(args.serial)} --serial, but {len(args.eds)} --eds")
     return list(zip(args.eds, args.node_id, strict=True))

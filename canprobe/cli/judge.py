@@ -87,6 +87,13 @@ def add_arguments(parser: Parser) -> None:
         help="throw this fault in the place of the sequence; may be repeated; `canprobe inject --list` lists them",
     )
     parser.add_argument("--passive", action="store_true", help="throw no faults")
+    parser.add_argument(
+        "--without",
+        metavar="RULES",
+        type=rule_numbers,
+        default=(),
+        help="leave out rules, such as 32,33,34 on a machine that keeps no time",
+    )
     parser.add_argument("--output", metavar="FILE", type=Path, help="file for the output of COMMAND [a temporary one]")
     parser.add_argument("--log", metavar="FILE", type=Path, help="write the frames as a candump log")
     parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
@@ -95,6 +102,17 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--list", action="store_true", help="list the rules, and end")
     add_options(parser, "--json")
     add_verbosity(parser)
+
+
+def rule_numbers(text: str) -> tuple[int, ...]:
+    """An argument type: numbers of rules."""
+    from canprobe.fieldbus.tools.judge import RULES
+
+    known = {rule.number for rule in RULES}
+    words = [word.strip() for word in text.split(",")]
+    if wrong := [word for word in words if not word.isdecimal() or int(word) not in known]:
+        raise argparse.ArgumentTypeError(f"expected numbers of rules, got {wrong[0]!r}; `canprobe judge --list`")
+    return tuple(map(int, words))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -127,7 +145,7 @@ def _judge_record(args: argparse.Namespace) -> int:
         raise UsageError("judge: a log is judged for one channel: --channel CH")
     frames = read_record(args.record, named[0] if named else None)
     nodes = _descriptions(args, named[0] if named else None)
-    judge = judge_frames(frames, nodes, bitrate=args.bitrate or 1_000_000)
+    judge = judge_frames(frames, nodes, bitrate=args.bitrate or 1_000_000, without=args.without)
     if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
         ids = ", ".join(map(str, nodes))
         raise UsageError(f"judge: {args.record} has no frame of node {ids} or to it: which nodes does the log have?")
@@ -142,17 +160,18 @@ def _judge_served(args: argparse.Namespace) -> int:
 
     nodes = _descriptions(args)
     output = args.output or Path(tempfile.mkstemp(prefix="canprobe-judge-", suffix=".txt")[1])
-    faults = () if args.passive else args.inject or None
-    bench = MasterBench(args.command, args.seconds, faults, output)
-    target, serve = _server(args, bench, nodes)
+    bench = MasterBench(args.command, args.seconds, () if args.passive else args.inject or None, output)
     try:
+        target, serve = _server(args, bench, nodes)
         with left_by_ctrl_c(), first_ctrl_c(bench.ask):
             serve()
     finally:
         bench.close()
         if args.output is None and not output.stat().st_size:
             output.unlink()
-    judge = bench.judged(nodes, target.bitrate)
+    if bench.command is not None and output.exists():
+        args.report.say(f"output of {args.command[0]}: {output}")
+    judge = bench.judged(nodes, target.bitrate, args.without)
     if args.log is not None:
         write_log(bench.record(), args.log, target.channel)
     report = _report_of(args, bench, judge, nodes, target)
@@ -177,7 +196,7 @@ def _server(
         raise UsageError("judge: the nodes are served on one channel, without a name: --channel CH")
     if args.scene is None:
         target = real_target(args.bus, channels[0][1], args.bitrate)
-        files = eds_files(args)
+        files = eds_files(args, "judge")
         positions = [start_position(node) for node in nodes.values()]
         return target, lambda: api.emulate_eds(files, target, positions=positions, onlooker=bench, say=args.report.say)
     scene = loaded(args)
@@ -204,7 +223,7 @@ def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mappi
     from canprobe.fieldbus.eds.packaged import load_eds
 
     if args.scene is None:
-        files = eds_files(args)
+        files = eds_files(args, "judge")
         if any(one == 255 for _, one in files):
             raise UsageError("judge: nodes without an id (255) are not judged")
     else:

@@ -25,13 +25,14 @@ examples:
   canprobe study estimators --quick --out runs/estimators
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
+  canprobe study recover --seed 17
   canprobe study regions --draw 2 --against earlier/regions.json
   canprobe study arrays --draw 2
   canprobe vcan -- canprobe study faults --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
 STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
-    "draw": ("arrays", "calibrations", "regions", "shapes"),
+    "draw": ("arrays", "calibrations", "link", "regions", "shapes"),
     "against": ("regions",),
 }
 """Studies that have an option, by the option's name."""
@@ -47,13 +48,13 @@ def add_arguments(parser: Parser) -> None:
         "--seed",
         metavar="N",
         type=whole(0, 2**63 - 1),
-        help="faults, regions: run only the case of this seed, and report each step",
+        help="faults, recover, regions: run only the case of this seed, and report each step",
     )
     parser.add_argument(
         "--draw",
         metavar="N",
         type=whole(0, 9999),
-        help="arrays, calibrations, regions, shapes: number that all cases follow from; others than those of the"
+        help="arrays, calibrations, link, regions, shapes: number that all cases follow from; others than those of the"
         " published figures",
     )
     parser.add_argument(
@@ -140,10 +141,12 @@ def _replay(args: argparse.Namespace) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
     if args.name == "faults":
         from canprobe.lab.studies.faults import replay
+    elif args.name == "recover":
+        from canprobe.lab.studies.recover import replay
     elif args.name == "regions":
         from canprobe.lab.studies.regions import replay
     else:
-        args.complain(f"--seed: expected study faults or regions, got {args.name}")
+        args.complain(f"--seed: expected study faults, recover or regions, got {args.name}")
     outcome = replay(args.seed, args.report.say)
     if args.json:
         print_json(outcome)

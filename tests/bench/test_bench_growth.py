@@ -31,6 +31,7 @@ AXES = {
         "s",
     ),
     "contacts": ("contacts over new ground: the map, solved", (1000, 10_000, 100_000, 1_000_000), 1e3, "ms"),
+    "held": ("minutes of a lockstep cell that `up` holds, with a monitor", (5, 10, 30), 1.0, "s"),
     "runs": ("runs of `run_many`, one worker: all of them", (1, 10, 100, 1000), 1.0, "s"),
 }
 

@@ -37,6 +37,8 @@ def test_a_log_of_a_bad_master(tmp_path, capsys):
     assert "FAIL   enable    01 target at enable" in told
     assert "target 15000 while the axis is at 5000: 10000 off, 2000 allowed" in told
     assert "201#0F00983A0000" in told and "hint: read 6064h" in told
+    assert main(["judge", *NODE, "--record", log, "--without", "1"]) == 0
+    assert "left out: 01 target at enable: left out on request" in capsys.readouterr().out
     failed = ElementTree.parse(tmp_path / "j.xml").findall(".//testcase[failure]")
     assert [(case.get("classname"), case.get("name")) for case in failed] == [
         ("canprobe.judge.enable", "01 target at enable")
@@ -70,7 +72,9 @@ def test_the_log_of_a_run_has_nothing_to_blame(tmp_path, capsys):
     [
         (["--record", "x.log"], "name a SCENE or a cell, or else --eds FILE"),
         ([*NODE, "--record", "x.log", "--passive", "--", "true"], "COMMAND belongs to served nodes"),
+        (["--eds", "puma260_joint", "--channel", "x"], "judge: 1 --eds, but 0 --node-id"),
         ([*NODE, "--passive", "--inject", "node 1: mute"], "choose one"),
+        ([*NODE, "--record", "x.log", "--without", "32,99"], "expected numbers of rules, got '99'"),
         ([*NODE, "--record", "/nowhere/x.log"], "/nowhere/x.log: No such file"),
         ([*NODE, "--bus", "lockstep", "--channel", "x"], "lockstep"),
     ],
@@ -108,3 +112,10 @@ def test_ctrl_c_ends_the_command_while_the_nodes_are_served(group, tmp_path, cap
     out = tmp_path / "out.txt"
     assert main(["judge", *NODE, "--passive", "--output", str(out), "--", sys.executable, "-c", master]) == 0
     assert "in order" in out.read_text() and "KeyboardInterrupt" in out.read_text()
+
+
+def test_the_nodes_of_a_scene_are_served(group, capsys):
+    assert main(["judge", "free", "--passive", "--seconds", "0.3", "-v"]) == 3
+    told = capsys.readouterr()
+    assert "serving nodes 1, 2, 3, 4, 5, 6" in told.err and "no master was heard" in told.err
+    assert "n/a    enable    01 target at enable" in told.out

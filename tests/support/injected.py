@@ -34,7 +34,8 @@ class Injected:
         if scene.task.kind in ("press", "scan"):
             scene = replace(scene, task=replace(scene.task, clearance_mm=0.8))
         scene = replace(scene, **{k: replace(getattr(scene, k), **v) for k, v in changes.items()})
-        self.session = Session(scene, RunOptions(say=self._say))
+        self.frames = []
+        self.session = Session(scene, RunOptions(say=self._say, observers=(self._hear,)))
         self.limits = limits_of(self.session.plan)
         self.faulty = self.session.world.make_faulty()
         self.nodes = {node.node_id: node for node in self.faulty.nodes}
@@ -47,6 +48,9 @@ class Injected:
     def _say(self, text):
         if text.startswith("lift off"):
             self.answered_ns = self.now()
+
+    def _hear(self, observation):
+        self.frames += observation.frames
 
     def now(self):
         return self.session.lockstep.clock.now_ns()

@@ -469,6 +469,18 @@ class GoesWithout(Master):
             super().configure(drive)
 
 
+class GoesWithoutAnswer(GoesWithout):
+    def boot(self, drive):
+        Master.boot(self, drive)
+        drive.beats = False
+
+    def configure(self, drive):
+        if drive.node_id == 1:
+            super().configure(drive)
+        else:
+            self.read(2, 0x1018, 1, 4, answered=False)
+
+
 class BootPassedOver(Master):
     numbers = (21,)
 

@@ -15,20 +15,18 @@ from canprobe.fieldbus.eds.packaged import eds_path
 pytestmark = pytest.mark.vcan
 SUPPORT = Path(__file__).parents[1] / "support"
 EDS = str(eds_path("puma260_joint"))
-MACHINES = {"32 SYNC jitter", "33 SYNC gaps", "34 RPDOs between SYNCs"}
-"""Rules on times, which a virtual machine that stands still raises."""
+WORDS = ("--passive", "--json", "--without", "32,33,34")
+"""A virtual machine that stands still raises the rules on times."""
 
 
 def found(capsys: Any, channel: str, script: str, *words: str) -> tuple[int, set[str]]:
     command = [sys.executable, str(SUPPORT / script), *words]
-    status = main(
-        ["judge", "--eds", EDS, "--node-id", "5", "--channel", channel, "--passive", "--json", "--", *command]
-    )
+    status = main(["judge", "--eds", EDS, "--node-id", "5", "--channel", channel, *WORDS, "--", *command])
     document = json.loads(capsys.readouterr().out)
     for row in document["rows"]:
         if row["verdict"] == "FAIL":
             print(row["name"], row["detail"], *row["came"][:6], sep="\n  ", file=sys.stderr)
-    return status, {row["name"] for row in document["rows"] if row["verdict"] == "FAIL"} - MACHINES
+    return status, {row["name"] for row in document["rows"] if row["verdict"] == "FAIL"}
 
 
 def test_a_small_master_on_python_can_jumps(vcan0: str, capsys: Any) -> None:

@@ -18,7 +18,8 @@ A `cell.Cell` is made of a plan and a port; nothing is sent before it is entered
 `observers` see every cycle after its work. `log` keeps rows, with positions as `joint_columns`. `homing`
 finds the zeros of drives without an absolute encoder. `monitor` reads a bus without sending and `monitor_text` writes
 it as lines. `scan` lists nodes; `commission` gives node ids by LSS: `id_assignment` decides which, `lss_session` sends.
-`raw_array_start` starts an array that is no node; `options` is what the caller of a run sets.
+`as_found` leaves nodes as a check found
+them. `raw_array_start` starts an array that is no node; `options` is what the caller of a run sets.
 The room knows `Setup`, `Plan`, `Clock` and `Port`; it never sees the emulator.
 Start reading at `cell`, then `conditions`.
 """

@@ -91,6 +91,7 @@ class BringUp:
         settings: times, retries, and whether the nodes store their configuration.
         say: called with each step, for the user.
         listened: whether the caller has listened for another master until now.
+        resets: whether the nodes are reset; else they are only made pre-operational, and keep what they hold.
 
     Attributes:
         took_over: the nodes were reset by this cell. Before that it must not send: another master may use them.
@@ -106,6 +107,7 @@ class BringUp:
         say: Callable[[str], None],
         *,
         listened: bool = False,
+        resets: bool = True,
     ) -> None:
         self._network = network
         self._watch = watch
@@ -116,6 +118,7 @@ class BringUp:
         self._history: dict[int, str] = {}
         self._refused: set[tuple[int, int]] = set()
         self._listened = listened
+        self._resets = resets
         self.took_over = False
         self.released: set[int] = set()
 
@@ -129,7 +132,11 @@ class BringUp:
         self.listen()
         if not self._setups:
             return
-        self._reset()
+        if self._resets:
+            self._reset()
+        else:
+            self.took_over, self._booted = True, dict(self._watch.boot_ups)
+            self._network.port.send_batch([pack_nmt(NmtCommand.PRE_OPERATIONAL, s.node_id) for s in self._setups])
         self._configure_all()
         self.listen()
         self._refuse_unconfigured()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 from types import TracebackType
@@ -12,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_patch_reader, make_tactile
+from canprobe.cell.master.as_found import FoundNodes
 from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.controller import (
     Command,
@@ -90,6 +92,7 @@ class Cell:
         cycle: None before bring-up is done.
         homing: homing of the drives without an absolute encoder; None where there are none.
         bring_up: the steps of bring-up.
+        found: the nodes as a check found them; None of another cell.
         stopped_by: condition that stopped the cell; None where something else did.
         doubted: nodes that may have been without power, so that a drive has to be homed; set before entering.
     """
@@ -131,9 +134,14 @@ class Cell:
         self._network = PumpedNetwork(port, other=self._other)
         self._make_cycle = direct or Cycle
         setups = make_setups(plan) if direct is None else ()  # without setups, bring-up only takes its time
+        settings, check = setup.bring_up, options.to_check
+        if check:  # nothing is commanded or stored, such as a tare
+            setups = tuple(replace(one, writes=tuple(w for w in one.writes if w.read_back)) for one in setups)
+            settings = replace(settings, store=False)
         self.bring_up = BringUp(
-            self._network, self.watch, setups, setup.bring_up, self._say, listened=before is not None
+            self._network, self.watch, setups, settings, self._say, listened=before is not None, resets=not check
         )
+        self.found = FoundNodes(self._network, self.watch, setups, settings) if check else None
         self.stopped_by: Condition | None = None
         self.doubted: frozenset[int] = frozenset()
         self._stopped = False
@@ -210,6 +218,9 @@ class Cell:
 
     def __enter__(self) -> Cell:
         try:
+            if self.found is not None:
+                self.bring_up.listen()
+                self.found.look()
             self.bring_up.run()
             if self._raw_array is not None:
                 self._raw_array.start()
@@ -297,6 +308,16 @@ class Cell:
                 if self._run_cycle(interrupts, progress):
                     return True
         return False
+
+    def idle(self, seconds: float) -> None:
+        """Cycle with disabled drives and without a controller; nothing is supervised, and no row is kept."""
+        assert self.cycle is not None
+        if self.drives is not None:
+            self.drives.goal = DriveState.SWITCH_ON_DISABLED
+        for _ in range(max(1, round(seconds * 1e9 / self._plan.sync.period_ns))):
+            self._look(self.cycle.begin())
+            self.cycle.end(None)
+            self.cycle.count_work()
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
@@ -575,6 +596,8 @@ class Cell:
         if self.homing is not None:
             self._try(self.homing.keep)
         self._try(self.bring_up.release)
+        if self.found is not None and self.bring_up.took_over:
+            self._try(self.found.restore)
 
     def _patch(self, sample: TactileSample) -> Patch:
         assert self._reader is not None

@@ -31,7 +31,7 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE, NodeSetup, Write
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.scene.setup import HomingParameters
-from canprobe.errors import CanprobeError, NodeError, UsageError
+from canprobe.errors import CanprobeError, NodeError, UsageError, check_schema
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
@@ -71,6 +71,10 @@ _MOVES = {
 """Direction in which a drive counts, and what it looks for, of the common methods."""
 
 
+SCHEMA = 1
+"""Version of the record of zeros."""
+
+
 class UnhomedError(NodeError):
     """A drive has to be homed before it may be enabled."""
 
@@ -80,16 +84,20 @@ class ZeroRecord:
 
     Args:
         path: path of a JSON file; None: nothing is kept.
+
+    Raises:
+        UsageError: the file is of a newer canprobe. One that cannot be read counts as none: the drives are homed again.
     """
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
         self._nodes: dict[str, dict[str, Any]] = {}
         if path is not None and path.is_file():
-            try:
-                self._nodes = dict(json.loads(path.read_text(encoding="utf-8"))["nodes"])
-            except (OSError, ValueError, KeyError, TypeError):
-                self._nodes = {}  # as where it was never written: the drives are homed again
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                content = json.loads(path.read_text(encoding="utf-8"))
+                nodes = dict(content["nodes"])
+                check_schema(path, content.get("schema", 1), SCHEMA, "remove it, and home the drives again")
+                self._nodes = nodes
 
     def entry(self, node_id: int) -> dict[str, Any]:
         """The entry of a node; empty where nothing is known."""
@@ -110,7 +118,7 @@ class ZeroRecord:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise UsageError(f"{self._path.parent}: {error.strerror}") from error
-            write_text(self._path, json.dumps({"nodes": self._nodes}, indent=1) + "\n")
+            write_text(self._path, json.dumps({"schema": SCHEMA, "nodes": self._nodes}, indent=1) + "\n")
 
 
 class Homing:

@@ -33,6 +33,8 @@ class RunOptions:
         early_summary: called with the summary of a completed run as soon as it holds the estimator in the loop: before
             others estimate again, and before pictures are drawn.
         to_home: the drives are about to be homed; else bring-up refuses one that is not.
+        to_check: the link is about to be checked: nodes are not reset, nothing is enabled, and what bring-up changes in
+            them is put back at the end.
         recover: a cell that has lost a node or its bus comes back; see `canprobe.cell.session.recovery`.
         rows_folder: folder of the rows while the run goes on, whose caller makes files of them at its end; None keeps
             them in memory.
@@ -45,6 +47,7 @@ class RunOptions:
     early_summary: Callable[[Mapping[str, Any]], None] = unread
     to_home: bool = False
     recover: bool = False
+    to_check: bool = False
     rows_folder: Path | None = None
 
 

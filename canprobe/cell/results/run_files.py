@@ -29,7 +29,7 @@ from canprobe.cell.scene.load import SAVED_AS, load_scene, written_by_other
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.probing import Phase
-from canprobe.errors import SceneError, UsageError, regular_file
+from canprobe.errors import SceneError, UsageError, check_schema, regular_file
 
 SCHEMA = 1
 """Version of ``summary.json``."""
@@ -88,7 +88,7 @@ def read_summary(folder: Path) -> dict[str, Any] | None:
     """The summary of a run; None where a run left none, as when it was killed.
 
     Raises:
-        UsageError: when it is another kind of file, or of another schema.
+        UsageError: when it is another kind of file, or of a newer canprobe.
     """
     file = folder / SUMMARY
     if not file.exists():
@@ -99,9 +99,8 @@ def read_summary(folder: Path) -> dict[str, Any] | None:
         raise UsageError(f"{file}: expected the summary of a run; cannot be read: {error}") from error
     if not isinstance(summary, dict):
         raise UsageError(f"{file}: expected the summary of a run, got {type(summary).__name__}")
-    if (found := summary.get("schema")) != SCHEMA:
-        where = f"{file}{written_by_other(summary.get('written_by'))}"
-        raise UsageError(f"{where}: expected schema {SCHEMA}, got {found!r}; run the scene again with this canprobe")
+    where = f"{file}{written_by_other(summary.get('written_by'))}"
+    check_schema(where, summary.get("schema"), SCHEMA, "run the scene again with this canprobe")
     return summary
 
 

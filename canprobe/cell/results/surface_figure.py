@@ -80,7 +80,8 @@ def _draw_disagreement(part: SubFigure, view: MapView) -> None:
     if view.path is not None:
         path = view.plane.mm(view.path)
         axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
-    places, beyond = view.plane.mm(view.map.points), view.map.disagreement(view.map.points)
+    points = view.map.points[drawn_rows(len(view.map))]
+    places, beyond = view.plane.mm(points), view.map.disagreement(points)
     for chosen, colour, what in ((beyond == 0.0, BLUE, "agree within their noise"), (beyond > 0.0, ORANGE, "disagree")):
         size = np.clip(8.0 + 8.0 * beyond[chosen], 8.0, 60.0)
         axes.scatter(

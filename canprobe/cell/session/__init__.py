@@ -20,6 +20,8 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     recovery        a cell that comes back after a node or the bus was lost
     step_log        the steps of such a run in a file
     up              a cell that holds its position for days
+    check           a verdict on link and machine before motion
+    first_second    the same verdict on the first second of a run
     check_joints, home   the joints of a cell, one after the other: which is which, and their zeros
     looking         a bus without a cell: scan, node ids, monitor
     emulation       emulated nodes for other masters

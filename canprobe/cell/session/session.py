@@ -32,6 +32,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.bus_record import BusRecord
 from canprobe.cell.session.buses import channel_routes, lockstep_bus, open_ports
 from canprobe.cell.session.emulator_child import EmulatorChild
+from canprobe.cell.session.first_second import FirstSecond
 from canprobe.cell.session.folder import STEPS, prepare_folder, zeros_file
 from canprobe.cell.session.link_faults import expected_of
 from canprobe.cell.session.links import check_links, need_controllers
@@ -186,10 +187,18 @@ class Session:
         """Run a controller until it is done; see :meth:`canprobe.cell.master.cell.Cell.run`."""
         if self._left:
             raise UsageError("the cell is closed: open another one with `with canprobe.open_cell(scene) as cell:`")
+        first_second = None if self.virtual else FirstSecond(self.cell, self.plan, self._say)
+
+        def after_cycle(measurement: Measurement) -> None:
+            if first_second is not None:
+                first_second(measurement)
+            progress(measurement)
+
+        after = progress if first_second is None else after_cycle
         if self._recovery is not None:
-            self._recovery.run(controller, progress)
+            self._recovery.run(controller, after)
         else:
-            self.cell.run(controller, progress)
+            self.cell.run(controller, after)
 
     def resume(self) -> None:
         """Ask for motion after a loss; see `canprobe.cell.session.recovery`.

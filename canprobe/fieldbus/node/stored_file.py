@@ -6,14 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from canprobe.errors import CanprobeError, UsageError
+from canprobe.errors import CanprobeError, UsageError, check_schema
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 
-_SCHEMA = 1
+SCHEMA = 1
 
 
 def keep_in_file(node: SlaveNode, path: Path) -> None:
@@ -46,7 +46,7 @@ def _identity(node: SlaveNode) -> list[int]:
 
 def _write(node: SlaveNode, path: Path) -> None:
     content = {
-        "schema": _SCHEMA,
+        "schema": SCHEMA,
         "identity": _identity(node),
         "device": node.store.kept.hex(),
         **({} if node.store.node_id is None else {"node_id": node.store.node_id}),
@@ -62,6 +62,7 @@ def _write(node: SlaveNode, path: Path) -> None:
 def _read(node: SlaveNode, path: Path) -> None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+        check_schema(path, content["schema"], SCHEMA, "remove it, and let the node store again")
         identity, texts, device = content["identity"], content["values"], bytes.fromhex(content["device"])
         values = {_key(text): _value(plain) for text, plain in texts.items()}
         node_id = _node_id(content.get("node_id"))

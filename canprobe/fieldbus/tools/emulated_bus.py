@@ -29,6 +29,7 @@ from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.drive.from_eds import make_eds_node
+from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.serve import serve
 from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
@@ -49,6 +50,7 @@ class EmulatedBus(ABC):
 
     Attributes:
         faulty: the emulated nodes.
+        descriptions: what the EDS files say, by node id.
         log: path of the candump log, whose time is 0 when the bus opens.
     """
 
@@ -56,6 +58,7 @@ class EmulatedBus(ABC):
         self.channel, self.clock, self.log = channel, clock, log
         self.start_ns = clock.now_ns()
         self.faulty = FaultyNodes([])
+        self.descriptions: dict[int, Description] = {}
         self._stack = ExitStack()
         self._writer = self._stack.enter_context(CandumpWriter(log, channel, self.start_ns))
 
@@ -71,6 +74,7 @@ class EmulatedBus(ABC):
         """
         nodes = [FaultyNode(make_eds_node(load_eds(name, node_id), node_id)) for name, node_id in files]
         self.power_on(nodes)
+        self.descriptions |= {node_id: Description(load_eds(name, node_id)) for name, node_id in files}
         return nodes
 
     def power_on(self, nodes: Sequence[FaultyNode]) -> None:
@@ -156,6 +160,8 @@ class VirtualTimeBus(EmulatedBus):
 
 class RealTimeNetwork(canopen.Network):
     """A network of canopen-python in real time."""
+
+    NOTIFIER_CYCLE = 0.05  # s; `disconnect` waits for the end of one
 
     def pass_time(self, seconds: float) -> None:
         """Sleep; the network's own thread receives meanwhile."""

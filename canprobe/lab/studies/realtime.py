@@ -17,9 +17,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 
+from canprobe.cell.planning.traffic import LAST_LOOK
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
 from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
+from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
 from canprobe.lab.studies.cycle_times import CycleTimes, Times
 from canprobe.lab.studies.harness import CHANNEL, Column, Row, Say, StudyResult
 from canprobe.lab.studies.realtime_cases import (
@@ -55,6 +57,7 @@ COLUMNS = (
     Column("latency_p50_us", "SYNC→last TPDO p50 µs", ".0f"),
     Column("latency_p99_us", "p99", ".0f"),
     Column("processor_percent", "processor %", ".1f"),
+    Column("verdict", "link"),
     Column("ended", "ended"),
 )
 
@@ -105,8 +108,19 @@ def _row(m: Measured) -> Row:
         **_percentiles("compute", times.compute_ns),
         **_percentiles("latency", times.latency_ns),
         "processor_percent": None if times.processor_share is None else 100 * times.processor_share,
+        "verdict": str(_verdict(m).fitness),
         "ended": m.ended,
     }
+
+
+def _verdict(m: Measured) -> LinkVerdict:
+    """The verdict of `canprobe check` on the cycles of a case: SYNCs that are late, and answers that were missed."""
+    times = m.times
+    answered, rows = tuple(sorted(times.latency_ns.tolist())), (1,) * times.missed
+    answers = AnswerFigures(0, times.cycles, answered, 0, times.missed, rows)
+    wait_ns = round(LAST_LOOK * times.period_ns)
+    figures = LinkFigures(times.period_ns, sorted(times.lateness_ns.tolist()), wait_ns, (answers,))
+    return judge_link(figures, LinkLimits())
 
 
 def _percentiles(name: str, values_ns: Any) -> dict[str, float | None]:
@@ -139,6 +153,12 @@ def findings(measured: list[Measured]) -> list[str]:
             f"controller time p99 is {response:.0f} % of the period until the commands are out, {whole:.0f} % with the"
             " estimator's work behind them (goal 30 %)"
         )
+    idle, whole_link = _verdict(bare), _verdict(scan)
+    lines.append(
+        f"the lateness of that loop predicts {1e4 * idle.overruns.get(scan.rate_hz, 0.0):.1f} overruns in 10 000 cycles"
+        f" for the whole controller; by the rules of `canprobe check` the loop is {idle.fitness}, the controller"
+        f" {whole_link.fitness}"
+    )
     for mode in MODES:
         mine = [m for m in measured if m.case == "hold" and m.sensor == mode]
         held = [m.rate_hz for m in mine if not m.ended and per_10000(m.times) <= HELD_PER_10000]

@@ -189,6 +189,8 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "shapes": "surfaces of unknown shapes by the map, every estimator, local fits and Gaussian processes",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
+        "link": "whether a check of the link says what the next minute of the cell shows",
+        "recover": "whether a cell comes back from power cycles, resets, cuts and unplugged interfaces, drawn by seed",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
         "faults": "how the cell reacts to thousands of random faults of its nodes and their links",
     }

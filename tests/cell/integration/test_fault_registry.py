@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from injected import FREE_CYCLE, HOLD_CYCLE, Injected
+from judged import rules_raised
 
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.master.conditions import BY_KEY
@@ -25,3 +26,5 @@ def test_a_kind_trips_the_conditions_that_it_declares(name):
     text = f"node {node_id}: {name} seed=1" + (" for 20 ms" if name in PASSING else "")
     run = Injected(scene, at, lambda run: run.inject(text), until=110)
     assert set(run.session.cell.supervisor.first) == kind.conditions
+    begin_ns = run.injected_ns - run.session.record.origin_ns
+    assert rules_raised(run.session.plan, run.frames, charges_ns=[(begin_ns, run.frames[-1][2])]) == {}

@@ -7,6 +7,7 @@ import json
 import re
 
 import pytest
+from judged import rules_raised
 from undrawn import undrawn_run
 
 import canprobe
@@ -17,6 +18,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cli import main
 from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
@@ -56,6 +58,8 @@ def test_a_packaged_scene_sends_what_its_plan_lists_and_nothing_else(name, tmp_p
     assert measured.unlisted == {} and measured.missing == () and measured.error_frames == 0
     assert all(one.late == 0 for one in measured.classes)
     assert measured.load < measured.planned_worst
+    log = read_candump(tmp_path / "bus.log")
+    assert rules_raised(result.plan, ((can_id, data, t_ns) for t_ns, _, can_id, data in log)) == {}
 
 
 def test_the_summary_says_the_same(press):

@@ -70,6 +70,17 @@ def test_the_contacts_of_a_folder_make_the_same_map_again(scan, tmp_path):
     np.testing.assert_array_equal(again.nodes.rows, replayed.surface_map.nodes.rows)
 
 
+def test_answers_are_joined_with_earlier_passes_only_where_a_scene_asks(scan):
+    """Ground is known 40 mm, two memories, behind the contact; the weave crosses itself, and a loop takes 5.8 s."""
+    plain, _ = scan
+    scene = replace(plain.plan.scene, shape=replace(plain.plan.scene.shape, revisit=True))
+    asked = canprobe.run(scene, duration_s=7.0, bus="direct", files=False)
+    notes = [str(record.estimate.notes) for record in asked.estimates["recursive"]]
+    back = ["touched before" in note for note in notes]
+    assert sum(back) > 15 and not any(back[:35])
+    assert not any("touched before" in str(record.estimate.notes) for record in plain.estimates["recursive"])
+
+
 def test_without_a_shape_there_is_no_map(tmp_path):
     (tmp_path / "surface.npz").write_text("of an earlier run")
     result = undrawn_run(canprobe.load_scene("press"), duration_s=0.2, out=tmp_path, force=True)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from judged import rules_raised
 from makes import MAKES, changed, without, write_eds
 from scenes import change, reasons, with_joints
 
@@ -57,10 +58,14 @@ class Bench:
         self.bus = LockstepBus(VirtualClock(), "can0")
         self.world = make_world(self.plan, self.plan.node_ids, truth=False, homed=False)
         self.record = folder / "state" / "zeros.json"
-        self.frames, self.said = [], []
-        self.bus.recorder = lambda can_id, data, t_ns: self.frames.append((can_id, data))
+        self.heard, self.said = [], []
+        self.bus.recorder = lambda *frame: self.heard.append(frame)
         for node in self.world.nodes:
             self.bus.attach(FaultyNode(node, faults) if faults else around(node))
+
+    @property
+    def frames(self):
+        return [frame[:2] for frame in self.heard]
 
     def cell(self, *, to_home=False):
         return Cell(self.plan, self.bus.port(), RunOptions(say=self.said.append, to_home=to_home), zeros=self.record)
@@ -101,6 +106,7 @@ def test_a_homed_joint_is_where_the_cell_has_it_and_stays_known(tmp_path, method
     resets = {data for can_id, data in bench.frames if can_id == 0}
     assert {pack_nmt(NmtCommand.RESET_COMMUNICATION, 1)[1], pack_nmt(NmtCommand.RESET_NODE, 2)[1]} <= resets
     assert pack_nmt(NmtCommand.RESET_NODE, 1)[1] not in resets
+    assert rules_raised(bench.plan, bench.heard) == {}
 
 
 def test_the_index_pulse_behind_the_positive_switch(tmp_path):

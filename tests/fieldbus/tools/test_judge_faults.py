@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import struct
 
+import pytest
+
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.drive.from_eds import make_eds_node
@@ -103,3 +105,24 @@ def test_a_careful_master_answers_in_time_and_nothing_is_found():
         assert found == set(), name
         assert master.stopped and answer is not None
         assert answer.t_ns - 3 * S <= within_ms * MS, name
+
+
+@pytest.mark.parametrize(
+    ("fault", "rules"),
+    [
+        ("mute", {20}),
+        ("deaf", {20}),
+        ("mute at 2 s for 2 s", {46}),
+        ("heartbeat-off at 2 s for 2 s", {19}),
+        ("reboot at 2 s", {21}),
+        ("nmt command=2 at 2 s for 1 s", {42}),
+        ("drive-fault at 2 s", {15}),
+        ("emcy at 2 s for 1 s", {15}),
+        ("sdo-abort index=0x60C2", {26}),
+        ("mode-refused", {26}),
+    ],
+)
+def test_which_rules_a_fault_provokes(fault, rules):
+    """The table of docs/judge.md."""
+    found, _ = SineMaster([f"node 2: {fault}"], careful=False).run(5).judged()
+    assert found == rules

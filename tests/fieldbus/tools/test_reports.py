@@ -226,7 +226,7 @@ def test_a_baseline_shows_what_became_worse_better_new_and_gone():
     ("change", "message"),
     [
         (lambda _: [], "got other JSON"),
-        (lambda d: d | {"schema": 2}, "schema: got 2, this canprobe reads up to 1"),
+        (lambda d: d | {"schema": 2}, "of a newer canprobe: this one reads up to schema 1, got 2"),
         (lambda d: {name: value for name, value in d.items() if name != "rows"}, "'rows' is missing"),
         (lambda d: d | {"rows": [d["rows"][0] | {"verdict": "GOOD"}]}, "'GOOD' is not a valid Verdict"),
         (lambda d: d | {"title": 3}, "expected text, got 3"),

@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal
 
 from canprobe.cli import main
 from canprobe.lab.studies.harness import Column
+from canprobe.lab.studies.shapes import revisits
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Touched, fit_quadric, rbf, thin_plate
 from canprobe.lab.studies.shapes.methods import METHODS, ProcessSurface
 from canprobe.lab.studies.shapes.patches import LocalPatch, PatchSurface
@@ -215,6 +216,16 @@ def test_the_words_name_what_is_better():
     assert (apart["nll_over_map_low"], apart["nll_over_map_high"]) == (1.0, 1.0)
 
 
+def test_the_words_on_revisits_name_the_least_good(tmp_path):
+    row = {"shape": "a", "share": 0.4, "own_per_m": 1.0, "joined_per_m": 0.5, "own_coverage": 1.0}
+    rows = [row | {"joined_coverage": 0.9}, row | {"shape": "b", "joined_per_m": 2.0, "joined_coverage": 0.8}]
+    (said,) = revisits.findings([*rows, {"shape": "c", "share": 0.0, "own_per_m": None}])
+    assert "has 1.00 of its own error of K" in said and "better on 1, the least good is b: 1.00 and 2.00" in said
+    assert "100% and 85%" in said
+    revisits.draw(rows, tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_a_draw_is_repeated_and_like_no_other(tmp_path):
     assert len(drawn(7)) == len(TEST)
     for name, other in zip(drawn(7), drawn(8), strict=True):
@@ -236,6 +247,8 @@ def test_a_short_run_of_every_method(tmp_path, capsys):
     later = json.loads((tmp_path / "shapes_after.json").read_text())
     assert {row["method"] for row in later["rows"]} == {method.name for method in METHODS}
     assert {"accuracy_um_over_map", "nll_over_map_high"} <= set(document["rows"][1])
+    (back,) = json.loads((tmp_path / "shapes_revisits.json").read_text())["rows"]
+    assert (back["share"], back["own_per_m"]) == (0.0, None)  # 30 mm: it came back to nothing
     digest = hashlib.sha256((tmp_path / "contacts.npz").read_bytes()).hexdigest()
     assert document["facts"]["contacts"] == digest[:16]
     assert (tmp_path / "shapes.png").stat().st_size > 10_000

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from canprobe.errors import UsageError, regular_file
+from canprobe.errors import UsageError, check_schema, regular_file
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.tools.conform.frame_text import place_text
@@ -19,6 +19,8 @@ from canprobe.fieldbus.tools.conform.outcome import BenchFailure, Deviation
 from canprobe.fieldbus.tools.conform.permits import Place, WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
 
+SCHEMA = 1
+"""Version of the snapshot."""
 _KIND = "canprobe conform snapshot"
 _MAX_BYTES = 1 << 24
 _PDOS = range(0x1400, 0x1C00)
@@ -55,7 +57,7 @@ class Journal:
         """Note that an entry is about to be written; the snapshot is on disk when this returns."""
         if not self._saved and self.path is not None:
             entries = {place_text(*at): value.hex() for at, value in sorted(self.values.items())}
-            document = {"kind": _KIND, "identity": self.identity, "values": entries}
+            document = {"kind": _KIND, "schema": SCHEMA, "identity": self.identity, "values": entries}
             write_text(self.path, json.dumps(document, indent=1) + "\n")
             self._saved = True
         self.touched.add(place)
@@ -76,6 +78,7 @@ class Journal:
             document = json.loads(regular_file(path, _MAX_BYTES).read_text(encoding="utf-8"))
             if document["kind"] != _KIND:
                 raise ValueError("another kind of file")
+            check_schema(path, document.get("schema", 1), SCHEMA, "put the device back with the canprobe that wrote it")
             values = {
                 (int(name[:4], 16), int(name[6:], 16)): bytes.fromhex(text) for name, text in document["values"].items()
             }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -144,10 +144,10 @@ class MasterBench:
             replace(one, begin_ns=one.begin_ns - self._begin_ns, end_ns=one.end_ns - self._begin_ns) for one in found
         ]
 
-    def judged(self, nodes: Mapping[int, Description], bitrate: int) -> Judge:
+    def judged(self, nodes: Mapping[int, Description], bitrate: int, without: Collection[int] = ()) -> Judge:
         """The frames, judged."""
         spans = [(one.begin_ns, one.end_ns) for one in self.thrown()]
-        judge = Judge(nodes, served=True, bitrate=bitrate, charges_ns=spans)
+        judge = Judge(nodes, served=True, bitrate=bitrate, charges_ns=spans, without=without)
         for frame in self.record():
             judge.take(frame)
         judge.finish(self._last_ns - self._begin_ns)

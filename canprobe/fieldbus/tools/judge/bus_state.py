@@ -155,6 +155,7 @@ class BusState:
 
     def _sent_by(self, node: SeenNode, frame: BusFrame) -> Iterator[BusEvent]:
         node.seen = True
+        node.answers = node.answers or frame.can_id != HEARTBEAT_BASE + node.node_id or frame.data != b"\0"
         if frame.from_node is False:
             yield ForgedSeen(frame, node)
 
@@ -198,6 +199,7 @@ class BusState:
 
     def _requested(self, event: BusEvent) -> BusEvent:
         if isinstance(event, RequestSeen):
+            event.node.asked = True
             event.node.touch(event.place[0])
         return event
 
@@ -225,7 +227,7 @@ class BusState:
         yield from self._valued(node, values, frame, pdo, written=True)
 
     def _tpdo(self, frame: BusFrame, node: SeenNode, pdo: PdoView) -> Iterator[BusEvent]:
-        node.seen = True
+        node.seen = node.answers = True
         yield from self._valued(node, _unpacked(pdo, frame), frame, pdo, written=False)
 
     def _valued(

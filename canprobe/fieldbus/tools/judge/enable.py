@@ -164,6 +164,7 @@ class ModeNotConfirmed(Rule):
     expected = "6061h = 6060h seen before operation is enabled and before targets of the mode change"
     hint = "read 6061h until it has the mode; stop where it does not come"
     hears = (ControlSeen, TargetSeen)
+    answers = True
 
     def see(self, event: BusEvent) -> None:
         """Compare 6061h with 6060h."""
@@ -226,6 +227,7 @@ class ResetHeld(Rule):
     expected = "a rising edge of bit 7, then 6040h without it"
     hint = "send 0000h, 0080h, 0000h"
     hears = (ControlSeen,)
+    answers = True
     _LONGEST_NS = 500_000_000
 
     def begin(self) -> None:
@@ -254,6 +256,7 @@ class ResetsAgain(Rule):
     expected = "at most three fault resets in 10 s, and then a stop"
     hint = "leave the reset to a person, or stop after the third"
     hears = (ControlSeen,)
+    answers = True
     _WINDOW_NS = 10_000_000_000
 
     def begin(self) -> None:
@@ -283,6 +286,7 @@ class LeavesQuickStop(Rule):
     expected = "a drive that came into quick stop by itself is disabled, and enabled again on request only"
     hint = "answer quick stop active with 0000h"
     hears = (StatusSeen, ControlSeen)
+    answers = True
     _PATIENCE_NS = 50_000_000
 
     def begin(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
@@ -22,6 +22,7 @@ class Judge:
         served: whether the nodes are emulated ones that are served here.
         bitrate: bit rate, bit/s.
         charges_ns: begin and end of each fault that was thrown at the nodes.
+        without: numbers of rules that are left out.
 
     Attributes:
         bus: state of the bus.
@@ -36,10 +37,12 @@ class Judge:
         served: bool = False,
         bitrate: int = 1_000_000,
         charges_ns: Iterable[tuple[int, int]] = (),
+        without: Collection[int] = (),
     ) -> None:
         self.bus = BusState(nodes, served=served, bitrate=bitrate)
         charges = Charges(list(charges_ns))
-        self.rules: list[Rule] = [rule(self.bus, charges) for rule in RULES]
+        self.rules: list[Rule] = [rule(self.bus, charges) for rule in RULES if rule.number not in without]
+        self._left_out = [(f"{r.number:02} {r.name}", "left out on request") for r in RULES if r.number in without]
         self.frame_count = 0
         self._ears: dict[type[BusEvent], list[Callable[[BusEvent], None]]] = {}
         for rule in self.rules:
@@ -72,7 +75,8 @@ class Judge:
             facts: facts on bench and command.
             log: path of the recorded frames; None where they were not kept.
         """
-        report = Report("judge", title, dict(facts), [_row(rule) for rule in self.rules], list(NO_RULES), log=log)
+        report = Report("judge", title, dict(facts), [_row(rule) for rule in self.rules], log=log)
+        report.left_out += [*NO_RULES, *self._left_out]
         for rule in self.rules:
             if isinstance(rule, IrregularSync) and rule.intervals_ns:
                 report.distributions["SYNC interval"] = tuple(ns * 1e-6 for ns in rule.intervals_ns)
@@ -103,9 +107,17 @@ def _row(rule: Rule) -> ReportRow:
     )
 
 
-def judge_frames(frames: Iterable[BusFrame], nodes: Mapping[int, Description], **options: bool | int) -> Judge:
-    """Judge frames that were recorded; options are those of `Judge`."""
-    judge = Judge(nodes, **options)  # type: ignore[arg-type]
+def judge_frames(
+    frames: Iterable[BusFrame],
+    nodes: Mapping[int, Description],
+    *,
+    served: bool = False,
+    bitrate: int = 1_000_000,
+    charges_ns: Iterable[tuple[int, int]] = (),
+    without: Collection[int] = (),
+) -> Judge:
+    """Judge frames that were recorded; the arguments are those of `Judge`."""
+    judge = Judge(nodes, served=served, bitrate=bitrate, charges_ns=charges_ns, without=without)
     for frame in frames:
         judge.take(frame)
     judge.finish()

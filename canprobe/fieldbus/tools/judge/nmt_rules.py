@@ -30,6 +30,7 @@ class WaitsForBootUp(Rule):
     expected = "a node that is there already is asked for 1000h, or reset"
     hint = "do not wait for a boot-up that came before the master"
     hears = (OtherHeartbeatSeen, SyncSeen)
+    answers = True
 
     def begin(self) -> None:
         """Remember nothing yet."""
@@ -45,10 +46,11 @@ class WaitsForBootUp(Rule):
         if first is None or self.bus.now_ns - first.t_ns < _PATIENCE_NS:
             return
         for node in self.bus.nodes.values():
-            running = node.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL) and node.heartbeats_ns
-            if running or node.booted:
-                self.looked += 1
-            if (running or node.booted) and not node.addressed:
+            waits = node.nmt in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL)  # else somebody has started it before
+            if not waits:
+                continue
+            self.looked += 1
+            if not node.addressed:
                 seconds = (self.bus.now_ns - first.t_ns) * 1e-9
                 self.blame(f"the node runs, and in {seconds:.1f} s nothing was sent to it", first, node_id=node.node_id)
 

@@ -243,10 +243,10 @@ class MuteIgnored(LossIgnored):
 
 
 class MissingFromStart(Rule):
-    """A node has never been heard, and others are enabled."""
+    """A node has never been heard, or never answered, and others are enabled."""
 
     number, name, group, severity = 20, "enabled without all nodes", "reactions", Severity.WRONG
-    expected = "no axis is enabled before all nodes have been heard"
+    expected = "no axis is enabled before all nodes have been heard, and have answered"
     hint = "wait for each node, and stop where one does not answer"
     hears = (StatusSeen,)
     answers = True
@@ -267,9 +267,11 @@ class MissingFromStart(Rule):
             return
         for node in self.bus.nodes.values():
             self.looked += 1
-            if not node.seen and node.node_id not in self._blamed:
+            silent = not node.seen or (node.asked and not node.answers)
+            if silent and node.node_id not in self._blamed:
                 self._blamed.add(node.node_id)
-                what = f"node {event.node.node_id} is enabled, and node {node.node_id} was never heard"
+                heard = "has never answered" if node.seen else "was never heard"
+                what = f"node {event.node.node_id} is enabled, and node {node.node_id} {heard}"
                 self.blame(what, self._since, event.frame, node_id=node.node_id)
 
 

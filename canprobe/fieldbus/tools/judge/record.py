@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from heapq import heappop, heappush
 from pathlib import Path
 
 from canprobe.errors import UsageError
@@ -11,9 +12,14 @@ from canprobe.fieldbus.bus.port import ERR_FLAG
 from canprobe.fieldbus.protocol.frames import EFF_FLAG
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 
+_OUT_OF_ORDER = 1000
+"""Lines by which a frame may stand too late in a log."""
+
 
 def read_record(path: Path, channel: str | None = None) -> Iterator[BusFrame]:
-    """Read the frames of one channel of a candump log; error frames are left out.
+    """Read the frames of one channel of a candump log in the order of their times; error frames are left out.
+
+    A log that was written by a master has the frames that it sent before those that it read later.
 
     Args:
         path: path of the log.
@@ -22,6 +28,16 @@ def read_record(path: Path, channel: str | None = None) -> Iterator[BusFrame]:
     Raises:
         UsageError: the file is no log, it has several channels and none is named, or not the one that is named.
     """
+    waiting: list[tuple[int, int, BusFrame]] = []
+    for number, frame in enumerate(_frames(path, channel)):
+        heappush(waiting, (frame.t_ns, number, frame))
+        if len(waiting) > _OUT_OF_ORDER:
+            yield heappop(waiting)[2]
+    while waiting:
+        yield heappop(waiting)[2]
+
+
+def _frames(path: Path, channel: str | None) -> Iterator[BusFrame]:
     seen: set[str] = set()
     for t_ns, on, can_id, data in read_candump(path):
         seen.add(on)

@@ -117,7 +117,8 @@ class Rule:
             self.findings.append(RuleFinding(t_ns, node_id, what, tuple(shown)))
 
     def in_a_row(self, key: Hashable, bad: bool, wanted: int = 2) -> bool:
-        """Count what is bad in a row; whether it has just become `wanted`."""
+        """Count what is bad in a row; whether it has just become `wanted`. While a fault excuses it nothing counts."""
         self.looked += 1
-        self._runs[key] = self._runs[key] + 1 if bad else 0
+        excused = bad and not self.answers and self._charges.cover(self.bus.now_ns)
+        self._runs[key] = self._runs[key] + 1 if bad and not excused else 0
         return self._runs[key] == wanted

@@ -19,6 +19,7 @@ class AbortPassedOver(Rule):
     expected = "an aborted write is repeated, the value is read back, or the axis is not enabled"
     hint = "check the answer to each write"
     hears = (AbortSeen, AnswerSeen, ControlSeen)
+    answers = True
 
     def begin(self) -> None:
         """Remember nothing yet."""
@@ -76,6 +77,7 @@ class TimeoutTooShort(Rule):
     expected = "a time-out above the time of the node's answers, and a new timer for each request"
     hint = "wait for at least 500 ms, and stop the timer with the answer"
     hears = (AbortSeen, AnswerSeen)
+    answers = True
     _STALE_NS = 10_000_000
 
     def begin(self) -> None:

@@ -31,6 +31,8 @@ _SIGNED = frozenset({MODE, MODE_DISPLAY, POSITION, VELOCITY, 0x6077, 0x60C2}) | 
 """Objects that are signed where no EDS says it. 60C2h:02 is, too."""
 _SPEED_LIMIT, _SPEED_UNIT, _SOFT_LIMITS, _RANGE = 0x607F, 0x60A9, 0x607D, 0x607B
 _UNLIMITED = 0x7FFFFFFF
+_NOISE = 20
+"""Least tolerance of a position, user units: an axis that is held is never quite still."""
 _FRESH_NS = 300_000_000
 """Age up to which positions show whether an axis moves."""
 _MOVING_SHARE = 0.01
@@ -90,6 +92,8 @@ class SeenNode:
         nmt: NMT state as last seen, or commanded; None before.
         booted: whether a boot-up was seen.
         seen: whether the node has sent anything.
+        answers: whether it has sent anything but a boot-up.
+        asked: whether it got an SDO request.
         started_ns: time of the last NMT start; None while it is not started.
         syncs: number of SYNCs since then.
         heartbeats_ns: times of the last heartbeats.
@@ -106,7 +110,7 @@ class SeenNode:
         self._served = served
         self.nmt: NmtState | None = None
         self.nmt_ns = 0
-        self.booted = self.seen = self.addressed = self.configured = self.stored = False
+        self.booted = self.seen = self.answers = self.asked = self.addressed = self.configured = self.stored = False
         self.started_ns: int | None = None
         self.syncs = 0
         self.heartbeats_ns: deque[int] = deque(maxlen=8)
@@ -261,7 +265,7 @@ class SeenNode:
     def tolerance(self, period_ns: int) -> float:
         """Difference of positions that is not a jump: the way of a period, or 0.1 % of the range."""
         limit = self.step_limit(period_ns) if period_ns else None
-        return limit if limit is not None else 0.001 * self._range()
+        return max(limit, _NOISE) if limit is not None else 0.001 * self._range()
 
     def soft_limits(self) -> tuple[int, int] | None:
         """Limits of positions (607Dh); None where there are none."""

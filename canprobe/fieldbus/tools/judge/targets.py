@@ -164,6 +164,7 @@ class FollowingErrorIgnored(Rule):
     expected = "targets stop when bit 13 of 6041h is set for more than three cycles"
     hint = "hold the target, or stop the axis, when bit 13 is set"
     hears = (StatusSeen, TargetSeen)
+    answers = True
 
     def begin(self) -> None:
         """Remember nothing yet."""

@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from canprobe.errors import UsageError, regular_file
+from canprobe.errors import UsageError, check_schema, regular_file
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.tools.reports.report import SEVERITIES, Report, ReportRow, Verdict
 
@@ -45,13 +45,9 @@ def read_json(path: Path) -> Report:
         raise UsageError(f"{path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path}: expected the JSON report of canprobe conform or judge: {error}") from error
-    if not isinstance(document, dict) or not isinstance(document.get("schema"), int) or "tool" not in document:
+    if not isinstance(document, dict) or "tool" not in document:
         raise UsageError(f"{path}: expected the JSON report of canprobe conform or judge, got other JSON")
-    if not 1 <= document["schema"] <= SCHEMA:
-        raise UsageError(
-            f"{path}: schema: got {document['schema']}, this canprobe reads up to {SCHEMA};"
-            " read it with the canprobe that wrote it, or a newer one"
-        )
+    check_schema(path, document.get("schema"), SCHEMA, "make the report anew with --json")
     try:
         return _parse_report(document)
     except (KeyError, TypeError, ValueError) as error:

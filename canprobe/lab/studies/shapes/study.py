@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from canprobe.cell.results.picture import GREEN, INK, METHOD_COLOURS, PINK, SKY, legend, log_scale, picture
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.shapes import revisits
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts, read_columns, read_contacts, write_contacts
 from canprobe.lab.studies.shapes.methods import METHODS, FittedSurface, Method
 from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, drawn, scan
@@ -126,7 +127,10 @@ def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
     facts = measuring_facts(quick, len(test), _FITS) | {"contacts": digest[:16], "shapes": ", ".join(test)}
     words = findings(rows, each, timed)
     after = StudyResult("shapes_after", AFTER, known, AFTER_FINDINGS, facts, partial(draw_after, known))
-    return StudyResult("shapes", COLUMNS, rows, words, facts, partial(draw_shapes, rows), [after])
+    back = sweep.map(revisits.measure, [revisits.Revisit(name, str(path), digest) for name in test], model=_FITS)
+    words_back, draw_back = revisits.findings(back), partial(revisits.draw, back)
+    again = StudyResult("shapes_revisits", revisits.COLUMNS, back, words_back, facts, draw_back)
+    return StudyResult("shapes", COLUMNS, rows, words, facts, partial(draw_shapes, rows), [after, again])
 
 
 def surface_of(fit: MethodFit, contacts: ShapeContacts) -> tuple[FittedSurface, Mesh]:

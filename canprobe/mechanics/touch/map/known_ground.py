@@ -42,6 +42,7 @@ MAX_WAITING = 10_000
 """Most contacts that wait to become ground: a contact at rest adds none beyond 50 s of an array of 200 Hz."""
 MAX_EXCESS = 1.0
 """Largest χ² per degree of freedom above 1 of the contacts of a map that is believed."""
+JOINED_NOTE = "of the curvature from ground that was touched before"
 MIN_NODES = 4
 """Least number of nodes of a quartic."""
 _OUTWARD, _MIRRORED = np.array([1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0])
@@ -157,7 +158,7 @@ def joined(answer: SurfaceEstimate, known: KnownCurvature) -> SurfaceEstimate:
         samples=answer.samples,
         method=answer.method,
         prior=answer.prior,
-        notes=(*answer.notes, f"{100.0 * share:.0f} % of the curvature from ground that was touched before"),
+        notes=(*answer.notes, f"{100.0 * share:.0f} % {JOINED_NOTE}"),
         evidence=answer.evidence,
         stiffness=answer.stiffness,
     )

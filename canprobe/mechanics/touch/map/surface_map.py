@@ -139,8 +139,13 @@ class SurfaceMap:
             self._solved = None
 
     def add_samples(self, samples: Sequence[ContactSample]) -> None:
-        """Take contacts of the pad, in the order of time."""
-        assert self.pad is not None
+        """Take contacts of the pad, in the order of time.
+
+        Raises:
+            UsageError: the map has no pad.
+        """
+        if self.pad is None:
+            raise UsageError("samples: expected a map of a pad, got one of points; use add(points, normals)")
         for sample in samples[: 1 if self._evidence.touch is None else 0]:
             if sample.slope is not None:
                 self._evidence.touch = sample.slope, sample.p_base

@@ -3,7 +3,8 @@
 - **Blur.** Each image shows how far the cover blurs it (`blur_fit`), whatever is touched.
 - **Stiffness.** The slope of the touch, the images' moments and the motion show the stiffness of the layer, and
   estimators know it as `SurfaceEstimate.stiffness`. Another layer and other gains change it alike, as images alone do
-  not show newtons. So does an object that gives way, which the message says.
+  not show newtons. So does an object or an arm that gives way, which the
+  message says.
 - **Disagreement.** On a surface that is known, the slope of the touch gives a stiffness, and so does the bend of the
   pressure in an image. Another pitch makes one of them smaller and the other larger, each by its square.
 
@@ -39,15 +40,21 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.15
 """Time between two images that are fitted, s: a fit takes a millisecond."""
+MAX_LIGHTNESS = 0.12
+"""Largest level over peak of an image that is fitted: the rim of a light touch is lost below the threshold."""
+MIN_BEND_SHARE = 0.8
+"""Least mean curvature of probe and object over the probe's: errors of curvature are large against that of a hollow."""
+TOUCH_ANSWERS = 10
+"""Number of the first answers, near the touch, whose curvature the slope of the touch belongs to."""
 MIN_TRIES, MAX_TRIES = 20, 64
 """Number of images after which something is said, so that it holds all signs, and at which the check ends."""
 MIN_IMAGES, MIN_ANSWERS = 16, 40
 """Number of images with a fit from which on blur and disagreement are judged, and of answers, for the stiffness."""
 MAX_RATIO = 1.22
 """Ratio of blur or stiffness to the calibration's, up or down, beyond which it is another array's."""
-MAX_DISAGREEMENT, DISAGREEMENT_SIGMAS = 0.3, 4.0
-"""Difference of the logarithms of two stiffnesses of one layer, and number of standard deviations of the touch's,
-beyond both of which the calibration is another array's."""
+MAX_DISAGREEMENT, MAX_TOUCH_SIGMA = 0.3, 0.08
+"""Difference of the logarithms of two stiffnesses of one layer beyond which the calibration is another array's, and
+largest standard deviation of the touch's at which they are compared: a light touch shows it to 30 % only."""
 
 
 class CalibrationCheck:
@@ -68,11 +75,10 @@ class CalibrationCheck:
         self._by_answers: list[float] = []
         self._by_images: list[float] = []
         self._by_touch: list[float] = []
-        self._touch_sigma = math.inf
         self._curvature: float | None = None
         self._tries = 0
         self._next_s = -math.inf
-        self._waiting: tuple[NDArray[np.uint8], Sequence[int]] | None = None
+        self._waiting: tuple[NDArray[np.uint8], Sequence[int], Patch] | None = None
 
     @classmethod
     def of(cls, calibration: ArrayCalibration, pad: Pad, *, images: bool) -> CalibrationCheck | None:
@@ -93,17 +99,18 @@ class CalibrationCheck:
         """
         if t_s < self._next_s or self._tries >= MAX_TRIES:
             return
-        if patch.cut_by_pad or patch.dead or patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa:
-            return
         self._next_s = t_s + LOOK_S
-        self._waiting = image, window
+        self._waiting = image, window, patch
 
     def work(self) -> bool:
         """Fit the image that waits; whether there was one, so that there may be a `finding`."""
         if self._waiting is None:
             return False
-        (image, window), self._waiting = self._waiting, None
+        (image, window, patch), self._waiting = self._waiting, None
         self._tries += 1
+        bent = patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa
+        if bent or patch.cut_by_pad or patch.dead or self._pad.lightness(patch.peak_pa) > MAX_LIGHTNESS:
+            return True
         found = fit_blur(image, window, blur=self._blur, crosstalk=self._crosstalk, gains=self._gains)
         if found is not None:
             self._blurs.append(math.log(found.blur / self._blur))
@@ -119,19 +126,20 @@ class CalibrationCheck:
             answer: answer at the last contact.
             slope: slope of the root of the force over the push; None where the touch showed none.
         """
-        if self._tries >= MAX_TRIES:
+        radius, kappa, self._curvature = self._pad.radius_m, answer.kappa, None
+        if self._tries >= MAX_TRIES or not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
             return
+        curvature = 0.5 / radius + 0.25 * float(kappa[0] + kappa[1])
+        if curvature < MIN_BEND_SHARE * 0.5 / radius:
+            return
+        self._curvature = curvature
         if answer.stiffness is not None:
             self._by_answers.append(math.log(answer.stiffness / self._stiffness))
-        radius, kappa = self._pad.radius_m, answer.kappa
-        if not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
-            self._curvature = None
+        if slope is None or len(self._by_touch) >= TOUCH_ANSWERS:
             return
-        self._curvature = 0.5 / radius + 0.25 * float(kappa[0] + kappa[1])
-        if slope is not None and len(self._by_touch) < MIN_ANSWERS:
+        if 2.0 * slope.sigma < MAX_TOUCH_SIGMA * slope.value:
             by_touch = stiffness_from_slope(slope.value, radius, kappa)
             self._by_touch.append(math.log(by_touch / self._stiffness))
-            self._touch_sigma = 2.0 * slope.sigma / slope.value
 
     @property
     def blur_off(self) -> float:
@@ -140,16 +148,21 @@ class CalibrationCheck:
 
     @property
     def stiffness_off(self) -> float:
-        """Logarithm of the stiffness over the calibration's; 0 before it is judged, and within the limit."""
-        return _beyond(_median(self._by_answers, MIN_ANSWERS), math.log(MAX_RATIO))
+        """Logarithm of the stiffness over the calibration's; 0 before it is judged, and within the limit.
+
+        Where the estimator gives no stiffness, touch and images must both show it: the nearer one counts.
+        """
+        off = _median(self._by_answers, MIN_ANSWERS)
+        if len(self._by_answers) < MIN_ANSWERS:
+            off = min(_median(self._by_touch, TOUCH_ANSWERS), _median(self._by_images, MIN_IMAGES), key=abs)
+        return _beyond(off, math.log(MAX_RATIO))
 
     @property
     def disagreement(self) -> float:
         """Logarithm of the stiffness by images over that by the touch; 0 as for the others."""
-        if len(self._by_touch) < MIN_ANSWERS or len(self._by_images) < MIN_IMAGES:
+        if len(self._by_touch) < TOUCH_ANSWERS or len(self._by_images) < MIN_IMAGES:
             return 0.0
-        limit = max(MAX_DISAGREEMENT, DISAGREEMENT_SIGMAS * self._touch_sigma)
-        return _beyond(median(self._by_images) - median(self._by_touch), limit)
+        return _beyond(median(self._by_images) - median(self._by_touch), MAX_DISAGREEMENT)
 
     @property
     def finding(self) -> str | None:
@@ -168,7 +181,8 @@ class CalibrationCheck:
             found.append(f"its images show a layer of {shown:.3g} N/m³ and its touch one of {by_touch:.3g}")
         if not found:
             return None
-        soft = "; or the object gives way" if len(found) == 1 and self.stiffness_off < 0.0 else ""
+        softer = (self.stiffness_off < 0.0 or self.disagreement > 0.0) and not self.blur_off
+        soft = "; or the object or the arm gives way" if softer else ""
         return f"the array is not as its calibration says: {', and '.join(found)}{soft}"
 
     @property

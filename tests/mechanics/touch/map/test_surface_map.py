@@ -8,7 +8,7 @@ import pytest
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample, Slope, indentation_from_force
-from canprobe.mechanics.touch.map import nodes
+from canprobe.mechanics.touch.map import discs, local_fits, nodes, surface_map
 from canprobe.mechanics.touch.map.fit import fit_map
 from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.noise import PAD_NOISE, MapNoise
@@ -174,6 +174,22 @@ def test_contacts_one_by_one_are_those_at_once():
         slowly.add(one, way)
     np.testing.assert_allclose(slowly.nodes.rows, at_once.nodes.rows, atol=1e-12)
     np.testing.assert_allclose(slowly.distance(p[::50]), at_once.distance(p[::50]), atol=1e-9)
+
+
+def test_a_map_in_parts_is_the_map_at_once(monkeypatch):
+    """Large maps are solved and asked in parts; the common errors are of all of them."""
+    p, n = touched("saddle", RASTER)
+
+    def answers():
+        found = SurfaceMap(PadLayer(0.04, 1.2e8), PAD_NOISE)
+        found.add(p, n, np.full(len(p), 2.0))
+        return [*found.closest(p[::50]), found.curvature(p[::50]).covariance, found.common.mean, len(found.normals)]
+
+    at_once = answers()
+    for module, name in ((local_fits, "ROWS_AT_ONCE"), (discs, "DISCS_AT_ONCE"), (surface_map, "PLACES_AT_ONCE")):
+        monkeypatch.setattr(module, name, 7)
+    for one, other in zip(answers(), at_once, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_ground_that_is_scanned_again_adds_weight_and_hardly_any_memory():

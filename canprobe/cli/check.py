@@ -1,0 +1,48 @@
+"""Judge link and machine of a cell before anything moves: fit, marginal or unfit for the rate of its plan, and why.
+
+The cell is configured as for a run, cycles with its drives disabled, and every node is left as it was found. Nothing is
+sent beside another master, nor to a drive under power.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from canprobe.cli.argument_types import seconds
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import scene_of
+
+HELP = "judge link and machine before motion"
+EXAMPLE = """\
+exit status: 0 fit, 1 marginal or unfit, 3 no node or no interface
+
+examples:
+  canprobe check free --bus socketcan --channel can0
+  canprobe check cell.toml --bus socketcan --channel can0 --seconds 30 --realtime
+  canprobe check free --json
+"""
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
+    add_scene(parser)
+    add_options(parser, *BUS, "--realtime", "--patient")
+    parser.add_argument("--seconds", metavar="S", type=seconds, default=10.0, help="length of the measurement [10]")
+    add_options(parser, "--json")
+    add_verbosity(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the report; the status is the verdict."""
+    scene = scene_of(args)
+
+    from canprobe import api
+    from canprobe.cli.output import print_json
+
+    report = api.check(scene, seconds=args.seconds, say=args.report.say)
+    if args.json:
+        print_json(report.as_document())
+    else:
+        print(report.text())
+    return 0 if report.fit else 1

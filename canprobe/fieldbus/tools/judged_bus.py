@@ -1,0 +1,48 @@
+"""The master of a test, judged by the log of the test's bus."""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.tools.emulated_bus import EmulatedBus
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS
+from canprobe.fieldbus.tools.judge import Judge, judge_frames, read_record
+from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
+
+
+class JudgedBus:
+    """Judges the master on the bus of a test: rules on what it sent to the nodes that came from EDS files.
+
+    Args:
+        bus: the bus.
+        bitrate: bit rate, bit/s.
+    """
+
+    def __init__(self, bus: EmulatedBus, bitrate: int) -> None:
+        self._bus, self._bitrate = bus, bitrate
+        self._allowed: set[str] = set()
+
+    def allow(self, *rules: int) -> None:
+        """Let findings of these rules pass; `canprobe judge --list` has the numbers."""
+        self._allowed |= {f"{rule:02}" for rule in rules}
+
+    def report(self) -> Report:
+        """What is to be said of the master until now; faults that were thrown excuse what follows them."""
+        self._bus.flush()
+        frames = read_record(self._bus.log, self._bus.channel)
+        judge: Judge = judge_frames(
+            frames, self._bus.descriptions, bitrate=self._bitrate, charges_ns=self._charges_ns()
+        )
+        return judge.report("the master", {"bit rate": f"{self._bitrate} bit/s"}, log=str(self._bus.log))
+
+    def findings(self) -> list[ReportRow]:
+        """Rules that found something and are not allowed."""
+        rows = self.report().rows
+        return [row for row in rows if row.verdict is Verdict.FAIL and row.name[:2] not in self._allowed]
+
+    def _charges_ns(self) -> list[tuple[int, int]]:
+        """Begin and end of each fault, on the clock of the log."""
+        spans: dict[int, tuple[int, int]] = {}
+        for node in self._bus.faulty.nodes:
+            for t_ns, word, fault in node.history:
+                now_ns = t_ns - self._bus.start_ns
+                spans[id(fault)] = (now_ns, FOREVER_NS) if word == "begins" else (spans[id(fault)][0], now_ns)
+        return list(spans.values())

@@ -1,0 +1,71 @@
+"""What the machine says about itself: kernel, governor, real-time rights, other load, timer slack, driver and queue.
+
+A value that the machine does not give is `NOT_AVAILABLE`: a guest has no governor, a container hides files of /sys.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+from pathlib import Path
+
+from canprobe.fieldbus.bus.clock import Clock
+
+NOT_AVAILABLE = "not available"
+
+
+def machine_facts(channel: str | None = None) -> dict[str, str]:
+    """Facts of this machine, and of the driver of an interface.
+
+    Args:
+        channel: SocketCAN interface; None leaves its facts out.
+    """
+    facts = {
+        "kernel": f"{os.uname().release}, {'PREEMPT_RT' if _read('/sys/kernel/realtime') == '1' else _preemption()}",
+        "processors": str(len(os.sched_getaffinity(0))),
+        "governor": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"),
+        "frequency_khz": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_cur_freq"),
+        "load": _read("/proc/loadavg").split(" ")[0],
+        "timer_slack_ns": _read("/proc/self/timerslack_ns"),
+        "realtime_priority": _limit("RLIMIT_RTPRIO"),
+        "locked_memory": _limit("RLIMIT_MEMLOCK"),
+    }
+    if channel is not None:
+        driver = Path(f"/sys/class/net/{channel}/device/driver")
+        facts["driver"] = driver.resolve().name if driver.exists() else NOT_AVAILABLE
+        facts["transmit_queue"] = _read(f"/sys/class/net/{channel}/tx_queue_len")
+    return facts
+
+
+def wake_lateness(clock: Clock, period_ns: int, cycles: int) -> list[int]:
+    """Lateness of a loop that does nothing but wake at its deadlines, ascending, ns: the machine's own."""
+    deadline_ns, lateness = clock.now_ns() + period_ns, list[int]()
+    for _ in range(cycles):
+        clock.sleep_until_ns(deadline_ns)
+        late_ns = clock.now_ns() - deadline_ns
+        lateness.append(late_ns)
+        deadline_ns += (late_ns // period_ns + 1) * period_ns
+    return sorted(lateness)
+
+
+def _preemption() -> str:
+    version = os.uname().version
+    return next((word for word in ("PREEMPT_DYNAMIC", "PREEMPT") if word in version), "no PREEMPT_RT")
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="ascii", errors="replace").strip() or NOT_AVAILABLE
+    except OSError:
+        return NOT_AVAILABLE
+
+
+def _limit(name: str) -> str:
+    """Soft limit of a resource: for real time, the highest priority that may be asked for; root may take any."""
+    number = getattr(resource, name, None)
+    if number is None:
+        return NOT_AVAILABLE
+    if os.geteuid() == 0:
+        return "any, as root"
+    soft = resource.getrlimit(number)[0]
+    return "unlimited" if soft == resource.RLIM_INFINITY else str(soft)

@@ -1,0 +1,252 @@
+"""Links that are constructed: a bus in virtual time whose port delays, scatters, loses or queues, whose machine wakes
+late, whose bus others use, or whose nodes answer late.
+
+Each is drawn from a seed: kind, rate of the cycle, and how bad, from not felt to hopeless.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from random import Random
+from typing import Any
+
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.session.session import Session
+from canprobe.fieldbus.bus.clock import Clock
+from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCounters, TimedFrame
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.protocol.frames import Frame
+
+FRAME_NS = 130_000
+"""Time of a frame of eight bytes at 1 Mbit/s."""
+RATES_HZ = (100, 200, 400)
+LOUD_ID = 0x120
+"""Identifier of the frames of others: it wins against every PDO."""
+RANGES = {
+    "delay": (0.05, 1.0),
+    "jitter": (0.005, 0.3),
+    "loss": (1e-5, 0.02),
+    "load": (0.03, 0.6),
+    "node": (0.05, 1.0),
+    "queue": (0.02, 1.0),
+    "machine": (0.1, 3.0),
+}
+"""How bad a set-up may be: delays, scatter and sleeps in periods of the cycle; loss and load as shares."""
+KINDS = ("clean", *RANGES)
+
+
+@dataclass(frozen=True, slots=True)
+class SetUp:
+    """One constructed link.
+
+    Attributes:
+        seed: seed that all of it follows from.
+        kind: what is wrong with it; also the cause that a check should name.
+        rate_hz: rate of the cycle.
+        size: how bad it is, as in `RANGES`.
+        share: share of the sleeps that end late, of a late machine.
+        room: frames that its transmit queue holds; of a lossy link one more than the periods that a loss lasts.
+        node_id: the node that answers late.
+    """
+
+    seed: int
+    kind: str
+    rate_hz: int
+    size: float
+    share: float
+    room: int
+    node_id: int
+
+
+def draw_setup(seed: int) -> SetUp:
+    """The set-up of a seed."""
+    rng = Random(seed)
+    kind = rng.choice(KINDS)
+    low, high = RANGES.get(kind, (1.0, 1.0))
+    size = math.exp(rng.uniform(math.log(low), math.log(high)))
+    share = math.exp(rng.uniform(math.log(1e-3), math.log(0.3)))
+    return SetUp(seed, kind, rng.choice(RATES_HZ), size, share, rng.randint(1, 8), rng.randint(1, 6))
+
+
+def scene_of(setup: SetUp) -> Scene:
+    """The scene `free` at the rate of a set-up, on a bus with its bit rate."""
+    return load_scene("free", {"cycle.rate_hz": setup.rate_hz, "bus.timed": True, "scene.figures": False})
+
+
+def construct(session: Session, setup: SetUp, part: int) -> None:
+    """Make a session's link that of a set-up, before the session is entered.
+
+    Args:
+        session: session in lockstep.
+        setup: the set-up.
+        part: number of the session among those of the set-up: each has other random numbers.
+    """
+    period_ns = round(1e9 / setup.rate_hz)
+    if setup.kind == "node":
+        faulty = session.world.make_faulty()
+        faulty.inject(f"node {setup.node_id}: delay ms={setup.size * period_ns * 1e-6:.6f}", 0)
+
+    def around(port: Port) -> Port:
+        if setup.kind == "load":
+            assert session.lockstep is not None
+            session.lockstep.attach(Loud(round(FRAME_NS / setup.size)))
+        return DisturbedPort(port, setup, Random(setup.seed * 1000 + part))
+
+    session.around = around
+
+
+class Loud(Participant):
+    """Sends a frame of eight bytes again and again.
+
+    Args:
+        period_ns: time from one to the next.
+    """
+
+    name = "somebody else"
+    listens: Collection[int] = ()
+    next_deadline_ns: int | None = 0
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        """Send one frame."""
+        self.next_deadline_ns = t_ns + self._period_ns
+        return [(LOUD_ID, bytes(8))]
+
+
+@dataclass(slots=True)
+class LateClock:
+    """A clock whose sleeps end late now and then.
+
+    Attributes:
+        clock: the clock behind it.
+        rng: generator of the lateness.
+        share: share of the sleeps that end late.
+        mean_ns: their mean lateness.
+    """
+
+    clock: Clock
+    rng: Random
+    share: float
+    mean_ns: float
+
+    def now_ns(self) -> int:
+        """Present time, ns."""
+        return self.clock.now_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep, and oversleep."""
+        if t_ns > self.clock.now_ns():
+            self.clock.sleep_until_ns(t_ns)
+            if self.rng.random() < self.share:
+                self.clock.sleep_until_ns(t_ns + round(self.rng.expovariate(1.0 / self.mean_ns)))
+
+
+@dataclass(slots=True, eq=False)
+class _Transit:
+    """Frames on their way to the reader: (time of arrival, number, frame)."""
+
+    heap: list[tuple[int, int, Frame]] = field(default_factory=list)
+    number: int = 0
+    last_ns: int = 0
+
+
+class DisturbedPort(PlainPort):
+    """A port that delays, scatters and loses frames, with a short transmit queue or a late clock.
+
+    Args:
+        port: port of the virtual bus.
+        setup: what is wrong.
+        rng: generator of its chances.
+    """
+
+    stamps_arrival = True
+
+    def __init__(self, port: Port, setup: SetUp, rng: Random) -> None:
+        self._port, self._setup, self._rng = port, setup, rng
+        self._period_ns = round(1e9 / setup.rate_hz)
+        self.channel = port.channel
+        late = setup.kind == "machine"
+        mean_ns = setup.size * self._period_ns if late else 1.0
+        self.clock: Clock = LateClock(port.clock, rng, setup.share if late else 0.0, mean_ns)
+        self._transit = _Transit()
+        self._sent_ns = self._lost_until_ns = 0
+
+    @property
+    def counters(self) -> PortCounters:
+        """Counters of the port."""
+        return self._port.counters
+
+    @property
+    def state(self) -> ControllerState:
+        """State of the port's controller."""
+        return self._port.state
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send frames, as far as they are not lost; a full queue is waited for."""
+        kept = [frame for frame in frames if not self._is_lost()]
+        if self._setup.kind != "queue":
+            self._port.send_batch(kept, t_ns)
+            return
+        for frame in kept:
+            while self._sent_ns - self.clock.now_ns() > self._setup.room * FRAME_NS:
+                self.counters.transmit_full += 1
+                self.clock.sleep_until_ns(self.clock.now_ns() + round(self._setup.size * self._period_ns))
+            self._sent_ns = max(self._sent_ns, self.clock.now_ns()) + FRAME_NS
+            self._port.send_batch([frame])
+
+    def drain(self) -> list[TimedFrame]:
+        """Return the frames that have arrived."""
+        self._take()
+        heap, arrived = self._transit.heap, list[TimedFrame]()
+        now_ns = self.clock.now_ns()
+        while heap and heap[0][0] <= now_ns:
+            ready_ns, _, (can_id, data) = heappop(heap)
+            arrived.append((can_id, data, ready_ns))
+        return arrived
+
+    def wait(self, until_ns: int) -> None:
+        """Wait for a frame, until `until_ns` at the latest."""
+        while True:
+            self._take()
+            heap, now_ns = self._transit.heap, self.clock.now_ns()
+            if now_ns >= until_ns or (heap and heap[0][0] <= now_ns):
+                return
+            self._port.wait(min(until_ns, heap[0][0]) if heap else until_ns)
+
+    def _is_lost(self) -> bool:
+        """Whether a frame falls into a loss: each begins with a frame, and lasts for some periods or for that frame."""
+        if self._setup.kind != "loss":
+            return False
+        now_ns = self.clock.now_ns()
+        if now_ns >= self._lost_until_ns:
+            if self._rng.random() >= self._setup.size:
+                return False
+            self._lost_until_ns = now_ns + (self._setup.room - 1) * self._period_ns
+        return True
+
+    def _take(self) -> None:
+        transit, kind = self._transit, self._setup.kind
+        for can_id, data, t_ns in self._port.drain():
+            if self._is_lost():
+                continue
+            delay_ns = self._setup.size * self._period_ns if kind in ("delay", "jitter") else 0.0
+            if kind == "jitter":
+                delay_ns = self._rng.expovariate(1.0 / delay_ns)
+            transit.last_ns = max(transit.last_ns, t_ns + round(delay_ns))  # an adapter keeps the order
+            transit.number += 1
+            heappush(transit.heap, (transit.last_ns, transit.number, (can_id, data)))
+
+
+def describe(setup: SetUp) -> dict[str, Any]:
+    """The set-up as columns of a table."""
+    return {"seed": setup.seed, "kind": setup.kind, "rate_hz": setup.rate_hz, "size": setup.size}

@@ -1,0 +1,106 @@
+"""Study `recover`: a thousand cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
+
+What is lost, when, for how long, alone or in pairs, follows from a seed, while the arm holds, moves, presses or scans
+(`recover_runs`). A run fails where a drive is enabled with a target more than one count beside its position, where the
+force exceeds the limit, where the cell does not come back or takes longer than the times of its nodes and one second
+from the last return, or where its log has a gap. A stop that somebody has to look at, such as a probe that is left
+pressing, is counted by itself. `canprobe study recover --seed N` carries out one run again; a failure is shrunk to the
+fewest losses that still fail.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from canprobe.cell.results.picture import BLUE, picture
+from canprobe.lab.studies.harness import Column, Row, Say, StudyResult
+from canprobe.lab.studies.recover_runs import SCENES, draw_case, run_case, shrink
+from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.sweep import Sweep
+
+RUNS, QUICK_RUNS, SEEDS_A_CELL = 1000, 8, 20
+COLUMNS = (
+    Column("work", "while it"),
+    Column("runs", "runs", "d"),
+    Column("lost", "losses", "d"),
+    Column("back", "came back", "d"),
+    Column("refused", "somebody has to look", "d"),
+    Column("jump_counts", "largest jump, counts", "d"),
+    Column("force_max_n", "highest force N", ".2f"),
+    Column("late_s", "longest from return to hold s", ".2f"),
+    Column("failures", "failures", "d"),
+)
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Carry out the runs."""
+    total = QUICK_RUNS if quick else RUNS
+    cells = [list(range(first, min(total, first + SEEDS_A_CELL))) for first in range(0, total, SEEDS_A_CELL)]
+    runs = [one for answer in sweep.map(measure, cells) for one in answer]
+    rows = table_rows(runs)
+    facts = measuring_facts(quick, total)
+    return StudyResult("recover", COLUMNS, rows, findings(runs), facts, partial(draw_runs, runs))
+
+
+def measure(seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """The runs of some seeds."""
+    return [run_case(draw_case(seed)) for seed in seeds]
+
+
+def replay(seed: int, say: Say) -> dict[str, Any]:
+    """Carry out the run of one seed again, and report what happens in it; a failure is shrunk."""
+    case = draw_case(seed)
+    say(f"seed {seed}: {case}")
+    outcome = run_case(case, say)
+    for failure in outcome["failures"]:
+        say(f"FAILURE: {failure}")
+    if outcome["failures"]:
+        say(f"shrunk: {shrink(case)} (canprobe study recover --seed {seed})")
+    return outcome
+
+
+def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """A row for each kind of work, and one for all."""
+    return [_row(work, [run for run in runs if run["work"] == work]) for work in SCENES] + [_row("all", runs)]
+
+
+def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
+    sums: Counter[str] = Counter()
+    for run in runs:
+        sums.update({key: int(run[key]) for key in ("lost", "back", "refused")})
+        sums["failures"] += bool(run["failures"])
+    most = {key: max((run[key] for run in runs), default=0) for key in ("jump_counts", "force_max_n", "late_s")}
+    return {
+        "work": name,
+        "runs": len(runs),
+        **{key: sums[key] for key in ("lost", "back", "refused", "failures")},
+        **most,
+    }
+
+
+def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The figures, and every failure with the line that runs it again."""
+    failed = [run for run in runs if run["failures"]]
+    all_of_them = _row("all", runs)
+    lines = [
+        f"{len(runs)} runs with {all_of_them['lost']} losses: the cell came back from {all_of_them['back']}, in"
+        f" {all_of_them['refused']} runs somebody has to look; {len(failed)} runs failed.",
+        f"Largest distance of a first target from the position: {all_of_them['jump_counts']} counts; longest time from"
+        f" the last return to the hold: {all_of_them['late_s']:.2f} s.",
+    ]
+    for run in failed[:20]:
+        lines.append(f"seed {run['seed']}: {'; '.join(run['failures'])} (canprobe study recover --seed {run['seed']})")
+    return lines
+
+
+def draw_runs(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Times from the last return to the hold."""
+    with picture(path, "Time from the last return of what was lost to the hold", 3.0) as figure:
+        axes = figure.subplots()
+        axes.hist([run["late_s"] for run in runs if run["back"]], bins=40, color=BLUE)
+        axes.set_xlabel("s")
+        axes.set_ylabel("runs")

@@ -1,0 +1,143 @@
+"""`canprobe check`: nothing moves, nodes are left as they were found, and a bad link is named with its cause."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import canprobe
+from canprobe.cell.master.controller import Command
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.check import measure_link, options_of_check
+from canprobe.cell.session.first_second import FirstSecond
+from canprobe.cell.session.session import Session
+from canprobe.cli import main
+from canprobe.errors import BusError, NodeError
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState, pack_nmt
+from canprobe.fieldbus.tools.link import Fitness
+from canprobe.lab.studies.link_setups import SetUp, construct, scene_of
+
+
+def session_of(scene="free", say=lambda _: None, **overrides):
+    plan = make_plan(resolve(canprobe.load_scene(scene, {"bus.timed": True, **overrides})))
+    return Session(plan, options_of_check(say))
+
+
+def test_a_sound_cell_is_fit(capsys):
+    assert main(["check", "cylinder", "--seconds", "1", "--json", "--set", "bus.timed=true"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == "fit" and report["rate_hz"] == 400.0 and report["cause"] is None
+    assert report["fit_rate_hz"] >= 400.0 and report["machine"] is None
+    assert [node["node_id"] for node in report["figures"]["nodes"]] == [1, 2, 3, 4, 5, 6]
+    assert 0.5 < report["figures"]["load"] < report["figures"]["planned_load"]
+    assert main(["check", "free", "--seconds", "1"]) == 0
+    assert capsys.readouterr().out.startswith("free on can0: FIT for 400 Hz\n")
+
+
+VOLATILE = {0x6041, 0x6064, 0x607A, 0x606C, 0x6077, 0x2006, 0x2120}
+"""Objects that a device changes by itself, and the target, which follows the position of a disabled drive."""
+
+
+def test_nodes_are_left_as_they_were_found_and_no_drive_is_enabled():
+    session = session_of("cylinder")
+    nodes = {node.node_id: node for node in session.world.nodes}
+    nodes[3].dictionary.put(0x1A01, 0, 0)
+    found = {}
+
+    def around(port):
+        port.send_batch([(0x603, bytes.fromhex("2b17100046000000")), pack_nmt(NmtCommand.START, 3)])
+        port.clock.sleep_until_ns(port.clock.now_ns() + 5_000_000)
+        port.drain()
+        found.update({i: dict(node.dictionary.values) for i, node in nodes.items()})
+        return port
+
+    session.around = around
+    report = measure_link(session, 0.5)
+    assert report.fit and not report.remarks
+    for i, node in nodes.items():
+        now = node.dictionary.values
+        changed = {key >> 8 for key in now.keys() | found[i].keys() if now.get(key) != found[i].get(key)}
+        assert changed <= VOLATILE, [
+            (hex(k), found[i].get(k), now.get(k)) for k in now if now.get(k) != found[i].get(k)
+        ]
+        assert state_of(node.dictionary.number(0x6041)) not in POWERED_STATES or i == 16
+    assert nodes[3].state is NmtState.OPERATIONAL and nodes[2].state is NmtState.PRE_OPERATIONAL
+
+
+def test_a_drive_under_power_is_refused_and_nothing_is_written():
+    session = session_of()
+    node = session.world.nodes[2]
+
+    def around(port):
+        node.dictionary.put(0x6041, 0, 0x0237)
+        return port
+
+    session.around = around
+    before = dict(node.dictionary.values)
+    with pytest.raises(NodeError, match=r"node 3: \(joint 3\) is OPERATION_ENABLED: somebody works with this cell"):
+        measure_link(session, 0.5)
+    changed = {key >> 8 for key in before if node.dictionary.values[key] != before[key]}
+    assert changed <= VOLATILE
+
+
+def test_another_master_is_refused():
+    def say(text):
+        if text == "listen for another master":
+            session.lockstep.port().send_batch([(0x080, b"\1")])
+
+    session = session_of(say=say)
+    with pytest.raises(BusError, match="another master is at work"):
+        measure_link(session, 0.5)
+
+
+def test_a_node_that_is_not_there_is_status_3(capsys, monkeypatch):
+    monkeypatch.setattr("canprobe.cell.session.check.Session", lambda *words: silent(Session(*words)))
+    assert main(["check", "free", "--seconds", "1"]) == 3
+    assert "node 5: (joint 5)" in capsys.readouterr().err
+
+
+def silent(session):
+    session.world.make_faulty().inject("node 5: mute", 0)
+    return session
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "fitness"),
+    [
+        ("delay", 0.7, Fitness.UNFIT),
+        ("jitter", 0.1, Fitness.MARGINAL),
+        ("loss", 0.01, Fitness.MARGINAL),
+        ("load", 0.95, Fitness.UNFIT),
+        ("node", 0.7, Fitness.UNFIT),
+        ("queue", 0.7, Fitness.UNFIT),
+        ("machine", 2.0, Fitness.UNFIT),
+    ],
+)
+def test_a_bad_link_is_named_with_its_cause(kind, size, fitness):
+    setup = SetUp(1, kind, 100, size, share=0.2, room=1, node_id=4)
+    session = Session(make_plan(resolve(scene_of(setup))), options_of_check())
+    construct(session, setup, 0)
+    verdict = measure_link(session, 3.0).verdict
+    assert (verdict.fitness, verdict.cause) == (fitness, kind), verdict
+
+
+def test_losses_as_long_as_the_drives_wait_are_unfit():
+    setup = SetUp(2, "loss", 100, 5e-4, share=0.2, room=9, node_id=4)
+    session = Session(make_plan(resolve(scene_of(setup))), options_of_check())
+    construct(session, setup, 0)
+    verdict = measure_link(session, 10.0).verdict
+    assert (verdict.fitness, verdict.cause) == (Fitness.UNFIT, "loss"), verdict
+
+
+def test_the_first_second_of_a_run_says_that_the_link_is_not_fit():
+    setup, said = SetUp(1, "machine", 100, 0.8, share=0.06, room=1, node_id=4), []
+    session = Session(make_plan(resolve(scene_of(setup))))
+    construct(session, setup, 0)
+    with session:
+        first = FirstSecond(session.cell, session.plan, said.append)
+        session.run(lambda measurement: Command(done=measurement.cycle > 250), first)
+    (line,) = said
+    assert line.startswith("warning: in its first second the link was") and "canprobe check free says why" in line

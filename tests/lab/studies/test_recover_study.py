@@ -1,0 +1,43 @@
+"""Cells that lose something by chance come back; the runs of the study `recover`, twenty of its seeds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from canprobe.cli import main
+from canprobe.lab.studies import recover_runs
+from canprobe.lab.studies.recover import findings, table_rows
+from canprobe.lab.studies.recover_runs import Outage, RecoverCase, draw_case, run_case, shrink
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_cell_comes_back_from_what_a_seed_takes(seed):
+    outcome = run_case(draw_case(seed))
+    assert outcome["failures"] == [], outcome
+    assert outcome["jump_counts"] <= 1 and outcome["force_max_n"] <= outcome["force_limit_n"]
+
+
+def test_the_same_seed_is_the_same_run():
+    first, second = run_case(draw_case(3)), run_case(draw_case(3))
+    assert first == second and table_rows([first])[-1]["runs"] == 1 and findings([first])
+
+
+def test_a_failure_is_shrunk_to_the_loss_that_makes_it(monkeypatch):
+    case = RecoverCase(
+        0, "hold", (Outage("reboot", 2, 0.5, 40), Outage("freeze", 3, 0.6, 40), Outage("bus-off", 5, 0.7, 40))
+    )
+    failing = case.outages[1]
+
+    def fails(some):
+        return {"failures": ["it fails"] if failing in some.outages else []}
+
+    monkeypatch.setattr(recover_runs, "run_case", fails)
+    assert shrink(case) == replace(case, outages=(failing,))
+
+
+def test_one_seed_is_repeated_from_the_command_line(capsys):
+    assert main(["study", "recover", "--seed", "6", "-v"]) == 0
+    said = capsys.readouterr().err
+    assert "seed 6: hold: reboot of node 1" in said and "the cell is back after" in said
