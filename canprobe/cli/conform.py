@@ -44,7 +44,7 @@ examples:
   canprobe conform --node 5 --eds drive.eds --channel can0
   canprobe conform --node 5 --eds drive.eds --channel can0 --junit conform.xml --html conform.html
   canprobe conform --node 5 --eds drive.eds --channel can0 --write 2000h-20FFh,6081h --points sdo,28
-  canprobe conform --node 5 --channel can0 --json > before.json
+  canprobe conform --node 5 --channel can0 --json      # redirect it to before.json
   canprobe conform --node 5 --channel can0 --baseline before.json
   canprobe conform --node 5 --channel can0 --restore conform-node5.snapshot.json
   canprobe conform --node 5 --eds puma260_joint --bus lockstep
@@ -247,9 +247,10 @@ def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
         or "nothing beyond the default",
     }
     if args.eds is not None:
-        from canprobe.fieldbus.eds.packaged import eds_file
+        from canprobe.fieldbus.eds.packaged import check_eds, eds_file
 
-        path = eds_file(args.eds)
+        path, reading = eds_file(args.eds), check_eds(args.eds, args.node)
+        facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
         facts["EDS"] = f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
     return facts
 

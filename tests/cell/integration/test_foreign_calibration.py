@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cell.master.monitor import Monitor
+from canprobe.cell.master.monitor_text import lines
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.scene.load import load_scene
@@ -59,3 +62,19 @@ def test_another_array_is_noticed(config, pad, sign):
         session.run(task)
     (line,) = said(session.cell.faults)
     assert re.search(sign, line)
+
+
+def test_the_monitor_shows_the_blur():
+    plan = make_plan(resolve(load_scene("press", {"task.duration_s": 4.0})))
+    monitor, views = Monitor(plan), []
+
+    def watch(observation):
+        monitor.push(observation.frames)
+        views.append(monitor.view(observation.t_ns).array)
+
+    session, task = Session(plan, RunOptions(observers=(watch,))), make_task(plan)
+    session.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3))
+    with session:
+        session.run(task)
+    assert views[0] is None and views[-1].startswith(f"{SAID}: its images are blurred by")
+    assert "array   the array is not as its calibration says" in "\n".join(lines(monitor.view(0)))

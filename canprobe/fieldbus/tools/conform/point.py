@@ -21,7 +21,7 @@ class Point:
         run: function that examines it: it returns where the device conforms, else raises an error of `outcome`.
         needs: what must be there: ``eds``, ``nmt`` (no other master), ``sync`` (no other SYNC producer), ``alone`` (no
             other node), ``drive``, ``motion`` (permission to switch the power stage on).
-        hint: what the author of a firmware can look at.
+        hint: what the author of a firmware can look at; of our points `hints` has it.
     """
 
     number: int
@@ -40,11 +40,11 @@ class Point:
 
 
 def conformance_point(
-    number: int, group: str, name: str, clause: str, expected: str, *, needs: str = "", hint: str = ""
+    number: int, group: str, name: str, clause: str, expected: str, *, needs: str = ""
 ) -> Callable[[Callable[[Bench], None]], Point]:
     """Make a `Point` of the function below; `needs` are words with blanks between them."""
 
     def make(run: Callable[[Bench], None]) -> Point:
-        return Point(number, group, name, clause, expected, run, frozenset(needs.split()), hint)
+        return Point(number, group, name, clause, expected, run, frozenset(needs.split()))
 
     return make

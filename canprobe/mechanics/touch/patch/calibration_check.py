@@ -3,7 +3,8 @@
 - **Blur.** Each image shows how far the cover blurs it (`blur_fit`), whatever is touched.
 - **Stiffness.** The slope of the touch, the images' moments and the motion show the stiffness of the layer, and
   estimators know it as `SurfaceEstimate.stiffness`. Another layer and other gains change it alike, as images alone do
-  not show newtons. So does an object that gives way, which the message says.
+  not show newtons. So does an object or an arm that gives way, which the
+  message says.
 - **Disagreement.** On a surface that is known, the slope of the touch gives a stiffness, and so does the bend of the
   pressure in an image. Another pitch makes one of them smaller and the other larger, each by its square.
 
@@ -39,6 +40,12 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.15
 """Time between two images that are fitted, s: a fit takes a millisecond."""
+MAX_LIGHTNESS = 0.12
+"""Largest level over peak of an image that is fitted: the rim of a light touch is lost below the threshold."""
+MIN_BEND_SHARE = 0.8
+"""Least mean curvature of probe and object over the probe's: errors of curvature are large against that of a hollow."""
+TOUCH_ANSWERS = 10
+"""Number of the first answers, near the touch, whose curvature the slope of the touch belongs to."""
 MIN_TRIES, MAX_TRIES = 20, 64
 """Number of images after which something is said, so that it holds all signs, and at which the check ends."""
 MIN_IMAGES, MIN_ANSWERS = 16, 40
@@ -101,7 +108,8 @@ class CalibrationCheck:
             return False
         (image, window, patch), self._waiting = self._waiting, None
         self._tries += 1
-        if patch.cut_by_pad or patch.dead or patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa:
+        bent = patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa
+        if bent or patch.cut_by_pad or patch.dead or self._pad.lightness(patch.peak_pa) > MAX_LIGHTNESS:
             return True
         found = fit_blur(image, window, blur=self._blur, crosstalk=self._crosstalk, gains=self._gains)
         if found is not None:
@@ -118,20 +126,18 @@ class CalibrationCheck:
             answer: answer at the last contact.
             slope: slope of the root of the force over the push; None where the touch showed none.
         """
-        if self._tries >= MAX_TRIES:
+        radius, kappa, self._curvature = self._pad.radius_m, answer.kappa, None
+        if self._tries >= MAX_TRIES or not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
             return
+        curvature = 0.5 / radius + 0.25 * float(kappa[0] + kappa[1])
+        if curvature < MIN_BEND_SHARE * 0.5 / radius:
+            return
+        self._curvature = curvature
         if answer.stiffness is not None:
             self._by_answers.append(math.log(answer.stiffness / self._stiffness))
-        radius, kappa = self._pad.radius_m, answer.kappa
-        if not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
-            self._curvature = None
+        if slope is None or len(self._by_touch) >= TOUCH_ANSWERS:
             return
-        self._curvature = 0.5 / radius + 0.25 * float(kappa[0] + kappa[1])
-        if (
-            slope is not None
-            and len(self._by_touch) < MIN_ANSWERS
-            and 2.0 * slope.sigma < MAX_TOUCH_SIGMA * slope.value
-        ):
+        if 2.0 * slope.sigma < MAX_TOUCH_SIGMA * slope.value:
             by_touch = stiffness_from_slope(slope.value, radius, kappa)
             self._by_touch.append(math.log(by_touch / self._stiffness))
 
@@ -148,13 +154,13 @@ class CalibrationCheck:
         """
         off = _median(self._by_answers, MIN_ANSWERS)
         if len(self._by_answers) < MIN_ANSWERS:
-            off = min(_median(self._by_touch, MIN_ANSWERS), _median(self._by_images, MIN_IMAGES), key=abs)
+            off = min(_median(self._by_touch, TOUCH_ANSWERS), _median(self._by_images, MIN_IMAGES), key=abs)
         return _beyond(off, math.log(MAX_RATIO))
 
     @property
     def disagreement(self) -> float:
         """Logarithm of the stiffness by images over that by the touch; 0 as for the others."""
-        if len(self._by_touch) < MIN_ANSWERS or len(self._by_images) < MIN_IMAGES:
+        if len(self._by_touch) < TOUCH_ANSWERS or len(self._by_images) < MIN_IMAGES:
             return 0.0
         return _beyond(median(self._by_images) - median(self._by_touch), MAX_DISAGREEMENT)
 
@@ -175,7 +181,8 @@ class CalibrationCheck:
             found.append(f"its images show a layer of {shown:.3g} N/m³ and its touch one of {by_touch:.3g}")
         if not found:
             return None
-        soft = "; or the object gives way" if len(found) == 1 and self.stiffness_off < 0.0 else ""
+        softer = (self.stiffness_off < 0.0 or self.disagreement > 0.0) and not self.blur_off
+        soft = "; or the object or the arm gives way" if softer else ""
         return f"the array is not as its calibration says: {', and '.join(found)}{soft}"
 
     @property
