@@ -105,13 +105,13 @@ class Recovery:
         runs = as_controller(controller)
         self._running = True
         try:
+            self._tries = 0  # it is asked for anew
+            if self._lost is None and (error := self._attempt(lambda: self.cell.start(runs))) is not None:
+                self._lose(error)
             if self._lost is not None:
-                self._tries = 0  # it is asked for anew
                 self._come_back(HeldTask(runs, self._place, None))
                 self._report_back("")
-            else:
-                self.cell.start(runs)
-            while (error := self._advance(progress)) is not None:
+            while (error := self._attempt(lambda: self.cell.advance(None, progress))) is not None:
                 self._lose(error)
                 if not runs.can_go_on:
                     raise error
@@ -141,10 +141,10 @@ class Recovery:
         self.cell.close()
         self._port.close()
 
-    def _advance(self, progress: Callable[[Measurement], None]) -> CanprobeError | None:
-        """Run the controller; the loss that ended it, None where it is done."""
+    def _attempt(self, work: Callable[[], object]) -> CanprobeError | None:
+        """Do some work of the cell; the loss that ended it, None where it was done."""
         try:
-            self.cell.advance(None, progress)
+            work()
         except CanprobeError as error:
             if not may_pass(error, self.cell):
                 raise
@@ -310,7 +310,10 @@ def may_pass(error: CanprobeError, cell: Cell) -> bool:
     """
     if isinstance(error, InterfaceError):
         return True
-    if cell.stopped_by is None or cell.stopped_by.key not in PASSING:
+    if cell.stopped_by is None:  # a request without an answer, while the drives are enabled
+        silent = cell.watch.silent(cell.supervisor.seen.sync_ns)
+        return isinstance(error, NodeError) and (silent is not None or bool(cell.bring_up.booted_again()))
+    if cell.stopped_by.key not in PASSING:
         return False
     if cell.stopped_by.key != "drive_fault" or not isinstance(error, NodeError):
         return True

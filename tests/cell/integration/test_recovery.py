@@ -127,6 +127,16 @@ def test_an_array_that_was_switched_off_comes_back():
     assert ages.max() == 12
 
 
+def test_a_node_that_is_lost_between_two_controllers_is_waited_for():
+    class Short(Nod):
+        def step(self, measurement):
+            return Command(done=measurement.cycle >= LOSS_CYCLE + 60)
+
+    run = Returning("node 3: reboot at 149 ms for 900 ms", controller=Short, again=True)
+    assert not run.errors and len(run.controllers) == 2
+    assert len(run.steps("the cell is back")) == 1 and run.said.count("enable the drives") == 3
+
+
 def homed_scene():
     """A scene whose third joint has no absolute encoder."""
     scene = canprobe.load_scene("free")
