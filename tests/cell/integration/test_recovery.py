@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recovering import HELD_CYCLES, LOSS_CYCLE, Returning, Way
+from recovering import HELD_CYCLES, LOSS_CYCLE, Enabled, Returning, Way
 
 import canprobe
 from canprobe.cell.master.conditions import BY_KEY
@@ -15,6 +15,7 @@ from canprobe.cell.master.controller import Command, Controller
 from canprobe.cell.master.monitor import Monitor
 from canprobe.cell.npz import read_npz
 from canprobe.cell.session.recovery import PASSING, TRIES
+from canprobe.cell.session.session import Session
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import read_candump
@@ -200,3 +201,18 @@ def test_resume_needs_a_cell_that_recovers():
 def test_homing_needs_somebody_beside_it(capsys):
     assert main(["up", "free", "--home", "--yes", "--recover"]) == 2
     assert "leave out --recover" in capsys.readouterr().err
+
+
+def test_a_second_controller_begins_where_the_arm_stands():
+    session = Session(canprobe.load_scene("free", {"bus.timed": False}))
+    watcher = Enabled(session.world.nodes)
+    session.world.participants.append(watcher)
+
+    def steps_ahead(measurement):
+        ahead = 0.004 if measurement.cycle > 200 else 0.0
+        return Command(q_target=measurement.q + ahead, done=ahead > 0.0)
+
+    with session:
+        session.run(steps_ahead)
+        session.run(lambda measurement: Command(done=measurement.cycle > 300))
+    assert max(distance for (_, time), distance in watcher.distances.items() if time == 2) <= 1
