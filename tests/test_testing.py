@@ -267,6 +267,8 @@ def test_a_vcan_of_each_worker_or_a_skip_that_says_what_to_type(run_inside, monk
         wanted.append(channel)
         raise InterfaceError(f"{channel}: no such interface; type: ip link add dev {channel} type vcan")
 
+    has_socketcan = "canprobe.fieldbus.bus.real.socketcan.has_socketcan"
+    monkeypatch.setattr(has_socketcan, lambda: True)
     monkeypatch.setattr("canprobe.fieldbus.bus.real.socketcan.check_interface", check_interface)
     text = """
 @pytest.mark.needs_vcan
@@ -274,9 +276,7 @@ def test_marked(): pass
 def test_asked(vcan): pass
 """
     out = run_inside(text, "-rs", outcomes={"skipped": 2})
-    out.fnmatch_lines(
-        ["*vcan0: no such interface; type: ip link add dev vcan0 type vcan; or run all *: canprobe vcan -- *"]
-    )
+    out.fnmatch_lines(["*vcan0: no such interface; type: ip link add dev vcan0 type vcan; or run the tests where *"])
     monkeypatch.setenv("PYTEST_XDIST_WORKER", "gw2")
     run_inside(text, "--canprobe-channel=vcan5", outcomes={"skipped": 2})
     assert wanted == ["vcan0", "vcan0", "vcan7", "vcan7"]
@@ -284,3 +284,7 @@ def test_asked(vcan): pass
     out.fnmatch_lines(["*can2 is no vcan; name one: --canprobe-channel vcan0*"])
     monkeypatch.setattr("canprobe.fieldbus.bus.real.socketcan.check_interface", lambda channel, setting=None: None)
     run_inside(text, outcomes={"passed": 2})
+    monkeypatch.setattr(has_socketcan, lambda: False)
+    with_fault = '@pytest.mark.fault("node 1: mute")\ndef test_bus(emulated_nodes): emulated_nodes(DRIVE)'
+    out = run_inside(with_fault, "-rs", "--canprobe-bus=vcan", outcomes={"skipped": 1})
+    out.fnmatch_lines(["*vcan2: this kernel has no SocketCAN; run the tests where there is one: canprobe vcan -- *"])

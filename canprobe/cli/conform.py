@@ -44,7 +44,7 @@ examples:
   canprobe conform --node 5 --eds drive.eds --channel can0
   canprobe conform --node 5 --eds drive.eds --channel can0 --junit conform.xml --html conform.html
   canprobe conform --node 5 --eds drive.eds --channel can0 --write 2000h-20FFh,6081h --points sdo,28
-  canprobe conform --node 5 --channel can0 --json > before.json
+  canprobe conform --node 5 --channel can0 --json      # redirect it to before.json
   canprobe conform --node 5 --channel can0 --baseline before.json
   canprobe conform --node 5 --channel can0 --restore conform-node5.snapshot.json
   canprobe conform --node 5 --eds puma260_joint --bus lockstep

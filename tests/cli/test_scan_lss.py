@@ -32,7 +32,7 @@ def serve(bus, monkeypatch):
     monkeypatch.setattr("canprobe.cell.session.emulation.ask_for_processor", lambda: False)
     nodes = []
 
-    def attach(buses, stop):
+    def attach(buses, stop, **_):
         ((participants, _),) = buses
         inner = (getattr(one, "node", one) for one in participants)  # without the wrapping for faults
         nodes[:] = [one for one in inner if hasattr(one, "lss")]

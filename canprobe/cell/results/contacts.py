@@ -40,7 +40,8 @@ class Contacts:
         normal_covariances: covariances of the normals (n, 3, 3), rad², the part coupled to the point included.
         sigma_normal: standard deviation of a normal per tangent axis without the coupled part, rad.
         coupling: coupling of the errors, 1/m; 0 where they are independent.
-        samples: samples that the estimators took, with times since the first SYNC, s.
+        samples: the contacts as estimators take them, with times since the first SYNC, s. Their depths are those of
+            the end of the scan (`ShapeTracker.settled`); the estimator in the loop had those of its time.
     """
 
     t_s: Floats

@@ -290,7 +290,7 @@ class OpenCell:
             return None
         from canprobe.cell.results.contacts import contacts_of
 
-        return contacts_of(record.shape.samples, task, start_s)
+        return contacts_of(record.shape.settled(task.probe.radius), task, start_s)
 
 
 def _drawings(data: RunData, out: Path) -> dict[str, Callable[[], None]]:

@@ -13,10 +13,12 @@ from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.first_second import link_limits
+from canprobe.cell.session.links import SOCKETCAN
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import ControllerState, Port
+from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.fieldbus.tools.link import (
@@ -27,7 +29,7 @@ from canprobe.fieldbus.tools.link import (
     judge_link,
 )
 from canprobe.fieldbus.tools.link.figures import quantile, us
-from canprobe.fieldbus.tools.link.machine import machine_facts, wake_lateness
+from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, wake_lateness
 
 IDLE_S = 1.0
 """Time of the loop that does nothing."""
@@ -176,6 +178,8 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
             passive=meter.state in (ControllerState.PASSIVE, ControllerState.BUS_OFF),
             failure=failure,
         )
+    if not session.virtual:
+        machine["controller"] = _controller(plan)
     found = session.cell.found
     return LinkReport(
         plan.setup.name,
@@ -194,6 +198,14 @@ def _machine(plan: Plan) -> dict[str, str]:
     shown = [_us(us(quantile(late, share))) for share in (0.5, 0.99, 1.0)]
     text = "p50 {}, p99 {}, at most {}, without a bus".format(*shown)
     return {"wakes_late_by": text, **machine_facts(plan.buses[0].channel)}
+
+
+def _controller(plan: Plan) -> str:
+    """State and error counters of the first bus's CAN controller, as its driver tells them."""
+    link = read_link(plan.buses[0].channel) if plan.scene.bus.interface == SOCKETCAN else None
+    if link is None or link.state is None:
+        return NOT_AVAILABLE
+    return f"{link.state}, error counters {link.tx_errors} transmit, {link.rx_errors} receive"
 
 
 def _traffic(plan: Plan) -> dict[str, Any]:

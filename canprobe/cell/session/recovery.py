@@ -89,6 +89,7 @@ class Recovery:
         self._place: LastPlace | None = None
         self._must_boot: set[int] = set()
         self._doubted: set[int] = set()
+        self._released: set[int] = set()
         self._asked = self._running = False
 
     def run(
@@ -103,6 +104,7 @@ class Recovery:
         self._running = True
         try:
             if self._lost is not None:
+                self._tries = 0  # it is asked for anew
                 self._come_back(HeldTask(runs, self._place, None))
                 self._report_back("")
             else:
@@ -128,6 +130,7 @@ class Recovery:
         if self._running or self._lost is None:
             self._asked = True
         else:
+            self._tries = 0
             self._come_back(None)
             self._report_back("")
 
@@ -158,7 +161,7 @@ class Recovery:
         if isinstance(error, InterfaceError):
             self._reopened()
         self._must_boot = cell.watch.alarmed - cell.bring_up.booted_again()
-        self._doubted = cell.bring_up.booted_again()
+        self._doubted, self._released = cell.bring_up.booted_again(), set(cell.bring_up.released)
         arm = self._plan.setup.arm
         if cell.drives is not None and cell.drives.heard_all and arm is not None:
             q, ways = cell.drives.last_place(HEARTBEAT_CONSUMED_MS * 1_000_000)
@@ -192,10 +195,11 @@ class Recovery:
                 self.cell = cell
                 if task is not None:
                     cell.start(task)
-            except BusError as error:
+            except CanprobeError as error:
                 cell.stop()
                 self._doubted |= cell.bring_up.booted_again()
-                if isinstance(error, UnhomedError) or self._tries == TRIES:
+                self._released |= cell.bring_up.released
+                if isinstance(error, UnhomedError) or not isinstance(error, BusError) or self._tries == TRIES:
                     raise
                 self._say(f"not back yet: {error}")
                 if isinstance(error, InterfaceError):
@@ -218,7 +222,7 @@ class Recovery:
             try:
                 why = seen.look(self._port, self._must_boot)
                 if why is None:
-                    self._doubted |= seen.without_power(self._port, self.cell.bring_up.released)
+                    self._doubted |= seen.without_power(self._port, self._released)
                     return
             except InterfaceError as error:
                 clock.sleep_until_ns(clock.now_ns() + round(REOPEN_S * 1e9))

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image_model import ImageModel
 
 
-HEIGHT_CORRELATION = (2e-3, 0.2)
+HEIGHT_CORRELATION = (2e-3, 0.5)
 """Correlation length of the heights of contacts along the path, m, and the share of their variance that is correlated,
-over 90 random scenes: the depth follows the force of some images."""
+over 120 random scenes: the depth follows force and curvature of some images."""
 SIGMA_NORMAL_RAD = 0.3e-3
 """Error of a normal that does not come from its centroid: joint counts displace the probe by 11 µm, times 28 1/m."""
 SIGMA_STIFFNESS = 0.6
@@ -91,7 +91,9 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     if method not in PATCH_METHODS:
         return estimator
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
+    from canprobe.mechanics.touch.estimate.noise_level import LevelledEstimator
 
+    estimator = LevelledEstimator(estimator, memory)
     scale = SCALE_ERROR + ROLLING_SCALE_ERROR * task.scan.rolling_share
     inner = _with_patch(task, estimator, memory) if _uses_patch(task) else estimator
     following = FollowingEstimator(inner, memory, scale)
@@ -152,7 +154,7 @@ def make_shape_tracker(setup: Setup, *, with_map: bool = True) -> ShapeTracker |
 def estimates_of(
     setup: Setup, tracker: ShapeTracker, methods: Iterable[str], most: int | None = None
 ) -> dict[str, list[ShapeRecord]]:
-    """The answers of ``methods`` on the tracker's contacts; those of its own estimator are taken from the tracker.
+    """The answers of ``methods`` on the tracker's settled contacts; those of its own estimator are the tracker's.
 
     Args:
         setup: of the scan.
@@ -165,10 +167,11 @@ def estimates_of(
     every = max(1, round(0.1 * task.array.rate_hz))
     if most is not None:
         every = max(every, math.ceil(len(tracker.samples) / most))
+    settled = tracker.settled(task.probe.radius)
     return {
         method: tracker.records
         if method == task.shape.method
-        else replay_samples(make_shape_estimator(task, method), tracker.samples, every)
+        else replay_samples(make_shape_estimator(task, method), settled, every)
         for method in dict.fromkeys(methods)
     }
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth, indentation_from_force
+
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.contact import ContactSample
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
@@ -96,6 +98,25 @@ class ShapeTracker:
         self._added += 1
         self.samples.append(sample)
         self._waiting.append(sample)
+
+    def settled(self, radius: float) -> list[ContactSample]:
+        """The contacts, placed anew by what is known by now: one stiffness for all, and the curvature at each.
+
+        In the loop a contact's depth follows from the answer before it, so heights carry the errors of answers, and
+        bend where the stiffness gets better known. Where no answer knew the stiffness the contacts are as they were.
+
+        Args:
+            radius: radius of the probe, m.
+        """
+        known = [r for r in self.records if r.estimate.rank == 3 and r.estimate.stiffness is not None]
+        if not known:
+            return list(self.samples)
+        stiffness, least = known[-1].estimate.stiffness, -HOLLOW_LIMIT_SHARE / radius
+        assert stiffness is not None
+        at_1_n = [indentation_from_force(1.0, stiffness, radius, np.maximum(r.estimate.kappa, least)) for r in known]
+        forces = np.array([max(sample.force_n, 0.0) for sample in self.samples])
+        depths = np.sqrt(forces) * np.interp([s.t_s for s in self.samples], [r.t_s for r in known], at_1_n)
+        return [at_depth(sample, depth, radius) for sample, depth in zip(self.samples, depths.tolist(), strict=True)]
 
     def work(self) -> SurfaceEstimate | None:
         """Take the contacts that wait, and answer where one is due; the estimate that `answer` has yet to report.

@@ -161,6 +161,8 @@ class VirtualTimeBus(EmulatedBus):
 class RealTimeNetwork(canopen.Network):
     """A network of canopen-python in real time."""
 
+    NOTIFIER_CYCLE = 0.05  # s; `disconnect` waits for the end of one
+
     def pass_time(self, seconds: float) -> None:
         """Sleep; the network's own thread receives meanwhile."""
         time.sleep(seconds)

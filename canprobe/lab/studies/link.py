@@ -3,7 +3,8 @@
 Set-ups are constructed at the port in virtual time (`link_setups`), each from a seed. Each is checked for 10 s with its
 drives disabled; then a new session of the same set-up holds the cell for 60 s, and shows what is true: fit, nothing
 missed and at most 0.1 % overruns; unfit, the cell is stopped, cannot be brought up, or more than 2 % overrun; marginal
-between. Thresholds were set on draw 0. The study shows other draws.
+between. Thresholds were set on draw 0, one rule (late SYNCs that outlast the drives' patience) after nine set-ups of
+draw 1. The study shows draw 2.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from canprobe.lab.studies.sweep import Sweep
 
 CHECK_S, MINUTE_S = 10.0, 60.0
 SETUPS, QUICK_SETUPS = 40, 8
-DEVELOPMENT_DRAW, TEST_DRAW = 0, 1
+DEVELOPMENT_DRAW, TEST_DRAW = 0, 2
 MODEL = (
     *("fieldbus/bus", "fieldbus/node", "fieldbus/drive", "fieldbus/tools/link", "cell/master", "cell/planning"),
     *("cell/session/check.py", "lab/studies/link.py", "lab/studies/link_setups.py"),

@@ -51,7 +51,7 @@ SLACK_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Loss:
+class Outage:
     """One thing that is lost.
 
     Attributes:
@@ -78,15 +78,15 @@ class RecoverCase:
     Attributes:
         seed: seed that it follows from.
         work: what the cell does: a key of `SCENES`.
-        losses: what is lost, in order.
+        outages: what is lost, in order.
     """
 
     seed: int
     work: str
-    losses: tuple[Loss, ...]
+    outages: tuple[Outage, ...]
 
     def __str__(self) -> str:
-        return f"{self.work}: " + "; ".join(map(str, self.losses))
+        return f"{self.work}: " + "; ".join(map(str, self.outages))
 
 
 def draw_case(seed: int) -> RecoverCase:
@@ -94,14 +94,14 @@ def draw_case(seed: int) -> RecoverCase:
     rng = Random(seed)
     work = rng.choice([*SCENES])
     nodes = (*range(1, 7), *((16,) if work in ("press", "scan") else ()))
-    losses = []
+    outages = []
     after_s = rng.uniform(BEGIN_S, END_S)
     for _ in range(rng.choice((1, 1, 2))):
         name = rng.choice((*LOST, "reboot", REPLUG))
         node_id = 0 if name == REPLUG else rng.choice(nodes)
-        losses.append(Loss(name, node_id, round(after_s, 4), round(10 ** rng.uniform(1.0, 3.5))))
+        outages.append(Outage(name, node_id, round(after_s, 4), round(10 ** rng.uniform(1.0, 3.5))))
         after_s += 10 ** rng.uniform(-3.0, 0.5)
-    return RecoverCase(seed, work, tuple(losses))
+    return RecoverCase(seed, work, tuple(outages))
 
 
 def run_case(case: RecoverCase, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
@@ -224,7 +224,7 @@ class RecoverRun:
     def _run(self) -> None:
         rate_hz = 1e9 / self._plan.sync.period_ns
         works = [Work(self._task(), self._at_cycle, round((END_S + 4.0) * rate_hz))]
-        works += [Work(HoldTask(), self._at_cycle, round(0.5 * rate_hz)) for _ in range(len(self._case.losses) + 1)]
+        works += [Work(HoldTask(), self._at_cycle, round(0.5 * rate_hz)) for _ in range(len(self._case.outages) + 1)]
         with self._session as session:
             for work in works:
                 try:
@@ -241,7 +241,7 @@ class RecoverRun:
 
     def _lies_ahead(self) -> bool:
         """Whether something is still to be lost."""
-        last_s = max(loss.after_s for loss in self._case.losses)
+        last_s = max(loss.after_s for loss in self._case.outages)
         return self._first_ns is not None and self._now_ns < self._first_ns + last_s * 1e9
 
     def _has_ended(self, error: CanprobeError) -> bool:
@@ -249,11 +249,11 @@ class RecoverRun:
         return self._said[-1][1].startswith("not back") or "nothing is enabled" in str(error)
 
     def _at_cycle(self, _: Measurement) -> None:
-        """Throw the losses, at the first cycle of the task."""
+        """Throw the outages, at the first cycle of the task."""
         if self._first_ns is not None:
             return
         self._first_ns = self._now_ns
-        for loss in self._case.losses:
+        for loss in self._case.outages:
             begin_ns = self._now_ns + round(loss.after_s * 1e9)
             if loss.name == REPLUG:
                 self._down.append((begin_ns, begin_ns + loss.lasts_ms * 1_000_000))
@@ -309,7 +309,7 @@ class RecoverRun:
         return {
             "seed": self._case.seed,
             "work": self._case.work,
-            "losses": [str(loss) for loss in self._case.losses],
+            "outages": [str(loss) for loss in self._case.outages],
             "lost": len(lost),
             "back": len(back),
             "jump_counts": self._drives.jump_counts,
@@ -326,9 +326,9 @@ class RecoverRun:
         return any(error.exit_status == 1 for error in self._errors)
 
     def _ready_s(self) -> float:
-        """Time at which the last of the losses was over."""
+        """Time at which the last of the outages was over."""
         first_s = (self._first_ns or 0) * 1e-9
-        return max(first_s + loss.after_s + loss.lasts_ms * 1e-3 for loss in self._case.losses)
+        return max(first_s + loss.after_s + loss.lasts_ms * 1e-3 for loss in self._case.outages)
 
 
 def _scene(work: str) -> Scene:
@@ -337,9 +337,9 @@ def _scene(work: str) -> Scene:
 
 
 def shrink(case: RecoverCase) -> RecoverCase:
-    """The case with the fewest losses that still fails; the case itself where none of them does."""
-    for i in range(len(case.losses)):
-        fewer = replace(case, losses=case.losses[:i] + case.losses[i + 1 :])
-        if fewer.losses and run_case(fewer)["failures"]:
+    """The case with the fewest outages that still fails; the case itself where none of them does."""
+    for i in range(len(case.outages)):
+        fewer = replace(case, outages=case.outages[:i] + case.outages[i + 1 :])
+        if fewer.outages and run_case(fewer)["failures"]:
             return shrink(fewer)
     return case

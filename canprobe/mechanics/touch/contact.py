@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
@@ -164,6 +164,16 @@ def contact_sample(
         slope=slope,
         sigma_height=sigma_height,
         sigma_slow=sigma_slow,
+    )
+
+
+def at_depth(contact: ContactSample, depth: float, radius: float) -> ContactSample:
+    """A contact of a probe of a radius (m), placed anew with another indentation of the layer (m)."""
+    reach = float(np.linalg.norm(contact.r_probe))
+    return replace(
+        contact,
+        p_base=contact.p_base + (reach - (radius - depth)) * contact.n_base,
+        r_probe=contact.r_probe * ((radius - depth) / reach),
     )
 
 

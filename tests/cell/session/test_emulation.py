@@ -27,7 +27,7 @@ def served(monkeypatch):
             "canprobe.cell.session.emulation.ask_for_processor", lambda: False
         )  # not for the tests' own process
 
-        def serve(buses, stop):
+        def serve(buses, stop, **_):
             emulate.look = stop
             act(buses[0][0])
 

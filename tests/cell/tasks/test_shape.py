@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from canprobe.cell.tasks.shape import MAX_CURVATURE, ShapeTracker, replay_samples
+from canprobe.cell.tasks.shape import MAX_CURVATURE, ShapeRecord, ShapeTracker, replay_samples
+from canprobe.mechanics.touch.contact import contact_sample, indentation_from_force
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 
 def contact(t_s, x=0.0):
@@ -122,3 +124,39 @@ def test_a_contact_that_an_estimator_cannot_take_starts_it_afresh():
 def test_recorded_contacts_are_answered_one_by_one():
     samples = [contact(0.005 * k) for k in range(10)]
     assert [r.t_s for r in replay_samples(Counting(), samples, 3)] == [s.t_s for s in samples[2::3]]
+
+
+def test_settled_contacts_have_the_depth_of_what_is_known_in_the_end():
+    """On a sphere of 50 mm: in the first half of the scan k and K are wrong, in all of it the force varies."""
+    radius, stiffness, kappa = 0.04, 1.3e8, np.array([20.0, 20.0])
+    tracker = ShapeTracker(Counting(), every=10)
+    for i in range(40):
+        a, force = 0.01 * i, 2.0 + 0.5 * np.sin(i)
+        normal = np.array([np.sin(a), 0.0, np.cos(a)])
+        depth = indentation_from_force(force, stiffness, radius, kappa)
+        T = homogeneous(tangent_rotation(-normal), (0.05 + radius - depth) * normal)
+        wrong = depth if i >= 20 else indentation_from_force(force, 0.9 * stiffness, radius, kappa + 5.0)
+        tracker.add(contact_sample(
+            t_s=0.01 * i, T_base_probe=T, uv=(0.0, 0.0), depth=wrong, radius=radius, force_n=force,
+        ))  # fmt: skip
+        if i % 10 == 9:
+            k = stiffness if i > 30 else 0.9 * stiffness
+            known = SimpleNamespace(rank=3, kappa=kappa, stiffness=k)
+            tracker.records.append(ShapeRecord(0.01 * i, 0.0, known, 0.01 * i))
+    before, after = (
+        [np.linalg.norm(sample.p_base) - 0.05 for sample in samples]
+        for samples in (tracker.samples, tracker.settled(radius))
+    )
+    assert np.ptp(before) > 30e-6
+    assert np.abs(after).max() < 1e-9
+    reach = [
+        np.linalg.norm(s.T_base_probe[:3, 3] - s.p_base) - np.linalg.norm(s.r_probe) for s in tracker.settled(radius)
+    ]
+    assert np.abs(reach).max() < 1e-12
+
+
+def test_contacts_stay_where_no_answer_knows_the_stiffness():
+    tracker = ShapeTracker(Counting(), every=10)
+    tracker.add(contact(0.0))
+    tracker.records.append(ShapeRecord(0.0, 0.0, SimpleNamespace(rank=3, kappa=np.zeros(2), stiffness=None), 0.0))
+    assert tracker.settled(0.04) == list(tracker.samples)

@@ -174,6 +174,25 @@ def test_a_power_stage_that_is_on_ends_it_before_anything_is_written():
     assert {row.verdict for row in report.rows} == {Verdict.ERROR}
     assert "OPERATION_ENABLED" in report.rows[0].detail
     assert list(downloads(device.port.sent)) == []
+    assert 0 not in {can_id for can_id, _ in device.port.sent}  # no NMT command to an axis that may hang on its motor
+
+
+def test_power_that_comes_on_in_between_ends_it_without_another_command():
+    device = eds_device()
+
+    def switch_on(count):
+        if count == 1200:
+            device.port.before = lambda count: None
+            device.node.receive(0, b"\x80\x05", device.port.clock.now_ns())
+            for word in (6, 7, 15):
+                device.node.receive(SDO, bytes.fromhex(f"2b406000{word:02x}000000"), device.port.clock.now_ns())
+
+    device.port.before = switch_on
+    report = device.run()
+    at = next(n for n, row in enumerate(report.rows) if row.verdict is Verdict.ERROR)
+    assert "OPERATION_ENABLED" in report.rows[at].detail
+    assert {row.verdict for row in report.rows[at:]} == {Verdict.ERROR}
+    assert device.node.dictionary.number(0x6041) & 0x6F == 0x27  # as whoever switched it on wants it
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,16 @@ def test_the_rate_that_it_is_fit_for_follows_from_the_lateness():
     assert slower.fit_rate_hz == 333.0 and "--set cycle.rate_hz=333" in slower.way_out
 
 
+def test_a_lateness_that_outlasts_the_drives_patience_is_unfit_even_if_it_is_rare():
+    """Of 4000 SYNCs thirty are late by an exponential time of a mean of two periods: some are beyond four of them."""
+    rng = Random(7)
+    late = [round(rng.expovariate(0.5) * PERIOD_NS) + PERIOD_NS // 2 for _ in range(30)]
+    lateness = sorted([10_000] * 3970 + late)
+    assert judge_link(LinkFigures(PERIOD_NS, lateness, WAIT_NS, (answers(),)), LIMITS).fitness is Fitness.UNFIT
+    short = sorted([10_000] * 3970 + [PERIOD_NS // 2 + 50_000] * 30)
+    assert judge_link(LinkFigures(PERIOD_NS, short, WAIT_NS, (answers(),)), LIMITS).fitness is Fitness.MARGINAL
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_single_losses_are_marginal_and_rows_that_stop_a_cell_unfit(seed):
     """Losses of a chain with two states, judged from forty seconds, and what an hour of it shows."""

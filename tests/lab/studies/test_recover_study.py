@@ -9,7 +9,7 @@ import pytest
 from canprobe.cli import main
 from canprobe.lab.studies import recover_runs
 from canprobe.lab.studies.recover import findings, table_rows
-from canprobe.lab.studies.recover_runs import Loss, RecoverCase, draw_case, run_case, shrink
+from canprobe.lab.studies.recover_runs import Outage, RecoverCase, draw_case, run_case, shrink
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -25,14 +25,16 @@ def test_the_same_seed_is_the_same_run():
 
 
 def test_a_failure_is_shrunk_to_the_loss_that_makes_it(monkeypatch):
-    case = RecoverCase(0, "hold", (Loss("reboot", 2, 0.5, 40), Loss("freeze", 3, 0.6, 40), Loss("bus-off", 5, 0.7, 40)))
-    failing = case.losses[1]
+    case = RecoverCase(
+        0, "hold", (Outage("reboot", 2, 0.5, 40), Outage("freeze", 3, 0.6, 40), Outage("bus-off", 5, 0.7, 40))
+    )
+    failing = case.outages[1]
 
     def fails(some):
-        return {"failures": ["it fails"] if failing in some.losses else []}
+        return {"failures": ["it fails"] if failing in some.outages else []}
 
     monkeypatch.setattr(recover_runs, "run_case", fails)
-    assert shrink(case) == replace(case, losses=(failing,))
+    assert shrink(case) == replace(case, outages=(failing,))
 
 
 def test_one_seed_is_repeated_from_the_command_line(capsys):

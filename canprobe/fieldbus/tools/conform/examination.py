@@ -31,7 +31,7 @@ from canprobe.fieldbus.tools.conform.outcome import (
     PointNotApplicable,
     PowerStageOn,
 )
-from canprobe.fieldbus.tools.conform.permits import Permits, WriteList
+from canprobe.fieldbus.tools.conform.permits import Permits, WriteList, is_object
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
@@ -117,7 +117,7 @@ class Examination:
         """
         self._meet()
         try:
-            self._put_back()
+            self._begin()
             for number, point in enumerate(points, start=1):
                 row = self._examine(point)
                 self.report.rows.append(row)
@@ -156,7 +156,9 @@ class Examination:
             raise NodeError(self._node_id, f"it cannot be examined: {error}") from error
         device.read_all(bench, written)
         self.journal = Journal(
-            restorable(device.values, [p for p in device.values if written.permits(p) and p[0] != CONTROLWORD]),
+            restorable(
+                device.values, [p for p in device.values if written.permits(p) and not is_object(p[0], CONTROLWORD)]
+            ),
             settings.snapshot,
             device.identity,
             temporary=not settings.keep_snapshot,
@@ -175,6 +177,15 @@ class Examination:
         self.report.facts["bus"] = f"{self._port.channel}, beside the device: {surroundings.text()}"
         if surroundings.lacks("nmt") and device.has(0x1017):
             self.report.facts["warning"] = "another master may watch the heartbeat of the device, which points change"
+
+    def _begin(self) -> None:
+        """Bring the device to pre-operational, unless its power stage is on: an axis may hang on it."""
+        try:
+            self._check_power()
+        except BenchFailure as error:
+            self._ended = f"not examined: {error}"
+        else:
+            self._put_back()
 
     def _examine(self, point: Point) -> ReportRow:
         """One point: run it, put back what it wrote, look for what it left behind."""
@@ -246,6 +257,7 @@ class Examination:
     def _prepare(self) -> None:
         """See that the device answers and that its power stage is off."""
         bench = self.bench
+        self._await_bus()
         bench.asked.clear()
         bench.forget()
         bench.emergencies.clear()
@@ -256,19 +268,27 @@ class Examination:
         self._check_power()
         bench.forget()
 
+    def _await_bus(self) -> None:
+        """Wait while the controller of this machine is bus off, as long as may help."""
+        until_ns = self.bench.now_ns + round(_BACK_ON_BUS_S * 1e9)
+        while self._port.state is ControllerState.BUS_OFF and self.bench.now_ns < until_ns:
+            self._port.wait(self.bench.now_ns + 100_000_000)
+            self._port.drain()
+
     def _check_power(self) -> None:
+        """Check that the power stage of each axis is off. Raises BenchFailure, or PowerStageOn where one is on."""
         for index in self.bench.device.statuswords:
-            word = self.bench.number(index)
+            try:
+                word = self.bench.number(index)
+            except Deviation as error:
+                raise BenchFailure(f"{index:04X}h cannot be read: {error}") from error
             if known_state(word) in POWERED_STATES:
                 raise PowerStageOn(f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)")
 
     def _put_back(self) -> list[str]:
         """Put back what the point wrote, and all of it where the device booted; it is pre-operational afterwards."""
         bench = self.bench
-        until_ns = bench.now_ns + round(_BACK_ON_BUS_S * 1e9)
-        while self._port.state is ControllerState.BUS_OFF and bench.now_ns < until_ns:
-            self._port.wait(bench.now_ns + 100_000_000)
-            self._port.drain()
+        self._await_bus()
         bench.load = None
         bench.permits.harmless.clear()
         commanded = not bench.permits.surroundings.lacks("nmt")
@@ -295,13 +315,16 @@ class Examination:
         return not self.bench.number(0x1001) & ~self.bench.device.number(0x1001)
 
     def _leave(self) -> None:
-        """Put back everything, and bring the device into the state that it had.
+        """Put back everything, and bring the device into the state that it had; nothing is sent to an axis with power.
 
         Raises:
             BenchFailure: something was not restored; the message says what to type.
         """
         bench, surroundings = self.bench, self.bench.permits.surroundings
+        if self._ended and not self.journal.touched:
+            return
         try:
+            self._check_power()
             self._put_back()
             self.journal.close()
             if surroundings.state_of(self._node_id) == NmtState.OPERATIONAL and not surroundings.lacks("nmt"):

@@ -7,7 +7,7 @@ from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
-from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS
+from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, is_object
 
 EVENT_TYPE = 255
 _DUMMY_WORDS = (0x00070020, 0x00060010, 0x00050008)
@@ -97,8 +97,7 @@ def permitted_entry(bench: Bench, *, transmits: bool) -> DescribedEntry:
     for entry in bench.device.entries():
         place = entry.index, entry.subindex
         mappable = entry.in_tpdo and entry.writable if transmits else entry.in_rpdo and entry.readable
-        of_motion = entry.index >= 0x6000 and 0x6000 | entry.index & 0x7FF in MOTION_OBJECTS  # of any axis
-        if of_motion or entry.index < 0x2000 or not entry.is_integer:
+        if is_object(entry.index, *MOTION_OBJECTS) or entry.index < 0x2000 or not entry.is_integer:
             continue
         if mappable and bench.permits.written.permits(place):
             return entry

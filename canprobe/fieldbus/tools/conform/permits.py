@@ -77,6 +77,11 @@ _RULES: dict[int, WriteRule] = {
 }
 
 
+def is_object(index: int, *wanted: int) -> bool:
+    """Whether an index is one of some objects of CiA 402, of any axis: those of the next one lie 800h above."""
+    return index >= 0x6000 and 0x6000 | index & 0x7FF in wanted
+
+
 def rule_of(index: int) -> WriteRule:
     """Rule of an object; one of the communication area that the table does not name is never written."""
     return _RULES.get(index, WriteRule.APPLICATION if index >= 0x2000 else WriteRule.NEVER)

@@ -2,6 +2,8 @@
 
 Overruns: the share of SYNCs that were later than half a period. A machine's lateness hangs little on the rate, so the
 same distribution predicts the overruns at other rates; it stops being true where the work of a cycle fills its period.
+A SYNC that is later than the drives wait stops the cell: how many a minute has follows from the late ones, whose tail
+is taken for exponential.
 
 Answers: one that is missed makes a link marginal. A node whose answers fail in rows of k cycles stops the cell. How
 many rows a minute has follows from those that were seen: with N_j rows of at least j cycles, a row of j goes on with
@@ -125,10 +127,22 @@ def judge_link(figures: LinkFigures, limits: LinkLimits) -> LinkVerdict:
 
 
 def _lateness(figures: LinkFigures, limits: LinkLimits, period_ns: int | None = None) -> Fitness:
+    period_ns = figures.period_ns if period_ns is None else period_ns
     share = figures.late_share(period_ns)
-    if share > min(UNFIT_SHARE, limits.late_share):
+    if share > min(UNFIT_SHARE, limits.late_share) or _gaps_expected(figures, limits, period_ns) > STOPS_EXPECTED:
         return Fitness.UNFIT
     return Fitness.MARGINAL if share > FIT_SHARE else Fitness.FIT
+
+
+def _gaps_expected(figures: LinkFigures, limits: LinkLimits, period_ns: int) -> float:
+    """Number of SYNCs a minute so late that the drives take their master for dead, by an exponential tail of the late
+    ones: they stop `missed_cycles` periods after the SYNC before.
+    """
+    limit_ns, most_ns = period_ns // 2, (limits.missed_cycles - 1) * period_ns
+    late = [time - limit_ns for time in figures.lateness_ns if time > limit_ns]
+    if len(late) < MIN_TAIL:
+        return float(sum(time > most_ns for time in figures.lateness_ns))
+    return len(late) / figures.seconds * MINUTE_S * math.exp((limit_ns - most_ns) * len(late) / sum(late))
 
 
 def _answers(figures: LinkFigures, limits: LinkLimits, wait_ns: int) -> Fitness:

@@ -11,7 +11,7 @@ from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
-from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
+from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
 from canprobe.fieldbus.tools.conform.point import conformance_point
 from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request, pack_write
 
@@ -83,6 +83,7 @@ def _limited(bench: Bench) -> Iterator[tuple[DescribedEntry, int, bool]]:
     for entry in bench.device.entries():
         place = entry.index, entry.subindex
         permitted = rule_of(entry.index) is WriteRule.CHANGED or bench.permits.written.permits(place)
+        permitted = permitted and not is_object(entry.index, *MOTION_OBJECTS)
         if not (permitted and entry.writable and entry.is_integer and place in bench.device.values):
             continue
         least = -(1 << entry.bits - 1) if entry.signed else 0
