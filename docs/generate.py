@@ -37,7 +37,7 @@ contact, blue the recovered surface, grey the true one. The pictures are panels 
 `python docs/gallery.py` from one run each with `--bus direct`, seed 0. `canprobe run NAME` makes the whole report,
 `canprobe view NAME` shows the scene in three dimensions.
 
-What the figures mean, and why three scenes have large errors: [scenes and plans](scenes.md#packaged-scenes)."""
+What the figures mean, and why three scenes have large errors: [packaged scenes](packaged-scenes.md)."""
 
 
 def read_measured() -> dict[str, Any]:

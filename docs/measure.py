@@ -209,7 +209,8 @@ def _found(name: str, result: Row) -> Entry:
 
 def _cell(form: str, row: Row) -> str:
     try:
-        return form.format_map({key.replace(".", "_"): value for key, value in row.items()}).replace("%", " %")
+        text = form.format_map({key.replace(".", "_"): value for key, value in row.items()})
+        return text.replace("%", " %").replace("  ", " ")
     except TypeError:  # None: does not apply
         return "–"
 

@@ -286,6 +286,7 @@ class Cell:
         runs = as_controller(controller)
         with self._one_at_a_time(), self._naming_another_master():
             self._controller, self._retreats_for, self._remarks_noted = runs, None, 0
+            self.stopped_by = None
             if runs.reader is not None:
                 self._note_silent_taxels()
                 self._reader = runs.reader
@@ -404,6 +405,7 @@ class Cell:
         if self.drives is None:
             return
         self._say("enable the drives")
+        self.drives.forget_targets()  # of a controller before this one: the arm may stand elsewhere
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         times = self._plan.setup.bring_up
         with self.bring_up.confirm_modes(times.enable_s) as modes:

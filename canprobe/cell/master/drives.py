@@ -343,6 +343,10 @@ class DriveGroup:
         if q is not None:
             self._targets = [round(c) for c in joints_to_units(self._model, q).tolist()]
 
+    def forget_targets(self) -> None:
+        """Let the target of each drive be its reported position again, as before the first one was set."""
+        self._targets = self._aimed = None
+
     def targets(self) -> Floats:
         """Last targets of the motors (n,), counts; their positions where no target was set."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]

@@ -33,6 +33,7 @@ from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, w
 
 IDLE_S = 1.0
 """Time of the loop that does nothing."""
+MIN_SECONDS = 1.0
 SETTLE_S = 0.3
 """Time of cycles before the measurement, until both sides run at their usual speed."""
 
@@ -128,6 +129,8 @@ def check(scene: Scene, *, seconds: float = 10.0, say: Say = quiet) -> LinkRepor
     plan = make_plan(resolve(scene))
     if plan.setup.bus.direct:
         raise UsageError("check: there is no bus in --bus direct; name one with --bus")
+    if seconds < MIN_SECONDS:
+        raise UsageError(f"check: expected at least {MIN_SECONDS:g} s, got {seconds:g}: a verdict needs cycles")
     return measure_link(Session(plan, options_of_check(say)), seconds)
 
 
@@ -169,6 +172,7 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
             wait_ns=plan.traffic.budget.looks_ns[-1],
             answers=meter.answers(),
             torn=None if cell.tactile is None else _torn(cell) - torn,
+            array_silent=_is_silent(cell),
             load=_per_bus(meter.load(plan.setup.bus.bitrate), plan),
             planned_load=max(bus.traffic.load for bus in plan.buses),
             foreign_hz=meter.foreign / max(meter.seconds, 1e-9),
@@ -229,7 +233,16 @@ def _lateness_count(cell: Cell) -> int:
 
 
 def _torn(cell: Cell) -> int:
-    return cell.tactile.unusable if cell.tactile is not None else 0
+    """Images that did not come, or not whole."""
+    return cell.tactile.unusable + cell.tactile.lost if cell.tactile is not None else 0
+
+
+def _is_silent(cell: Cell) -> bool:
+    """Whether the array sends no images any more."""
+    if cell.tactile is None or cell.cycle is None:
+        return False
+    age = cell.cycle.number - (cell.tactile.newest_cycle or 0)
+    return age > cell.supervisor.seen.limits.tactile_timeout
 
 
 def _per_bus(load: float | None, plan: Plan) -> float | None:

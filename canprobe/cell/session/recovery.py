@@ -41,6 +41,8 @@ PASSING = frozenset(
 """Keys of the conditions behind which may be a node that was switched off, or a bus that was cut."""
 ANSWER_S = 0.1
 """Longest time to the answer of a node that is there."""
+MASTER_QUIET_S = 2.0
+"""Time for which another master has to be silent: somebody works at the nodes, and may go on."""
 REOPEN_S = 0.5
 """Time between two attempts to open an interface."""
 TRIES = 5
@@ -103,13 +105,13 @@ class Recovery:
         runs = as_controller(controller)
         self._running = True
         try:
+            self._tries = 0  # it is asked for anew
+            if self._lost is None and (error := self._attempt(lambda: self.cell.start(runs))) is not None:
+                self._lose(error)
             if self._lost is not None:
-                self._tries = 0  # it is asked for anew
                 self._come_back(HeldTask(runs, self._place, None))
                 self._report_back("")
-            else:
-                self.cell.start(runs)
-            while (error := self._advance(progress)) is not None:
+            while (error := self._attempt(lambda: self.cell.advance(None, progress))) is not None:
                 self._lose(error)
                 if not runs.can_go_on:
                     raise error
@@ -139,10 +141,10 @@ class Recovery:
         self.cell.close()
         self._port.close()
 
-    def _advance(self, progress: Callable[[Measurement], None]) -> CanprobeError | None:
-        """Run the controller; the loss that ended it, None where it is done."""
+    def _attempt(self, work: Callable[[], object]) -> CanprobeError | None:
+        """Do some work of the cell; the loss that ended it, None where it was done."""
         try:
-            self.cell.advance(None, progress)
+            work()
         except CanprobeError as error:
             if not may_pass(error, self.cell):
                 raise
@@ -215,7 +217,7 @@ class Recovery:
             CanprobeError: the loss, where it has lasted too long.
         """
         assert self._lost is not None
-        clock, seen = self._port.clock, _Wait(self._plan)
+        clock, seen = self._port.clock, _Wait(self._plan, self.cell.watch.foreign is not None)
         end_ns, said = clock.now_ns() + self._longest_s * 1e9, ""
         while True:
             self._alive()
@@ -243,13 +245,19 @@ class Recovery:
 
 
 class _Wait:
-    """What was seen of the nodes while the cell waits for them."""
+    """What was seen of the nodes while the cell waits for them.
 
-    def __init__(self, plan: Plan) -> None:
+    Args:
+        plan: plan of the cell.
+        foreign: whether another master was at work.
+    """
+
+    def __init__(self, plan: Plan, foreign: bool) -> None:
         self._plan, self._settings = plan, plan.setup.bring_up
         self._setups = {setup.node_id: setup for setup in make_setups(plan)}
         self._watch = NodeWatch(plan.node_ids)
         self._absent: set[int] = set()
+        self._listen_s = MASTER_QUIET_S if foreign else max(self._settings.listen_s, ANSWER_S)
 
     def look(self, port: Port, must_boot: set[int]) -> str | None:
         """Listen, then ask the nodes that were not heard; why the cell has to wait on, None where it need not."""
@@ -257,8 +265,9 @@ class _Wait:
         watch.foreign = None
         watch.states.clear()
         network = PumpedNetwork(port, other=watch.push)
-        network.pump_until(lambda: watch.foreign is not None, max(self._settings.listen_s, ANSWER_S))
+        network.pump_until(lambda: watch.foreign is not None, self._listen_s)
         if watch.another_master is not None:
+            self._listen_s = MASTER_QUIET_S
             return watch.another_master
         silent = set(watch.node_ids) - set(watch.states)
         missing = silent - set(answering_nodes(network, silent, ANSWER_S))
@@ -301,7 +310,10 @@ def may_pass(error: CanprobeError, cell: Cell) -> bool:
     """
     if isinstance(error, InterfaceError):
         return True
-    if cell.stopped_by is None or cell.stopped_by.key not in PASSING:
+    if cell.stopped_by is None:  # a request without an answer, while the drives are enabled
+        silent = cell.watch.silent(cell.supervisor.seen.sync_ns)
+        return isinstance(error, NodeError) and (silent is not None or bool(cell.bring_up.booted_again()))
+    if cell.stopped_by.key not in PASSING:
         return False
     if cell.stopped_by.key != "drive_fault" or not isinstance(error, NodeError):
         return True

@@ -129,7 +129,8 @@ def findings(rows: Sequence[Row]) -> list[str]:
     dangerous = [row for row in rows if row["verdict"] == Fitness.FIT and row["truth"] == Fitness.UNFIT]
     bad = [row for row in rows if row["verdict"] != Fitness.FIT and row["truth"] != Fitness.FIT]
     named = [row for row in bad if row["cause"] == row["kind"]]
-    late = [row for row in rows if row["overruns_percent"] > 0.5 and row["true_overruns_percent"] > 0.5]
+    whole = [row for row in rows if not row["ended"]]  # a cell that stopped has too few cycles to compare
+    late = [row for row in whole if row["overruns_percent"] > 0.0 and row["true_overruns_percent"] > 0.0]
     ratios = sorted(row["overruns_percent"] / row["true_overruns_percent"] for row in late)
     lines = [
         f"{len(right)} of {len(rows)} set-ups are judged as the next minute shows them",

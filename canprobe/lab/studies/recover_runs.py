@@ -118,6 +118,7 @@ class WatchedDrives(Participant):
     Attributes:
         enabled: number of times that drives were enabled.
         jump_counts: largest distance in those SYNCs, from the second enabling of a drive on.
+        lifting: the cell takes the probe off, which is no jump.
     """
 
     name = "watcher of the drives"
@@ -130,6 +131,7 @@ class WatchedDrives(Participant):
             node.node_id: (-1, 0, node) for node in nodes if node.dictionary.entries.get(0x604100) is not None
         }
         self.jump_counts = 0
+        self.lifting = False
         self.enabled = 0
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
@@ -142,7 +144,7 @@ class WatchedDrives(Participant):
             times = before + (age < 0)
             self.enabled += age < 0
             self._ages[node_id] = (age + 1, times, node)
-            if times > 1 and age + 1 < self.FIRST_SYNCS:
+            if times > 1 and age + 1 < self.FIRST_SYNCS and not self.lifting:
                 self.jump_counts = max(self.jump_counts, abs(number(0x607A) - number(0x6064)))
         return []
 
@@ -218,6 +220,8 @@ class RecoverRun:
         time_s = self._now_ns * 1e-9 if self._session.lockstep is not None else 0.0
         self._said.append((time_s, text))
         self._say_too(f"{time_s:8.3f} s  {text}")
+        if text.startswith(("lift off", "enable the drives")):
+            self._drives.lifting = text.startswith("lift off")
         if text.startswith("the cell is back"):
             self._resumes_in = round(HELD_S * 1e9 / self._plan.sync.period_ns)
 
@@ -323,7 +327,7 @@ class RecoverRun:
 
     def _is_refused(self) -> bool:
         """Whether somebody has to look at the arm: a stop for safety, such as a probe that is left pressing."""
-        return any(error.exit_status == 1 for error in self._errors)
+        return bool(self._errors) and self._errors[-1].exit_status == 1
 
     def _ready_s(self) -> float:
         """Time at which the last of the outages was over."""

@@ -64,11 +64,17 @@ def somebody_resets(run):
         "node 1: heartbeat-off for 400 ms",
         "node 4: nmt command=129",
         "node 3: reboot for 100 ms;node 6: bus-off for 1200 ms",
-        somebody_resets,
     ],
 )
 def test_whatever_was_lost_comes_back(action):
     Returning(action).assert_came_back()
+
+
+def test_somebody_who_resets_a_node_has_time_to_go_on():
+    run = Returning(somebody_resets).assert_came_back()
+    assert run.steps("lost: another master is on the bus")
+    (back,) = run.steps("the cell is back after")
+    assert float(back.split()[5]) > 2.0
 
 
 def test_an_interface_that_was_down_comes_back():
@@ -119,6 +125,16 @@ def test_an_array_that_was_switched_off_comes_back():
     assert run.steps("lost: no tactile frame for 13 cycles") and run.steps("wait: node 16 not there")
     ages = np.asarray(run.session.cell.log.arrays()["tactile_age"])
     assert ages.max() == 12
+
+
+def test_a_node_that_is_lost_between_two_controllers_is_waited_for():
+    class Short(Nod):
+        def step(self, measurement):
+            return Command(done=measurement.cycle >= LOSS_CYCLE + 60)
+
+    run = Returning("node 3: reboot at 149 ms for 900 ms", controller=Short, again=True)
+    assert not run.errors and len(run.controllers) == 2
+    assert len(run.steps("the cell is back")) == 1 and run.said.count("enable the drives") == 3
 
 
 def homed_scene():

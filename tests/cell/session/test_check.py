@@ -67,6 +67,18 @@ def test_nodes_are_left_as_they_were_found_and_no_drive_is_enabled():
     assert nodes[3].state is NmtState.OPERATIONAL and nodes[2].state is NmtState.PRE_OPERATIONAL
 
 
+def test_an_array_that_sends_no_image_is_not_fit():
+    session = session_of("listen")
+    session.world.make_faulty().inject("node 16: sync-lost", 0)
+    verdict = measure_link(session, 1.0).verdict
+    assert verdict.fitness is Fitness.UNFIT and verdict.cause == "loss" and "the array sends no images" in verdict.why
+
+
+def test_a_verdict_needs_a_second(capsys):
+    assert main(["check", "free", "--seconds", "0.5"]) == 2
+    assert "expected at least 1 s" in capsys.readouterr().err
+
+
 def test_a_drive_under_power_is_refused_and_nothing_is_written():
     session = session_of()
     node = session.world.nodes[2]

@@ -53,7 +53,8 @@ class LinkFigures:
         lateness_ns: delay of each SYNC behind its deadline, ascending, ns.
         wait_ns: time after SYNC until which the cell waits for answers.
         answers: the answers of the nodes that the cell waits for.
-        torn: images of the array that did not come whole; None without an array.
+        torn: images of the array that did not come, or not whole; None without an array.
+        array_silent: whether the array sent no images at the end.
         load, planned_load: share of the bit rate that was measured, and the worst case of the plan; None: not known.
         foreign_hz: frames a second that the plan does not know.
         queue_full: number of times that the transmit queue was full.
@@ -68,6 +69,7 @@ class LinkFigures:
     wait_ns: int
     answers: tuple[AnswerFigures, ...] = ()
     torn: int | None = None
+    array_silent: bool = False
     load: float | None = None
     planned_load: float | None = None
     foreign_hz: float = 0.0
@@ -94,7 +96,8 @@ class LinkFigures:
 
     def as_document(self) -> dict[str, Any]:
         """The figures for JSON."""
-        names = ("torn", "load", "planned_load", "foreign_hz", "queue_full", "dropped", "error_frames", "passive")
+        names = ["torn", "array_silent", "load", "planned_load", "foreign_hz"]
+        names += ["queue_full", "dropped", "error_frames", "passive"]
         return {
             "rate_hz": 1e9 / self.period_ns,
             "cycles": self.cycles,

@@ -111,7 +111,7 @@ def judge_link(figures: LinkFigures, limits: LinkLimits) -> LinkVerdict:
     findings = [
         (answers := _answers(figures, limits, figures.wait_ns)),
         (lateness := _lateness(figures, limits)),
-        Fitness.UNFIT if figures.failure is not None or figures.passive else Fitness.FIT,
+        Fitness.UNFIT if figures.failure is not None or figures.passive or figures.array_silent else Fitness.FIT,
         Fitness.MARGINAL if figures.torn or figures.dropped else Fitness.FIT,
     ]
     worst = max(findings, key=_ORDER.index)
@@ -187,7 +187,9 @@ def _longest_in_a_minute(ascending: Sequence[int], seconds: float) -> float:
 
 def _fit_rate(figures: LinkFigures, limits: LinkLimits, rate_hz: float) -> float | None:
     """Highest rate at which the same answers and lateness would be fit; None where none is."""
-    if figures.failure is not None or figures.passive or any(one.absent for one in figures.answers):
+    if figures.failure is not None or figures.passive or figures.array_silent:
+        return None
+    if any(one.absent for one in figures.answers):
         return None
     load, planned = figures.load or 0.0, figures.planned_load or 0.0
     for rate in sorted({*RATES_HZ, rate_hz}, reverse=True):
@@ -231,12 +233,11 @@ def _cause_of_answers(figures: LinkFigures) -> tuple[str, str, str]:
     answers = figures.answers
     missed = sum(one.missed for one in answers)
     worst = max(answers, key=lambda one: (one.missed, one.at(1.0) or 0), default=None)
-    if worst is None or not (missed or any(one.times_ns for one in answers)):
-        return (
-            "loss",
-            f"{figures.torn} images of the array did not come whole",
-            "check cable, terminators, and its load",
-        )
+    if worst is None or (not missed and (figures.torn or figures.array_silent)):
+        if figures.array_silent:
+            return "loss", "the array sends no images", "check its power, its cable, and that SYNC reaches it"
+        why = f"{figures.torn} images of the array did not come, or not whole"
+        return "loss", why, "check cable, terminators and its load"
     others = [time for one in answers if one is not worst and (time := one.at(0.5)) is not None]
     usual = max(others, default=None)
     alone = usual is not None and (worst.missed > ONE_NODE_SHARE * missed if missed else True)

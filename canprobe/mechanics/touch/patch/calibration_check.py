@@ -44,8 +44,9 @@ MAX_LIGHTNESS = 0.12
 """Largest level over peak of an image that is fitted: the rim of a light touch is lost below the threshold."""
 MIN_BEND_SHARE = 0.8
 """Least mean curvature of probe and object over the probe's: errors of curvature are large against that of a hollow."""
-TOUCH_ANSWERS = 10
-"""Number of the first answers, near the touch, whose curvature the slope of the touch belongs to."""
+MAX_BEND_CHANGE = 0.1
+"""Largest change of the bend from the first three images to all, in ln, on a surface that stays as curved as it was at
+the touch: the slope of the touch belongs to that curvature, which only the motion shows later."""
 MIN_TRIES, MAX_TRIES = 20, 64
 """Number of images after which something is said, so that it holds all signs, and at which the check ends."""
 MIN_IMAGES, MIN_ANSWERS = 16, 40
@@ -75,6 +76,7 @@ class CalibrationCheck:
         self._by_answers: list[float] = []
         self._by_images: list[float] = []
         self._by_touch: list[float] = []
+        self._bends: list[float] = []
         self._curvature: float | None = None
         self._tries = 0
         self._next_s = -math.inf
@@ -114,6 +116,7 @@ class CalibrationCheck:
         found = fit_blur(image, window, blur=self._blur, crosstalk=self._crosstalk, gains=self._gains)
         if found is not None:
             self._blurs.append(math.log(found.blur / self._blur))
+            self._bends.append(max(found.bend, 1e-9))
             if self._curvature is not None and found.bend > 0.0:
                 stiffness = self._stiffness_of_bend * found.bend / self._curvature
                 self._by_images.append(math.log(stiffness / self._stiffness))
@@ -135,7 +138,7 @@ class CalibrationCheck:
         self._curvature = curvature
         if answer.stiffness is not None:
             self._by_answers.append(math.log(answer.stiffness / self._stiffness))
-        if slope is None or len(self._by_touch) >= TOUCH_ANSWERS:
+        if slope is None or len(self._by_touch) >= MIN_ANSWERS:
             return
         if 2.0 * slope.sigma < MAX_TOUCH_SIGMA * slope.value:
             by_touch = stiffness_from_slope(slope.value, radius, kappa)
@@ -154,13 +157,15 @@ class CalibrationCheck:
         """
         off = _median(self._by_answers, MIN_ANSWERS)
         if len(self._by_answers) < MIN_ANSWERS:
-            off = min(_median(self._by_touch, TOUCH_ANSWERS), _median(self._by_images, MIN_IMAGES), key=abs)
+            off = min(_median(self._by_touch, MIN_ANSWERS), _median(self._by_images, MIN_IMAGES), key=abs)
         return _beyond(off, math.log(MAX_RATIO))
 
     @property
     def disagreement(self) -> float:
         """Logarithm of the stiffness by images over that by the touch; 0 as for the others."""
-        if len(self._by_touch) < TOUCH_ANSWERS or len(self._by_images) < MIN_IMAGES:
+        if len(self._by_touch) < MIN_ANSWERS or len(self._by_images) < MIN_IMAGES:
+            return 0.0
+        if abs(math.log(median(self._bends[:3]) / median(self._bends))) > MAX_BEND_CHANGE:
             return 0.0
         return _beyond(median(self._by_images) - median(self._by_touch), MAX_DISAGREEMENT)
 

@@ -1,0 +1,85 @@
+"""A task in a cell that has come back: it is held until motion is asked for, by a call, a bridge, or a key."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.tasks.held import HeldTask, LastPlace
+from canprobe.cell.tasks.requested import Request, RequestedTask
+from canprobe.cli.operator import LetterKey
+
+
+class Mine(Controller):
+    def __init__(self):
+        self.steps, self.went_on = 0, 0
+
+    def step(self, measurement):
+        self.steps += 1
+        return Command(q_target=np.zeros(6))
+
+    def go_on(self, measurement):
+        assert not self.steps, "it prepares before its next step"
+        self.went_on += 1
+
+
+def test_nothing_is_commanded_before_motion_is_asked_for():
+    asked, mine, resumed = [], Mine(), []
+    held = HeldTask(mine, None, lambda: bool(asked), lambda: resumed.append(1))
+    assert held.step(Measurement(0, 0)).q_target is None and not held.lets_go and mine.steps == 0
+    asked.append(True)
+    assert held.step(Measurement(1, 0)).q_target is not None
+    assert (mine.went_on, mine.steps, resumed) == (1, 1, [1])
+    held.step(Measurement(2, 0))
+    assert mine.went_on == 1
+
+
+@pytest.mark.parametrize(("moved_deg", "words"), [(0.9, None), (1.1, "joint 2 reports")])
+def test_an_arm_that_stands_elsewhere_is_refused(moved_deg, words):
+    joints = canprobe.plan("free").setup.arm.model.joints
+    place = LastPlace(joints, np.zeros(6), np.full(6, np.radians(1.0)))
+    found = HeldTask(Mine(), place, lambda: False).inspect(np.radians([0, moved_deg, 0, 0, 0, 0]))
+    assert (found is None) if words is None else found.startswith(words)
+
+
+def test_a_bridge_asks_for_motion_and_what_came_before_is_dropped():
+    queue, made = deque(), []
+    task = RequestedTask(None, lambda: made.append(Mine()) or made[-1], [queue], 0.0025)
+    held = HeldTask(task, None, lambda: False)
+    queue.append(Request("start"))
+    held.step(Measurement(0, 0))
+    queue.append(Request("resume"))
+    held.step(Measurement(1, 2_500_000))
+    assert not held.held and not made, "the start that came in the hold is dropped"
+    queue.append(Request("start"))
+    held.step(Measurement(2, 5_000_000))
+    assert len(made) == 1 and made[0].steps == 1
+
+
+def test_a_key_is_a_line_of_its_letter(monkeypatch):
+    reader, writer = os.pipe()
+
+    class Terminal:
+        @staticmethod
+        def isatty():
+            return True
+
+        @staticmethod
+        def fileno():
+            return reader
+
+    monkeypatch.setattr("sys.stdin", Terminal())
+    key = LetterKey("r")
+    found = []
+    for typed in (b"", b"x\n", b"R\n"):
+        os.write(writer, typed)
+        found.append(any([key.pressed() for _ in range(25)]))
+    os.close(writer)
+    found.append(any([key.pressed() for _ in range(45)]))
+    os.close(reader)
+    assert found == [False, False, True, False]
