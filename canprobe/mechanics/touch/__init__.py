@@ -10,7 +10,7 @@ Reading a touch:
     pad               where the taxels are, and what their counts mean
     patch/            images: force, centroid, moments, and curvature from them
     contact           from the centroid on the wrapped pad to the object's point and normal in base
-    layer_stiffness   the stiffness of the layer from a push
+    layer_stiffness   the stiffness of the layer: from a push, and as a state of a scan
     stops             the limits at which a touch is stopped, and why a touch at rest must not go on
 
 Shape:

@@ -30,6 +30,7 @@ Estimators, one sample after another:
     sandwich            the covariance of weighted and correlated rows
     change              the test for a changed surface
     following           wider regions where the answers change along the path
+    noise_level         variances by the level of the innovations
     widened             wider regions of an array that is not as its calibration says
 
 Answers:

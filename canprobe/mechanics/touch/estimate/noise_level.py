@@ -14,14 +14,13 @@ internal consistency.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate, is_umbilic
-from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
+from canprobe.mechanics.touch.estimate.widened import widened
 from canprobe.mechanics.types import Floats
 
 MIN_LEVEL = 0.5
@@ -71,17 +70,4 @@ class LevelledEstimator:
         self._place = answer.point
         self._mean += (1.0 - math.exp(-moved / self._memory)) * (answer.innovation - self._mean)
         self.level = max(self._mean, MIN_LEVEL)
-        return with_level(answer, self.level)
-
-
-def with_level(answer: SurfaceEstimate, level: float) -> SurfaceEstimate:
-    """An answer with its variances multiplied by a level; place, curvature and what was observed stay."""
-    covariance, evidence = level * answer.covariance, answer.evidence
-    return replace(
-        answer,
-        covariance=covariance,
-        information=answer.information / level,
-        model_root=None if answer.model_root is None else answer.model_root / math.sqrt(level),
-        evidence=None if evidence is None else CurvatureInformation(evidence.q, evidence.information / level),
-        umbilic=answer.rank == 3 and is_umbilic(answer.K, covariance),
-    )
+        return widened(answer, math.sqrt(self.level))

@@ -1,4 +1,4 @@
-"""An answer of an array that is not as its calibration says: the same shape, with wider regions."""
+"""An answer with wider or narrower regions and the same shape: of an array that is not as its calibration says."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ REGION_FACTOR = 2.0
 """Factor of the standard deviations of curvature, from a development draw of study `regions`."""
 
 
-def widened(answer: SurfaceEstimate) -> SurfaceEstimate:
-    """An answer whose standard deviations of curvature are `REGION_FACTOR` times as large."""
-    f, evidence, root = REGION_FACTOR, answer.evidence, answer.model_root
+def widened(answer: SurfaceEstimate, factor: float = REGION_FACTOR) -> SurfaceEstimate:
+    """An answer whose standard deviations of curvature are `factor` times as large."""
+    f, evidence, root = factor, answer.evidence, answer.model_root
     covariance = answer.covariance * f**2
     return replace(
         answer,
