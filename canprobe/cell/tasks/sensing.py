@@ -124,7 +124,7 @@ class ContactSensing:
         self.dropped = 0
         self.reader = PatchReader(calibration)
         self._noise = noise
-        self._pad = calibration.pad
+        self._level_pa = MomentImage(calibration).level_pa
         self._moment_image = moment_image
         self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
@@ -194,7 +194,8 @@ class ContactSensing:
             return None
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         depth = self.depth(patch.force)
-        lightness = self._pad.lightness(patch.peak_pa)
+        # over the peak of the layer at this depth: that of one image has the noise of one taxel, and steers the servo
+        lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
         image_sigma = 0.0 if self._noise is None else self._noise.image(lightness)
         found = contact_sample(
             t_s=t_s,
