@@ -67,8 +67,10 @@ def somebody_resets(run):
         "node 3: reboot for 100 ms;node 6: bus-off for 1200 ms",
     ],
 )
-def test_whatever_was_lost_comes_back(action):
-    Returning(action).assert_came_back()
+def test_whatever_was_lost_comes_back(action, tmp_path, capsys):
+    """And `canprobe judge` finds no fault of the master on the way."""
+    Returning(action, out=tmp_path).assert_came_back()
+    assert main(["judge", "free", "--record", str(tmp_path / "bus.log")]) == 0, capsys.readouterr().out
 
 
 def test_somebody_who_resets_a_node_has_time_to_go_on():

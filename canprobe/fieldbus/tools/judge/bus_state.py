@@ -154,7 +154,7 @@ class BusState:
                 yield ForgedSeen(frame, node)
 
     def _sent_by(self, node: SeenNode, frame: BusFrame) -> Iterator[BusEvent]:
-        node.seen = True
+        node.hear(frame.t_ns)
         node.answers = node.answers or frame.can_id != HEARTBEAT_BASE + node.node_id or frame.data != b"\0"
         if frame.from_node is False:
             yield ForgedSeen(frame, node)
@@ -227,7 +227,8 @@ class BusState:
         yield from self._valued(node, values, frame, pdo, written=True)
 
     def _tpdo(self, frame: BusFrame, node: SeenNode, pdo: PdoView) -> Iterator[BusEvent]:
-        node.seen = node.answers = True
+        node.hear(frame.t_ns)
+        node.answers = True
         yield from self._valued(node, _unpacked(pdo, frame), frame, pdo, written=False)
 
     def _valued(

@@ -71,7 +71,7 @@ class ResetsEnabled(Rule):
             return
         self.looked += 1
         for node in event.nodes:
-            if node.enabled:
+            if node.enabled and not node.silent(event.frame.t_ns):
                 to = "all nodes" if event.to_all else "the node"
                 what = f"NMT {event.command:02X}h to {to} while its drive is enabled"
                 self.blame(what, frame_of(node.known(STATUSWORD)), event.frame, node_id=node.node_id)

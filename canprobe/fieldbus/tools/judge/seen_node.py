@@ -29,12 +29,15 @@ TARGET_OF_MODE = {
 }
 _SIGNED = frozenset({MODE, MODE_DISPLAY, POSITION, VELOCITY, 0x6077, 0x60C2}) | TARGETS
 """Objects that are signed where no EDS says it. 60C2h:02 is, too."""
+_HEARTBEAT_TIME = 0x1017
 _SPEED_LIMIT, _SPEED_UNIT, _SOFT_LIMITS, _RANGE = 0x607F, 0x60A9, 0x607D, 0x607B
 _UNLIMITED = 0x7FFFFFFF
 _NOISE = 20
 """Least tolerance of a position, user units: an axis that is held is never quite still."""
 _FRESH_NS = 300_000_000
 """Age up to which positions show whether an axis moves."""
+_LOST_BEATS = 3
+"""Heartbeats without one frame of a node after which it may be in any state."""
 _MOVING_SHARE = 0.01
 """Share of the largest speed from which on an axis moves."""
 
@@ -92,6 +95,7 @@ class SeenNode:
         nmt: NMT state as last seen, or commanded; None before.
         booted: whether a boot-up was seen.
         seen: whether the node has sent anything.
+        heard_ns: time of its last frame.
         answers: whether it has sent anything but a boot-up.
         asked: whether it got an SDO request.
         started_ns: time of the last NMT start; None while it is not started.
@@ -109,7 +113,7 @@ class SeenNode:
         self._description = description
         self._served = served
         self.nmt: NmtState | None = None
-        self.nmt_ns = 0
+        self.nmt_ns = self.heard_ns = 0
         self.booted = self.seen = self.answers = self.asked = self.addressed = self.configured = self.stored = False
         self.started_ns: int | None = None
         self.syncs = 0
@@ -131,6 +135,17 @@ class SeenNode:
         kept = range(0x1000, 0x6000) if self.stored else ()
         self._known = {place: known for place, known in self._known.items() if place[0] in kept}
         self.read_pdos()
+
+    def hear(self, t_ns: int) -> None:
+        """Note a frame of the node; behind a silence its last statusword says nothing any more."""
+        if self.silent(t_ns):
+            self._known.pop((STATUSWORD, 0), None)
+        self.seen, self.heard_ns = True, t_ns
+
+    def silent(self, t_ns: int) -> bool:
+        """Whether heartbeats were missed since its last frame: a drive without its link stops, or loses its power."""
+        beat_ms = self.number(_HEARTBEAT_TIME) or 0
+        return beat_ms > 0 and self.seen and t_ns - self.heard_ns > _LOST_BEATS * beat_ms * 1_000_000
 
     def known(self, index: int, subindex: int = 0) -> Known | None:
         """The last value of an object that passed on the bus since the boot-up."""

@@ -79,7 +79,7 @@ class SyncGaps(Rule):
         settled = any(node.settled for node in self.bus.nodes.values())
         before, self._before = self._before, event if settled else None
         period_ns = self.bus.period_ns
-        if before is None or not period_ns:
+        if before is None or not settled or not period_ns:
             return
         self.looked += 1
         interval_ns = event.frame.t_ns - before.frame.t_ns
