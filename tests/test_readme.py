@@ -21,6 +21,7 @@ from canprobe.cell.scene.load import load_scene, scenes_folder
 from canprobe.cell.scene.model import ArrayFile, Scene
 from canprobe.cli import COMMANDS, main
 from canprobe.fieldbus.eds.packaged import eds_path
+from canprobe.fieldbus.tools.conform.own_points import read_points
 from canprobe.lab.studies.sweep import STUDIES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -166,3 +167,9 @@ def test_the_stops_of_the_path_through_the_code_are_there():
     for file, name in stops:
         tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
         assert name in [node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)], file
+
+
+def test_the_example_of_own_points_can_be_read(tmp_path):
+    (block,) = re.findall(r"```text\n(\[\[point\]\].*?)```", TEXTS["docs/conform.md"], re.DOTALL)
+    (tmp_path / "own.toml").write_text(block, encoding="utf-8")
+    assert [point.title for point in read_points(tmp_path / "own.toml")] == ["201 temperature"]

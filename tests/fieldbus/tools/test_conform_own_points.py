@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 from examined import eds_device, failed
 
@@ -99,9 +96,3 @@ def test_a_mistake_in_the_file_is_named(text, tmp_path):
     with pytest.raises(UsageError) as refused:
         points(tmp_path, text)
     assert WRONG[text] in str(refused.value) and "own.toml" in str(refused.value)
-
-
-def test_the_example_of_the_page_can_be_read(tmp_path):
-    page = (Path(__file__).parents[3] / "docs" / "conform.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```text\n(\[\[point\]\].*?)```", page, re.DOTALL)
-    assert [point.title for point in points(tmp_path, block)] == ["201 temperature"]
