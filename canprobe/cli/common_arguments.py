@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from canprobe.cli.argument_types import channel, folder_path, seconds, setting, whole, word
+from canprobe.cli.argument_types import channel, folder_path, node_id, seconds, setting, whole, word
 from canprobe.cli.parser import Parser
 
 PATIENT_SYNCS = 40
@@ -74,6 +74,25 @@ def add_scene(parser: Parser, optional: bool = False) -> None:
         "--cell", metavar="C", type=word, help="a packaged cell (`canprobe cells` lists them) or a path [the scene's]"
     )
     add_options(parser, "--set")
+
+
+def add_eds_nodes(parser: Parser, *, more: str = "") -> None:
+    """Add --eds and --node-id, which stand in pairs; `more` ends the help of the latter."""
+    parser.add_argument(
+        "--eds",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="EDS or DCF file of a node; may be repeated, each with its --node-id",
+    )
+    parser.add_argument(
+        "--node-id",
+        metavar="N",
+        action="append",
+        default=[],
+        type=node_id,
+        help=f"node id for the --eds at the same position{more}",
+    )
 
 
 def add_options(parser: argparse._ActionsContainer, *names: str) -> None:

@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.argument_types import node_id, node_ids, number_of_32_bits, whole, word
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.argument_types import node_ids, number_of_32_bits, whole, word
+from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_options, add_scene, add_verbosity
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, real_target, target_of
@@ -43,21 +43,7 @@ def add_arguments(parser: Parser) -> None:
     """Add the command's arguments."""
     add_scene(parser, optional=True)
     add_options(parser, *BUS, "--realtime", "--seed")
-    parser.add_argument(
-        "--eds",
-        metavar="FILE",
-        action="append",
-        default=[],
-        help="EDS or DCF file of a node; may be repeated, each with its --node-id",
-    )
-    parser.add_argument(
-        "--node-id",
-        metavar="N",
-        action="append",
-        default=[],
-        type=node_id,
-        help="node id for the --eds at the same position; 255: no id, the node waits for LSS",
-    )
+    add_eds_nodes(parser, more="; 255: no id, the node waits for LSS")
     parser.add_argument(
         "--serial",
         metavar="N",

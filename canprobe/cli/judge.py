@@ -20,8 +20,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.argument_types import node_id, seconds, word
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.argument_types import seconds, word
+from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_options, add_scene, add_verbosity
 from canprobe.cli.emulate import eds_files, scene_target
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_json, print_table
@@ -59,21 +59,7 @@ def add_arguments(parser: Parser) -> None:
     parser.usage = "canprobe judge [SCENE | --eds FILE --node-id N ...] [--record FILE] [options] [-- COMMAND...]"
     add_scene(parser, optional=True)
     add_options(parser, *BUS)
-    parser.add_argument(
-        "--eds",
-        metavar="FILE",
-        action="append",
-        default=[],
-        help="EDS or DCF file of a node; may be repeated, each with its --node-id",
-    )
-    parser.add_argument(
-        "--node-id",
-        metavar="N",
-        action="append",
-        default=[],
-        type=node_id,
-        help="node id for the --eds at the same position",
-    )
+    add_eds_nodes(parser)
     parser.add_argument("--record", metavar="FILE", type=Path, help="judge a candump log, and serve nothing")
     parser.add_argument(
         "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"

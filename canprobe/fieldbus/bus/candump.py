@@ -19,7 +19,8 @@ from types import TracebackType
 
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame, nothing
+from canprobe.fieldbus.bus.port import Port, TimedFrame, nothing
+from canprobe.fieldbus.bus.tapped import TappedPort
 from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
@@ -281,7 +282,7 @@ def _parse_id(match: re.Match[str]) -> int:
     return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
 
 
-class RecordingPort(PlainPort):
+class RecordingPort(TappedPort):
     """A `Port` that records what passes through it, sent frames with the time of sending.
 
     In real time a received frame is written when it is drained, with the time of its reception, so a line may be older
@@ -293,31 +294,15 @@ class RecordingPort(PlainPort):
     """
 
     def __init__(self, port: Port, write: Callable[[int, bytes, int], None]) -> None:
-        self._port = port
+        super().__init__(port)
         self._write = write
-        self.clock, self.channel, self.counters = port.clock, port.channel, port.counters
-        self.stamps_arrival, self.wait, self.close = port.stamps_arrival, port.wait, port.close
 
-    @property
-    def state(self) -> ControllerState:
-        """State of the port's controller."""
-        return self._port.state
-
-    @property
-    def descriptor(self) -> int | None:
-        """Descriptor of the port."""
-        return self._port.descriptor
-
-    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send `frames` and record them, with `t_ns` where it is given."""
-        sent_ns = self.clock.now_ns() if t_ns is None else t_ns
-        self._port.send_batch(frames)
+    def hear_sent(self, frames: Sequence[Frame], t_ns: int) -> None:
+        """Record frames that were sent."""
         for can_id, data in frames:
-            self._write(can_id, data, sent_ns)
+            self._write(can_id, data, t_ns)
 
-    def drain(self) -> list[TimedFrame]:
-        """Return what arrived, and record it."""
-        frames = self._port.drain()
+    def hear_received(self, frames: Sequence[TimedFrame]) -> None:
+        """Record frames that arrived."""
         for can_id, data, t_ns in frames:
             self._write(can_id, data, t_ns)
-        return frames

@@ -8,7 +8,8 @@ from operator import attrgetter
 from pathlib import Path
 
 from canprobe.fieldbus.bus.candump import CandumpWriter
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
+from canprobe.fieldbus.bus.port import Port, TimedFrame
+from canprobe.fieldbus.bus.tapped import TappedPort
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, command_of
 from canprobe.fieldbus.protocol.frames import Frame
@@ -28,7 +29,7 @@ _START = 100_000
 """Place of a drive at first, counts, where its limits do not ask for less."""
 
 
-class HeardPort(PlainPort):
+class HeardPort(TappedPort):
     """The port of served nodes, whose frames are kept with their direction.
 
     Args:
@@ -37,32 +38,16 @@ class HeardPort(PlainPort):
     """
 
     def __init__(self, port: Port, frames: list[BusFrame]) -> None:
-        self._port = port
+        super().__init__(port)
         self._frames = frames
-        self.clock, self.channel, self.counters = port.clock, port.channel, port.counters
-        self.stamps_arrival, self.wait, self.close = port.stamps_arrival, port.wait, port.close
 
-    @property
-    def state(self) -> ControllerState:
-        """State of the port's controller."""
-        return self._port.state
+    def hear_sent(self, frames: Sequence[Frame], t_ns: int) -> None:
+        """Keep frames of the nodes."""
+        self._frames += [BusFrame(t_ns, can_id, data, True) for can_id, data in frames]
 
-    @property
-    def descriptor(self) -> int | None:
-        """Descriptor of the port."""
-        return self._port.descriptor
-
-    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send frames of nodes, and keep them."""
-        sent_ns = self.clock.now_ns()
-        self._port.send_batch(frames)
-        self._frames += [BusFrame(sent_ns, can_id, data, True) for can_id, data in frames]
-
-    def drain(self) -> list[TimedFrame]:
-        """Return what arrived, and keep it."""
-        frames = self._port.drain()
+    def hear_received(self, frames: Sequence[TimedFrame]) -> None:
+        """Keep frames of others."""
         self._frames += [BusFrame(t_ns, can_id, data, False) for can_id, data, t_ns in frames]
-        return frames
 
 
 class MasterBench:
