@@ -65,7 +65,7 @@ def draw(number):
 def test_an_interrupt_ends_the_drawing_of_a_run_even_if_a_library_drops_it(
     number, status, monkeypatch, tmp_path, capfd
 ):
-    monkeypatch.setattr("canprobe.lab.bridge.view.page.write_page", lambda *_: draw(number))
+    monkeypatch.setattr("canprobe.cell.results.figures.draw_run", lambda *_: draw(number))
     out = tmp_path / "run"
     assert main(["run", "free", "--duration", "0.05", "--out", str(out)]) == status
     assert capfd.readouterr().err == f"canprobe: interrupted, the cell is stopped; results until then: {out}\n"

@@ -177,9 +177,9 @@ def test_arrays_of_other_sizes_scan(sensor, curvature):
     plan = plan_of(scene)
     assert plan.setup.shape.patch is curvature
     assert curvature or "no curvature: fewer than 16 taxels" in dict(plan.left_out)["curvature from the patch"]
-    summary = canprobe.run(scene).summary
+    summary = canprobe.run(scene, files=False, duration_s=2.0).summary  # a coarse array needs more path than 20 mm
     assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.2
-    assert summary["shape"]["kappa_est_per_m"][0] == pytest.approx(1 / 0.036, abs=5.0)
+    assert summary["shape"]["kappa_est_per_m"][0] == pytest.approx(1 / 0.036, abs=3.0)
 
 
 def test_a_node_of_another_size_computes_features():
