@@ -31,7 +31,7 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import SceneError, UsageError, check_schema, regular_file
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of ``summary.json``."""
 SUMMARY, LOG, TACTILE, TRUTH = "summary.json", "log.npz", "tactile.npz", "truth.npz"
 _MOST_SUMMARY_BYTES = 16 << 20

@@ -234,7 +234,7 @@ def test_a_folder_of_another_version_says_so(folder: Path, capsys: pytest.Captur
     (folder / "summary.json").write_text(json.dumps({"schema": 1, "written_by": "canprobe 9.1.0"}))
     line = last_line(capsys, "replay", str(folder))
     assert line.startswith(f"canprobe: {folder}/log.npz: written by canprobe 9.1.0, {own}: expected the columns")
-    (folder / "summary.json").write_text(json.dumps({"schema": 2, "written_by": "canprobe 9.1.0"}))
+    (folder / "summary.json").write_text(json.dumps({"schema": 3, "written_by": "canprobe 9.1.0"}))
     told = (
         f"summary.json: written by canprobe 9.1.0, {own}: the file is of a newer canprobe: this one reads up to schema"
     )
