@@ -371,7 +371,7 @@ ROWS = {"t_s": np.arange(0.5, 3.0)}
         (
             "summary.json",
             b'{"schema": 99}',
-            r"json: written by an earlier canprobe, .*: .* up to schema 1, got 99; run the scene",
+            r"json: written by an earlier canprobe, .*: .* up to schema 2, got 99; run the scene",
         ),
         ("summary.json", b"{", r"summary\.json: expected the summary of a run; cannot be read"),
     ],
