@@ -13,18 +13,24 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
-import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import channel, seconds, whole, word
-from canprobe.cli.common_arguments import OPTIONS, add_options, add_verbosity
+from canprobe.cli.common_arguments import OPTIONS, add_verbosity
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser
 from canprobe.cli.progress import say
+from canprobe.cli.reports import (
+    add_report_options,
+    command_line,
+    eds_and_hash,
+    read_baseline,
+    versions,
+    write_report,
+)
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 
@@ -90,12 +96,9 @@ def add_arguments(parser: Parser) -> None:
         help="keep the snapshot in this file [conform-node<N>.snapshot.json, removed when all is put back]",
     )
     parser.add_argument("--restore", metavar="FILE", type=Path, help="put back a snapshot, and end")
-    parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
-    parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
     parser.add_argument("--log", metavar="FILE", type=Path, help="record all frames as a candump log")
     parser.add_argument("--list", action="store_true", help="list the points, and end")
-    add_options(parser, "--json")
+    add_report_options(parser)
     add_verbosity(parser)
 
 
@@ -107,10 +110,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("conform: --node N names the device; `canprobe scan` lists the nodes on a bus")
     from canprobe.fieldbus.tools.conform import ExaminationSettings, WriteList, restore_snapshot
     from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
-    from canprobe.fieldbus.tools.reports import read_json
 
     points, description = _points(args), _description(args)
-    baseline = read_json(args.baseline) if args.baseline is not None else None
+    baseline = read_baseline(args)
     times = BenchTimes(sdo_s=args.timeout, slack_s=_REAL_SLACK_S)
     if args.motion:
         _confirm(args)
@@ -156,21 +158,9 @@ def _examine(args: argparse.Namespace, examination: Examination, points: Sequenc
 
 
 def _finish(args: argparse.Namespace, report: Report, baseline: Report | None) -> int:
-    from canprobe.fieldbus.tools.reports import (
-        append_step_summary,
-        closing_text,
-        compare,
-        report_document,
-        write_html,
-        write_junit,
-    )
+    from canprobe.fieldbus.tools.reports import closing_text, report_document
 
-    change = None if baseline is None else compare(report, baseline)
-    if args.junit is not None:
-        write_junit(report, args.junit)
-    if args.html is not None:
-        write_html(report, args.html, change)
-    append_step_summary(report, os.environ, change)
+    change = write_report(args, report, baseline)
     if args.json:
         print_json(report_document(report))
     else:
@@ -233,25 +223,20 @@ def _emulated(args: argparse.Namespace) -> Port:
 
 def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
     """What the report says of the bench."""
-    import hashlib
-    import platform
-
-    import canprobe
-
     facts = {
-        "command": shlex.join(["canprobe", *sys.argv[1:]]),
+        "command": command_line(),
         "adapter": args.bus or "socketcan",
         "bit rate": f"{args.bitrate or 1_000_000} bit/s" if args.bus != "lockstep" else "virtual time",
-        "versions": f"canprobe {canprobe.__version__}, Python {platform.python_version()}, {platform.platform()}",
+        "versions": versions(),
         "permitted": ", ".join(filter(None, [args.write, "motion" if args.motion else ""]))
         or "nothing beyond the default",
     }
     if args.eds is not None:
-        from canprobe.fieldbus.eds.packaged import check_eds, eds_file
+        from canprobe.fieldbus.eds.packaged import check_eds
 
-        path, reading = eds_file(args.eds), check_eds(args.eds, args.node)
+        reading = check_eds(args.eds, args.node)
         facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
-        facts["EDS"] = f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+        facts["EDS"] = eds_and_hash(args.eds)
     return facts
 
 

@@ -12,9 +12,7 @@ throws none. Your master never drives anything real here, as long as no real nod
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -27,6 +25,14 @@ from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser
 from canprobe.cli.progress import say
+from canprobe.cli.reports import (
+    add_report_options,
+    command_line,
+    eds_and_hash,
+    read_baseline,
+    versions,
+    write_report,
+)
 from canprobe.cli.target import loaded, real_target
 from canprobe.errors import UsageError
 
@@ -82,11 +88,8 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--output", metavar="FILE", type=Path, help="file for the output of COMMAND [a temporary one]")
     parser.add_argument("--log", metavar="FILE", type=Path, help="write the frames as a candump log")
-    parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
-    parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
     parser.add_argument("--list", action="store_true", help="list the rules, and end")
-    add_options(parser, "--json")
+    add_report_options(parser)
     add_verbosity(parser)
 
 
@@ -111,9 +114,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("judge: name a SCENE or a cell, or else --eds FILE --node-id N")
     if args.inject and args.passive:
         raise UsageError("judge: --inject throws faults, and --passive throws none; choose one")
-    from canprobe.fieldbus.tools.reports import read_json
-
-    args.older = read_json(args.baseline) if args.baseline is not None else None
+    args.older = read_baseline(args)
     if args.record is not None:
         return _judge_record(args)
     return _judge_served(args)
@@ -256,42 +257,21 @@ def _report_of(
 
 def _facts(args: argparse.Namespace) -> dict[str, str]:
     """What the report says of the bench."""
-    import hashlib
-    import platform
-
-    import canprobe
-    from canprobe.fieldbus.eds.packaged import eds_file
-
     facts = {
-        "command": shlex.join(["canprobe", *sys.argv[1:]]),
+        "command": command_line(),
         "bit rate": f"{args.bitrate or 1_000_000} bit/s",
-        "versions": f"canprobe {canprobe.__version__}, Python {platform.python_version()}, {platform.platform()}",
+        "versions": versions(),
     }
     for name, one in zip(args.eds, args.node_id, strict=False):
-        path = eds_file(name)
-        facts[f"EDS of node {one}"] = f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+        facts[f"EDS of node {one}"] = eds_and_hash(name)
     return facts
 
 
 def _print(args: argparse.Namespace, report: Report) -> None:
     """Write the files, and print the findings and the closing table."""
-    from canprobe.fieldbus.tools.reports import (
-        Verdict,
-        append_step_summary,
-        closing_text,
-        compare,
-        report_document,
-        row_text,
-        write_html,
-        write_junit,
-    )
+    from canprobe.fieldbus.tools.reports import Verdict, closing_text, report_document, row_text
 
-    change = None if args.older is None else compare(report, args.older)
-    if args.junit is not None:
-        write_junit(report, args.junit)
-    if args.html is not None:
-        write_html(report, args.html, change)
-    append_step_summary(report, os.environ, change)
+    change = write_report(args, report, args.older)
     if args.json:
         print_json(report_document(report))
         return

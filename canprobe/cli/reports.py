@@ -1,0 +1,68 @@
+"""What commands with a report of an examination share: options, facts of the bench, and the files that are written."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.cli.common_arguments import add_options
+
+if TYPE_CHECKING:
+    from canprobe.cli.parser import Parser
+    from canprobe.fieldbus.tools.reports import Report, ReportChange
+
+
+def add_report_options(parser: Parser) -> None:
+    """Add --baseline, --junit, --html and --json."""
+    parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
+    parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
+    parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
+    add_options(parser, "--json")
+
+
+def read_baseline(args: argparse.Namespace) -> Report | None:
+    """The older report, read before anything is sent; None where none is named."""
+    from canprobe.fieldbus.tools.reports import read_json
+
+    return read_json(args.baseline) if args.baseline is not None else None
+
+
+def write_report(args: argparse.Namespace, report: Report, baseline: Report | None) -> ReportChange | None:
+    """Write the files that are asked for, and the step summary of GitHub; what changed since the baseline."""
+    from canprobe.fieldbus.tools.reports import append_step_summary, compare, write_html, write_junit
+
+    change = None if baseline is None else compare(report, baseline)
+    if args.junit is not None:
+        write_junit(report, args.junit)
+    if args.html is not None:
+        write_html(report, args.html, change)
+    append_step_summary(report, os.environ, change)
+    return change
+
+
+def command_line() -> str:
+    """The command as it was typed."""
+    return shlex.join(["canprobe", *sys.argv[1:]])
+
+
+def versions() -> str:
+    """Versions of canprobe, Python and the system."""
+    import platform
+
+    import canprobe
+
+    return f"canprobe {canprobe.__version__}, Python {platform.python_version()}, {platform.platform()}"
+
+
+def eds_and_hash(name: str) -> str:
+    """Name of an EDS file with the hash of its content."""
+    import hashlib
+
+    from canprobe.fieldbus.eds.packaged import eds_file
+
+    path = eds_file(name)
+    return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
