@@ -16,9 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate, is_umbilic
-from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
+from canprobe.mechanics.touch.estimate.online import Estimator, OuterEstimator
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.types import Floats
 
@@ -31,7 +30,7 @@ LAG_SHARE = 0.075
 set on scans of nine packaged scenes."""
 
 
-class FollowingEstimator:
+class FollowingEstimator(OuterEstimator):
     """An estimator, with covariances that grow by the lag of its answers.
 
     Args:
@@ -41,25 +40,16 @@ class FollowingEstimator:
     """
 
     def __init__(self, inner: Estimator, memory_m: float, scale: float = 0.0) -> None:
-        self._inner = inner
+        super().__init__(inner)
         self._scale = scale
         self._memory = memory_m
         self._past: deque[tuple[float, Floats]] = deque()
         self._place: Floats | None = None
         self._travelled = 0.0
 
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by reason."""
-        return self._inner.dropped
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        self._inner.add(sample)
-
     def reset(self) -> None:
         """Forget everything but the settings."""
-        self._inner.reset()
+        super().reset()
         self._past.clear()
         self._place = None
 

@@ -17,9 +17,8 @@ import math
 
 import numpy as np
 
-from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
+from canprobe.mechanics.touch.estimate.online import Estimator, OuterEstimator
 from canprobe.mechanics.touch.estimate.widened import widened
 from canprobe.mechanics.types import Floats
 
@@ -27,7 +26,7 @@ MIN_LEVEL = 0.5
 """Least level of the variances."""
 
 
-class LevelledEstimator:
+class LevelledEstimator(OuterEstimator):
     """An estimator with variances multiplied by the mean of its innovations over the path.
 
     Args:
@@ -39,7 +38,7 @@ class LevelledEstimator:
     """
 
     def __init__(self, inner: Estimator, memory_m: float) -> None:
-        self._inner = inner
+        super().__init__(inner)
         self._memory = memory_m
         self._restart()
 
@@ -47,18 +46,9 @@ class LevelledEstimator:
         self._mean = self.level = 1.0
         self._place: Floats | None = None
 
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by reason."""
-        return self._inner.dropped
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        self._inner.add(sample)
-
     def reset(self) -> None:
         """Forget everything but the settings."""
-        self._inner.reset()
+        super().reset()
         self._restart()
 
     def estimate(self) -> SurfaceEstimate | None:

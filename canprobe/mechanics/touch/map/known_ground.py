@@ -20,7 +20,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import Decision
-from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
+from canprobe.mechanics.touch.estimate.online import Estimator, OuterEstimator
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, parameters_of
 from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted, solved
@@ -56,7 +56,7 @@ class KnownCurvature(NamedTuple):
     covariance: Floats
 
 
-class RevisitingEstimator:
+class RevisitingEstimator(OuterEstimator):
     """An estimator that knows the ground which it comes back to.
 
     Args:
@@ -66,20 +66,16 @@ class RevisitingEstimator:
     """
 
     def __init__(self, inner: Estimator, surface_map: SurfaceMap, memory_m: float) -> None:
-        self._inner, self._map = inner, surface_map
+        super().__init__(inner)
+        self._map = surface_map
         self._between = MEMORIES_BETWEEN * memory_m
         self._waiting: deque[tuple[float, ContactSample]] = deque()
         self._travel = Travel(step_of(surface_map.noise.lateral))
 
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by reason."""
-        return self._inner.dropped
-
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         before = self._inner.dropped.total
-        self._inner.add(sample)
+        super().add(sample)
         if self._inner.dropped.total == before:
             self._travel.add(sample.p_base)
             if len(self._waiting) < MAX_WAITING:
@@ -87,7 +83,7 @@ class RevisitingEstimator:
 
     def reset(self) -> None:
         """Forget everything but the settings and the ground."""
-        self._inner.reset()
+        super().reset()
         self._learn(math.inf)
 
     def estimate(self) -> SurfaceEstimate | None:
