@@ -1,11 +1,11 @@
-"""A port that is heard: a record, or a judge, takes the place of a port and passes everything on."""
+"""A port in the place of another one, which passes everything on: a record, a judge or a meter hears its frames."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
+from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCounters, TimedFrame
 from canprobe.fieldbus.protocol.frames import Frame
 
 
@@ -18,8 +18,13 @@ class TappedPort(PlainPort, ABC):
 
     def __init__(self, port: Port) -> None:
         self._port = port
-        self.clock, self.channel, self.counters = port.clock, port.channel, port.counters
+        self.clock, self.channel = port.clock, port.channel
         self.stamps_arrival, self.wait, self.close = port.stamps_arrival, port.wait, port.close
+
+    @property
+    def counters(self) -> PortCounters:
+        """Counters of the port."""
+        return self._port.counters
 
     @property
     def state(self) -> ControllerState:
@@ -34,7 +39,7 @@ class TappedPort(PlainPort, ABC):
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames`, which are heard with `t_ns` where it is given, and else with the time before they are sent."""
         sent_ns = self.clock.now_ns() if t_ns is None else t_ns
-        self._port.send_batch(frames)
+        self._port.send_batch(frames, t_ns)
         self.hear_sent(frames, sent_ns)
 
     def drain(self) -> list[TimedFrame]:

@@ -183,6 +183,13 @@ class Bench(SdoClient):
                 self.deviates(f"no EMCY {code:04X}h ({describe(code)}) came")
             self.pass_time(min(0.005, (until_ns - self.now_ns) * 1e-9))
 
+    def optional_emcy(self, code: int, within_s: float) -> int:
+        """Time of an EMCY message that a device may leave out. Raises PointNotApplicable where it does not come."""
+        try:
+            return self.emcy(code, within_s)[1]
+        except Deviation as error:
+            raise PointNotApplicable("the device does not report it; CiA 301 leaves that open") from error
+
     def errors(self) -> list[Emcy]:
         """EMCY messages that have come and report an error."""
         self.pass_time(0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from canprobe.fieldbus.bus.clock import Clock
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCounters, TimedFrame
+from canprobe.fieldbus.bus.port import Port, TimedFrame
+from canprobe.fieldbus.bus.tapped import TappedPort
 from canprobe.fieldbus.protocol.frame_bits import best_case_bits
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, SYNC_ID, Frame
 from canprobe.fieldbus.tools.link.figures import AnswerFigures
@@ -51,7 +51,7 @@ class NodeAnswers:
         return AnswerFigures(node_id, self.expected, tuple(sorted(self.times_ns)), self.late, self.absent, rows)
 
 
-class LinkMeter(PlainPort):
+class LinkMeter(TappedPort):
     """Passes everything on to a port, and notes SYNCs, answers and bits from `begin` to `end`.
 
     A frame counts for the last SYNC that was sent before it arrived. Bits are counted without stuffing.
@@ -64,7 +64,7 @@ class LinkMeter(PlainPort):
     """
 
     def __init__(self, port: Port, *, wait_ns: int, answers: Mapping[int, int], known: Collection[int]) -> None:
-        self._port = port
+        super().__init__(port)
         self._wait_ns, self._known = wait_ns, frozenset(known)
         self._answers = dict(answers)
         nodes = [*answers.values()]
@@ -74,63 +74,40 @@ class LinkMeter(PlainPort):
         self._sync_before_ns: int | None = None
         self._begin_ns = self._end_ns = 0
         self.bits = self.foreign = 0
-        self.clock: Clock = port.clock
-        self.channel = port.channel
-        self.stamps_arrival = port.stamps_arrival
-        self.wait, self.close = port.wait, port.close
-
-    @property
-    def counters(self) -> PortCounters:
-        """Counters of the port."""
-        return self._port.counters
-
-    @property
-    def state(self) -> ControllerState:
-        """State of the port's controller."""
-        return self._port.state
-
-    @property
-    def descriptor(self) -> int | None:
-        """Descriptor of the port."""
-        return self._port.descriptor
 
     def defer(self, can_ids: Collection[int]) -> None:
         """Let the port defer frames."""
         self._port.defer(can_ids)
 
-    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send frames; a SYNC begins a cycle."""
-        if self._measures:
-            for can_id, data in frames:
-                self._count(data)
-                if can_id == SYNC_ID:
-                    if self._sync_ns is not None:
-                        for one in self._nodes.values():
-                            one.next_cycle(self._wait_ns)
-                    self._sync_before_ns, self._sync_ns = (
-                        self._sync_ns,
-                        self.clock.now_ns() if t_ns is None else t_ns,
-                    )
-        self._port.send_batch(frames, t_ns)
-
     def send_on(self, channel: str, frames: Sequence[Frame]) -> None:
         """Send frames on one of several buses."""
         self._port.send_on(channel, frames)  # type: ignore[attr-defined]  # a `JoinedPort` has it
 
-    def drain(self) -> list[TimedFrame]:
-        """Return the frames of the port."""
-        frames = self._port.drain()
-        if self._measures and self._sync_ns is not None:
-            for can_id, data, t_ns in frames:
-                self._count(data)
-                node_id = self._answers.get(can_id)
-                if node_id is None:
-                    self.foreign += can_id not in self._known
-                elif t_ns >= self._sync_ns:
-                    self._nodes[node_id].now.append(t_ns - self._sync_ns)
-                elif self._sync_before_ns is not None and (before := self._nodes[node_id].before) is not None:
-                    before.append(t_ns - self._sync_before_ns)
-        return frames
+    def hear_sent(self, frames: Sequence[Frame], t_ns: int) -> None:
+        """Note frames of the master; a SYNC begins a cycle."""
+        if not self._measures:
+            return
+        for can_id, data in frames:
+            self._count(data)
+            if can_id == SYNC_ID:
+                if self._sync_ns is not None:
+                    for one in self._nodes.values():
+                        one.next_cycle(self._wait_ns)
+                self._sync_before_ns, self._sync_ns = self._sync_ns, t_ns
+
+    def hear_received(self, frames: Sequence[TimedFrame]) -> None:
+        """Note frames of others: each counts for the last SYNC before it."""
+        if not self._measures or self._sync_ns is None:
+            return
+        for can_id, data, t_ns in frames:
+            self._count(data)
+            node_id = self._answers.get(can_id)
+            if node_id is None:
+                self.foreign += can_id not in self._known
+            elif t_ns >= self._sync_ns:
+                self._nodes[node_id].now.append(t_ns - self._sync_ns)
+            elif self._sync_before_ns is not None and (before := self._nodes[node_id].before) is not None:
+                before.append(t_ns - self._sync_before_ns)
 
     def begin(self) -> None:
         """Begin to measure, with the next SYNC."""
