@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import replace
 
 import pytest
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.slow
         (0.181, "ideal", 2.0, 10.0, 3.0),
         (4.5, "ideal", 2.0, 10.0, 3.0),
         (18.0, "ideal", 2.0, 20.0, 3.5),
-        (18.0, "dynamic", 6.0, 20.0, 4.0),
+        (18.0, "dynamic", 6.0, 20.0, 3.5),
     ],
     ids=["4 kN/m", "20 kN/m", "40 kN/m", "40 kN/m, dynamic arm"],
 )
@@ -28,17 +29,21 @@ def test_force_is_kept_without_retuning(share, fidelity, seconds, rms_percent, m
 
     At 40 kN/m one count of an encoder is up to 1.1 N, which must not make the stiffness that is felt a doubtful one.
     There the dynamic arm errs by 20 to 21 % over the first two seconds, while the curvature is learned, by 17 to 18 %
-    over six and 16 % over a whole scan; its highest force over six seeds is 3.1 to 3.7 N.
+    over six and 16 % over a whole scan. Its highest force depends on the seed, from 3.1 to 3.7 N: the limit is that of
+    the median of three.
     """
     scene = canprobe.load_scene("cylinder")
     plant = replace(scene.plant or PlantSettings(), stiffness_n_m3=share * NOMINAL, fidelity=fidelity)
     assert scene.shape is not None
     scene = replace(scene, plant=plant, shape=replace(scene.shape, also=()))
-    result = canprobe.run(scene, files=False, duration_s=seconds)
-    contact = result.summary["contact"]
-    assert contact["contact_fraction"] == 1.0
-    assert 100 * contact["force_rms_error_n"] / 2.0 < rms_percent
-    assert result.truth["force_n"].max() < most_n
+    highest = []
+    for seed in range(3 if fidelity == "dynamic" else 1):
+        result = canprobe.run(scene, files=False, duration_s=seconds, seed=seed)
+        contact = result.summary["contact"]
+        assert contact["contact_fraction"] == 1.0
+        assert 100 * contact["force_rms_error_n"] / 2.0 < rms_percent
+        highest.append(result.truth["force_n"].max())
+    assert statistics.median(highest) < most_n
 
 
 def test_the_first_answer_of_the_estimator_does_not_jerk_a_stiff_arm():
