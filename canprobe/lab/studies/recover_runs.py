@@ -31,6 +31,8 @@ from canprobe.lab.studies.recover_cases import BOOTING, END_S, REPLUG, SCENES, S
 
 HELD_S = 0.25
 """Time of the hold before motion is asked for."""
+SETTLED_S = 0.5
+"""Time of the work after the last outage, and after motion was asked for: what is lost is noticed within 0.2 s."""
 SLACK_S = 1.0
 """Time that a cell may take from the boot-up of a node to the hold, besides the node's SDO times: 0 in lockstep."""
 
@@ -85,20 +87,18 @@ class Work(Controller):
 
     Args:
         task: the task.
-        at_cycle: called with each measurement.
-        most: cycles after which it is done.
+        is_over: called with each measurement; whether the case is over.
     """
 
-    def __init__(self, task: Controller, at_cycle: Callable[[Measurement], None], most: int) -> None:
-        self._task, self._at_cycle, self._left = task, at_cycle, most
+    def __init__(self, task: Controller, is_over: Callable[[Measurement], bool]) -> None:
+        self._task, self._is_over = task, is_over
         self.can_go_on = task.can_go_on
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle of the task."""
-        self._at_cycle(measurement)
-        self._left -= 1
+        over = self._is_over(measurement)
         command = self._task.step(measurement)
-        return replace(command, done=True) if self._left <= 0 else command
+        return replace(command, done=True) if over else command
 
     def update(self) -> None:
         """Let the task work."""
@@ -146,15 +146,22 @@ class RecoverScore:
         if text.startswith("the cell is back"):
             self.resumes_in = round(HELD_S * 1e9 / self.plan.sync.period_ns)
 
-    def works(self, at_cycle: Callable[[Measurement], None]) -> list[Work]:
-        """The work of the case, and short ones that follow a loss that ended it."""
-        rate_hz = 1e9 / self.plan.sync.period_ns
-        task = HoldTask() if self.case.work == "hold" else make_task(self.plan)
-        held = [Work(HoldTask(), at_cycle, round(0.5 * rate_hz)) for _ in range(len(self.case.outages) + 1)]
-        return [Work(task, at_cycle, round((END_S + 4.0) * rate_hz)), *held]
+    def carry_out(self, session: Session, begin: Callable[[], None], now_s: Callable[[], float]) -> None:
+        """Run the work in an open session, then hold, until nothing more is to be lost or the cell has ended.
 
-    def carry_out(self, session: Session, works: Sequence[Work], now_s: Callable[[], float]) -> None:
-        """Run the works in an open session, until nothing more is to be lost or the cell has ended."""
+        Args:
+            session: the session.
+            begin: called in the first cycle of the work: the outages count from then.
+            now_s: present time, s.
+        """
+
+        def is_over(_: Measurement) -> bool:
+            if self.first_s is None:
+                self.first_s = now_s()
+                begin()
+            last_s = max(loss.ends_s for loss in self.case.outages) + self.first_s
+            back_s = max((time for time, text in self._said if text.startswith("the cell is back")), default=0.0)
+            return now_s() >= max(last_s, back_s + HELD_S) + SETTLED_S
 
         def after_cycle(_: Measurement) -> None:
             if self.resumes_in is not None:
@@ -163,11 +170,11 @@ class RecoverScore:
                     self.resumes_in = None
                     session.resume()
 
-        last_s = max(loss.after_s for loss in self.case.outages)
-        for work in works:
+        task = HoldTask() if self.case.work == "hold" else make_task(self.plan)
+        for controller in (task, *(HoldTask() for _ in range(len(self.case.outages) + 1))):
             try:
-                session.run(work, after_cycle)
-                if self.first_s is None or now_s() >= self.first_s + last_s:
+                session.run(Work(controller, is_over), after_cycle)
+                if is_over(Measurement(0, 0)):
                     break
             except CanprobeError as error:
                 self.errors.append(error)
@@ -262,7 +269,7 @@ class RecoverRun:
         session.around = self._disturbed
         self._away: list[tuple[int, int, bool]] = []
         with session:
-            self._score.carry_out(session, self._score.works(self._at_cycle), lambda: self._now_ns * 1e-9)
+            self._score.carry_out(session, self._begin, lambda: self._now_ns * 1e-9)
 
     @property
     def _now_ns(self) -> int:
@@ -274,11 +281,8 @@ class RecoverRun:
         if text.startswith(("lift off", "enable the drives")):
             self._drives.lifting = text.startswith("lift off")
 
-    def _at_cycle(self, _: Measurement) -> None:
-        """Throw the outages, at the first cycle of the work."""
-        if self._score.first_s is not None:
-            return
-        self._score.first_s = self._now_ns * 1e-9
+    def _begin(self) -> None:
+        """Throw the outages."""
         for loss in self._case.outages:
             if loss.name in (REPLUG, STALL):
                 begin_ns = self._now_ns + round(loss.after_s * 1e9)
