@@ -229,7 +229,8 @@ def test_frames_go_where_they_belong_and_what_came_before_a_sync_does_first():
 
 def test_requests_to_the_array_go_out_with_the_cycle_that_makes_them():
     port = Written()
-    array = SimpleNamespace(cob_ids=(0x511,), newest_cycle=2, channel="can0", take=lambda *_: None)
+    array, counters = SimpleNamespace(cob_ids=(0x511,), newest_cycle=2, channel="can0"), []
+    array.take = lambda number, counter, *_: counters.append(counter)
     array.requests = lambda number: [(0x600, bytes((number,)))] if number == 3 else []
     cycle = a_cycle(port, drives=False, tactile=array)
     cycled(cycle, 5)
@@ -237,6 +238,7 @@ def test_requests_to_the_array_go_out_with_the_cycle_that_makes_them():
         (3 * PERIOD_NS + LOOKS[0] * 1000, b"\x03")
     ]
     assert cycle.begin().tactile_age == 3
+    assert counters == [0] * 6, "this SYNC has no counter"
 
 
 def test_without_drives_a_cell_counts_as_enabled():

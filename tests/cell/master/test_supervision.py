@@ -74,6 +74,7 @@ def felt(**patch):
         ("force", touch(4.8, force_sigma=0.1), touch(4.8, force_sigma=0.101), "4.80 N, or up to 5.00 N (2σ), above"),
         ("force", touch(4.9, force_sigma=math.inf), touch(5.001, force_sigma=math.inf), "above the limit of 5.00 N"),
         ("sensor_stale", touch(age=12), touch(age=13), "no tactile frame for 13 cycles"),
+        ("sensor_stale", touch(age=None), touch(age=20), "no tactile frame for 20 cycles"),
         ("contact_lost", touch(lost_s=0.0299), touch(lost_s=0.0301), "contact lost"),
         ("drive_late", with_ages(0, 2), with_ages(0, 3), "node 2: no usable TPDO for 3 cycles"),
         ("drive_silent", with_ages(5, 0), with_ages(6, 0), "node 1: lost: no usable TPDO for 6 cycles"),
