@@ -48,8 +48,11 @@ def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_
     steps = ("node 3: booted", "nodes 1-6: NMT command reset node", "nodes 1-6: enabled")
     assert [there.index(step) for step in steps] == sorted(there.index(step) for step in steps)
     kinds = "\n".join(run.summary["faults"])
-    for words in ("node 3: lost: no usable TPDO", "the cell came back, at", "motion was asked for, and went on, at"):
-        assert words in kinds
+    words = ("node 3: lost: no usable TPDO .*", "the cell came back", "motion was asked for, and went on")
+    lost_s, back_s, went_on_s = (float(re.search(rf"{one}, at ([\d.]+) s", kinds)[1]) for one in words)
+    assert times[LOSS_CYCLE] < lost_s < times[LOSS_CYCLE] + 0.05
+    assert 2.5 < back_s - lost_s < 3.0, "half a second after it booted"
+    assert went_on_s == pytest.approx(back_s + HELD_CYCLES * 0.0025, abs=0.02)
 
 
 def somebody_resets(run):

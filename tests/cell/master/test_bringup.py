@@ -153,6 +153,10 @@ def assert_left_pre_operational(tmp_path, before=(0x81,)):
 def test_the_nodes_are_configured_side_by_side(tmp_path):
     with open_session(tmp_path) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
+    assert [line for line in session.said if not line.startswith("node ")] == [
+        *("listen for another master", "reset nodes 1, 2, 3, 4, 5, 6"),
+        *("identify and configure the nodes", "start all nodes"),
+    ]
     asked = [i - 0x600 for _, i, _ in frames(tmp_path) if 0x600 < i < 0x680]
     for part in range(1, 6):
         so_far = asked[: len(asked) * part // 6]

@@ -446,6 +446,35 @@ def test_a_record_is_gone_before_the_drive_moves(tmp_path):
     assert kept == [{}] and json.loads(bench.record.read_text())["nodes"].keys() == {"1"}
 
 
+def test_a_record_is_there_as_soon_as_the_joint_is_homed(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path)
+    with bench.cell(to_home=True) as cell:
+        cell.homing.home(0)
+        entry = json.loads(bench.record.read_text())["nodes"]["1"]
+    assert entry["position"] == -entry["objects"]["607Ch:00"]
+
+
+class Odd(Turned):
+    """A drive whose statusword is that of no state, the first times that it is asked for it."""
+
+    def __init__(self, node):
+        super().__init__(node)
+        self._left = 2 * (node.node_id == 1)
+
+    def receive(self, can_id, data, t_ns):
+        answers = self._node.receive(can_id, data, t_ns)
+        if self._left and data[:4].hex() == "40416000":
+            self._left -= 1
+            return [(i, d[:4] + b"\x01\x06\0\0") for i, d in answers]
+        return answers
+
+
+def test_a_drive_in_no_known_state_is_given_no_voltage_before_it_is_homed(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path, around=Odd)
+    bench.home()
+    assert bench.words(1)[:3] == [0x00, 0x00, 0x06]
+
+
 def test_a_drive_that_does_not_say_where_it_is_left_keeps_no_record_and_the_others_theirs(tmp_path):
     bench = Bench(scene_of([35, 35]), tmp_path)
     bench.home()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -218,3 +219,14 @@ def test_a_list_of_numbers_is_a_target_and_the_first_joint_beyond_is_named(guard
 def test_the_workspace_ends_beyond_its_borders(at_mm, told):
     found = outside_workspace(1e-3 * np.array(at_mm), 1e-3 * np.array([[0, 0, 0], [100, 200, 300]]))
     assert found is None if told is None else told in found
+
+
+def test_a_target_outside_of_the_workspace_is_not_sent(plan, guard):
+    tip_at = guard.T_base_tip(ELBOW_FORM)[:3, 3]
+    limits = replace(plan.setup.limits, workspace=np.array([tip_at - 0.01, tip_at + 0.01]))
+    boxed = JointGuard(replace(plan, setup=replace(plan.setup, limits=limits)))
+    assert boxed.command(ELBOW_FORM, at(ELBOW_FORM, 0)).q is ELBOW_FORM
+    turned = ELBOW_FORM + np.radians([5.0, 0, 0, 0, 0, 0])
+    found = boxed.command(turned, at(turned, 1))
+    assert found.q is None and found.limit.startswith("the probe's tip at ") and found.limit == boxed.outside(turned)
+    assert guard.outside(turned) is None
