@@ -277,11 +277,10 @@ class Homing:
         found, braking = self._read(setup, POSITION, 0), zero.zero_speed**2 / (2.0 * zero.acceleration)
         per_q = abs(float(self._model.units_per_q[axis, axis]))
         if abs(found - home) > self._tolerance(axis) + braking * per_q:
-            raise self._error(
-                setup,
-                f"homed, but is at {found} (6064h) where {home} was expected with 607Ch = {-home}: the drive may count"
-                " the home offset the other way round",
-            )
+            why = "it has no home offset (607Ch)"
+            if any(write.index == HOME_OFFSET for write in setup.homing):
+                why = f"with 607Ch = {-home}: the drive may count the home offset the other way round"
+            raise self._error(setup, f"homed, but is at {found} (6064h) where {home} was expected, {why}")
         inside = float(np.clip(zero.home, self._low[axis], self._high[axis]))
         joint, stands = self._model.joints[axis], "it stands there"
         if inside != zero.home and _has_profile_position(setup):
