@@ -286,7 +286,8 @@ class Homing:
         if inside != zero.home and _has_profile_position(setup):
             with self._left_disabled(setup):
                 target = round(drive_position_at(self._model, axis, inside, units))
-                self._move(setup, zero, target, max(1, round(zero.speed * per_q / setup.speed_unit)))
+                speed = max(1, round(zero.speed * per_q / setup.speed_unit))
+                self._move(setup, zero, target, speed, self._tolerance(axis))
             stands = f"it stands at {joint.text(inside, '.2f')}, inside its range"
         elif inside != zero.home:
             stands = "it stands there, outside its range: move it inside by hand before a run"
@@ -332,7 +333,7 @@ class Homing:
             setup, (HOMING_ATTAINED_BIT, TARGET_REACHED_BIT), zero.timeout_s, what, late, error=HOMING_ERROR_BIT
         )
 
-    def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int) -> None:
+    def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int, tolerance: float) -> None:
         """Move a drive to a target in profile position."""
         self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         self._enable(setup, OperationMode.PROFILE_POSITION)
@@ -342,6 +343,12 @@ class Homing:
         self._await_bits(setup, (SETPOINT_ACKNOWLEDGE_BIT,), self._times.enable_s, what, late)
         self._command(setup, _ENABLE)
         self._await_bits(setup, (TARGET_REACHED_BIT,), zero.timeout_s, what, late)
+        # Bit 10 may still be that of the homing, or of a drive whose position window (6067h) is switched off.
+        self._await(
+            lambda: abs(self._read(setup, POSITION, 0) - target) <= tolerance,
+            zero.timeout_s,
+            lambda: self._error(setup, late),
+        )
 
     def _enable(self, setup: NodeSetup, mode: OperationMode) -> None:
         self._write(setup, Write(MODE, 0, mode, "mode of operation"))
