@@ -211,7 +211,7 @@ def _rows(rows: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, K_r
             (node[..., column.HEADING], on_pad, -node[..., column.X_PAD], -node[..., column.Y_PAD])
         ):
             A[..., 1:, TERMS + k] = -tilt[..., None] * (way @ discs.R)[..., :2]
-    heights, normals = noise.independent(node[..., column.COUNT], node[..., column.PATH])
+    heights, normals = noise.independent(node[..., column.COUNT], node[..., column.PATH], column.NODE_M)
     lateral2 = node[..., column.LATERAL2]
     scale = np.empty((m, n, 3))
     scale[..., 0] = np.sqrt(heights / node[..., column.HEIGHT2]) * LENGTH_M
