@@ -301,6 +301,52 @@ def test_the_map_shows_where_passes_disagree():
     assert apart.distance(at)[1][1] > 0.1e-3  # half of the step between them
 
 
+def test_what_every_pass_repeats_is_not_averaged_away_and_no_disagreement():
+    """Taxels under the patch lift a pad by up to 6 µm, every 3 mm, and on each of 200 passes by the same."""
+    p, n, _ = on_sphere(RASTER, 0.05)
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    lift = 6e-6 * np.sin(2.0 * np.pi * p[:, 0] / 3e-3)
+    samples = []
+    for i, (place, up) in enumerate(zip(p + lift[:, None] * n, n, strict=True)):
+        at = T.copy()
+        at[:3, 3] = place + 0.04 * up
+        samples.append(ContactSample(0.005 * i, place, up, at, np.array([0.0, 0.0, 0.04]), 0.0, 30e-6))
+    once = SurfaceMap(PadLayer(0.04, 1e8), PAD_NOISE)
+    once.add_samples(samples)
+    rows = once.nodes.rows
+    rows[:, nodes.COUNT :] *= 200.0
+    often = SurfaceMap.of_nodes(rows, once.pad, PAD_NOISE, once.stiffness)
+    at = on_sphere(PLACES, 0.05)[0]
+    assert (often.disagreement(at) == 0.0).all()
+    less = np.sqrt(np.trace(often.normal(at)[1], axis1=1, axis2=2) / np.trace(once.normal(at)[1], axis1=1, axis2=2))
+    assert (less > 0.25).all()  # 0.07 where all passes count as independent
+    assert (less < 0.6).all()
+
+
+def test_contacts_are_placed_by_what_the_map_knows_in_the_end():
+    """A pad on a ball whose contacts were placed as if the ball were flat, and its layer a fifth too soft."""
+    radius, stiffness = 0.04, 1.2e8
+    p, n, _ = on_sphere(RASTER, 0.05)
+    forces = np.linspace(1.0, 3.0, len(p))
+    samples = []
+    for i, (place, up, force) in enumerate(zip(p, n, forces.tolist(), strict=True)):
+        depth, wrong = (
+            indentation_from_force(force, k, radius, kappa)
+            for k, kappa in ((stiffness, (20.0, 20.0)), (0.8 * stiffness, (0.0, 0.0)))
+        )
+        T = np.diag([1.0, -1.0, -1.0, 1.0])
+        T[:3, 3] = place + (radius - depth) * up
+        r = np.array([0.0, 0.0, radius - wrong])
+        samples.append(ContactSample(0.005 * i, place + (wrong - depth) * up, up, T, r, force, 30e-6))
+    found = SurfaceMap(PadLayer(radius, stiffness), PAD_NOISE)
+    found.add_samples(samples)
+    off = [np.linalg.norm(sample.p_base - np.array([0.0, 0.0, -0.05])) - 0.05 for sample in found.settled(samples)]
+    assert np.abs(off).max() < 5e-6
+    alone = SurfaceMap(PadLayer(radius, stiffness), PAD_NOISE)
+    alone.add_samples(samples[:1])
+    assert alone.settled(samples[:1]) == samples[:1]  # one contact shows no curvature
+
+
 def test_terms_are_the_derivatives_of_the_height():
     a = np.random.default_rng(0).normal(size=15)
     x, y, d = np.array([0.3, -0.7]), np.array([0.5, 0.2]), 1e-5
