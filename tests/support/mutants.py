@@ -116,10 +116,9 @@ def mutants_of(module: str) -> Iterator[Mutant]:
         for change, (what, _) in enumerate(_changes(node)):
             statement, names = statements[id(node)], frozenset[str]()
             lines = (statement.lineno, *range(node.lineno, node.end_lineno + 1))
-            if id(node) not in called and isinstance(statement, ast.FunctionDef):  # a default, or a decorator
-                lines = tuple(range(statement.body[0].lineno, statement.end_lineno + 1))
-            elif id(node) not in called:
-                names = frozenset(part.id for part in ast.walk(statement) if _is_name(part, ast.Store))
+            if id(node) not in called:
+                made = (one.id for one in ast.walk(statement) if _is_name(one, ast.Store))
+                names = frozenset((statement.name,) if isinstance(statement, ast.FunctionDef) else made)
                 lines = ()
             yield Mutant(module, number, change, node.lineno, what, lines, names)
 
@@ -221,12 +220,12 @@ class Choice:
 
     def __init__(self, record: dict[str, Any], limit_s: float) -> None:
         self._seconds, self._tests, self._limit_s = record["seconds"], record["tests"], limit_s
-        self._uses: dict[str, set[str]] = {}
+        self._uses: dict[tuple[str, str], set[str]] = {}
         for module in MODULES:
             for node in ast.walk(parse(module)):
                 if _is_name(node, ast.Load) or isinstance(node, ast.Attribute):
                     name = node.id if isinstance(node, ast.Name) else node.attr
-                    self._uses.setdefault(name, set()).add(f"{module}:{node.lineno}")
+                    self._uses.setdefault((module, name), set()).add(f"{module}:{node.lineno}")
 
     def tests(self, mutant: Mutant) -> dict[str, float]:
         """The quickest tests that run a mutant's line, with their times."""
@@ -236,9 +235,9 @@ class Choice:
         return {test: self._seconds[test] for test, end_s in zip(found, until, strict=True) if end_s <= self._limit_s}
 
     def _import_lines(self, mutant: Mutant) -> set[str]:
-        """Lines that use what a change on import gives another value; all of its module where none is known."""
-        used = {line for name in mutant.names for line in self._uses.get(name, ()) if line in self._tests}
-        return used or {line for line in self._tests if line.startswith(f"{mutant.module}:")}
+        """Lines of its module that use what a change on import gives another value; all where none does."""
+        used = {line for name in mutant.names for line in self._uses.get((mutant.module, name), ())}
+        return used & self._tests.keys() or {line for line in self._tests if line.startswith(f"{mutant.module}:")}
 
 
 def wilson(killed: int, count: int) -> tuple[float, float]:
