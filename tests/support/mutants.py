@@ -194,6 +194,8 @@ class Tree:
         if child.exitcode == 0:
             return None
         failed = re.findall("^(?:FAILED|ERROR) (.*)", (self.folder / "out.txt").read_text(encoding="utf-8"), re.M)
+        if not failed and child.exitcode == pytest.ExitCode.USAGE_ERROR:
+            sys.exit("the record names tests that are not there: remove it")
         return failed[0] if failed else f"pytest ends with {child.exitcode}"
 
     def _run(self, tests: Iterable[str], test_s: float, plugins: tuple[object, ...]) -> None:
@@ -228,16 +230,22 @@ class Choice:
                     self._uses.setdefault((module, name), set()).add(f"{module}:{node.lineno}")
 
     def tests(self, mutant: Mutant) -> dict[str, float]:
-        """The quickest tests that run a mutant's line, with their times."""
-        lines = {f"{mutant.module}:{line}" for line in mutant.lines} or self._import_lines(mutant)
-        found = sorted({test for line in lines for test in self._tests.get(line, ())}, key=self._seconds.__getitem__)
-        until = accumulate(self._seconds[test] for test in found)
-        return {test: self._seconds[test] for test, end_s in zip(found, until, strict=True) if end_s <= self._limit_s}
+        """The quickest tests that meet a mutant, with their times."""
+        lines = {f"{mutant.module}:{line}" for line in mutant.lines}
+        for name in mutant.names:
+            lines |= self._uses.get((mutant.module, name), set()) & self._tests.keys()
+        found = {test for line in lines for test in self._tests.get(line, ())} if lines else self._all(mutant.module)
+        ordered = sorted(found, key=self._seconds.__getitem__)
+        ends_s = accumulate(self._seconds[test] for test in ordered)
+        return {
+            test: self._seconds[test] for test, end_s in zip(ordered, ends_s, strict=True) if end_s <= self._limit_s
+        }
 
-    def _import_lines(self, mutant: Mutant) -> set[str]:
-        """Lines of its module that use what a change on import gives another value; all where none does."""
-        used = {line for name in mutant.names for line in self._uses.get((mutant.module, name), ())}
-        return used & self._tests.keys() or {line for line in self._tests if line.startswith(f"{mutant.module}:")}
+    def _all(self, module: str) -> set[str]:
+        """All tests of the files in which a test runs a line of a module: they import it."""
+        reached = (tests for line, tests in self._tests.items() if line.startswith(f"{module}:"))
+        files = {test.partition("::")[0] for tests in reached for test in tests}
+        return {test for test in self._seconds if test.partition("::")[0] in files}
 
 
 def wilson(killed: int, count: int) -> tuple[float, float]:

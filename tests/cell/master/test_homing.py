@@ -24,6 +24,7 @@ from canprobe.cell.tasks.joint_finding import Answer
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
+from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtCommand, pack_nmt
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
@@ -134,6 +135,24 @@ def test_a_record_without_a_schema_is_of_the_first_one(tmp_path):
     bench.record.write_text(json.dumps({**content, "schema": 2}))
     with pytest.raises(UsageError, match="remove it, and home the drives again"):
         bench.cell()
+
+
+def test_a_drive_without_a_home_offset_counts_zero_at_home(tmp_path):
+    """An EPOS4 has no 607Ch. The plan names the zero_counts that the cell then needs, and with it homing is right."""
+    eds = tmp_path / "no_home_offset.eds"
+    eds.write_text(eds_path("puma260_joint").read_text().replace("607C", "5FFC"))
+    scene = change(scene_of([17]), arm={"eds": str(eds)})
+    (problem,) = reasons(scene)
+    head, _, zero_counts = problem.rpartition(" = ")
+    assert head.endswith("and the cell -23736: set joints.joint_1.zero_counts"), problem
+    first = next(iter(scene.joints))
+    joints = {**scene.joints, first: replace(scene.joints[first], zero_counts=int(zero_counts))}
+    bench = Bench(replace(scene, joints=joints), tmp_path)
+    bench.home()
+    q, truth = bench.run()
+    assert q[0] == pytest.approx(truth[0], abs=2e-4)
+    (coupled,) = reasons(change(scene_of([0, 0, 0, 0, 17]), arm={"eds": str(eds)}))
+    assert "depends on other joints: it cannot be homed" in coupled
 
 
 def test_the_index_pulse_behind_the_positive_switch(tmp_path):
@@ -370,7 +389,7 @@ class Turned:
 def test_a_drive_that_takes_the_home_offset_the_other_way_round(tmp_path):
     bench = Bench(scene_of([35]), tmp_path, around=Turned)
     assert re.fullmatch(
-        r"node 1: \(joint 1\) homed, but is at -(\d+) \(6064h\) where \1 was expected with 607Ch = -\1: the drive may"
+        r"node 1: \(joint 1\) homed, but is at -(\d+) \(6064h\) where \1 was expected, with 607Ch = -\1: the drive may"
         " count the home offset the other way round",
         failure(bench),
     )
