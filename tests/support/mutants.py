@@ -116,10 +116,9 @@ def mutants_of(module: str) -> Iterator[Mutant]:
         for change, (what, _) in enumerate(_changes(node)):
             statement, names = statements[id(node)], frozenset[str]()
             lines = (statement.lineno, *range(node.lineno, node.end_lineno + 1))
-            if id(node) not in called and isinstance(statement, ast.FunctionDef):  # a default, or a decorator
-                lines = tuple(range(statement.body[0].lineno, statement.end_lineno + 1))
-            elif id(node) not in called:
-                names = frozenset(part.id for part in ast.walk(statement) if _is_name(part, ast.Store))
+            if id(node) not in called:
+                made = (one.id for one in ast.walk(statement) if _is_name(one, ast.Store))
+                names = frozenset((statement.name,) if isinstance(statement, ast.FunctionDef) else made)
                 lines = ()
             yield Mutant(module, number, change, node.lineno, what, lines, names)
 
@@ -195,6 +194,8 @@ class Tree:
         if child.exitcode == 0:
             return None
         failed = re.findall("^(?:FAILED|ERROR) (.*)", (self.folder / "out.txt").read_text(encoding="utf-8"), re.M)
+        if not failed and child.exitcode == pytest.ExitCode.USAGE_ERROR:
+            sys.exit("the record names tests that are not there: remove it")
         return failed[0] if failed else f"pytest ends with {child.exitcode}"
 
     def _run(self, tests: Iterable[str], test_s: float, plugins: tuple[object, ...]) -> None:
@@ -221,24 +222,30 @@ class Choice:
 
     def __init__(self, record: dict[str, Any], limit_s: float) -> None:
         self._seconds, self._tests, self._limit_s = record["seconds"], record["tests"], limit_s
-        self._uses: dict[str, set[str]] = {}
+        self._uses: dict[tuple[str, str], set[str]] = {}
         for module in MODULES:
             for node in ast.walk(parse(module)):
                 if _is_name(node, ast.Load) or isinstance(node, ast.Attribute):
                     name = node.id if isinstance(node, ast.Name) else node.attr
-                    self._uses.setdefault(name, set()).add(f"{module}:{node.lineno}")
+                    self._uses.setdefault((module, name), set()).add(f"{module}:{node.lineno}")
 
     def tests(self, mutant: Mutant) -> dict[str, float]:
-        """The quickest tests that run a mutant's line, with their times."""
-        lines = {f"{mutant.module}:{line}" for line in mutant.lines} or self._import_lines(mutant)
-        found = sorted({test for line in lines for test in self._tests.get(line, ())}, key=self._seconds.__getitem__)
-        until = accumulate(self._seconds[test] for test in found)
-        return {test: self._seconds[test] for test, end_s in zip(found, until, strict=True) if end_s <= self._limit_s}
+        """The quickest tests that meet a mutant, with their times."""
+        lines = {f"{mutant.module}:{line}" for line in mutant.lines}
+        for name in mutant.names:
+            lines |= self._uses.get((mutant.module, name), set()) & self._tests.keys()
+        found = {test for line in lines for test in self._tests.get(line, ())} if lines else self._all(mutant.module)
+        ordered = sorted(found, key=self._seconds.__getitem__)
+        ends_s = accumulate(self._seconds[test] for test in ordered)
+        return {
+            test: self._seconds[test] for test, end_s in zip(ordered, ends_s, strict=True) if end_s <= self._limit_s
+        }
 
-    def _import_lines(self, mutant: Mutant) -> set[str]:
-        """Lines that use what a change on import gives another value; all of its module where none is known."""
-        used = {line for name in mutant.names for line in self._uses.get(name, ()) if line in self._tests}
-        return used or {line for line in self._tests if line.startswith(f"{mutant.module}:")}
+    def _all(self, module: str) -> set[str]:
+        """All tests of the files in which a test runs a line of a module: they import it."""
+        reached = (tests for line, tests in self._tests.items() if line.startswith(f"{module}:"))
+        files = {test.partition("::")[0] for tests in reached for test in tests}
+        return {test for test in self._seconds if test.partition("::")[0] in files}
 
 
 def wilson(killed: int, count: int) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtCommand, pack_nmt
 
 
@@ -84,6 +85,31 @@ def test_somebody_who_resets_a_node_has_time_to_go_on():
     assert run.steps("lost: another master is on the bus")
     (back,) = run.steps("the cell is back after")
     assert float(back.split()[5]) > 2.0
+
+
+class Busy(Participant):
+    """A master that sends an NMT command again, one and a half seconds later."""
+
+    next_deadline_ns = None
+
+    def __init__(self, now_ns):
+        self.next_deadline_ns = now_ns + 1_500_000_000
+
+    def receive(self, can_id, data, t_ns):
+        return []
+
+    def advance(self, t_ns):
+        self.next_deadline_ns = None
+        return [pack_nmt(NmtCommand.PRE_OPERATIONAL, 3)]
+
+
+def test_somebody_who_goes_on_is_waited_for():
+    def act(run):
+        somebody_resets(run)
+        run.session.lockstep.attach(Busy(run.now()))
+
+    run = Returning(act).assert_came_back()
+    assert run.steps("wait:") == ["wait: another master is on the bus: an NMT command from another master"]
 
 
 DOWN = "can0: interface is down; type: sudo ip link set can0 up"
@@ -203,6 +229,15 @@ def test_a_drive_that_may_have_booted_out_of_reach_is_homed_again(what, store):
     (error,) = run.errors
     assert "node 3: (joint 3) is not homed" in str(error)
     assert {time for _, time in run.enabled.distances} == {1}
+
+
+def test_a_drive_that_does_not_show_that_it_kept_its_power_is_homed_again():
+    def silent(run):
+        run.inject("node 3: bus-off for 2500 ms")
+        run.nodes[3].dictionary.entries.pop(0x101601)
+
+    (error,) = Returning(silent, homed_scene()).errors
+    assert "node 3: (joint 3) is not homed" in str(error)
 
 
 def test_an_arm_that_reports_another_place_is_not_enabled():

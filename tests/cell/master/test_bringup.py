@@ -286,6 +286,7 @@ def remarks(session):
         ({(0x6091, 2): 2}, "counts 2000 units a motor turn by its 6092h and 6091h"),
         ({(0x6092, 1): 0}, None),
         ({(0x6092, 2): 0}, None),
+        ({(0x6092, 2): None}, None),
     ],
 )
 def test_units_of_the_device_are_compared_with_those_of_the_cell(tmp_path, entries, told):
@@ -294,7 +295,9 @@ def test_units_of_the_device_are_compared_with_those_of_the_cell(tmp_path, entri
     def change(node):
         if node.node_id == 3:
             for (index, subindex), value in entries.items():
-                node.dictionary.set_default(index, subindex, value)
+                node.dictionary.set_default(index, subindex, value or 0)
+                if value is None:
+                    node.dictionary.entries.pop(index << 8 | subindex)
 
     with open_session(tmp_path, change=change) as session:
         pass
@@ -620,6 +623,18 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
 
 
+def test_drives_that_cannot_say_what_they_have_stored_are_configured_each_time(tmp_path):
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
+    session = Session(
+        replace(scene, bring_up=replace(scene.bring_up, store=True)), RunOptions(tmp_path, (tell := []).append)
+    )
+    with session:
+        pass
+    assert not any("kept" in line for line in tell)
+    assert not any(index == 0x1010 for index, _ in writes_to(frames(tmp_path), 2))
+
+
 def test_drives_whose_file_has_oddities_that_nobody_uses_are_planned_and_run(tmp_path):
     """Values and types that other tools read or that mean nothing, limits and a revision that nobody filled in."""
     odd = [("0x7", "0.0"), ("0x15", "0x1234LL"), ("0x7", "0x00 00 01 00"), ("UDINT", "1"), ("", "1"), ("0x5", "off")]
@@ -682,6 +697,19 @@ def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_
             match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
         ):
             session.__enter__()
+
+
+def test_a_drive_that_keeps_no_interpolation_time_at_all_has_no_rate_that_fits(tmp_path):
+    def fix(node):
+        if node.node_id == 5:
+            node.dictionary.set_default(0x60C2, 1, 0)
+            node.dictionary.on_check(0x60C2, refuse)
+
+    def refuse(subindex, value):
+        raise SdoAbort(Abort.READ_ONLY)
+
+    with pytest.raises(NodeError, match=r"; it holds 0x0$"):
+        open_session(tmp_path, change=fix).__enter__()
 
 
 def test_a_drive_whose_unit_is_fixed_is_given_the_rates_that_fit(tmp_path):

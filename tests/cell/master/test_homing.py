@@ -416,6 +416,32 @@ def test_the_speed_of_the_way_back_is_written_in_the_unit_of_the_drive(tmp_path)
     assert speed == round(90 / 360 * 60 * scene.joints["joint_1"].gear)
 
 
+def test_a_drive_that_was_out_of_sight_is_not_homed_whatever_it_says(tmp_path):
+    bench = Bench(scene_of([35, 35]), tmp_path)
+    bench.home()
+    cell = bench.cell()
+    cell.doubted = frozenset({1})
+    with pytest.raises(NodeError, match=r"node 1: \(joint 1\) is not homed.* since; type:"):
+        cell.__enter__()
+    assert json.loads(bench.record.read_text())["nodes"].keys() == {"2"}
+    assert refusal(bench).startswith("node 1: (joint 1) is not homed")
+
+
+class Deaf(Turned):
+    """A drive that confirms the command to enable operation and does not follow it."""
+
+    def receive(self, can_id, data, t_ns):
+        if (can_id, data[:5].hex()) == (0x601, "2b4060000f"):
+            return [(0x581, bytes.fromhex("6040600000000000"))]
+        return self._node.receive(can_id, data, t_ns)
+
+
+def test_a_drive_that_is_not_enabled_for_homing_is_named_with_its_state(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path, around=Deaf)
+    told = r"node 1: \(joint 1\) is SWITCHED_ON \d+ s after the command for OPERATION_ENABLED"
+    assert re.fullmatch(told, failure(bench))
+
+
 class Once(Participant):
     """Does something when a drive starts to home."""
 

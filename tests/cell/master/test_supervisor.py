@@ -230,3 +230,17 @@ def test_a_target_outside_of_the_workspace_is_not_sent(plan, guard):
     found = boxed.command(turned, at(turned, 1))
     assert found.q is None and found.limit.startswith("the probe's tip at ") and found.limit == boxed.outside(turned)
     assert guard.outside(turned) is None
+
+
+def test_the_command_that_may_be_sent(plan, guard):
+    """As it is, nearer where it is too far, and without a target where that is out of bounds."""
+    seen = Seen(LIMITS, NodeWatch((1, 2)), None, None, PortCounters())
+    supervisor = Supervisor(seen, guard, None)
+    seen.measurement = at(ELBOW_FORM, 0)
+    near = Command(ELBOW_FORM, columns={"mine": 1.0})
+    assert supervisor.guard_target(near) == (near, None)
+    sent, finding = supervisor.guard_target(replace(near, q_target=ELBOW_FORM + 2 * limit_of(plan)))
+    np.testing.assert_allclose(sent.q_target, ELBOW_FORM + limit_of(plan))
+    assert (finding, seen.slowed, sent.columns) == (None, 1, {"mine": 1.0})
+    sent, finding = supervisor.guard_target(replace(near, q_target=ELBOW_FORM + 9.0))
+    assert sent.q_target is None and sent.columns == {"mine": 1.0} and finding.condition.key == "joint_stop"

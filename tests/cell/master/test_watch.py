@@ -100,6 +100,9 @@ def test_silence_begins_after_250_ms_and_is_counted_from_the_start():
     assert watch.silent(251_000_001) == 2
     state(watch, 2, 5, 201_000_000)
     assert watch.silent(450_000_000) is None and watch.silent(450_000_001) == 1
+    assert watch.silent(451_000_000) == 1
+    state(watch, 1, 5, 202_000_000)
+    assert watch.silent(452_000_000) == 2, "the other one has just its time"
     watch.forget()
     assert watch.silent(10**12) is None and watch.states == {}
 

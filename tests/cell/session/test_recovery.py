@@ -159,6 +159,14 @@ def test_after_so_many_failures_it_ends_and_a_new_request_begins_anew(monkeypatc
     assert bench.told()[1:] == [FAILED] * (TRIES * (1 + again)) + [[]] * (TRIES * (1 - again))
 
 
+def test_a_lost_cell_is_brought_up_on_request(monkeypatch):
+    bench = Bench(monkeypatch, [*[{"fails": LOST}] * TRIES, {}])
+    with pytest.raises(NodeError):
+        bench.run()
+    bench.recovery.resume()
+    assert bench.told()[-1] == ["enter"] and bench.said[-1].startswith("the cell is back after 0.0 s")
+
+
 @pytest.mark.parametrize(("lasts_ns", "returns"), [(STEADY_NS, TRIES), (STEADY_NS + 1, TRIES + 3)])
 def test_a_loss_within_a_second_of_the_return_is_a_failure_to_return(monkeypatch, lasts_ns, returns):
     bench = Bench(monkeypatch, [{"lasts_ns": lasts_ns}] * (TRIES + 2) + [{}])
