@@ -1,7 +1,7 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
-`growth`, `gym`, `learning`, `bridges`, `local_node`,
+`growth`, `held`, `gym`, `learning`, `bridges`, `local_node`,
 `canopen_node`. Without names everything is measured but what takes more than
 half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has
 its own command, date, commit and machine, so that one can be measured anew without the others. Then
@@ -39,7 +39,7 @@ SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
 IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
-LONG = ("faults", "soak", "growth", "canopen_node")
+LONG = ("faults", "soak", "growth", "held", "canopen_node")
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
 """Of a picture in the documentation."""
@@ -279,6 +279,7 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "pace": partial(bench_table, "pace"),
     "side_by_side": partial(bench_table, "side_by_side"),
     "growth": partial(bench_table, "growth"),
+    "held": partial(bench_table, "held"),
     "gym": gym,
     "learning": learning,
     "bridges": bridges,

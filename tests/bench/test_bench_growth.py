@@ -2,7 +2,7 @@
 
 Each size is measured in a process by itself (`growth_child.py`). A cost in proportion to size has the exponent 1. The
 exponent of the time is the slope of a line through all sizes on logarithmic axes, and of its steepest part: the slope
-over the last two. Memory is the largest resident size of any process. The table is that of docs/accuracy.md:
+over the last two. Memory is the largest resident size of any process. The table is that of docs/cost.md:
 `python docs/measure.py growth` writes it there; CANPROBE_LONGEST_S=300 leaves the hour out.
 """
 
@@ -31,7 +31,6 @@ AXES = {
         "s",
     ),
     "contacts": ("contacts over new ground: the map, solved", (1000, 10_000, 100_000, 1_000_000), 1e3, "ms"),
-    "held": ("minutes of a lockstep cell that `up` holds, with a monitor", (5, 10, 30), 1.0, "s"),
     "runs": ("runs of `run_many`, one worker: all of them", (1, 10, 100, 1000), 1.0, "s"),
 }
 

@@ -18,6 +18,7 @@ from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.patch.moments import MomentImage
+from canprobe.mechanics.touch.strategies import Rectangle
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.noise import Correlation
@@ -186,7 +187,12 @@ def make_task(plan: Plan) -> Controller:
     if isinstance(task, Touch):
         array = task.array
         check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
-        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup), check)
+        parts = plan, task, make_sensing(task), make_shape_tracker(plan.setup), check
+        if task.scan is None or not isinstance(task.scan.strategy, Rectangle):
+            return TouchTask(*parts)
+        from canprobe.cell.tasks.explore import ExploreTask
+
+        return ExploreTask(*parts)
     if isinstance(task, Calibrate):
         from canprobe.cell.tasks.calibrate import CalibrateTask
 
