@@ -2,10 +2,10 @@
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
 `growth`, `held`, `gym`, `learning`, `bridges`, `local_node`,
-`canopen_node`. Without names everything is measured but what takes more than
-half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has
-its own command, date, commit and machine, so that one can be measured anew without the others. Then
-`python docs/generate.py` writes the pages.
+`canopen_node`, `exploration` (the study `explore`, as a scene has its name). Without names everything is measured but
+what takes more than half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the
+figures. Every entry has its own command, date, commit and machine, so that one can be measured anew without the others.
+Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
@@ -64,6 +64,20 @@ TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] =
             "error, 1/m": "{error_per_m:.2f}",
             "log score": "{log_score:.2f}",
             "worst scene": "{worst}",
+        },
+    ),
+    "explore": (
+        lambda rows: rows,
+        {
+            "strategy": "{strategy}",
+            "path to 20 µm": "{height_mm:.0f} mm",
+            "time": "{height_s:.1f} s",
+            "path to 3 mrad": "{normal_mm:.0f} mm",
+            "path to 2 1/m": "{curvature_mm:.0f} mm",
+            "reached": "{reached}",
+            "force off its target": "{force_percent:.1f} %",
+            "in contact": "{contact:.1%}",
+            "stopped": "{stopped}",
         },
     ),
     "shapes": (
@@ -283,13 +297,14 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "gym": gym,
     "learning": learning,
     "bridges": bridges,
+    "exploration": partial(study, "explore"),
 }
 
 
 def main(wanted: Sequence[str]) -> None:
     """Measure what is named, or all; the rest keeps its figures. The file is written after each."""
     scenes = [name for name, _ in packaged_scenes()]
-    known = [*scenes, *OTHERS, *STUDIES]
+    known = [*scenes, *OTHERS, *(name for name in STUDIES if name not in scenes)]
     if unknown := set(wanted) - set(known):
         raise SystemExit(f"expected names among {', '.join(known)}; got {', '.join(sorted(unknown))}")
     for name in wanted or [name for name in known if name not in LONG]:
