@@ -101,6 +101,8 @@ def summarise(
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+    if record.explored is not None:
+        summary["explore"] = record.explored.summarised()
     return {name: without_nan(value) for name, value in summary.items()}
 
 
