@@ -238,9 +238,10 @@ def bench(file: str) -> list[Row]:
 
 
 def bench_table(name: str) -> Entry:
-    """The table of a file of `tests/bench` that makes one."""
+    """The table of a file of `tests/bench`; of several with the same headings, the rows of all."""
     file = f"test_bench_{name}.py"
-    return {"command": f"{BENCH}{file} -s", "table": bench(file)[0]["extra_info"]["table"]}
+    tables = [one["extra_info"]["table"] for one in bench(file)]
+    return {"command": f"{BENCH}{file} -s", "table": [tables[0][0], *(row for table in tables for row in table[1:])]}
 
 
 def gym() -> Entry:
