@@ -54,7 +54,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         sweep.say(f"{seed + 1} of {total}: {case}: {'; '.join(runs[-1]['failures']) or 'no failure'}")
     patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
     facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
-    return StudyResult("recover", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_runs, runs))
+    return StudyResult("recover_vcan", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_runs, runs))
 
 
 class ServedRun:
