@@ -145,6 +145,7 @@ class Cell:
         self.stopped_by: Condition | None = None
         self.doubted: frozenset[int] = frozenset()
         self._stopped = False
+        self._recorded = seen.measurement
         self._before = before
         self._raw_array = (
             RawArrayStart(self.tactile, self._network, setup.bring_up.boot_up_s, self._say)
@@ -316,7 +317,8 @@ class Cell:
         if self.drives is not None:
             self.drives.goal = DriveState.SWITCH_ON_DISABLED
         for _ in range(max(1, round(seconds * 1e9 / self._plan.sync.period_ns))):
-            self._look(self.cycle.begin())
+            self._recorded = self.cycle.begin()
+            self._look(self._recorded)
             self.cycle.end(None)
             self.cycle.count_work()
 
@@ -460,12 +462,22 @@ class Cell:
             measurement = self.cycle.begin()
             self._look(measurement)
             check()
-            reached = bool(states) and measurement.q is not None and self.drives.all_in(*states)
+            reached = bool(states) and measurement.q is not None and not self._drives_beside(states)
             self.cycle.end(None)
             self._record(measurement, None)
             if reached:
                 return True
         return False
+
+    def _drives_beside(self, states: tuple[DriveState, ...]) -> list[int]:
+        """Nodes of the drives in none of the states.
+
+        A drive that has booted since it was configured is off, and its last statusword is of before.
+        """
+        assert self.drives is not None
+        off = self.bring_up.booted_again() if DriveState.SWITCH_ON_DISABLED in states else set[int]()
+        drives = zip(self.drives.axes, self.drives.states, strict=True)
+        return [axis.node_id for axis, state in drives if state not in states and axis.node_id not in off]
 
     def _look(self, measurement: Measurement) -> None:
         assert self.cycle is not None
@@ -553,6 +565,7 @@ class Cell:
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         assert self.cycle is not None
+        self._recorded = measurement
         t_s = measurement.t_ns * 1e-9 + self.log.start_s
         row: dict[str, object] = {"t_s": t_s, "sync_late_us": self.cycle.late_ns * 1e-3}
         if self.drives is not None:
@@ -589,6 +602,7 @@ class Cell:
         if self._stopped:
             return
         self._stopped = True
+        self._try(self._record_last)
         self._try(self._stop_drives)
         if force := self.supervisor.pressing():
             free = "free it; a run does not begin while the array measures a force"
@@ -600,6 +614,11 @@ class Cell:
         self._try(self.bring_up.release)
         if self.found is not None and self.bring_up.took_over:
             self._try(self.found.restore)
+
+    def _record_last(self) -> None:
+        """Record the cycle in which the reason of the stop was found: the error left it before its row."""
+        if self.cycle is not None and (seen := self.supervisor.seen.measurement) is not self._recorded:
+            self._record(seen, None)
 
     def _patch(self, sample: TactileSample) -> Patch:
         assert self._reader is not None
@@ -630,7 +649,7 @@ class Cell:
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         disabled = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON)
         if not self._stop_until(disabled):
-            stuck = [a.node_id for a, s in zip(self.drives.axes, self.drives.states, strict=True) if s not in disabled]
+            stuck = self._drives_beside(disabled)
             self.notes.add(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
 
     def _stop_until(self, states: tuple[DriveState, ...]) -> bool:
@@ -640,6 +659,8 @@ class Cell:
         failure: CanprobeError | None = None
         while (left_ns := end_ns - self._port.clock.now_ns()) > 0:
             try:
+                if self.cycle.begun:  # its commands are the first to stop; the next SYNC keeps the period
+                    self.cycle.end(None)
                 return self._cycle_until(states, left_ns * 1e-9)
             except CanprobeError as error:
                 failure = error

@@ -144,6 +144,9 @@ class Cycle:
             do not wake the process: a real bus brings one after the other, and most are in by then.
         kept: number of cycles whose times are kept; None for all.
         before: cycle of a cell that this one comes after; number, time and statistics go on from it.
+
+    Attributes:
+        begun: a SYNC was sent, and the commands of its cycle were not.
     """
 
     def __init__(
@@ -176,6 +179,7 @@ class Cycle:
         self._watch = watch
         self._other = other
         self._sync = SyncCounter(plan.sync.overflow)
+        self.begun = False
         self._deadline = self.t_first_ns + ((now_ns - self.t_first_ns) // period_ns + 1) * period_ns
         self._started_ns = self._sent_ns = 0
 
@@ -190,6 +194,7 @@ class Cycle:
             self.statistics.overruns += 1
             self._deadline += late_ns // self._period_ns * self._period_ns
         self.number += 1
+        self.begun = True
         self.t_ns = self._deadline - self.t_first_ns
         self._intake.begin(self.number, self.t_ns, self.sync_ns)
         self.collect()
@@ -236,6 +241,7 @@ class Cycle:
 
     def skip(self) -> None:
         """Skip this cycle: wait for the end of its period."""
+        self.begun = False
         self._deadline += self._period_ns
         self._port.clock.sleep_until_ns(self._deadline)
 
@@ -243,6 +249,7 @@ class Cycle:
         """Send the commands of this cycle and set the next deadline."""
         if self._drives is not None and command is not None:
             self._drives.set_target(command.q_target)
+        self.begun = False
         self.send_commands()
         self._sent_ns = elapsed_ns() if self._started_ns else 0
         self._deadline += self._period_ns

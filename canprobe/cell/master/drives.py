@@ -322,7 +322,7 @@ class DriveGroup:
         """Every drive reports operation enabled."""
         if all([word & _STATE_BITS == _ENABLED for word in self.statuswords]):
             return True  # as in every cycle of operation
-        return self.all_in(DriveState.OPERATION_ENABLED)
+        return all(state is DriveState.OPERATION_ENABLED for state in self.states)
 
     def enabled_ones(self) -> tuple[bool, ...]:
         """Whether each drive reported operation enabled last."""
@@ -333,10 +333,6 @@ class DriveGroup:
         """A drive reported last a position that it cannot have reached."""
         positions = [(k, source.axis) for k, source in self._sources.values() if source.counts is not None]
         return any(self._heard[k] > self._tracks[axis].cycle for k, axis in positions)
-
-    def all_in(self, *states: DriveState) -> bool:
-        """Every drive is in one of ``states``."""
-        return all(state in states for state in self.states)
 
     def set_target(self, q: Floats | None) -> None:
         """Joint target (n,), rad or m, of the next RPDOs; None holds the last one."""

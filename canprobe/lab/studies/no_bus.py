@@ -16,13 +16,12 @@ from canprobe.fieldbus.eds.packaged import eds_file
 
 def on_any_bitrate(scene: Scene, bitrate: int) -> Scene:
     """The scene with a bit rate (bit/s) that no CAN has, and copies of its EDS files that list no bit rates."""
-    assert scene.arm is not None and scene.sensor is not None
-    return replace(
-        scene,
-        bus=replace(scene.bus, bitrate=bitrate),
-        arm=replace(scene.arm, eds=_eds_for_any_bitrate(scene.arm.eds)),
-        sensor=replace(scene.sensor, eds=_eds_for_any_bitrate(scene.sensor.eds)),
-    )
+    arm, sensor = scene.arm, scene.sensor
+    if arm is not None:
+        arm = replace(arm, eds=_eds_for_any_bitrate(arm.eds))
+    if sensor is not None:
+        sensor = replace(sensor, eds=_eds_for_any_bitrate(sensor.eds))
+    return replace(scene, bus=replace(scene.bus, bitrate=bitrate), arm=arm, sensor=sensor)
 
 
 @functools.cache

@@ -1,15 +1,17 @@
 """Study `recover`: a thousand cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
 
 What is lost, when, for how long, alone or in pairs, follows from a seed, while the arm holds, moves, presses or scans
-(`recover_runs`). A run fails where a drive is enabled with a target more than one count beside its position, where the
-force exceeds the limit, where the cell does not come back or takes longer than the times of its nodes and one second
-from the last return, or where its log has a gap. A stop that somebody has to look at, such as a probe that is left
-pressing, is counted by itself. `canprobe study recover --seed N` carries out one run again; a failure is shrunk to the
-fewest losses that still fail.
+(`recover_cases`). A run fails where a drive is enabled with a target more than one count beside its position, where the
+force exceeds the limit, where the cell does not come back or takes more than a second from the boot-up of the last node
+to the hold, or where its log lacks a cycle. Behind a loss without a boot-up the cell may take as long again as its
+nodes may take to stop. A stop that somebody has to look at, such as a probe that is left pressing, is counted by
+itself. `canprobe study recover --seed N` carries out one run again; a failure is shrunk to the fewest losses that still
+fail.
 """
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -18,7 +20,8 @@ from typing import Any
 
 from canprobe.cell.results.picture import BLUE, picture
 from canprobe.lab.studies.harness import Column, Row, Say, StudyResult
-from canprobe.lab.studies.recover_runs import SCENES, draw_case, run_case, shrink
+from canprobe.lab.studies.recover_cases import SCENES, draw_case, shrink
+from canprobe.lab.studies.recover_runs import run_case
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
@@ -32,6 +35,7 @@ COLUMNS = (
     Column("jump_counts", "largest jump, counts", "d"),
     Column("force_max_n", "highest force N", ".2f"),
     Column("late_s", "longest from return to hold s", ".2f"),
+    Column("rows_lost", "cycles without a row", "d"),
     Column("failures", "failures", "d"),
 )
 
@@ -47,19 +51,26 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 
 def measure(seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """The runs of some seeds."""
-    return [run_case(draw_case(seed)) for seed in seeds]
+    """The runs of some seeds; a case that fails is shrunk."""
+    return [_one(seed) for seed in seeds]
+
+
+def _one(seed: int) -> dict[str, Any]:
+    case = draw_case(seed)
+    outcome = run_case(case)
+    return {**outcome, "shrunk": str(shrink(case, run_case)) if outcome["failures"] else ""}
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
     """Carry out the run of one seed again, and report what happens in it; a failure is shrunk."""
     case = draw_case(seed)
     say(f"seed {seed}: {case}")
-    outcome = run_case(case, say)
+    with tempfile.TemporaryDirectory(prefix="canprobe-recover-") as folder:
+        outcome = run_case(case, say, Path(folder))
     for failure in outcome["failures"]:
         say(f"FAILURE: {failure}")
     if outcome["failures"]:
-        say(f"shrunk: {shrink(case)} (canprobe study recover --seed {seed})")
+        say(f"shrunk: {shrink(case, run_case)} (canprobe study recover --seed {seed})")
     return outcome
 
 
@@ -71,13 +82,13 @@ def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
 def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
     sums: Counter[str] = Counter()
     for run in runs:
-        sums.update({key: int(run[key]) for key in ("lost", "back", "refused")})
+        sums.update({key: int(run[key]) for key in ("lost", "back", "refused", "rows_lost")})
         sums["failures"] += bool(run["failures"])
     most = {key: max((run[key] for run in runs), default=0) for key in ("jump_counts", "force_max_n", "late_s")}
     return {
         "work": name,
         "runs": len(runs),
-        **{key: sums[key] for key in ("lost", "back", "refused", "failures")},
+        **{key: sums[key] for key in ("lost", "back", "refused", "rows_lost", "failures")},
         **most,
     }
 
@@ -89,11 +100,13 @@ def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = [
         f"{len(runs)} runs with {all_of_them['lost']} losses: the cell came back from {all_of_them['back']}, in"
         f" {all_of_them['refused']} runs somebody has to look; {len(failed)} runs failed.",
-        f"Largest distance of a first target from the position: {all_of_them['jump_counts']} counts; longest time from"
-        f" the last return to the hold: {all_of_them['late_s']:.2f} s.",
+        f"Largest distance of a first target from the position: {all_of_them['jump_counts']} counts; highest force:"
+        f" {all_of_them['force_max_n']:.2f} N; longest time from the last return to the hold:"
+        f" {all_of_them['late_s']:.2f} s; {all_of_them['rows_lost']} cycles without a row in the log.",
     ]
     for run in failed[:20]:
-        lines.append(f"seed {run['seed']}: {'; '.join(run['failures'])} (canprobe study recover --seed {run['seed']})")
+        why = "; ".join(run["failures"])
+        lines.append(f"seed {run['seed']}: {run['shrunk']}: {why} (canprobe study recover --seed {run['seed']})")
     return lines
 
 

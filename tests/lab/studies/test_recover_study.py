@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from canprobe.cli import main
-from canprobe.lab.studies import recover_runs
 from canprobe.lab.studies.recover import findings, table_rows
-from canprobe.lab.studies.recover_runs import Outage, RecoverCase, draw_case, run_case, shrink
+from canprobe.lab.studies.recover_cases import Outage, RecoverCase, draw_case, shrink
+from canprobe.lab.studies.recover_runs import run_case
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -17,6 +17,7 @@ def test_a_cell_comes_back_from_what_a_seed_takes(seed):
     outcome = run_case(draw_case(seed))
     assert outcome["failures"] == [], outcome
     assert outcome["jump_counts"] <= 1 and outcome["force_max_n"] <= outcome["force_limit_n"]
+    assert outcome["rows_lost"] == 0 and outcome["back"] + outcome["refused"] == outcome["lost"]
 
 
 def test_the_same_seed_is_the_same_run():
@@ -24,7 +25,7 @@ def test_the_same_seed_is_the_same_run():
     assert first == second and table_rows([first])[-1]["runs"] == 1 and findings([first])
 
 
-def test_a_failure_is_shrunk_to_the_loss_that_makes_it(monkeypatch):
+def test_a_failure_is_shrunk_to_the_loss_that_makes_it():
     case = RecoverCase(
         0, "hold", (Outage("reboot", 2, 0.5, 40), Outage("freeze", 3, 0.6, 40), Outage("bus-off", 5, 0.7, 40))
     )
@@ -33,8 +34,7 @@ def test_a_failure_is_shrunk_to_the_loss_that_makes_it(monkeypatch):
     def fails(some):
         return {"failures": ["it fails"] if failing in some.outages else []}
 
-    monkeypatch.setattr(recover_runs, "run_case", fails)
-    assert shrink(case) == replace(case, outages=(failing,))
+    assert shrink(case, fails) == replace(case, outages=(failing,))
 
 
 def test_one_seed_is_repeated_from_the_command_line(capsys):
