@@ -39,6 +39,8 @@ SIGMA_STIFFNESS = 0.6
 SCALE_ERROR, ROLLING_SCALE_ERROR = 4e-3, 0.08
 """Relative error of curvature that no path averages, and the error that a probe adds which keeps its orientation: creep
 shortens the measured way of the contact over the pad, and the rolling share is its part in the turn of the normal."""
+TOOL_SIGMA_M = 0.2e-3
+"""Standard deviation of the probe's centre along its pole, m, as a tool is known after its calibration."""
 PATCH_METHODS = ("recursive", "ml")
 """Estimators that use the patch, and whose confidence regions follow changes; the others are as published."""
 
@@ -99,7 +101,7 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     estimator = LevelledEstimator(estimator, memory)
     scale = SCALE_ERROR + ROLLING_SCALE_ERROR * task.scan.rolling_share
     inner = _with_patch(task, estimator, memory) if _uses_patch(task) else estimator
-    following = FollowingEstimator(inner, memory, scale)
+    following = FollowingEstimator(inner, memory, scale, TOOL_SIGMA_M * (1.0 - task.scan.rolling_share))
     if not task.shape.revisit:
         return following
     from canprobe.mechanics.touch.map.known_ground import RevisitingEstimator
