@@ -290,8 +290,7 @@ class OpenCell:
             return None
         from canprobe.cell.results.contacts import contacts_of
 
-        samples, surface_map = record.shape.settled(task.probe.radius), record.shape.surface_map
-        return contacts_of(samples if surface_map is None else surface_map.settled(samples), task, start_s)
+        return contacts_of(record.shape.settled(task.probe.radius), task, start_s)
 
 
 def _drawings(data: RunData, out: Path) -> dict[str, Callable[[], None]]:
