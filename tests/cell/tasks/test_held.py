@@ -51,8 +51,9 @@ def test_a_bridge_asks_for_motion_and_what_came_before_is_dropped():
     queue, made = deque(), []
     task = RequestedTask(None, lambda: made.append(Mine()) or made[-1], [queue], 0.0025)
     held = HeldTask(task, None, lambda: False)
-    queue.append(Request("start"))
+    queue += [Request("resume"), Request("start")]
     held.step(Measurement(0, 0))
+    assert held.held, "what was asked for while the cell was lost does not count"
     queue.append(Request("resume"))
     held.step(Measurement(1, 2_500_000))
     assert not held.held and not made, "the start that came in the hold is dropped"
