@@ -33,7 +33,7 @@ examples:
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
 STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
-    "draw": ("arrays", "calibrations", "link", "regions", "shapes"),
+    "draw": ("arrays", "calibrations", "explore", "link", "regions", "shapes"),
     "against": ("regions",),
 }
 """Studies that have an option, by the option's name."""
@@ -55,8 +55,8 @@ def add_arguments(parser: Parser) -> None:
         "--draw",
         metavar="N",
         type=whole(0, 9999),
-        help="arrays, calibrations, link, regions, shapes: number that all cases follow from; others than those of the"
-        " published figures",
+        help="arrays, calibrations, explore, link, regions, shapes: number that all cases follow from; others than"
+        " those of the published figures",
     )
     parser.add_argument(
         "--against", metavar="FILE", type=Path, help="regions: regions.json of an earlier run, to compare with"

@@ -1,89 +1,141 @@
-"""Mutation testing of the modules that keep an arm safe: small changes, one at a time, that the nearest tests notice.
+"""Mutation testing of the modules that keep an arm safe: small changes, one at a time, that some test notices.
 
-    python tests/support/mutants.py --seed 1 --count 300 --processes 2
+    python tests/support/mutants.py --seed 1 --count 300 --record /tmp/reach.json
 
-A mutant is one changed place of one module, in a copy of the tree: a comparison, a condition, a boolean, a constant, a
-sum, a returned value, a call whose result is not used. It is killed where a test fails, or takes twice the time of the
-unchanged tree and a minute. Survivors are printed with their line; the share that was killed comes with its interval of
-95 % (Wilson). Not part of CI: it takes hours.
+A mutant is one changed place of one module, in a copy of the tree: a comparison, a condition, a boolean, a number, a
+sum, a returned value, a call whose result is not used. What is no behaviour is not changed: annotations, how
+dataclasses are made, texts. The nearest tests run once without a mutant, and it is recorded which of them run which
+lines, and for how long. A mutant then meets the tests that run its line, the quickest first, as many as fit into a
+time. It is killed where one fails or does not end; where no test runs its line it survives. Survivors are printed with
+their line, and the share that was killed with its interval of 95 % (Wilson). Not part of CI: it takes an hour.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import copy
+import json
 import math
+import multiprocessing
 import os
 import random
+import re
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
+from itertools import accumulate
 from pathlib import Path
-from queue import SimpleQueue
+from typing import Any
+
+import can  # noqa: F401  what most tests import is loaded once: each mutant runs in a fork
+import canopen  # noqa: F401
+import pytest
+import scipy.optimize
+import scipy.spatial  # noqa: F401
+from reach import Reach
 
 ROOT = Path(__file__).resolve().parents[2]
-MASTER = "canprobe/cell/master"
-SUPERVISION = ("tests/cell/master/test_supervision.py", "tests/cell/integration/test_supervision.py")
-STOPS = (*SUPERVISION, "tests/cell/integration/test_lift_off.py", "tests/cell/integration/test_troubled_wire.py")
-NEAREST = {
-    "lift_off": STOPS,
-    "supervisor": STOPS,
-    "conditions": (*STOPS, "tests/cell/integration/test_overruns.py"),
-    "drives": ("tests/cell/master/test_drives.py", "tests/cell/master/test_cycle.py", *STOPS),
-    "bringup": ("tests/cell/master/test_bringup.py", "tests/cell/integration/test_mixed_nodes.py"),
-    "homing": ("tests/cell/master/test_homing.py",),
-    "watch": ("tests/cell/master/test_watch.py", *STOPS),
-    "cycle": ("tests/cell/master/test_cycle.py", "tests/cell/integration/test_overruns.py", *SUPERVISION),
+MASTER_MODULES = ("lift_off", "supervisor", "conditions", "drives", "bringup", "homing", "watch", "cycle")
+MODULES = {
+    **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
+    "recovery": "canprobe/cell/session/recovery.py",
+    "held": "canprobe/cell/tasks/held.py",
 }
-"""Tests to run for a module of `canprobe/cell/master`, the quickest first."""
+INTEGRATION = (
+    "lift_off",
+    "recovery",
+    "supervision",
+    "preload",
+    "mixed_nodes",
+    "troubled_wire",
+    "overruns",
+    "two_buses",
+)
+TESTS = (
+    *("tests/cell/master", "tests/cell/tasks/test_held.py"),
+    *("tests/cell/session/test_up.py", "tests/cell/session/test_recovery.py"),
+    *(f"tests/cell/integration/test_{name}.py" for name in INTEGRATION),
+)
 COMPARISONS = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
 }  # fmt: skip
 SUMS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.BitAnd: ast.BitOr}
+LEAST_TIMEOUT_S = 30
+"""Shortest time, s, after which a test that does not end has failed."""
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: the module, the line, what it does, and the module's text with it."""
+    """One change of a module.
+
+    Attributes:
+        node, change: number of the node in `ast.walk`, and of the change among those of the node.
+        lines: lines of which a test that meets the change runs one; empty where the change acts on import.
+        names: names that such a change gives another value.
+    """
 
     module: str
+    node: int
+    change: int
     line: int
     what: str
-    text: str
+    lines: tuple[int, ...]
+    names: frozenset[str]
 
     def __str__(self) -> str:
-        return f"{MASTER}/{self.module}.py:{self.line}: {self.what}"
+        return f"{MODULES[self.module]}:{self.line}: {self.what}"
+
+    def text(self) -> str:
+        """The module's text with the change."""
+        tree = parse(self.module)
+        list(_changes(list(ast.walk(tree))[self.node]))[self.change][1]()
+        return ast.unparse(ast.fix_missing_locations(tree))
+
+
+def parse(module: str) -> ast.Module:
+    """The syntax tree of a module."""
+    return ast.parse((ROOT / MODULES[module]).read_text(encoding="utf-8"))
 
 
 def mutants_of(module: str) -> Iterator[Mutant]:
     """Every mutant of a module."""
-    tree = ast.parse((ROOT / MASTER / f"{module}.py").read_text(encoding="utf-8"))
-    nodes = list(ast.walk(tree))
-    annotations = {id(part) for node in nodes for part in _annotations(node)}
-    for at, node in enumerate(nodes):
-        if id(node) in annotations:
+    nodes = list(ast.walk(parse(module)))  # the outer ones come first
+    left_out = {id(part) for node in nodes for root in _no_behaviour(node) for part in ast.walk(root)}
+    statements = {id(part): node for node in nodes if isinstance(node, ast.stmt) for part in ast.walk(node)}
+    bodies = [body for node in nodes if isinstance(node, ast.FunctionDef) for body in node.body]
+    bodies += [node.body for node in nodes if isinstance(node, ast.Lambda)]
+    called = {id(part) for body in bodies for part in ast.walk(body)}
+    for number, node in enumerate(nodes):
+        if id(node) in left_out:
             continue
-        for variant in range(len(list(_changes(node)))):
-            changed = copy.deepcopy(tree)
-            target = list(ast.walk(changed))[at]
-            what, change = list(_changes(target))[variant]
-            change()
-            yield Mutant(module, getattr(node, "lineno", 0), what, ast.unparse(ast.fix_missing_locations(changed)))
+        for change, (what, _) in enumerate(_changes(node)):
+            statement, names = statements[id(node)], frozenset[str]()
+            lines = (statement.lineno, *range(node.lineno, node.end_lineno + 1))
+            if id(node) not in called:
+                made = (one.id for one in ast.walk(statement) if _is_name(one, ast.Store))
+                names = frozenset((statement.name,) if isinstance(statement, ast.FunctionDef) else made)
+                lines = ()
+            yield Mutant(module, number, change, node.lineno, what, lines, names)
 
 
-def _annotations(node: ast.AST) -> Iterator[ast.AST]:
+def _is_name(node: ast.AST, context: type[ast.expr_context]) -> bool:
+    return isinstance(node, ast.Name) and isinstance(node.ctx, context)
+
+
+def _no_behaviour(node: ast.AST) -> Iterator[ast.AST]:
     hints = [getattr(node, name, None) for name in ("annotation", "returns")]
-    yield from (part for hint in hints if isinstance(hint, ast.AST) for part in ast.walk(hint))
+    yield from (hint for hint in hints if isinstance(hint, ast.AST))
+    yield from (one for one in getattr(node, "decorator_list", ()) if ast.unparse(one).startswith("dataclass"))
+    if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+        yield node
 
 
-def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
+def _changes(node: Any) -> Iterator[tuple[str, Callable[[], object]]]:
     """The changes of one node, each with its words and the function that makes it."""
     if isinstance(node, ast.Compare) and type(node.ops[0]) in COMPARISONS:
         new = COMPARISONS[type(node.ops[0])]()
@@ -102,25 +154,98 @@ def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
         yield f"{node.value} becomes {not node.value}", lambda: setattr(node, "value", not node.value)
     elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
         yield f"{node.value} becomes {node.value + 1}", lambda: setattr(node, "value", node.value + 1)
-    if isinstance(node, ast.Return) and node.value is not None and not _is_none(node.value):
+    if isinstance(node, ast.Return) and node.value is not None and ast.unparse(node.value) != "None":
         yield f"return None, not `{ast.unparse(node.value)[:60]}`", lambda: setattr(node, "value", ast.Constant(None))
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
         yield f"without `{ast.unparse(node)[:60]}`", lambda: setattr(node, "value", ast.Constant(None))
 
 
-def _is_none(node: ast.AST) -> bool:
-    return isinstance(node, ast.Constant) and node.value is None
+class Tree:
+    """A copy of the repository, in which one module is changed and tests run."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        ignored = shutil.ignore_patterns(".git", ".venv", "runs", "site", ".*_cache")
+        shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
+
+    def record(self) -> dict[str, Any]:
+        """Run all tests, and return what `Reach` writes."""
+        self.run(TESTS, 180, 3600, Reach(MODULES))
+        return json.loads((self.folder / "reach.json").read_text(encoding="utf-8"))
+
+    def kills(self, number: int, mutant: Mutant, tests: dict[str, float]) -> str | None:
+        """The test that notices a mutant; None where all pass. The tests come with their times."""
+        place = self.folder / MODULES[mutant.module]
+        place.write_text(mutant.text(), encoding="utf-8")
+        os.utime(place, (number, number))  # or Python would take the compiled file of another mutant for it
+        try:
+            return self.run(tests, LEAST_TIMEOUT_S + 10 * max(tests.values()), 60 + 10 * sum(tests.values()))
+        finally:
+            shutil.copy2(ROOT / MODULES[mutant.module], place)
+
+    def run(self, tests: Iterable[str], test_s: float, all_s: float, *plugins: object) -> str | None:
+        """Run tests in a fork, without a plugin until one fails; what failed or did not end, None where none did."""
+        child = multiprocessing.get_context("fork").Process(target=self._run, args=(tests, test_s, plugins))
+        child.start()
+        child.join(all_s)
+        if child.exitcode is None:
+            os.killpg(child.pid or 0, signal.SIGKILL)
+            return "no end"
+        if child.exitcode == 0:
+            return None
+        failed = re.findall("^(?:FAILED|ERROR) (.*)", (self.folder / "out.txt").read_text(encoding="utf-8"), re.M)
+        if not failed and child.exitcode == pytest.ExitCode.USAGE_ERROR:
+            sys.exit("the record names tests that are not there: remove it")
+        return failed[0] if failed else f"pytest ends with {child.exitcode}"
+
+    def _run(self, tests: Iterable[str], test_s: float, plugins: tuple[object, ...]) -> None:
+        os.setsid()
+        os.chdir(self.folder)
+        os.environ.update(PYTHONPATH=str(self.folder), CI="1")
+        sys.path.insert(0, str(self.folder))
+        with open("out.txt", "w", encoding="utf-8") as out:
+            os.dup2(out.fileno(), 1)
+            os.dup2(out.fileno(), 2)
+        first = [] if plugins else ["-x"]
+        options = ["-n0", "-q", "--tb=no", "-m", "not vcan and not slow", "-o", f"timeout={test_s:.0f}", *first]
+        options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # plugins are loaded already
+        sys.exit(pytest.main([*options, *tests], plugins=plugins))
 
 
-def run_tests(tree: Path, module: str, limit_s: float | None = None) -> bool:
-    """Whether the nearest tests of a module pass in a tree; not in time is not passed."""
-    command = [sys.executable, "-m", "pytest", "-n0", "-x", "-q", "-p", "no:cacheprovider", *NEAREST[module]]
-    environment = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1", "CI": "1"}
-    try:
-        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=limit_s, check=False)
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode == 0
+class Choice:
+    """Which tests a mutant meets.
+
+    Args:
+        record: what `Reach` has written.
+        limit_s: longest time of the tests of one mutant.
+    """
+
+    def __init__(self, record: dict[str, Any], limit_s: float) -> None:
+        self._seconds, self._tests, self._limit_s = record["seconds"], record["tests"], limit_s
+        self._uses: dict[tuple[str, str], set[str]] = {}
+        for module in MODULES:
+            for node in ast.walk(parse(module)):
+                if _is_name(node, ast.Load) or isinstance(node, ast.Attribute):
+                    name = node.id if isinstance(node, ast.Name) else node.attr
+                    self._uses.setdefault((module, name), set()).add(f"{module}:{node.lineno}")
+
+    def tests(self, mutant: Mutant) -> dict[str, float]:
+        """The quickest tests that meet a mutant, with their times."""
+        lines = {f"{mutant.module}:{line}" for line in mutant.lines}
+        for name in mutant.names:
+            lines |= self._uses.get((mutant.module, name), set()) & self._tests.keys()
+        found = {test for line in lines for test in self._tests.get(line, ())} if lines else self._all(mutant.module)
+        ordered = sorted(found, key=self._seconds.__getitem__)
+        ends_s = accumulate(self._seconds[test] for test in ordered)
+        return {
+            test: self._seconds[test] for test, end_s in zip(ordered, ends_s, strict=True) if end_s <= self._limit_s
+        }
+
+    def _all(self, module: str) -> set[str]:
+        """All tests of the files in which a test runs a line of a module: they import it."""
+        reached = (tests for line, tests in self._tests.items() if line.startswith(f"{module}:"))
+        files = {test.partition("::")[0] for tests in reached for test in tests}
+        return {test for test in self._seconds if test.partition("::")[0] in files}
 
 
 def wilson(killed: int, count: int) -> tuple[float, float]:
@@ -136,47 +261,37 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--modules", nargs="+", choices=NEAREST, default=list(NEAREST))
+    parser.add_argument("--modules", nargs="+", choices=MODULES, default=list(MODULES))
+    parser.add_argument(
+        "--limit", type=float, default=15.0, help="longest processor time of the tests of one mutant, s"
+    )
+    parser.add_argument("--record", type=Path, help="file that keeps which test runs which line, for the next time")
+    parser.add_argument("--again", type=int, nargs="+", help="numbers of single mutants of the draw")
     options = parser.parse_args()
+    for plugin in entry_points(group="pytest11"):
+        if not plugin.value.startswith("canprobe"):
+            plugin.load()
     pool = [mutant for module in options.modules for mutant in mutants_of(module)]
-    drawn = random.Random(options.seed).sample(pool, min(options.count, len(pool)))
+    drawn = dict(enumerate(random.Random(options.seed).sample(pool, min(options.count, len(pool))), start=1))
     print(f"seed {options.seed}: {len(drawn)} of {len(pool)} mutants of {', '.join(options.modules)}", flush=True)
+    drawn = {number: mutant for number, mutant in drawn.items() if number in (options.again or drawn)}
     with tempfile.TemporaryDirectory() as folder:
-        trees: SimpleQueue[Path] = SimpleQueue()
-        for i in range(options.processes):
-            tree = Path(folder) / str(i)
-            shutil.copytree(
-                ROOT, tree, symlinks=True, ignore=shutil.ignore_patterns(".git", ".venv", "runs", "site", ".*_cache")
-            )
-            trees.put(tree)
-        limits = {}
-        for module in sorted({mutant.module for mutant in drawn}):
-            start = time.monotonic()
-            tree = trees.get()
-            if not run_tests(tree, module):
-                sys.exit(f"the nearest tests of {module} fail without a mutant")
-            trees.put(tree)
-            limits[module] = 2 * (time.monotonic() - start) + 60
-            print(f"{module}: {time.monotonic() - start:.0f} s", flush=True)
-
-        def survives(mutant: Mutant) -> bool:
-            tree = trees.get()
-            place = tree / MASTER / f"{mutant.module}.py"
-            whole = place.read_text(encoding="utf-8")
-            try:
-                place.write_text(mutant.text, encoding="utf-8")
-                return run_tests(tree, mutant.module, limits[mutant.module])
-            finally:
-                place.write_text(whole, encoding="utf-8")
-                trees.put(tree)
-
-        killed = 0
-        with ThreadPoolExecutor(options.processes) as workers:
-            for i, (mutant, alive) in enumerate(zip(drawn, workers.map(survives, drawn), strict=True), start=1):
-                killed += not alive
-                if alive:
-                    print(f"survived: {mutant}  ({killed} of {i} killed)", flush=True)
+        tree = Tree(Path(folder) / "tree")
+        if options.record is None or not options.record.exists():
+            record = tree.record()
+            if options.record is not None:
+                options.record.write_text(json.dumps(record), encoding="utf-8")
+        else:
+            record = json.loads(options.record.read_text(encoding="utf-8"))
+        left_out = sum(seconds == math.inf for seconds in record["seconds"].values())
+        print(f"{len(record['seconds'])} tests, and {left_out} of them left out, as they do not pass", flush=True)
+        choice, killed = Choice(record, options.limit), 0
+        for tried, (number, mutant) in enumerate(drawn.items(), start=1):
+            tests = choice.tests(mutant)
+            by = tree.kills(number, mutant, tests) if tests else None
+            killed += by is not None
+            fate = f"killed by {by}" if by is not None else f"SURVIVED {len(tests)} tests"
+            print(f"{number}: {mutant}: {fate} ({killed} of {tried} killed)", flush=True)
     low, high = wilson(killed, len(drawn))
     print(f"{killed} of {len(drawn)} killed: {killed / len(drawn):.1%} ({low:.1%} to {high:.1%})")
 

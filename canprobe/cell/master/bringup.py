@@ -106,8 +106,8 @@ class BringUp:
         settings: BringUpSettings,
         say: Callable[[str], None],
         *,
-        listened: bool = False,
-        resets: bool = True,
+        listened: bool,
+        resets: bool,
     ) -> None:
         self._network = network
         self._watch = watch

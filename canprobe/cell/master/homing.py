@@ -277,17 +277,17 @@ class Homing:
         found, braking = self._read(setup, POSITION, 0), zero.zero_speed**2 / (2.0 * zero.acceleration)
         per_q = abs(float(self._model.units_per_q[axis, axis]))
         if abs(found - home) > self._tolerance(axis) + braking * per_q:
-            raise self._error(
-                setup,
-                f"homed, but is at {found} (6064h) where {home} was expected with 607Ch = {-home}: the drive may count"
-                " the home offset the other way round",
-            )
+            why = "it has no home offset (607Ch)"
+            if any(write.index == HOME_OFFSET for write in setup.homing):
+                why = f"with 607Ch = {-home}: the drive may count the home offset the other way round"
+            raise self._error(setup, f"homed, but is at {found} (6064h) where {home} was expected, {why}")
         inside = float(np.clip(zero.home, self._low[axis], self._high[axis]))
         joint, stands = self._model.joints[axis], "it stands there"
         if inside != zero.home and _has_profile_position(setup):
             with self._left_disabled(setup):
                 target = round(drive_position_at(self._model, axis, inside, units))
-                self._move(setup, zero, target, max(1, round(zero.speed * per_q / setup.speed_unit)))
+                speed = max(1, round(zero.speed * per_q / setup.speed_unit))
+                self._move(setup, zero, target, speed, self._tolerance(axis))
             stands = f"it stands at {joint.text(inside, '.2f')}, inside its range"
         elif inside != zero.home:
             stands = "it stands there, outside its range: move it inside by hand before a run"
@@ -333,7 +333,7 @@ class Homing:
             setup, (HOMING_ATTAINED_BIT, TARGET_REACHED_BIT), zero.timeout_s, what, late, error=HOMING_ERROR_BIT
         )
 
-    def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int) -> None:
+    def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int, tolerance: float) -> None:
         """Move a drive to a target in profile position."""
         self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         self._enable(setup, OperationMode.PROFILE_POSITION)
@@ -343,6 +343,12 @@ class Homing:
         self._await_bits(setup, (SETPOINT_ACKNOWLEDGE_BIT,), self._times.enable_s, what, late)
         self._command(setup, _ENABLE)
         self._await_bits(setup, (TARGET_REACHED_BIT,), zero.timeout_s, what, late)
+        # Bit 10 may still be that of the homing, or of a drive whose position window (6067h) is switched off.
+        self._await(
+            lambda: abs(self._read(setup, POSITION, 0) - target) <= tolerance,
+            zero.timeout_s,
+            lambda: self._error(setup, late),
+        )
 
     def _enable(self, setup: NodeSetup, mode: OperationMode) -> None:
         self._write(setup, Write(MODE, 0, mode, "mode of operation"))

@@ -7,8 +7,6 @@ position it cannot have reached may be moving: then nothing is moved.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,7 +59,7 @@ class WayBack:
         if self._away is None:
             self._away = -T[:3, 2]
         before, self._t = self._gone(self._t), self._t + self._period_s
-        if before >= LIFT_WAY and self._t > LIFT_WAY / LIFT_SPEED + ARRIVAL_S:
+        if self._t > LIFT_WAY / LIFT_SPEED + ARRIVAL_S:
             return None
         move = self._away * (self._gone(self._t) - before)
         if move.any():
@@ -70,11 +68,6 @@ class WayBack:
                 return None
             self._targets = self._targets + units
         return units_to_joints(self._model, self._targets)
-
-    @staticmethod
-    def cycles(period_s: float) -> int:
-        """Highest number of cycles that the way back takes."""
-        return math.ceil((LIFT_WAY / LIFT_SPEED + ARRIVAL_S) / period_s) + 1
 
     @staticmethod
     def _gone(t: float) -> float:

@@ -203,7 +203,11 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     drive = arm.drives[arm.node_ids.index(node.node_id)] if arm is not None and node.kind == "drive" else None
     times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
     homing, not_homing, no_homing = _possible(device, _homing_writes(plan, node, device))
-    no_homing += [*homing_problems(device), *_coupling_problems(plan, node)] if homing else []
+    no_homing += (
+        [*homing_problems(device), *_coupling_problems(plan, node), *_offset_problems(plan, node, device)]
+        if homing
+        else []
+    )
     return NodeSetup(
         node_id=node.node_id,
         name=node.role,
@@ -366,7 +370,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
 
 
 def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
-    """607Ch is from the home position to the zero: at home the drive is at -607Ch. Source: CiA 402-2, "Homing mode"."""
+    """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
     arm = plan.setup.arm
     axis = arm.node_ids.index(node.node_id) if arm is not None and node.kind == "drive" else None
     zero = arm.drives[axis].zero if arm is not None and axis is not None else None
@@ -385,8 +389,26 @@ def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Wri
         Write(0x6099, 1, max(1, round(zero.speed * speed)), "speed of the search for the switch", still),
         Write(0x6099, 2, max(1, round(zero.zero_speed * speed)), "speed of the search for the zero", still),
         Write(0x609A, 0, max(1, round(zero.acceleration * acceleration)), "acceleration in homing", ramp),
-        Write(HOME_OFFSET, 0, -round(home), "home offset"),
+        *([Write(HOME_OFFSET, 0, -round(home), "home offset")] if device.has(HOME_OFFSET) else []),
     ]
+
+
+def _offset_problems(plan: Plan, node: PlannedNode, device: Abilities) -> list[str]:
+    """Problems of a drive without 607Ch, which counts 0 at home, where the cell expects another number."""
+    arm = plan.setup.arm
+    assert arm is not None
+    axis = arm.node_ids.index(node.node_id)
+    model, zero = arm.model, arm.drives[axis].zero
+    if zero is None or device.has(HOME_OFFSET):
+        return []
+    name, lack = model.joints[axis].name, f"{device.eds}: no such object: 607Ch (home offset)"
+    if coupled_joints(model, axis):
+        return [f"{lack}, and what the motor of {name} counts at home depends on other joints: it cannot be homed"]
+    home = drive_position_at(model, axis, zero.home, joints_to_units(model, arm.q_start))
+    if not round(home):
+        return []
+    counts = round(model.zero_units[axis] - home)
+    return [f"{lack}: the drive counts 0 at home, and the cell {home:.0f}: set joints.{name}.zero_counts = {counts}"]
 
 
 def _coupling_problems(plan: Plan, node: PlannedNode) -> list[str]:

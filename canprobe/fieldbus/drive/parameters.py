@@ -62,7 +62,7 @@ class DriveParameters:
         dictionary.on_change(self.read, *_INDICES)
         for index, allowed in _ALLOWED_OPTIONS.items():
             dictionary.on_check(index, partial(_check_among, allowed))
-        dictionary.on_check(0x60C2, _check_interpolation)
+        dictionary.on_check(0x60C2, partial(_check_interpolation, dictionary.number(0x60C2, 1, -1)))
 
     def read(self) -> None:
         """Read the present values of the dictionary."""
@@ -116,6 +116,7 @@ def _check_among(allowed: frozenset[int], subindex: int, value: Value) -> None:
         raise SdoAbort(Abort.VALUE)
 
 
-def _check_interpolation(subindex: int, value: Value) -> None:
-    if (subindex == 1 and not value) or (subindex == 2 and not -9 <= int(value) <= 0):
+def _check_interpolation(initial: int, subindex: int, value: Value) -> None:
+    """Refuse a period of 0, except in a drive that boots with it."""
+    if (subindex == 1 and not value and initial) or (subindex == 2 and not -9 <= int(value) <= 0):
         raise SdoAbort(Abort.VALUE)

@@ -3,13 +3,15 @@
 A rising edge of controlword bit 4 offers a set-point (607Ah with 6081h, 6083h and 6084h of that moment); bit 5 puts
 it in place of everything else at once, bit 6 makes it relative to the set-point before. Statusword bit 12 is set when
 it was taken, and stays set while bit 4 is or while no other one can be taken; one that is offered then is ignored.
-The next set-point starts when the last is reached: the actual position has been within 6067h for 6068h (bit 10).
+The next set-point starts when the last is reached (bit 10): the actual position has been within 6067h for 6068h, or,
+where 6067h is FFFFFFFFh and so switched off, the move has ended.
 Bit 9 (change on set-point) and 60F2h are not supported. Halt interrupts a move, which goes on when halt is over.
 Source: CiA 402-2, "Profile position mode", objects 6067h, 6068h, 607Ah, 607Dh, 607Fh, 6081h, 6083h, 6084h, 6086h.
 """
 
 from __future__ import annotations
 
+from math import inf
 from typing import NamedTuple
 
 from canprobe.fieldbus.drive.cyclic_position import POSITION_TARGET_KEY
@@ -116,7 +118,10 @@ class ProfilePosition(ProfiledMode):
         """Check whether the set-point is reached."""
         point = self._active
         if point is not None and not self._reached and not self.halted:
-            if abs(point.counts - counts) > self._parameters.position_window:
+            window = self._parameters.position_window
+            if window == inf:
+                window, counts = 0.5, self._motion.demand(t_ns)
+            if abs(point.counts - counts) > window:
                 self._inside_ns = None
             elif self._inside_ns is None:
                 self._inside_ns = t_ns

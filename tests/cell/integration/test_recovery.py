@@ -19,6 +19,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtCommand, pack_nmt
 
 
@@ -28,7 +29,7 @@ def test_losses_are_conditions_of_the_table():
 
 def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_path):
     run = Returning("node 3: reboot for 2500 ms", out=tmp_path).assert_came_back()
-    assert run.steps("wait: node 3 not there")
+    assert run.steps("wait:") == ["wait: node 3 not there"]
     log = read_npz(tmp_path / "log.npz")
     times, rows = np.asarray(log["t_s"]), run.summary["cycle"]["cycles"]
     assert (np.diff(times) > 0.0).all() and len(times) == rows
@@ -51,8 +52,11 @@ def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_
     steps = ("node 3: booted", "nodes 1-6: NMT command reset node", "nodes 1-6: enabled")
     assert [there.index(step) for step in steps] == sorted(there.index(step) for step in steps)
     kinds = "\n".join(run.summary["faults"])
-    for words in ("node 3: lost: no usable TPDO", "the cell came back, at", "motion was asked for, and went on, at"):
-        assert words in kinds
+    words = ("node 3: lost: no usable TPDO .*", "the cell came back", "motion was asked for, and went on")
+    lost_s, back_s, went_on_s = (float(re.search(rf"{one}, at ([\d.]+) s", kinds)[1]) for one in words)
+    assert times[LOSS_CYCLE] < lost_s < times[LOSS_CYCLE] + 0.05
+    assert 2.5 < back_s - lost_s < 3.0, "half a second after it booted"
+    assert went_on_s == pytest.approx(back_s + HELD_CYCLES * 0.0025, abs=0.02)
 
 
 def somebody_resets(run):
@@ -83,23 +87,72 @@ def test_somebody_who_resets_a_node_has_time_to_go_on():
     assert float(back.split()[5]) > 2.0
 
 
-def test_an_interface_that_was_down_comes_back():
+class Busy(Participant):
+    """A master that sends an NMT command again, one and a half seconds later."""
+
+    next_deadline_ns = None
+
+    def __init__(self, now_ns):
+        self.next_deadline_ns = now_ns + 1_500_000_000
+
+    def receive(self, can_id, data, t_ns):
+        return []
+
+    def advance(self, t_ns):
+        self.next_deadline_ns = None
+        return [pack_nmt(NmtCommand.PRE_OPERATIONAL, 3)]
+
+
+def test_somebody_who_goes_on_is_waited_for():
+    def act(run):
+        somebody_resets(run)
+        run.session.lockstep.attach(Busy(run.now()))
+
+    run = Returning(act).assert_came_back()
+    assert run.steps("wait:") == ["wait: another master is on the bus: an NMT command from another master"]
+
+
+DOWN = "can0: interface is down; type: sudo ip link set can0 up"
+
+
+def cut_for(seconds, *, replugged=False, opened=None):
+    """Take the interface away for a time; one that was replugged is another one, which has to be opened."""
+
     def cut(run):
-        port, until_ns = run.session.cell._port, run.now() + 1_700_000_000
+        port, until_ns = run.session.cell._port, run.now() + round(seconds * 1e9)
+        opened_ns = [] if opened is None else opened
 
         def failing(method):
             def call(*arguments):
-                if run.now() < until_ns:
-                    raise InterfaceError("can0: interface is down; type: sudo ip link set can0 up")
+                if run.now() < until_ns or (replugged and not opened_ns):
+                    raise InterfaceError(DOWN)
                 return method(*arguments)
 
             return call
 
+        def reopen(port):
+            if run.now() < until_ns:
+                raise InterfaceError(DOWN)
+            opened_ns.append(run.now())
+            return port
+
+        run.session._reopen = reopen
         for name in ("send_batch", "drain", "wait"):
             setattr(port, name, failing(getattr(port, name)))
 
-    run = Returning(cut).assert_came_back()
-    assert run.steps("wait: can0: interface is down; type:")
+    return cut
+
+
+@pytest.mark.parametrize("replugged", [False, True])
+def test_an_interface_that_was_down_comes_back(replugged):
+    run = Returning(cut_for(1.7, replugged=replugged)).assert_came_back()
+    assert run.steps("wait:") == [f"wait: {DOWN}"]
+
+
+def test_an_interface_that_was_replugged_at_once_is_opened_at_the_loss():
+    opened = []
+    run = Returning(cut_for(0.0, replugged=True, opened=opened)).assert_came_back()
+    assert len(opened) == 1 and not run.steps("wait:")
 
 
 class Nod(Controller):
@@ -159,8 +212,32 @@ def test_a_drive_that_counts_increments_is_homed_again_after_it_was_without_powe
     assert {time for _, time in run.enabled.distances} == {1}, "no drive was enabled after it"
 
 
-def test_a_drive_that_counts_increments_and_kept_its_power_keeps_its_zero():
-    Returning("node 3: bus-off for 900 ms", homed_scene()).assert_came_back()
+@pytest.mark.parametrize("out_of_reach_ms", [900, 2500])
+def test_a_drive_that_counts_increments_and_kept_its_power_keeps_its_zero(out_of_reach_ms):
+    """It was released at the stop; or it was out of reach then, and still holds what bring-up has written."""
+    Returning(f"node 3: bus-off for {out_of_reach_ms} ms", homed_scene()).assert_came_back()
+
+
+@pytest.mark.parametrize(
+    ("what", "store"),
+    [("node 3: bus-off for 2500 ms;node 3: reboot at 1 s for 100 ms", False), ("node 3: bus-off for 2500 ms", True)],
+)
+def test_a_drive_that_may_have_booted_out_of_reach_is_homed_again(what, store):
+    """Nobody heard its boot-up, and what it had in its memory is gone; what it stores says nothing."""
+    scene = homed_scene()
+    run = Returning(what, replace(scene, bring_up=replace(scene.bring_up, store=store)))
+    (error,) = run.errors
+    assert "node 3: (joint 3) is not homed" in str(error)
+    assert {time for _, time in run.enabled.distances} == {1}
+
+
+def test_a_drive_that_does_not_show_that_it_kept_its_power_is_homed_again():
+    def silent(run):
+        run.inject("node 3: bus-off for 2500 ms")
+        run.nodes[3].dictionary.entries.pop(0x101601)
+
+    (error,) = Returning(silent, homed_scene()).errors
+    assert "node 3: (joint 3) is not homed" in str(error)
 
 
 def test_an_arm_that_reports_another_place_is_not_enabled():

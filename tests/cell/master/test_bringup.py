@@ -153,6 +153,10 @@ def assert_left_pre_operational(tmp_path, before=(0x81,)):
 def test_the_nodes_are_configured_side_by_side(tmp_path):
     with open_session(tmp_path) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
+    assert [line for line in session.said if not line.startswith("node ")] == [
+        *("listen for another master", "reset nodes 1, 2, 3, 4, 5, 6"),
+        *("identify and configure the nodes", "start all nodes"),
+    ]
     asked = [i - 0x600 for _, i, _ in frames(tmp_path) if 0x600 < i < 0x680]
     for part in range(1, 6):
         so_far = asked[: len(asked) * part // 6]
@@ -267,6 +271,40 @@ def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuse
         assert nodes[3].dictionary.number(0x1800, 1) == 0x4000_0183
 
 
+def remarks(session):
+    """What bring-up remarks on nodes, but for what it did to them."""
+    lines = [line for line in session.said if re.match(r"node \d+: \(", line)]
+    return [line for line in lines if not re.match(r"node \d+: \(.*\) configur", line)]
+
+
+@pytest.mark.parametrize(
+    ("entries", "told"),
+    [
+        ({}, None),
+        ({(0x6092, 1): 2000}, "counts 2000 units a motor turn by its 6092h"),
+        ({(0x6092, 1): 2000, (0x6091, 1): 2}, None),
+        ({(0x6091, 2): 2}, "counts 2000 units a motor turn by its 6092h and 6091h"),
+        ({(0x6092, 1): 0}, None),
+        ({(0x6092, 2): 0}, None),
+        ({(0x6092, 2): None}, None),
+    ],
+)
+def test_units_of_the_device_are_compared_with_those_of_the_cell(tmp_path, entries, told):
+    """What fits is not remarked, and a quotient without sense is no statement."""
+
+    def change(node):
+        if node.node_id == 3:
+            for (index, subindex), value in entries.items():
+                node.dictionary.set_default(index, subindex, value or 0)
+                if value is None:
+                    node.dictionary.entries.pop(index << 8 | subindex)
+
+    with open_session(tmp_path, change=change) as session:
+        pass
+    assert [line.split(":")[0] for line in remarks(session)] == ([] if told is None else ["node 3"])
+    assert told is None or told in remarks(session)[0]
+
+
 @pytest.mark.parametrize(("revision", "taken"), [(0x1_0004, True), (0x2_0000, False), (0xFFFF, False)])
 def test_a_revision_of_the_same_major_number_is_taken(tmp_path, revision, taken):
     def newer(node):
@@ -296,6 +334,25 @@ def test_a_drive_in_another_mode_is_not_enabled(tmp_path):
         session.cell.run(lambda _: Command())
     words = {d[:2] for _, i, d in frames(tmp_path) if 0x201 <= i <= 0x206}
     assert words == {bytes(2)}, "no drive was switched on"
+
+
+def test_a_drive_that_changes_its_mode_late_is_waited_for(tmp_path):
+    """As one that does so only while SYNC runs."""
+    answers = []
+
+    def change(node):
+        if node.node_id == 2:
+            right = node.dictionary.number(0x6061)
+            node.dictionary.on_read(0x6061, lambda _: node.dictionary.put(0x6061, 0, answer(right)))
+
+    def answer(right):
+        answers.append(right if session.lockstep.clock.now_ns() > began + 200 * MS else 1)
+        return 8 if answers[-1] != 1 else 1
+
+    with open_session(tmp_path, change=change, enable_s=0.3) as session:
+        began = session.lockstep.clock.now_ns()
+        session.cell.run(lambda _: Command(done=True))
+    assert answers.count(1) == len(answers) - 1 > 3
 
 
 def test_a_kept_configuration_is_not_written_again(tmp_path):
@@ -566,6 +623,18 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
 
 
+def test_drives_that_cannot_say_what_they_have_stored_are_configured_each_time(tmp_path):
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
+    session = Session(
+        replace(scene, bring_up=replace(scene.bring_up, store=True)), RunOptions(tmp_path, (tell := []).append)
+    )
+    with session:
+        pass
+    assert not any("kept" in line for line in tell)
+    assert not any(index == 0x1010 for index, _ in writes_to(frames(tmp_path), 2))
+
+
 def test_drives_whose_file_has_oddities_that_nobody_uses_are_planned_and_run(tmp_path):
     """Values and types that other tools read or that mean nothing, limits and a revision that nobody filled in."""
     odd = [("0x7", "0.0"), ("0x15", "0x1234LL"), ("0x7", "0x00 00 01 00"), ("UDINT", "1"), ("", "1"), ("0x5", "off")]
@@ -628,6 +697,19 @@ def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_
             match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
         ):
             session.__enter__()
+
+
+def test_a_drive_that_keeps_no_interpolation_time_at_all_has_no_rate_that_fits(tmp_path):
+    def fix(node):
+        if node.node_id == 5:
+            node.dictionary.set_default(0x60C2, 1, 0)
+            node.dictionary.on_check(0x60C2, refuse)
+
+    def refuse(subindex, value):
+        raise SdoAbort(Abort.READ_ONLY)
+
+    with pytest.raises(NodeError, match=r"; it holds 0x0$"):
+        open_session(tmp_path, change=fix).__enter__()
 
 
 def test_a_drive_whose_unit_is_fixed_is_given_the_rates_that_fit(tmp_path):

@@ -72,7 +72,7 @@ class Drives:
         return ()
 
 
-def a_cycle(port, *, on_arrival=True, drives=True):
+def a_cycle(port, *, on_arrival=True, drives=True, **more):
     """A cycle of 2.5 ms that looks at `LOOKS`."""
     budget = SimpleNamespace(looks_ns=tuple(look * 1000 for look in LOOKS))
     plan = SimpleNamespace(
@@ -82,10 +82,8 @@ def a_cycle(port, *, on_arrival=True, drives=True):
         port,
         plan,
         drives=Drives() if drives else None,
-        tactile=None,
-        watch=SimpleNamespace(push=lambda *_: True),
-        other=lambda _: None,
         on_arrival=on_arrival,
+        **{"tactile": None, "watch": SimpleNamespace(push=lambda *_: True), "other": lambda _: None, **more},
     )
 
 
@@ -154,6 +152,98 @@ def test_an_array_that_was_never_heard_is_as_old_as_the_run():
     for number in range(21):
         intake.begin(number, number * PERIOD_NS, number * PERIOD_NS)
     assert intake.measure(0).tactile_age == 20
+
+
+class Written(Port):
+    """A port that keeps what is sent."""
+
+    def __init__(self, arrivals=()):
+        super().__init__(arrivals)
+        self.sent = []
+
+    def send_batch(self, frames, t_ns=None):
+        super().send_batch(frames, t_ns)
+        self.sent += [(self._now, *frame) for frame in frames]
+
+
+def cycled(cycle, number, *, work=False):
+    for _ in range(number):
+        cycle.begin()
+        cycle.end(None)
+        if work:
+            cycle.count_work()
+
+
+def test_the_heartbeat_goes_every_100_ms_behind_the_commands():
+    port = Written()
+    cycle = a_cycle(port, drives=False)
+    cycled(cycle, 82)
+    beats = [(t_ns - cycle.t_first_ns) // PERIOD_NS for t_ns, can_id, data in port.sent if can_id == 0x77F]
+    assert beats == [0, 40, 80]
+    assert {data for _, can_id, data in port.sent if can_id == 0x77F} == {b"\x05"}
+    assert sum(can_id == SYNC_ID for _, can_id, _ in port.sent) == 82
+    assert {can_id for _, can_id, _ in port.sent} == {SYNC_ID, 0x77F}
+
+
+def test_every_fifth_cycle_is_timed_and_the_last_ones_are_kept():
+    cycle = a_cycle(Written(), drives=False)
+    cycled(cycle, 11, work=True)
+    statistics = cycle.statistics
+    assert (len(statistics.period_error_ns), len(statistics.response_ns), len(statistics.compute_ns)) == (11, 3, 3)
+    assert all(
+        0 < response <= work for response, work in zip(statistics.response_ns, statistics.compute_ns, strict=True)
+    )
+    kept = a_cycle(Written(), drives=False, kept=2)
+    cycled(kept, 11, work=True)
+    kept = kept.statistics
+    assert (len(kept.period_error_ns), len(kept.response_ns), len(kept.compute_ns)) == (2, 2, 2)
+
+
+def test_a_cycle_that_comes_after_another_goes_on_on_its_grid():
+    port = Written()
+    first = a_cycle(port, drives=False)
+    cycled(first, 5)
+    port.sleep_until_ns(first.t_first_ns + round(19.3 * PERIOD_NS))
+    second = a_cycle(port, drives=False, before=first)
+    measurement = second.begin()
+    assert (measurement.cycle, measurement.t_ns) == (5, 20 * PERIOD_NS)
+    assert second.t_first_ns == first.t_first_ns and len(first.statistics.period_error_ns) == 6
+    assert first.begin().cycle == 5, "a cycle by itself"
+    assert a_cycle(port, drives=False).begin().t_ns == 0
+
+
+def test_frames_go_where_they_belong_and_what_came_before_a_sync_does_first():
+    taken, left = [], []
+    port = Written([(0x583, 100), (0x703, 200), (TPDOS[0], 300), (TPDOS[1], 300)])
+    watch = SimpleNamespace(push=lambda can_id, *_: can_id == 0x703 and not taken.append(can_id))
+    cycle = a_cycle(port, watch=watch, other=left.append)
+    cycle.begin()
+    assert taken == [0x703] and [can_id for frames in left for can_id, _, _ in frames] == [0x583]
+    cycle.skip()
+    port.stamps_arrival, port.drains, at = False, 0, []
+    drain = port.drain
+    port.drain = lambda: at.append(len(port.sent)) or drain()
+    cycle.begin()
+    assert at[0] == 1 and at[1:] == [2] * (len(at) - 1), "one look before the second SYNC"
+
+
+def test_requests_to_the_array_go_out_with_the_cycle_that_makes_them():
+    port = Written()
+    array, counters = SimpleNamespace(cob_ids=(0x511,), newest_cycle=2, channel="can0"), []
+    array.take = lambda number, counter, *_: counters.append(counter)
+    array.requests = lambda number: [(0x600, bytes((number,)))] if number == 3 else []
+    cycle = a_cycle(port, drives=False, tactile=array)
+    cycled(cycle, 5)
+    assert [(t - cycle.t_first_ns, data) for t, can_id, data in port.sent if can_id == 0x600] == [
+        (3 * PERIOD_NS + LOOKS[0] * 1000, b"\x03")
+    ]
+    assert cycle.begin().tactile_age == 3
+    assert counters == [0] * 6, "this SYNC has no counter"
+
+
+def test_without_drives_a_cell_counts_as_enabled():
+    measurement = a_cycle(Written(), drives=False).begin()
+    assert measurement.enabled and measurement.q is None and measurement.tactile_age is None
 
 
 # Observers of a cell: what they see, and that they cannot harm it.

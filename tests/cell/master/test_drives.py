@@ -304,6 +304,80 @@ def test_the_group_takes_the_time_from_its_syncs():
     assert joints_to_units(MODEL, group.joints()) == pytest.approx([190, 190, 220, 190, 190, 190])
 
 
+def test_a_drive_that_was_missed_while_its_target_moved_is_believed_where_it_went():
+    """As far as its targets asked in that time, and no further; a cycle may be late, too."""
+    for late, way, believed in ((1, 30, True), (1, 110, False), (7, 90, True), (7, 170, False)):
+        group = make_group()
+        for cycle in range(22):
+            group.begin(cycle, 0, (cycle + (late - 1) * (cycle > 20)) * PERIOD)
+            hear(group, [10 * cycle] * 6, skip=(2,) if cycle > 19 else ())
+            group.set_target(units_to_joints(MODEL, np.full(6, 10.0 * (cycle + 1))))
+            group.frames()
+        group.begin(22, 0, (21 + late) * PERIOD)
+        hear(group, [190 + way if i == 2 else 220 for i in range(6)])
+        assert (group.ages()[2] == 0) is believed, (late, way)
+        assert group.implausible == (not believed) and group.disbelieved is not believed
+
+
+@pytest.mark.parametrize(
+    ("goal", "word"),
+    [
+        (DriveState.OPERATION_ENABLED, 0x02),
+        (DriveState.QUICK_STOP_ACTIVE, 0x02),
+        (DriveState.SWITCH_ON_DISABLED, 0x00),
+    ],
+)
+def test_a_drive_in_no_known_state_is_stopped(goal, word):
+    group = make_group()
+    group.goal = goal
+    group.begin(0)
+    hear(group, [0] * 6, status=0x0601)
+    assert group.states == (None,) * 6 and not any(group.enabled_ones()) and not group.enabled
+    assert {int.from_bytes(data[:2], "little") for _, data in group.frames()} == {word}
+
+
+@pytest.mark.parametrize(
+    ("transmission", "sent"), [(1, [6, 6, 6]), (240, [6, 6, 6]), (241, [6, 0, 0]), (255, [6, 0, 0])]
+)
+def test_what_follows_sync_is_sent_in_every_cycle_and_the_rest_on_change(transmission, sent):
+    axes = [
+        DriveAxis(i, (PdoLayout(0x180 + i, (STATUS, POSITION)),), (PdoLayout(0x200 + i, (WORD, TARGET), transmission),))
+        for i in range(1, 7)
+    ]
+    group, counts = DriveGroup(tuple(axes), MODEL), []
+    for cycle in range(3):
+        group.begin(cycle)
+        hear(group, [5] * 6)
+        counts.append(len(group.frames()))
+    assert counts == sent
+
+
+def test_the_first_drive_that_is_not_where_it_should_be_is_named():
+    group = make_group()
+    group.begin(0)
+    hear(group, [0] * 6)
+    assert group.enabled and group.all_in(DriveState.OPERATION_ENABLED)
+    group.begin(1)
+    hear(group, [0] * 6, skip=(3, 5))
+    for i in (4, 6):
+        group.push(0x180 + i, group.axes[i - 1].feedback[0].pack(0x21, 0, 0))
+    assert group.first_not_in(DriveState.OPERATION_ENABLED) == (3, "READY_TO_SWITCH_ON")
+    assert group.enabled_ones() == (True, True, True, False, True, False) and not group.enabled
+
+
+def test_the_time_from_the_sync_to_the_last_answer_and_to_a_late_one():
+    group = make_group()
+    group.begin(0, 1000)
+    hear_at = lambda i, t_ns: group.push(0x180 + i, group.axes[i - 1].feedback[0].pack(ENABLED, 0, 0), t_ns)  # noqa: E731
+    hear_at(1, 1300)
+    assert group.answer_ns == 300
+    group.begin(1, 5000)
+    hear_at(2, 4900)
+    hear_at(3, 5200)
+    hear_at(3, 5700)
+    assert (group.answer_ns, group.lateness_ns[1], group.lateness_ns[2]) == (200, 3900, 700)
+
+
 def test_drives_that_are_stopped_get_a_quick_stop_and_the_others_go_on():
     group = make_group()
     group.begin(0)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from judged import rules_raised
-from makes import MAKES, changed, without, write_eds
+from makes import MAKES, Entry, changed, without, write_eds
 from scenes import change, reasons, with_joints
 
 import canprobe
@@ -24,6 +24,7 @@ from canprobe.cell.tasks.joint_finding import Answer
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
+from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtCommand, pack_nmt
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
@@ -57,7 +58,7 @@ class Bench:
         self.plan = canprobe.plan(scene)
         self.bus = LockstepBus(VirtualClock(), "can0")
         self.world = make_world(self.plan, self.plan.node_ids, truth=False, homed=False)
-        self.record = folder / "state" / "zeros.json"
+        self.record = folder / "state" / "canprobe" / "zeros.json"
         self.heard, self.said = [], []
         self.bus.recorder = lambda *frame: self.heard.append(frame)
         for node in self.world.nodes:
@@ -109,6 +110,51 @@ def test_a_homed_joint_is_where_the_cell_has_it_and_stays_known(tmp_path, method
     assert rules_raised(bench.plan, bench.heard) == {}
 
 
+@pytest.mark.parametrize(("method", "end"), [(17, "min_deg"), (18, "max_deg")])
+def test_a_joint_goes_back_inside_its_range_and_one_that_is_homed_where_it_stands_stays(tmp_path, method, end):
+    """A degree inside of where a run could begin, by a motion that has ended."""
+    scene = scene_of([method, 35])
+    bench = Bench(scene, tmp_path)
+    bench.home()
+    inward = 1 if method == 17 else -1
+    stands = getattr(next(iter(scene.joints.values())), end) + inward * (scene.limits.joint_margin_deg + 1.0)
+    assert np.degrees(bench.world.plant.truth()["q"][0]) == pytest.approx(stands, abs=0.05)
+    modes = {
+        i: [d[4] for can_id, d in bench.frames if can_id == 0x600 + i and d[:4].hex() == "2f606000"] for i in (1, 2)
+    }
+    assert modes == {1: [8, 6, 8, 1, 8], 2: [8, 6, 8]}
+
+
+def test_a_record_without_a_schema_is_of_the_first_one(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path)
+    bench.home()
+    content = json.loads(bench.record.read_text())
+    assert content.pop("schema") == 1
+    bench.record.write_text(json.dumps(content))
+    assert bench.run()
+    bench.record.write_text(json.dumps({**content, "schema": 2}))
+    with pytest.raises(UsageError, match="remove it, and home the drives again"):
+        bench.cell()
+
+
+def test_a_drive_without_a_home_offset_counts_zero_at_home(tmp_path):
+    """An EPOS4 has no 607Ch. The plan names the zero_counts that the cell then needs, and with it homing is right."""
+    eds = tmp_path / "no_home_offset.eds"
+    eds.write_text(eds_path("puma260_joint").read_text().replace("607C", "5FFC"))
+    scene = change(scene_of([17]), arm={"eds": str(eds)})
+    (problem,) = reasons(scene)
+    head, _, zero_counts = problem.rpartition(" = ")
+    assert head.endswith("and the cell -23736: set joints.joint_1.zero_counts"), problem
+    first = next(iter(scene.joints))
+    joints = {**scene.joints, first: replace(scene.joints[first], zero_counts=int(zero_counts))}
+    bench = Bench(replace(scene, joints=joints), tmp_path)
+    bench.home()
+    q, truth = bench.run()
+    assert q[0] == pytest.approx(truth[0], abs=2e-4)
+    (coupled,) = reasons(change(scene_of([0, 0, 0, 0, 17]), arm={"eds": str(eds)}))
+    assert "depends on other joints: it cannot be homed" in coupled
+
+
 def test_the_index_pulse_behind_the_positive_switch(tmp_path):
     """A joint whose motor turns once in 7.7 deg, and whose pulses count from the position at power on."""
     bench = Bench(scene_of([2]), tmp_path)
@@ -131,6 +177,30 @@ def test_a_slide_whose_drive_counts_backwards_finds_its_negative_switch_at_its_u
     q, truth = bench.run()
     assert q == pytest.approx(truth, abs=1e-5)
     assert 0.39 < q[0] < 0.4
+
+
+QUESTIONS = {
+    1: "move in negative direction to the index pulse at the negative limit switch, at 100 and 1 deg/s?",
+    2: "move in positive direction to the index pulse at the positive limit switch, at 100 and 1 deg/s?",
+    17: "move in negative direction to the negative limit switch, at 100 and 1 deg/s?",
+    18: "move in positive direction to the positive limit switch, at 100 and 1 deg/s?",
+    33: "move in negative direction to the next index pulse, at 100 and 1 deg/s?",
+    34: "move in positive direction to the next index pulse, at 100 and 1 deg/s?",
+    7: "move as its maker says, at 100 and 1 deg/s?",
+    35: "take the place where it stands for 90.00 deg?",
+    37: "take the place where it stands for 65.00 deg?",
+}
+
+
+@pytest.mark.parametrize("methods", [(1, 2, 17, 18, 33, 34), (35, 37, 7)], ids=str)
+def test_the_operator_is_asked_what_the_joint_will_do(tmp_path, methods):
+    bench = Bench(scene_of(methods), tmp_path)
+    with bench.cell(to_home=True) as cell:
+        asked = [cell.homing.question(axis) for axis in cell.homing.order]
+    assert asked == [
+        f"joint {i} (joint_{i}, node {i}): home it by method {method}: {QUESTIONS[method]}"
+        for i, method in enumerate(methods, start=1)
+    ]
 
 
 def test_joints_in_their_order_each_alone_with_heartbeats_and_without_sync(tmp_path):
@@ -319,7 +389,7 @@ class Turned:
 def test_a_drive_that_takes_the_home_offset_the_other_way_round(tmp_path):
     bench = Bench(scene_of([35]), tmp_path, around=Turned)
     assert re.fullmatch(
-        r"node 1: \(joint 1\) homed, but is at -(\d+) \(6064h\) where \1 was expected with 607Ch = -\1: the drive may"
+        r"node 1: \(joint 1\) homed, but is at -(\d+) \(6064h\) where \1 was expected, with 607Ch = -\1: the drive may"
         " count the home offset the other way round",
         failure(bench),
     )
@@ -332,6 +402,44 @@ def test_without_profile_position_the_joint_is_left_at_its_switch(tmp_path):
     bench = Bench(change(scene_of([18], homing_speed_deg_s=20.0), arm=eds, cycle={"rate_hz": 333.333}), tmp_path)
     (told,) = bench.home()
     assert told.endswith("it stands there, outside its range: move it inside by hand before a run")
+
+
+def test_the_speed_of_the_way_back_is_written_in_the_unit_of_the_drive(tmp_path):
+    """60A9h: revolutions a minute. The joint is homed at 90 deg/s, and its motor turns 46.72 times as often."""
+    make = MAKES["late_target"]()
+    make.objects[0x60A9, 0] = Entry("SI unit velocity", "U32", "ro", 0x00B4_4700)
+    eds = {"eds": str(write_eds(make, tmp_path)), "emulated": False}
+    scene = change(scene_of([18], homing_speed_deg_s=90.0), arm=eds, cycle={"rate_hz": 333.333})
+    bench = Bench(scene, tmp_path)
+    bench.home()
+    (speed,) = [struct.unpack("<I", d[4:])[0] for i, d in bench.frames if i == 0x601 and d[:4].hex() == "23816000"]
+    assert speed == round(90 / 360 * 60 * scene.joints["joint_1"].gear)
+
+
+def test_a_drive_that_was_out_of_sight_is_not_homed_whatever_it_says(tmp_path):
+    bench = Bench(scene_of([35, 35]), tmp_path)
+    bench.home()
+    cell = bench.cell()
+    cell.doubted = frozenset({1})
+    with pytest.raises(NodeError, match=r"node 1: \(joint 1\) is not homed.* since; type:"):
+        cell.__enter__()
+    assert json.loads(bench.record.read_text())["nodes"].keys() == {"2"}
+    assert refusal(bench).startswith("node 1: (joint 1) is not homed")
+
+
+class Deaf(Turned):
+    """A drive that confirms the command to enable operation and does not follow it."""
+
+    def receive(self, can_id, data, t_ns):
+        if (can_id, data[:5].hex()) == (0x601, "2b4060000f"):
+            return [(0x581, bytes.fromhex("6040600000000000"))]
+        return self._node.receive(can_id, data, t_ns)
+
+
+def test_a_drive_that_is_not_enabled_for_homing_is_named_with_its_state(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path, around=Deaf)
+    told = r"node 1: \(joint 1\) is SWITCHED_ON \d+ s after the command for OPERATION_ENABLED"
+    assert re.fullmatch(told, failure(bench))
 
 
 class Once(Participant):
@@ -381,6 +489,47 @@ def test_a_record_is_gone_before_the_drive_moves(tmp_path):
     bench.bus.attach(Once(lambda: kept.append(json.loads(bench.record.read_text())["nodes"])))
     bench.home()
     assert kept == [{}] and json.loads(bench.record.read_text())["nodes"].keys() == {"1"}
+
+
+def test_a_record_is_there_as_soon_as_the_joint_is_homed(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path)
+    with bench.cell(to_home=True) as cell:
+        cell.homing.home(0)
+        entry = json.loads(bench.record.read_text())["nodes"]["1"]
+    assert entry["position"] == -entry["objects"]["607Ch:00"]
+
+
+class Odd(Turned):
+    """A drive whose statusword is that of no state, the first times that it is asked for it."""
+
+    def __init__(self, node):
+        super().__init__(node)
+        self._left = 2 * (node.node_id == 1)
+
+    def receive(self, can_id, data, t_ns):
+        answers = self._node.receive(can_id, data, t_ns)
+        if self._left and data[:4].hex() == "40416000":
+            self._left -= 1
+            return [(i, d[:4] + b"\x01\x06\0\0") for i, d in answers]
+        return answers
+
+
+def test_a_drive_in_no_known_state_is_given_no_voltage_before_it_is_homed(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path, around=Odd)
+    bench.home()
+    assert bench.words(1)[:3] == [0x00, 0x00, 0x06]
+
+
+def test_a_drive_that_does_not_say_where_it_is_left_keeps_no_record_and_the_others_theirs(tmp_path):
+    bench = Bench(scene_of([35, 35]), tmp_path)
+    bench.home()
+    before = json.loads(bench.record.read_text())["nodes"]
+    with bench.cell() as cell:
+        cell.run(lambda m: Command(q_target=m.q + np.array([2e-3, 2e-3, 0, 0, 0, 0]), done=m.cycle > 60))
+        bench.world.nodes[0].dictionary.entries.pop(0x101801)
+    after = json.loads(bench.record.read_text())["nodes"]
+    assert before["1"] == after["1"] and before["2"] != after["2"]
+    assert any(fault.startswith("while stopping: node 1: (joint 1) read of 1018h:01 failed") for fault in cell.faults)
 
 
 def test_another_master_that_comes_while_homing_is_named(tmp_path):

@@ -2,6 +2,7 @@
 
 import math
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import pytest
 from puma_arm import UPENN
 
 import canprobe
-from canprobe.cell.master.conditions import BY_KEY, CONDITIONS
+from canprobe.cell.master.conditions import BY_KEY, CONDITIONS, COUNTERS
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.supervision import Limits, Reaction, Seen, TouchState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
@@ -18,15 +19,19 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.scene.setup import SafetyLimits
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.fieldbus.protocol.cia402 import DriveState
-from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtState
+from canprobe.fieldbus.protocol.emcy import Emcy
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
 from canprobe.mechanics.touch.patch.force_errors import ForceSigma
 
 LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_000)
+SCANNING = replace(LIMITS, regain=3e-3)
+TARING = replace(LIMITS, tares=True)
+COMMUNICATION, TEMPERATURE = Emcy(0x8210, 0x11).pack(), Emcy(0x4210, 0x09).pack()
 PASSIVE = {"controller_state": ControllerState.PASSIVE}
 
 
-def seen(**fields):
-    return Seen(LIMITS, NodeWatch((1, 2)), None, None, PortCounters(), **fields)
+def seen(limits=LIMITS, **fields):
+    return Seen(limits, NodeWatch((1, 2)), None, None, PortCounters(), **fields)
 
 
 def with_ages(*ages):
@@ -40,8 +45,22 @@ def check(key):
     return BY_KEY[key].check
 
 
-def touch(force=2.0, age=2, lost_s=0.0, **more):
-    return TouchState(LIMITS, force, age, lost_s, **more)
+def touch(force=2.0, age=2, lost_s=0.0, limits=LIMITS, **more):
+    return TouchState(limits, force, age, lost_s, **more)
+
+
+def scan(lost_s=0.0, **more):
+    """A scan that may search for its contact."""
+    return touch(lost_s=lost_s, path=True, limits=SCANNING, **more)
+
+
+def heard(can_id, *data):
+    """A cell whose nodes are operational, after one more frame."""
+    found = seen()
+    for node_id in (1, 2):
+        found.watch.push(HEARTBEAT_BASE + node_id, bytes((NmtState.OPERATIONAL,)), 0)
+    found.watch.push(can_id, bytes(data), 0)
+    return found
 
 
 def felt(**patch):
@@ -55,6 +74,7 @@ def felt(**patch):
         ("force", touch(4.8, force_sigma=0.1), touch(4.8, force_sigma=0.101), "4.80 N, or up to 5.00 N (2σ), above"),
         ("force", touch(4.9, force_sigma=math.inf), touch(5.001, force_sigma=math.inf), "above the limit of 5.00 N"),
         ("sensor_stale", touch(age=12), touch(age=13), "no tactile frame for 13 cycles"),
+        ("sensor_stale", touch(age=None), touch(age=20), "no tactile frame for 20 cycles"),
         ("contact_lost", touch(lost_s=0.0299), touch(lost_s=0.0301), "contact lost"),
         ("drive_late", with_ages(0, 2), with_ages(0, 3), "node 2: no usable TPDO for 3 cycles"),
         ("drive_silent", with_ages(5, 0), with_ages(6, 0), "node 1: lost: no usable TPDO for 6 cycles"),
@@ -67,6 +87,27 @@ def felt(**patch):
         ),
         ("error_passive", seen(), seen(passive_ns=1_000_000_000, **PASSIVE), "error-passive"),
         ("bus_off", seen(**PASSIVE), seen(controller_state=ControllerState.BUS_OFF), "bus-off"),
+        ("force_hidden", touch(hidden_s=0.02), touch(hidden_s=0.0201), "force is above the 2.0 N measured"),
+        ("off_pad", touch(off_pad_s=0.02), touch(off_pad_s=0.0201), "runs off the edge of the array"),
+        ("taxels_hidden", touch(bridged_s=0.02), touch(bridged_s=0.0201, bridged=0.6), "60 % of the force"),
+        ("contact_lost", scan(0.1), replace(scan(0.0301), path=False), "contact lost"),
+        ("contact_lost", touch(lost_s=0.03, path=True), touch(lost_s=0.0301, path=True), "contact lost"),
+        ("contact_to_regain", scan(0.03), scan(0.0301), "contact lost"),
+        ("contact_to_regain", touch(lost_s=0.1), scan(0.1), "contact lost"),
+        ("contact_not_regained", scan(searched=3e-3), scan(searched=3.01e-3), "not found again within 3.0 mm"),
+        ("joint_stop", touch(), touch(limit="joint 1 at 90 deg, its stop"), "joint 1 at 90 deg, its stop"),
+        ("preload", seen(TARING, preload=0.15), seen(TARING, preload=0.151), "measures 0.15 N before the run"),
+        ("preload", seen(preload=0.2), seen(TARING, preload=0.2), "limits.preload_max_n = 0.15"),
+        ("joint_speed", seen(), seen(speeding="joint 2 reports a motion"), "joint 2 reports a motion"),
+        ("log", seen(), seen(log_failure="bus.log: cannot be written"), "bus.log: cannot be written"),
+        ("foreign_master", heard(HEARTBEAT_BASE + 1, 5), heard(SYNC_ID), "another master is on the bus: SYNC"),
+        (
+            "nmt_state",
+            heard(HEARTBEAT_BASE + 2, 5),
+            heard(HEARTBEAT_BASE + 2, 4),
+            "node 2: left operation: NMT state STO",
+        ),
+        ("emcy", heard(EMCY_BASE + 2, *COMMUNICATION), heard(EMCY_BASE + 2, *TEMPERATURE), "node 2: EMCY 4210h"),
     ],
 )
 def test_a_limit_itself_is_kept_and_what_is_beyond_is_named(key, within, beyond, told):
@@ -76,6 +117,27 @@ def test_a_limit_itself_is_kept_and_what_is_beyond_is_named(key, within, beyond,
 
 def test_a_hold_that_took_too_long_is_a_retreat_and_no_longer_a_hold():
     assert check("error_passive")(seen(passive_ns=1_000_000_001, **PASSIVE)) is None
+
+
+def test_what_is_counted():
+    """Each number of the cell, by the condition that counts it; without drives and array there are none of theirs."""
+    found = heard(EMCY_BASE + 1, *COMMUNICATION)
+    found.silent_taxels, found.slowed, found.restarts = 2, 3, 4
+    found.counters.error_frames, found.counters.overruns, found.counters.clock_steps = 5, 6, 7
+    expected = {"emcy_communication": 1, "silent_taxels": 2, "target_speed": 3, "estimator": 4}
+    expected |= {"error_frames": 5, "frames_dropped": 6, "clock_step": 7}
+    assert {key: n for key, count in COUNTERS if (n := count(found))} == expected
+    found.drives, found.tactile = SimpleNamespace(missed=8, implausible=100), SimpleNamespace(unusable=9, stale=10)
+    expected |= {"pdo_missed": 108, "torn_frame": 9, "sync_mismatch": 10}
+    assert {key: count(found) for key, count in COUNTERS} == expected
+
+
+def test_what_ends_the_enabling_of_the_drives_already():
+    """All that is wrong with nodes, bus, array or log; the rest needs a drive in operation, or a controller."""
+    assert {condition.key for condition in CONDITIONS if condition.enabling} == {
+        *("foreign_master", "heartbeat", "nmt_state", "emcy"),
+        *("error_passive", "bus_off", "preload", "joint_speed", "log"),
+    }
 
 
 def test_a_heartbeat_is_lost_after_its_time_and_not_in_it():

@@ -39,6 +39,29 @@ def test_nothing_is_commanded_before_motion_is_asked_for():
     assert mine.went_on == 1
 
 
+def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
+    asked, done = [], []
+
+    class Working(Mine):
+        lets_go, restarts = True, 3
+
+        def update(self):
+            done.append("update")
+
+        def retreat(self, reason):
+            done.append(reason)
+
+    held = HeldTask(Working(), None, lambda: bool(asked))
+    held.update()
+    assert done == [] and not held.lets_go and held.restarts == 3
+    asked.append(True)
+    held.step(Measurement(0, 0))
+    held.update()
+    held.retreat("the force")
+    assert done == ["update", "the force"] and held.lets_go
+    assert HeldTask(Working(), None, None).lets_go, "a controller that is new begins at once"
+
+
 @pytest.mark.parametrize(("moved_deg", "words"), [(0.9, None), (1.1, "joint 2 reports")])
 def test_an_arm_that_stands_elsewhere_is_refused(moved_deg, words):
     joints = canprobe.plan("free").setup.arm.model.joints

@@ -201,6 +201,14 @@ def test_cia402_6067_6068_target_reached_is_the_motors_and_takes_its_time(rig, p
     assert rig.bits(10) == (1,)
 
 
+def test_cia402_6067_switched_off_a_set_point_is_reached_when_its_move_has_ended(rig):
+    rig.put(_6067=0xFFFFFFFF, _6068=0, _6081=10_000, _6083=10**6, _6084=10**6).enable(1)
+    move(rig, 1000).run(50)
+    assert 400 < rig.counts < 600 and rig.bits(10) == (0,)
+    rig.run(100)
+    assert (rig.counts, rig.bits(10)) == (1000, (1,))
+
+
 @pytest.mark.parametrize(("target", "place", "limited"), [(900, 900, 0), (1500, 1000, 1), (-1500, -200, 1)])
 def test_cia402_57_software_limits_of_a_move(rig, target, place, limited):
     rig.put(_607D_1=-200, _607D_2=1000).enable(1)

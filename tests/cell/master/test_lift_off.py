@@ -1,0 +1,205 @@
+"""The way back of the probe: how far and how fast, which drives make it, and what ends it. Without a bus."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from puma_arm import ELBOW_FORM
+
+import canprobe
+from canprobe.cell.master.controller import Command, Measurement
+from canprobe.cell.master.lift_off import ARRIVAL_S, LIFT_SPEED, LIFT_WAY, LiftOff, WayBack
+from canprobe.cell.master.supervision import limits_of
+from canprobe.cell.master.watch import NodeWatch
+from canprobe.errors import NodeError, SafetyStop
+from canprobe.fieldbus.protocol.emcy import Emcy
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
+
+PLAN = canprobe.plan("press")
+MODEL, T_FLANGE_PROBE = PLAN.setup.arm.model, PLAN.setup.probe.T_flange_probe
+PERIOD_S = PLAN.sync.period_ns * 1e-9
+NODES = range(1, 7)
+
+
+@pytest.mark.parametrize("still", [None, 0, 2, 5])
+def test_the_way_is_straight_back_and_fast_at_first(still):
+    free = np.arange(6) != (9 if still is None else still)
+    targets = joints_to_units(MODEL, ELBOW_FORM)
+    way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, free, targets)
+    joints = [ELBOW_FORM]
+    while (q := way.step(joints[-1])) is not None:
+        joints.append(q)
+    T = [forward(MODEL.chain, q) @ T_FLANGE_PROBE for q in joints]
+    ways = np.array([one[:3, 3] - T[0][:3, 3] for one in T])
+    back = -ways @ T[0][:3, 2]
+    assert np.linalg.norm(ways + np.outer(back, T[0][:3, 2]), axis=1).max() < 0.01 * LIFT_WAY
+    assert back[-1] == pytest.approx(LIFT_WAY, rel=0.01)
+    assert len(joints) - 1 == pytest.approx((LIFT_WAY / LIFT_SPEED + ARRIVAL_S) / PERIOD_S, abs=1.5)
+    speed = np.diff(back) / PERIOD_S
+    assert speed[0] == pytest.approx(2 * LIFT_SPEED, rel=0.02) and np.diff(speed).max() < 1e-4
+    moving = round(LIFT_WAY / LIFT_SPEED / PERIOD_S)
+    assert np.abs(speed[moving:]).max() < 1e-9 < speed[moving - 1]
+    moved = np.abs(joints_to_units(MODEL, joints[-1]) - targets) > 1e-6
+    assert moved.any() and not moved[~free].any()
+
+
+def test_a_way_that_the_remaining_drives_cannot_make_ends():
+    way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, np.arange(6) == 5, joints_to_units(MODEL, ELBOW_FORM))
+    assert way.step(ELBOW_FORM) is None
+
+
+class Drives:
+    """Six drives that are enabled and were heard in this cycle."""
+
+    axes = tuple(SimpleNamespace(node_id=i) for i in NODES)
+    disbelieved = False
+    stopped = frozenset()
+
+    def __init__(self):
+        self.age, self.on = [0] * 6, [True] * 6
+
+    def ages(self):
+        return tuple(self.age)
+
+    def enabled_ones(self):
+        return tuple(self.on)
+
+    def targets(self):
+        return joints_to_units(MODEL, ELBOW_FORM)
+
+
+def a_watch():
+    watch = NodeWatch(PLAN.node_ids)
+    for i in NODES:
+        watch.push(HEARTBEAT_BASE + i, bytes((NmtState.OPERATIONAL,)), 0)
+    return watch
+
+
+def lift(drives, watch=None, error=None):
+    return LiftOff(PLAN, drives, watch or a_watch(), error or SafetyStop("the sensor is lost"))
+
+
+def missed(drives, watch):
+    drives.age[1] = 1
+
+
+def disabled(drives, watch):
+    drives.on[1] = False
+
+
+def alarmed(drives, watch):
+    watch.push(EMCY_BASE + 2, Emcy(0x4210, 1).pack(), 0)
+
+
+def stopped(drives, watch):
+    watch.push(HEARTBEAT_BASE + 2, bytes((NmtState.STOPPED,)), 0)
+
+
+def never_heard(drives, watch):
+    del watch.states[2]
+
+
+@pytest.mark.parametrize("trouble", [missed, disabled, alarmed, stopped, never_heard])
+def test_a_drive_in_trouble_is_stopped_and_the_others_lift(trouble):
+    drives, watch = Drives(), a_watch()
+    trouble(drives, watch)
+    going = lift(drives, watch)
+    assert going.possible
+    going.begin()
+    assert drives.stopped == {2}
+
+
+def test_the_node_that_the_cell_is_stopped_for_does_not_lift_and_others_do():
+    for error, still in ((NodeError(3, "lost"), {3}), (NodeError(16, "lost"), set()), (SafetyStop("node 3"), set())):
+        drives = Drives()
+        lift(drives, error=error).begin()
+        assert drives.stopped == still
+
+
+def test_without_a_drive_that_obeys_or_with_one_that_may_be_moving_nothing_lifts():
+    drives = Drives()
+    drives.on = [False] * 6
+    assert not lift(drives).possible
+    drives = Drives()
+    drives.disbelieved = True
+    assert not lift(drives).possible
+
+
+class Cell:
+    """What a lift-off asks of the supervisor."""
+
+    def __init__(self):
+        self.seen = SimpleNamespace(measurement=Measurement(1000, 0, q=ELBOW_FORM), limits=limits_of(PLAN))
+        self.force, self.stops, self.finding = 2.0, False, None
+
+    def felt(self):
+        return self.force
+
+    def must_stop(self):
+        return self.stops
+
+    def guard_target(self, command):
+        return command, self.finding
+
+
+def begun():
+    drives, cell = Drives(), Cell()
+    going = lift(drives)
+    for _ in range(20):
+        command = going.command(cell)
+        cell.seen.measurement = replace(
+            cell.seen.measurement, cycle=cell.seen.measurement.cycle + 1, q=command.q_target
+        )
+    return drives, cell, going
+
+
+ENDS = {
+    "two cycles without a TPDO": (lambda d, c: d.age.__setitem__(4, 2), False),
+    "three cycles without a TPDO": (lambda d, c: d.age.__setitem__(4, 3), True),
+    "a drive that is off": (lambda d, c: d.on.__setitem__(4, False), True),
+    "a report that cannot be": (lambda d, c: setattr(d, "disbelieved", True), True),
+    "a condition that forbids motion": (lambda d, c: setattr(c, "stops", True), True),
+    "a joint at its stop": (lambda d, c: setattr(c, "finding", object()), True),
+    "no positions": (lambda d, c: setattr(c.seen, "measurement", replace(c.seen.measurement, q=None)), True),
+    "the force as before": (lambda d, c: setattr(c, "force", 2.0), False),
+    "a force that grows": (lambda d, c: setattr(c, "force", 2.001), True),
+}
+
+
+@pytest.mark.parametrize("what", ENDS)
+def test_what_ends_a_lift_off_on_its_way(what):
+    change, ends = ENDS[what]
+    drives, cell, going = begun()
+    change(drives, cell)
+    assert (going.command(cell) is None) is ends
+
+
+def test_a_drive_that_was_lost_before_does_not_end_it():
+    drives, cell = Drives(), Cell()
+    drives.age[2], drives.on[2] = 9, False
+    going = lift(drives)
+    drives.age[2] = 10
+    assert going.command(cell) is not None
+
+
+def test_what_was_pressed_before_the_motion_is_felt_for_a_while_and_is_no_growth():
+    drives, cell = Drives(), Cell()
+    going, first = lift(drives), cell.seen.measurement.cycle
+    for k in range(12):
+        cell.force = 2.0 + 0.1 * k
+        cell.seen.measurement = replace(cell.seen.measurement, cycle=first + k)
+        if going.command(cell) is None:
+            break
+    assert k == cell.seen.limits.cycles_to_feel
+
+
+def test_the_command_is_the_guarded_one():
+    drives, cell = Drives(), Cell()
+    nearer = Command(units_to_joints(MODEL, drives.targets()))
+    cell.guard_target = lambda command: (nearer, None)
+    assert lift(drives).command(cell) is nearer
