@@ -54,8 +54,9 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
     held = HeldTask(Working(), None, lambda: bool(asked))
     held.update()
     assert done == [] and not held.lets_go and held.restarts == 3
-    asked.append(True)
     held.step(Measurement(0, 0))
+    asked.append(True)
+    held.step(Measurement(1, 0))
     held.update()
     held.retreat("the force")
     assert done == ["update", "the force"] and held.lets_go
