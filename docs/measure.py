@@ -1,11 +1,11 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
-`growth`, `gym`, `learning`, `bridges`, `local_node`,
-`canopen_node`. Without names everything is measured but what takes more than
-half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has
-its own command, date, commit and machine, so that one can be measured anew without the others. Then
-`python docs/generate.py` writes the pages.
+`growth`, `held`, `gym`, `learning`, `bridges`, `local_node`,
+`canopen_node`, `exploration` (the study `explore`, as a scene has its name). Without names everything is measured but
+what takes more than half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the
+figures. Every entry has its own command, date, commit and machine, so that one can be measured anew without the others.
+Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
 IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
-LONG = ("faults", "soak", "growth", "canopen_node")
+LONG = ("faults", "soak", "growth", "held", "canopen_node")
+FORMS = {"soak": "realtime --soak", "recover_vcan": "recover --vcan"}
+"""Studies of another form, as they are typed."""
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
 """Of a picture in the documentation."""
@@ -64,6 +66,20 @@ TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] =
             "error, 1/m": "{error_per_m:.2f}",
             "log score": "{log_score:.2f}",
             "worst scene": "{worst}",
+        },
+    ),
+    "explore": (
+        lambda rows: rows,
+        {
+            "strategy": "{strategy}",
+            "path to 20 µm": "{height_mm:.0f} mm",
+            "time": "{height_s:.1f} s",
+            "path to 3 mrad": "{normal_mm:.0f} mm",
+            "path to 2 1/m": "{curvature_mm:.0f} mm",
+            "reached": "{reached}",
+            "force off its target": "{force_percent:.1f} %",
+            "in contact": "{contact:.1%}",
+            "stopped": "{stopped}",
         },
     ),
     "shapes": (
@@ -185,8 +201,8 @@ def _scan_figures(summary: Row) -> dict[str, float]:
 
 def study(name: str) -> Entry:
     """Findings and table of a study; its pictures, where the pages show them, are drawn anew."""
-    command = "canprobe study " + ("realtime --soak" if name == "soak" else name)
-    if name in ("realtime", "soak"):
+    command = f"canprobe study {FORMS.get(name, name)}"
+    if name in ("realtime", *FORMS):
         command = IN_GUEST + command
     out = RUNS / name
     printed(f"{command} --out {out}")
@@ -224,9 +240,10 @@ def bench(file: str) -> list[Row]:
 
 
 def bench_table(name: str) -> Entry:
-    """The table of a file of `tests/bench` that makes one."""
+    """The table of a file of `tests/bench`; of several with the same headings, the rows of all."""
     file = f"test_bench_{name}.py"
-    return {"command": f"{BENCH}{file} -s", "table": bench(file)[0]["extra_info"]["table"]}
+    tables = [one["extra_info"]["table"] for one in bench(file)]
+    return {"command": f"{BENCH}{file} -s", "table": [tables[0][0], *(row for table in tables for row in table[1:])]}
 
 
 def gym() -> Entry:
@@ -279,16 +296,18 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "pace": partial(bench_table, "pace"),
     "side_by_side": partial(bench_table, "side_by_side"),
     "growth": partial(bench_table, "growth"),
+    "held": partial(bench_table, "held"),
     "gym": gym,
     "learning": learning,
     "bridges": bridges,
+    "exploration": partial(study, "explore"),
 }
 
 
 def main(wanted: Sequence[str]) -> None:
     """Measure what is named, or all; the rest keeps its figures. The file is written after each."""
     scenes = [name for name, _ in packaged_scenes()]
-    known = [*scenes, *OTHERS, *STUDIES]
+    known = [*scenes, *OTHERS, *(name for name in STUDIES if name not in scenes), *FORMS]
     if unknown := set(wanted) - set(known):
         raise SystemExit(f"expected names among {', '.join(known)}; got {', '.join(sorted(unknown))}")
     for name in wanted or [name for name in known if name not in LONG]:

@@ -63,6 +63,10 @@ def folder(tmp_path_factory):
     assert main(["init", str(folder / "my-cell"), "--eds", str(folder / "drive.eds")]) == 0
     undrawn_run(load_scene("cylinder"), out=folder / "runs" / "first", duration_s=0.5)
     shutil.copy(folder / "runs" / "first" / "bus.log", folder / "candump.log")
+    shutil.copy(folder / "drive.eds", folder / "epos4.dcf")
+    assert main(["init", str(folder / "rehearsal"), "--eds", str(folder / "epos4.dcf")]) == 0
+    first = load_scene(str(folder / "rehearsal" / "first.toml"))
+    undrawn_run(first, out=folder / "runs" / "rehearsal", duration_s=0.5)
     return folder
 
 

@@ -40,6 +40,7 @@ _TAIL = """
 [sensor]
 array = "inch16" # `canprobe cells` lists more; docs/own-array.md describes one of your own
 node_id = 16
+emulated = true # false where the array is real
 
 [probe] # the sphere that carries the array, behind the flange
 radius_mm = 40

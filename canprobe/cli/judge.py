@@ -84,7 +84,7 @@ def add_arguments(parser: Parser) -> None:
         metavar="RULES",
         type=rule_numbers,
         default=(),
-        help="leave out rules, such as 32,33,34 on a machine that keeps no time",
+        help="leave out rules, such as 32,33,34,45 on a machine that keeps no time",
     )
     parser.add_argument("--output", metavar="FILE", type=Path, help="file for the output of COMMAND [a temporary one]")
     parser.add_argument("--log", metavar="FILE", type=Path, help="write the frames as a candump log")

@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     def print_early(summary: Mapping[str, Any]) -> None:
         if not args.json:
             with contextlib.suppress(OSError):  # what follows is printed there too, and then it is reported
-                print_summary(summary_text({**summary, "bridges": None}, folder))
+                print_summary(summary_text({**summary, "bridges": None}, None))
                 sys.stdout.flush()
 
     try:
@@ -96,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         of_others = dict(list(result.summary["shape"].get("methods", {}).items())[1:])
         print_lines([*method_lines(of_others), *bridge_lines(result.summary.get("bridges") or {}), *_expected(args)])
+        print(f"  files      {folder}")
         view = BRIDGES["view"]
         print(f"next: {f'{view.pip} && ' if view.missing else ''}canprobe view {shlex.quote(str(folder))}")
     return 0

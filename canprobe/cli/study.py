@@ -29,10 +29,11 @@ examples:
   canprobe study regions --draw 2 --against earlier/regions.json
   canprobe study arrays --draw 2
   canprobe vcan -- canprobe study faults --vcan
+  canprobe vcan -- canprobe study recover --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
 STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
-    "draw": ("arrays", "calibrations", "link", "regions", "shapes"),
+    "draw": ("arrays", "calibrations", "explore", "link", "regions", "shapes"),
     "against": ("regions",),
 }
 """Studies that have an option, by the option's name."""
@@ -54,14 +55,16 @@ def add_arguments(parser: Parser) -> None:
         "--draw",
         metavar="N",
         type=whole(0, 9999),
-        help="arrays, calibrations, link, regions, shapes: number that all cases follow from; others than those of the"
-        " published figures",
+        help="arrays, calibrations, explore, link, regions, shapes: number that all cases follow from; others than"
+        " those of the published figures",
     )
     parser.add_argument(
         "--against", metavar="FILE", type=Path, help="regions: regions.json of an earlier run, to compare with"
     )
     parser.add_argument(
-        "--vcan", action="store_true", help="faults: on a real vcan0; processes are killed and the link is taken down"
+        "--vcan",
+        action="store_true",
+        help="faults, recover: on a real vcan0; processes are killed (faults), and the link is taken down",
     )
     parser.add_argument(
         "--soak", action="store_true", help="realtime: hold the cell for an hour, and watch memory, clocks and counters"
@@ -124,8 +127,8 @@ def _refuse_wrong(args: argparse.Namespace, studies: Mapping[str, str]) -> None:
         known = ", ".join(studies)
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, studies)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
-    if args.vcan and args.name != "faults":
-        args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults does")
+    if args.vcan and args.name not in ("faults", "recover"):
+        args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults and recover do")
     if args.vcan and args.seed is not None:
         args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
     if args.soak and args.name != "realtime":

@@ -12,13 +12,6 @@ from time import process_time
 import numpy as np
 
 import canprobe
-from canprobe.cell.master.controller import Command
-from canprobe.cell.master.monitor import Monitor
-from canprobe.cell.master.monitor_text import lines
-from canprobe.cell.master.observers import Observation
-from canprobe.cell.master.options import RunOptions, quiet
-from canprobe.cell.session.session import Session
-from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.cell.tasks.shape import MAPPED_AT_ONCE
 from canprobe.fieldbus import LockstepBus, PortNetwork, VirtualClock, load_eds, make_eds_node
 from canprobe.mechanics.touch.map.local_fits import PadLayer
@@ -154,23 +147,6 @@ def contacts(n: int, folder: Path) -> float:
         part = slice(k, min(k + MAPPED_AT_ONCE, n))
         found.add(points[part], normals[part], np.full(len(points[part]), 2.0))
     found.solved()
-    return process_time() - began
-
-
-def held(minutes: int, folder: Path) -> float:
-    """Minutes of a cell that `up` holds and a monitor watches, in virtual time on a lockstep bus."""
-    plan = canprobe.plan("cylinder", {"bus.interface": "lockstep"})
-    monitor, period_ns = Monitor(plan), plan.sync.period_ns
-
-    def watch(observation: Observation) -> None:
-        monitor.push(observation.frames)
-        if observation.t_ns % (40 * period_ns) < period_ns:  # a screen every 0.1 s
-            "".join(lines(monitor.view(observation.t_ns)))
-
-    session = Session(plan, RunOptions(None, quiet, (watch,), ROWS_OF_UP))
-    began = process_time()
-    with session:
-        session.run(lambda measurement: Command(done=measurement.t_ns >= 60e9 * minutes))
     return process_time() - began
 
 

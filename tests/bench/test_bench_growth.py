@@ -2,8 +2,9 @@
 
 Each size is measured in a process by itself (`growth_child.py`). A cost in proportion to size has the exponent 1. The
 exponent of the time is the slope of a line through all sizes on logarithmic axes, and of its steepest part: the slope
-over the last two. Memory is the largest resident size of any process. The table is that of docs/accuracy.md:
-`python docs/measure.py growth` writes it there; CANPROBE_LONGEST_S=300 leaves the hour out.
+over the last two. Memory is the largest resident size of any process. The table is that of docs/cost.md:
+`python docs/measure.py growth` writes it there; CANPROBE_LONGEST_S=300 leaves the hour out, and `-k contacts` measures
+one row.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ AXES = {
         "s",
     ),
     "contacts": ("contacts over new ground: the map, solved", (1000, 10_000, 100_000, 1_000_000), 1e3, "ms"),
-    "held": ("minutes of a lockstep cell that `up` holds, with a monitor", (5, 10, 30), 1.0, "s"),
     "runs": ("runs of `run_many`, one worker: all of them", (1, 10, 100, 1000), 1.0, "s"),
 }
+HEADINGS = ("against", "sizes", "processor time", "exponent, steepest", "memory", "exponent")
 
 
 def measured(axis: str, size: int) -> dict[str, Any]:
@@ -46,23 +47,23 @@ def measured(axis: str, size: int) -> dict[str, Any]:
 
 
 @pytest.mark.timeout(0)
-def test_bench_growth(benchmark):
-    rows = [("against", "sizes", "processor time", "exponent, steepest", "memory", "exponent")]
-
-    def all_axes():
-        for axis, (title, sizes, scale, unit) in AXES.items():
-            found = [measured(axis, size) for size in sizes]
-            logs = np.log(sizes), np.log([one["s"] for one in found]), np.log([one["mib"] for one in found])
-            slope, of_memory = (np.polyfit(logs[0], log, 1)[0] for log in logs[1:])
-            steepest = (logs[1][-1] - logs[1][-2]) / (logs[0][-1] - logs[0][-2])
-            costs, memory = [f"{scale * one['s']:.3g}" for one in found], [f"{one['mib']:.0f}" for one in found]
-            behind = ", ".join(f"{100 * share:.2g}" for one in found for share in one["behind"])
-            also = f"; behind the last cycle {behind} %" if behind else ""
-            rows.append((
-                title, ", ".join(map(str, sizes)), f"{', '.join(costs)} {unit}{also}", f"{slope:.2f}, {steepest:.2f}",
-                f"{memory[0]} to {memory[-1]} MiB", f"{of_memory:.2f}",
-            ))  # fmt: skip
-            print(" | ".join(rows[-1]), flush=True)
-
-    benchmark.pedantic(all_axes, rounds=1)
-    benchmark.extra_info["table"] = rows
+@pytest.mark.parametrize("axis", AXES)
+def test_bench_growth(benchmark, axis):
+    title, sizes, scale, unit = AXES[axis]
+    found = benchmark.pedantic(lambda: [measured(axis, size) for size in sizes], rounds=1)
+    logs = np.log(sizes), np.log([one["s"] for one in found]), np.log([one["mib"] for one in found])
+    slope, of_memory = (np.polyfit(logs[0], log, 1)[0] for log in logs[1:])
+    steepest = (logs[1][-1] - logs[1][-2]) / (logs[0][-1] - logs[0][-2])
+    costs, memory = [f"{scale * one['s']:.3g}" for one in found], [f"{one['mib']:.0f}" for one in found]
+    behind = ", ".join(f"{100 * share:.2g}" for one in found for share in one["behind"])
+    also = f"; behind the last cycle {behind} %" if behind else ""
+    row = (
+        title,
+        ", ".join(map(str, sizes)),
+        f"{', '.join(costs)} {unit}{also}",
+        f"{slope:.2f}, {steepest:.2f}",
+        f"{memory[0]} to {memory[-1]} MiB",
+        f"{of_memory:.2f}",
+    )
+    benchmark.extra_info["table"] = [HEADINGS, row]
+    print("\n" + " | ".join(row))

@@ -88,6 +88,13 @@ def test_unknown_scene(command, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_in_the_place_of_a_scene_is_told_with_the_files_in_it(tmp_path):
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell" / "first.toml").write_text("")
+    (line,) = lines_of(tmp_path, 2, "run", "cell")
+    assert line == "canprobe: cell: is a folder; type the scene file in it: cell/first.toml"
+
+
 def test_view_says_that_a_folder_was_possible_too(tmp_path):
     (line,) = lines_of(tmp_path, 2, "view", "nope", "--no-open")
     assert "no such scene or file" in line and line.endswith("nor is there a folder of a run of that name")

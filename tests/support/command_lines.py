@@ -15,7 +15,7 @@ def command_lines(script: str) -> list[list[str]]:
     for line in script.splitlines():
         for command in re.split(r" && | \| ", line):
             try:
-                words = shlex.split(command, comments=True)
+                words = shlex.split(command.removesuffix(" &"), comments=True)
             except ValueError:  # prose with an apostrophe
                 continue
             _collect(words, found)

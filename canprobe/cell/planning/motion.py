@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
+from canprobe.mechanics.touch.strategies import Rectangle, turn_radius
 from canprobe.mechanics.types import Floats
 
 _METRES_GUESS_M = (
@@ -216,6 +218,8 @@ def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose])
 def _check_touch(
     task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats
 ) -> tuple[JointSpeeds | None, list[str]]:
+    if (unreached := _unreached(task, path, stops, q_start)) is not None:
+        return None, [unreached]
     joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
     gone = joints_on_way(task.arm, task.probe, q_start, lambda pose: over_path(task, path, pose))
     problems = stops.problems(gone, touching=True)
@@ -231,9 +235,50 @@ def _check_touch(
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
     rates = np.abs(np.diff(joints[_POSES_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
     speeds = stops.speeds(rates.max(axis=0))
+    if isinstance(task.scan.strategy, Rectangle):  # the path may take any direction
+        along, across = np.abs(np.diff(path.points, axis=0) @ task.approach.axes[:2].T).T
+        speeds = stops.speeds(np.hypot(rates[along >= across].max(axis=0), rates[along < across].max(axis=0)))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
+
+
+def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> str | None:
+    """Problem with the part of an explored rectangle that the arm cannot reach; None without such a part."""
+    if task.scan is None or not isinstance(rectangle := task.scan.strategy, Rectangle):
+        return None
+    if min(rectangle.length, rectangle.width) < (least := 4.0 * turn_radius(task.scan.speed, task.gains.tilt_hz)):
+        slower = 1e3 * task.scan.speed * min(rectangle.length, rectangle.width) / least
+        return (
+            f"task.length_mm and width_mm: an exploration at {1e3 * task.scan.speed:g} mm/s needs {1e3 * least:.3g} mm "
+            f"to turn round; make the rectangle larger, or lower task.speed_mm_s to {slower:.3g}"
+        )
+    why, missed, q = "", [], q_start
+    for pose, point in zip(
+        itertools.islice(_along_path(task, path), _POSES_BEFORE_CONTACT, None), path.points, strict=True
+    ):
+        try:
+            (found,) = _follow(task.arm, task.probe, [pose], q)
+        except PlanError as error:
+            missed.append(point)
+            why = why or error.problems[0].removeprefix("task: ").partition("; ")[0]
+            continue
+        if (outside := np.flatnonzero(~stops.inside(found, found))).size:
+            missed.append(point)
+            i = int(outside[0])
+            joint = task.arm.model.joints[i]
+            why = why or f"joint {i + 1} would be at {joint.text(found[i])}, allowed {stops.allowed(i)}"
+        else:
+            q = found
+    if not missed:
+        return None
+    flat = 1e3 * (np.array(missed) - path.points[0]) @ task.approach.axes[:2].T
+    (a, b), (c, d) = zip(flat.min(axis=0).tolist(), flat.max(axis=0).tolist(), strict=True)
+    return (
+        f"task: {100 * len(missed) / len(path.points):.0f} % of the rectangle cannot be reached, within {a:.0f} to "
+        f"{b:.0f} mm along the heading and {c:.0f} to {d:.0f} mm across it: {why}; shorten task.length_mm or "
+        "task.width_mm, turn task.heading_deg, or move task.start_mm"
+    )
 
 
 def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeeds, list[str]]:

@@ -11,10 +11,13 @@ from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.touch.strategies import Rectangle
 from canprobe.mechanics.types import Floats
 
 SAMPLES = 240
 """Number of points of a path."""
+LINE_M, MIN_LINES, MAX_LINES = 4e-3, 4, 14
+"""Distance between the lines on which a rectangle is checked, m; least and largest number of them."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
 _BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
@@ -51,8 +54,11 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
     """
     approach, down = task.approach, task.approach.normal
     plane = approach.start[None, :]  # points in the scan plane; one for a press
-    if task.scan is not None:
-        flat = [task.scan.strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
+    strategy = task.scan.strategy if task.scan is not None else None
+    if isinstance(strategy, Rectangle):
+        plane = approach.start + lines_over(strategy) @ approach.axes[:2]
+    elif strategy is not None:
+        flat = [strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
         plane = approach.start + np.array(flat) @ approach.axes[:2]
     if shape is None:
         return SurfacePath(plane, np.tile(down, (len(plane), 1)), np.zeros((len(plane), 2)), math.inf)
@@ -61,12 +67,43 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
     _check_approach(approach, _along(shape, approach.start, down, radius))
     if not task.array.pad.is_flat:
         plane = plane + _first_contact(shape, approach, task.probe.radius)
+    explores = isinstance(strategy, Rectangle)
+    if explores:
+        plane = touchable(shape, plane, down, task.probe.radius)
     path = _contacts(shape, plane, down, radius)
-    if shape.by_gaps:
-        path = _under_ball(shape, path, plane, down, radius)
+    if shape.by_gaps:  # the contacts of a rectangle need not lie exactly under its points
+        path = _over_patches(path, plane, radius) if explores else _under_ball(shape, path, plane, down, radius)
     if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused elsewhere
         _check_first_touch(task, shape)
     return path
+
+
+def lines_over(rectangle: Rectangle) -> Floats:
+    """(n, 2) points of the scan plane all over a rectangle, m: from its middle to a corner, then lines both ways."""
+    sizes = (rectangle.length, rectangle.width)
+    counts = [min(max(math.ceil(side / LINE_M) + 1, MIN_LINES), MAX_LINES) for side in sizes]
+    x, y = (side * np.linspace(-0.5, 0.5, count) for side, count in zip(sizes, counts, strict=True))
+    along = [(a, b) for k, b in enumerate(y) for a in (x if k % 2 == 0 else x[::-1])]
+    back = x if along[-1][0] < 0.0 else x[::-1]
+    across = [(a, b) for k, a in enumerate(back) for b in (y[::-1] if k % 2 == 0 else y)]
+    to_corner = np.linspace(0.0, 1.0, max(counts))[:-1, None] * np.array(along[0])
+    return np.concatenate([to_corner, np.array(along), np.array(across)[1:]])
+
+
+def touchable(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> Floats:
+    """The points (n, 3) of a rectangle under which a probe of a radius (m) touches the object in one place.
+
+    An exploration turns back from the others. The first contact is kept, and refused elsewhere.
+    """
+    ball = radius if shape.by_gaps else 0.0
+    heights = [_along(shape, point, up, ball) for point in plane]
+    found = [0]
+    for i, height in enumerate(heights[1:], start=1):
+        if height is not None:
+            at = shape.closest(plane[i] + (height + ball) * up).point
+            if shape.tightest_concave_radius(at[None]) > radius:
+                found.append(i)
+    return plane[found]
 
 
 def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Floats:

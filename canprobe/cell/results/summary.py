@@ -24,7 +24,6 @@ from canprobe.cell.results.scores import (
     score_shape,
     state_force_sigma,
 )
-from canprobe.cell.results.surface_file import SURFACE, save_surface_map
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup
@@ -102,6 +101,8 @@ def summarise(
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+    if record.explored is not None:
+        summary["explore"] = record.explored.summarised()
     return {name: without_nan(value) for name, value in summary.items()}
 
 
@@ -306,13 +307,20 @@ def write_files(result: RunData, out: Path) -> None:
     Raises:
         ResultsError: when a file cannot be written; no part of it is left, and the others are written.
     """
-    found, surface_map = result.summary["calibration"], result.surface_map
+    found = result.summary["calibration"]
     tool = None if found is None else tool_text(found, result.plan.scene.name)
     _write_each(
         lambda: write_summary(result.summary, out),
         lambda: write_text(out / FILE, tool) if tool is not None else None,
-        lambda: save_surface_map(surface_map, out / SURFACE) if surface_map is not None else None,
+        lambda: _write_map(result, out),
     )
+
+
+def _write_map(result: RunData, out: Path) -> None:
+    if result.surface_map is not None:
+        from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
+
+        save_surface_map(result.surface_map, out / SURFACE)
 
 
 def write_summary(summary: Mapping[str, Any], out: Path) -> None:

@@ -65,7 +65,9 @@ def draw_map(
     view = MapView(surface_map, walked, shape, plane)
     common = any(surface_map.noise.common)
     with picture(
-        path, f"{title}\none surface of {len(surface_map)} nodes, whichever pass they are from", 7.8
+        path,
+        f"{title}\none surface of {len(surface_map)} nodes: a node is the mean of the contacts along 1 mm of the path",
+        7.8,
     ) as figure:
         upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
         draw_map_surface(upper, view)
@@ -102,13 +104,23 @@ def _draw_common(part: SubFigure, surface_map: SurfaceMap) -> None:
     prior = np.array(surface_map.noise.common)
     mean, sigma = surface_map.common.mean, np.sqrt(np.diag(surface_map.common.covariance))
     rows = np.arange(len(COMMON))
-    axes.barh(rows, 2.0 * TWO_SIGMA, left=-TWO_SIGMA, color=GREY, alpha=0.3, label="believed before, 95 %")
-    axes.errorbar(mean / prior, rows, xerr=TWO_SIGMA * sigma / prior, fmt="o", color=ORANGE, capsize=4, label="found")
+    axes.barh(rows, 2.0 * TWO_SIGMA, left=-TWO_SIGMA, color=GREY, alpha=0.3, label="before the scan, 95 %")
+    axes.errorbar(
+        mean / prior,
+        rows,
+        xerr=TWO_SIGMA * sigma / prior,
+        fmt="o",
+        color=ORANGE,
+        capsize=4,
+        label="after the scan, 95 %",
+    )
     axes.axvline(0.0, color=INK, linewidth=0.9, linestyle=":")
     texts = (
         f"{name}\n{unit * value:.0f} ± {unit * spread:.0f} {of}"
         for (name, unit, of), value, spread in zip(COMMON, mean, sigma, strict=True)
     )
     axes.set_yticks(rows, list(texts))
-    axes.set(title="errors that the whole scan has in common", xlabel="over the standard deviation believed before")
+    axes.set(
+        title="errors that the whole scan has in common", xlabel="error over its standard deviation before the scan"
+    )
     legend(part)

@@ -43,6 +43,8 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         lines.append(f"  {losses_text(contact['losses'])}")
     if shape["method"] is not None:
         lines += shape_lines(shape)
+    if summary.get("explore") is not None:
+        lines.append(f"  explored   {explored_text(summary['explore'])}")
     if summary.get("calibration") is not None:
         lines += calibration_lines(summary["calibration"])
     lines += bridge_lines(summary.get("bridges") or {})
@@ -112,6 +114,19 @@ def shape_lines(shape: dict[str, Any]) -> list[str]:
     if (surface := shape.get("map")) is not None:
         lines.append(f"  map        {_map_text(surface)}")
     return lines
+
+
+def explored_text(explored: Mapping[str, Any]) -> str:
+    """The section ``explore`` of a summary as text."""
+    after = f"after {explored['path_mm']:.0f} mm in {explored['time_s']:.1f} s"
+    target, largest = f"target {explored['target_sigma_um']:g} µm", explored["sigma_max_um"]
+    if explored["reached"]:
+        return f"σ of the height at most {largest:.0f} µm, {target}, reached {after}"
+    at_most = f"σ of the height up to {largest:.0f} µm" if largest is not None else "a part was not touched"
+    return (
+        f"{100 * explored['done_fraction']:.0f} % within {target}, {at_most} {after}; not reached:"
+        f" {explored['why_not']}"
+    )
 
 
 def method_lines(methods: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -17,7 +17,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
-from os.path import isfile  # False where the system refuses a name, as `Path.is_file` does not promise
+from os.path import isdir, isfile  # False where the system refuses a name, as `Path.is_file` does not promise
 from pathlib import Path
 from typing import Any
 
@@ -372,6 +372,8 @@ def find_file(name: str, *kinds: str) -> tuple[Path, str]:
     for kind in kinds:
         if (own := packaged_files(f"{kind}s").get(name.removeprefix("canprobe:"))) is not None:
             return own, own.name
+    if inside := sorted(Path(name).glob("*.toml")) if isdir(name) else []:
+        raise SceneError([f"{name}: is a folder; type the {kinds[0]} file in it: {', '.join(map(str, inside))}"])
     if isfile(name) or name.endswith(".toml") or "/" in name:
         return Path(name), name
     for kind in kinds:

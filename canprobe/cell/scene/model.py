@@ -31,7 +31,7 @@ from canprobe.cell.scene.offers import find_offer
 from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
-Strategy = Literal["weave", "straight", "circle"]
+Strategy = Literal["weave", "straight", "circle", "explore"]
 OFFERED_ESTIMATOR = Check("that another package offers", lambda name: find_offer("estimator", name) is not None)
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"] | Annotated[str, OFFERED_ESTIMATOR]
 ObjectKind = Literal[
@@ -288,7 +288,7 @@ class TaskSettings:
     search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCH_ONLY] = 8.0
     """Distance beyond `start_mm` at which the approach gives up."""
     strategy: Annotated[Strategy, SCAN_ONLY] = "weave"
-    """Path of the scan."""
+    """Path of the scan. With `explore` it goes where the map of the surface is least sure."""
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCAN_ONLY] = 25.0
     """Speed of the contact over the surface."""
     heading_deg: Annotated[float, Range(-360, 360), SCAN_ONLY] = 0.0
@@ -297,10 +297,12 @@ class TaskSettings:
     """Distance over which a scan searches towards the object for a lost contact. 0: it retreats at once."""
     length_mm: Annotated[float, Range(0.1, 500), SCAN_ONLY] = 36.0
     """Full length of the path along the heading; diameter of a circle."""
-    width_mm: Annotated[float, Range(0, 500, open_low=True), SCAN_ONLY, Only("strategy", ("weave",))] = 9.0
-    """Full width of the path across the heading."""
+    width_mm: Annotated[float, Range(0, 500, open_low=True), SCAN_ONLY, Only("strategy", ("weave", "explore"))] = 9.0
+    """Full width of the path across the heading; with `explore` of the rectangle, as `length_mm` is its length."""
     wavelength_mm: Annotated[float, Range(1, 500), SCAN_ONLY, Only("strategy", ("weave",))] = 12.0
     """Length of one weave along the heading."""
+    target_sigma_um: Annotated[float, Range(0, 10_000, open_low=True), SCAN_ONLY, Only("strategy", ("explore",))] = 20.0
+    """Standard deviation of the height that `explore` wants in the whole rectangle: there the scan ends."""
     rolling_share: Annotated[float, Range(0, 1), SCAN_ONLY] = 0.05
     """How the probe turns: 0 follows the normal of the surface, 1 keeps its orientation."""
     ball_radius_mm: Annotated[float, Range(5, 500), CALIBRATE_ONLY] = 25.0

@@ -56,7 +56,7 @@ from canprobe.mechanics.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
 from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 from canprobe.mechanics.touch.servo import SurfaceGains
-from canprobe.mechanics.touch.strategies import make_strategy
+from canprobe.mechanics.touch.strategies import Rectangle, make_strategy
 
 LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
@@ -287,9 +287,11 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:
-    sizes = (settings.length_mm * MM, settings.width_mm * MM, settings.wavelength_mm * MM)
+    length, width = settings.length_mm * MM, settings.width_mm * MM
     return Scan(
-        strategy=make_strategy(settings.strategy, *sizes),
+        strategy=Rectangle(length, width, settings.target_sigma_um * 1e-6)
+        if settings.strategy == "explore"
+        else make_strategy(settings.strategy, length, width, settings.wavelength_mm * MM),
         name=settings.strategy,
         speed=settings.speed_mm_s * MM,
         rolling_share=1.0 if task_rows(arm.model) == FIXED_POLE else settings.rolling_share,

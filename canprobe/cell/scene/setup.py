@@ -33,7 +33,7 @@ from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE, ArrayCalibration
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.shapes import PlacedShape
-from canprobe.mechanics.touch.strategies import Strategy
+from canprobe.mechanics.touch.strategies import Rectangle, Strategy
 from canprobe.mechanics.types import Floats
 
 
@@ -281,14 +281,14 @@ class Scan:
     """The path of a scan.
 
     Attributes:
-        strategy: closed curve in the scan plane.
+        strategy: closed curve in the scan plane, or the rectangle that is explored.
         name: name of the strategy.
         speed: speed of the contact, m/s.
         rolling_share: 0: the pad follows the normal, 1: it keeps its orientation.
         regain: distance towards the object that is searched for a lost contact, m; 0: none.
     """
 
-    strategy: Strategy
+    strategy: Strategy | Rectangle
     name: str
     speed: float
     rolling_share: float

@@ -34,6 +34,10 @@ class Search:
         sideways = self._sideways * (BRAKE_S * (1.0 - math.exp(-t / BRAKE_S)))
         return ProbePose(self._start.centre + sideways + self._start.pole * (SEARCH_SPEED * t), self._start.pole)
 
+    def searched(self, t: float) -> float:
+        """Distance towards the object that was searched by then, m."""
+        return SEARCH_SPEED * t
+
 
 def summarise_losses(losses: Sequence[Loss]) -> list[dict[str, float | None]]:
     """Each loss for `summary.json`: `searched_mm`, and `regained_after_ms`, None where it was not."""

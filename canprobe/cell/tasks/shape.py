@@ -132,7 +132,7 @@ class ShapeTracker:
             if self._taken % self._every == 0:
                 self._answer_at(sample.t_s)
         if self._map is not None:
-            self._unmapped += [sample for sample in self._waiting if np.isfinite(sample.p_base).all()]
+            self._unmapped += [sample for sample in self._waiting if all(map(math.isfinite, sample.p_base.tolist()))]
             if len(self._unmapped) >= MAPPED_AT_ONCE:
                 self._extend_map()
         self._waiting.clear()

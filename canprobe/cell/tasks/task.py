@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,49 @@ class Loss:
 
 
 @dataclass(frozen=True, slots=True)
+class Exploration:
+    """The end of an exploration, in m.
+
+    Attributes:
+        target: deviation of the height that was wanted.
+        sigma_max: largest stated deviation in the cells that can be touched; None before the first is known.
+        common: deviation that the whole scan has in common.
+        path: path that was walked.
+        seconds: time of the scan, s.
+        done, closed, rough: shares of the rectangle: within the target, beyond edges or in hollows, and where contacts
+            contradict every smooth surface.
+        reached: whether all of the rectangle is within the target.
+        why: why it is not, in words; None where it is.
+    """
+
+    target: float
+    sigma_max: float | None
+    common: float
+    path: float
+    seconds: float
+    done: float
+    closed: float
+    rough: float
+    reached: bool
+    why: str | None
+
+    def summarised(self) -> dict[str, Any]:
+        """The section ``explore`` of ``summary.json``."""
+        return {
+            "target_sigma_um": 1e6 * self.target,
+            "sigma_max_um": None if self.sigma_max is None else 1e6 * self.sigma_max,
+            "reached": self.reached,
+            "why_not": self.why,
+            "path_mm": 1e3 * self.path,
+            "time_s": self.seconds,
+            "done_fraction": self.done,
+            "closed_fraction": self.closed,
+            "rough_fraction": self.rough,
+            "common_sigma_um": 1e6 * self.common,
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class TaskRecord:
     """The results of a task at its end; a user's own controller leaves an empty record.
 
@@ -74,6 +117,7 @@ class TaskRecord:
         scan_cycles: first cycle of the scan or hold, and the one after its last; None before.
         unplaced: contacts that were not used because the joints of their instant are unknown.
         slowed: cycles in which a joint could not keep up with the probe's path.
+        explored: end of an exploration; None where nothing was explored.
     """
 
     shape: ShapeTracker | None = None
@@ -83,6 +127,7 @@ class TaskRecord:
     scan_cycles: tuple[int, int] | None = None
     unplaced: int = 0
     slowed: int = 0
+    explored: Exploration | None = None
 
 
 class Task(Controller):

@@ -14,7 +14,7 @@ from canprobe.cell.master.supervision import Reaction
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.probing import Phase, ProbingTask
-from canprobe.cell.tasks.regain import REST_S, SEARCH_SPEED, Search
+from canprobe.cell.tasks.regain import REST_S, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
@@ -25,7 +25,7 @@ from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, SETTLE_S, LineMotion, smooth_step
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
-from canprobe.mechanics.touch.strategies import PathFollower
+from canprobe.mechanics.touch.strategies import PathFollower, Rectangle
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
@@ -225,8 +225,11 @@ class TouchTask(ProbingTask):
             # the depth that is aimed at has changed as much: without this the force would jump with the first answer
             self._servo.surface.raise_by(self.sensing.depth(contact.force_n) - before)
             if self.phase not in _LEAVING and is_too_hollow(estimate, self.sensing.radius):
-                hollow = -1e3 / float(estimate.kappa[1])
-                self._leave(f"a hollow of radius {hollow:.0f} mm: as tight as the probe, no contact in one place")
+                self._at_hollow(-1.0 / float(estimate.kappa[1]))
+
+    def _at_hollow(self, radius: float) -> None:
+        """Let go: the object is as hollow as the probe, with a radius, m."""
+        self._leave(f"a hollow of radius {1e3 * radius:.0f} mm: as tight as the probe, no contact in one place")
 
     def _watch(self) -> None:
         if self.phase in _LEAVING:
@@ -298,7 +301,9 @@ class TouchTask(ProbingTask):
     def _follower(self) -> PathFollower | None:
         """What leads the contact over the surface; None holds it where it is."""
         scan = self._task.scan
-        return PathFollower(scan.strategy) if scan is not None else None
+        if scan is None or isinstance(scan.strategy, Rectangle):  # `ExploreTask` has a leader of its own
+            return None
+        return PathFollower(scan.strategy)
 
     def _sink_from(self, contact: ContactSample, pose: ProbePose) -> None:
         """Remember how deep and with which pole the probe touches, to go on from there without a bump."""
@@ -336,8 +341,7 @@ class TouchTask(ProbingTask):
     def _scan(self) -> ProbePose:
         assert self._servo is not None
         left = self._task.duration_s - self._scan_t
-        share = min(1.0, self._t / RAMP_S, max(left, 0.0) / RAMP_S)
-        pose = self._servo.step(self._speed * share, self._target_depth(), self._dt)
+        pose = self._servo.step(self._speed * self._pace(left), self._target_depth(), self._dt)
         if self._asked is not None:
             self._velocity = (pose.centre - self._asked.centre) / self._dt
         self._asked = pose
@@ -345,17 +349,25 @@ class TouchTask(ProbingTask):
             self._leave(None)
         return pose
 
+    def _pace(self, left: float) -> float:
+        """Share of the speed: it grows and falls at the ends of the scan, of which some time is left, s."""
+        return min(1.0, self._t / RAMP_S, max(left, 0.0) / RAMP_S)
+
     def _look_for_contact(self) -> None:
         """Leave the path for where the object should be."""
         assert self._motion is not None
         if self.phase is Phase.SCAN:
             self.losses.append(Loss(self._cycle))
-        self._search = Search(self._motion.pose, self._velocity)
+        self._search = self._search_from(self._motion.pose)
         self._floor = self._touch.force
         self._asked, self._velocity = None, np.zeros(3)
         self._searched_before = self.losses[-1].searched
         self._touch.lost_s = 0.0
         self._enter(Phase.REGAIN)
+
+    def _search_from(self, pose: ProbePose) -> Search:
+        """The search for a contact that was lost at a pose."""
+        return Search(pose, self._velocity)
 
     def _regain(self) -> ProbePose:
         assert self._servo is not None
@@ -366,7 +378,7 @@ class TouchTask(ProbingTask):
                 self._enter(Phase.SCAN)
             return self._sink(smooth_step(self._t / (0.6 * REST_S)))
         pose, loss = self._search.pose(self._t), self.losses[-1]
-        loss.searched = self._searched_before + SEARCH_SPEED * self._t
+        loss.searched = self._searched_before + self._search.searched(self._t)
         if self._contact is not None and self._touch.force > TOUCH_FORCE + self._floor:
             loss.regained_s = (self._cycle - loss.cycle) * self._period_s
             self._servo.rest_on(self._contact.p_base, self._contact.n_base)

@@ -70,10 +70,6 @@ class FramePattern:
             values.append(tuple(4 * (2 * length - 1 - place) for place in ordered))
         return cls(length, mask, tag, tuple(values))
 
-    def matches(self, data: bytes) -> bool:
-        """Whether the bytes are this frame."""
-        return len(data) >= self.length and self._number(data) & self.mask == self.tag
-
     def resembles(self, other: FramePattern) -> bool:
         """Whether there are bytes that match both frames."""
         length = max(self.length, other.length)
@@ -179,13 +175,22 @@ class ImageFormat:
     def _id_numbers(self) -> dict[int, int]:
         return {can_id: number for number, can_id in enumerate(self.ids)}
 
+    @cached_property
+    def _tags(self) -> dict[tuple[int, int], dict[int, int]]:
+        """Places of the frames by their tags, for each length and mask: one look, however many frames there are."""
+        found: dict[tuple[int, int], dict[int, int]] = {}
+        for place, frame in enumerate(self.frames):
+            found.setdefault((frame.length, frame.mask), {})[frame.tag] = place
+        return found
+
     def part_of(self, can_id: int, data: bytes) -> int | None:
         """Number of this frame in the image, from 0; None for a frame of something else."""
         number = self._id_numbers.get(can_id)
         if number is None:
             return None
-        for place, frame in enumerate(self.frames):
-            if frame.matches(data):
+        for (length, mask), places in self._tags.items():
+            place = places.get(int.from_bytes(data[:length], "big") & mask)
+            if place is not None and len(data) >= length:
                 return number * len(self.frames) + place
         return None
 

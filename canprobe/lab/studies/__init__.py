@@ -18,7 +18,8 @@ other methods; `arrays` calibrates unseen arrays, and with `array_forces` scores
 counts the scans that notice a calibration of another array.
 Plant and loop: `workprec`, with `workprec_cell` (`workprec_cell_choice`, `workprec_cell_figure`) on `no_bus`;
 `stability` with `stability_runs`, `stability_extremes` and `linear_loop`.
+Exploration: `explore`, on the shapes of `shapes`.
 Robustness: `faults` with `fault_cases`, `fault_runs`, `fault_scenes`, `fault_scores`, `witnessed_run`; `faults_vcan`.
-Link: `link` with `link_setups`; `recover` with `recover_runs`.
+Link: `link` with `link_setups` and `link_rates`; `recover` with `recover_cases`, `recover_runs` and `recover_vcan`.
 Real time: `realtime` with `realtime_cases`, `cycle_times` and `plain_canopen`; `realtime_soak`.
 """

@@ -23,6 +23,7 @@ from typing import IO, Any
 import canprobe
 from canprobe.errors import ResultsError, StudyError
 from canprobe.fieldbus.bus.files import make_folder, writing
+from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 
 PACKAGE = Path(canprobe.__file__).parent
 _SOURCES = (".py", ".toml", ".eds")
@@ -119,18 +120,23 @@ class CellStore:
         return self._answers.get(key)
 
     def put(self, key: str, what: object, answer: str) -> None:
-        """Keep an answer (JSON text) with what it answers.
+        """Keep an answer (JSON text) with what it answers; nothing happens where its key has one.
+
+        An interrupt waits until the line is whole: whoever then keeps what is ready does not write it twice.
 
         Raises:
             ResultsError: it cannot be written; what was kept before is whole.
         """
+        if key in self._answers:
+            return
         document = as_json({"key": key, "what": what, "answer": json.loads(answer)})
-        try:
-            self._file.write(f"{_checksum(document)} {document}\n")
-            self._file.flush()
-        except OSError as error:
-            raise ResultsError(f"{self.path}: cannot be written: {error.strerror or error}") from error
-        self._answers[key] = answer
+        with interrupts_held():
+            try:
+                self._file.write(f"{_checksum(document)} {document}\n")
+                self._file.flush()
+            except OSError as error:
+                raise ResultsError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+            self._answers[key] = answer
 
     def _read(self) -> None:
         last = "\n"

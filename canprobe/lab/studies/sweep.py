@@ -187,6 +187,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
         "calibrations": "whether the cell notices that its array has the calibration of another one",
         "shapes": "surfaces of unknown shapes by the map, every estimator, local fits and Gaussian processes",
+        "explore": "path that exploration needs for an error, against weaves, rasters and a circle, on unknown shapes",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "link": "whether a check of the link says what the next minute of the cell shows",
@@ -205,7 +206,7 @@ def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "", **chosen:
         name: one of `STUDIES`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
-        form: variant of it: ``vcan`` of `faults`, with processes on a real vcan0; ``soak`` of `realtime`, an hour.
+        form: variant of it: ``vcan`` of `faults` and `recover`, on a real vcan0; ``soak`` of `realtime`, an hour.
         chosen: arguments of this study only.
     """
     module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")

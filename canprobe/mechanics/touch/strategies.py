@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
+
+TURN_PERIODS = 3.0
+"""Time of a turn by a radian over the time constant of the servo's normal."""
 
 
 class Strategy(Protocol):
@@ -83,6 +87,31 @@ class Straight:
 
     def tangent(self, phase: float) -> tuple[float, float]:
         return (self._slope if (phase + math.pi / 2) % (2 * math.pi) < math.pi else -self._slope), 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """A rectangle that is explored: no curve, the path follows from what is known (`mechanics.touch.explore`).
+
+    Attributes:
+        length: full size along the heading, m; its middle is the first contact.
+        width: full size across it, m.
+        target_sigma: standard deviation of the height that is wanted everywhere in it, m.
+    """
+
+    length: float
+    width: float
+    target_sigma: float
+
+
+def turn_radius(speed: float, tilt_hz: float) -> float:
+    """Smallest radius of a turn of an explored path, m: the heading turns with a third of the servo's bandwidth.
+
+    Args:
+        speed: speed of the contact, m/s.
+        tilt_hz: bandwidth with which the servo's normal follows the contacts, Hz.
+    """
+    return TURN_PERIODS * speed / (2 * math.pi * tilt_hz)
 
 
 def make_strategy(name: str, length_m: float, width_m: float, wavelength_m: float = 0.012) -> Strategy:

@@ -58,6 +58,15 @@ def test_frames_of_others_on_the_same_identifier_are_no_part():
     assert other.values_of(9, bytes.fromhex("B19001020304")) == [1, 2, 3, 4]  # the O6 hand, thumb row 9
 
 
+def test_frames_may_differ_in_length_and_in_the_place_of_their_tag():
+    frames = tuple(map(FramePattern.parse, ("A1 ww xx", "B. ww xx yy zz", "0C ww xx", "AA 77 ww")))
+    image = ImageFormat((0x27,), frames, 3, 3)
+    sent = ("A10102", "B501020304", "0C0102", "AA7702")
+    assert [image.part_of(0x27, bytes.fromhex(text)) for text in sent] == [0, 1, 2, 3]
+    assert image.part_of(0x27, bytes.fromhex("A1010299")) == 0  # what follows is not read
+    assert [image.part_of(0x27, bytes.fromhex(text)) for text in ("A101", "B5010203", "AA7802", "")] == [None] * 4
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(sorted(FORMATS)), st.integers(0, 2**32), st.randoms(use_true_random=False))
 def test_an_image_comes_back_from_its_frames_in_any_order(name, seed, order):

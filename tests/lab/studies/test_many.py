@@ -1,6 +1,7 @@
 """`run_many`: every combination and seed once, the results of single runs, failures as rows, resumed, in any script."""
 
 import json
+import multiprocessing
 import subprocess
 import sys
 
@@ -10,7 +11,7 @@ from waiting import wait_until
 
 import canprobe
 from canprobe.cell.planning.make import make_plan
-from canprobe.errors import SceneError, UsageError
+from canprobe.errors import SceneError, StudyError, UsageError
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.lab.studies import many
 from canprobe.lab.studies.cell_store import CellStore
@@ -182,7 +183,8 @@ def test_a_script_needs_no_guard(tmp_path):
     assert (tmp_path / "runs/many-listen/cells.jsonl").is_file()
 
 
-def test_after_a_kill_every_run_is_there_once(tmp_path):
+def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
+    """A kill, the death of a worker and Ctrl-C, one after the other: nothing is left running, lost or done twice."""
     kept = tmp_path / "cells.jsonl"
     script = (
         "import canprobe, sys\n"
@@ -196,11 +198,37 @@ def test_after_a_kill_every_run_is_there_once(tmp_path):
         process.communicate,
     )
     process.kill()
-    process.communicate()
-    assert kept.read_bytes().count(b"\n") < 60
-    scene = canprobe.load_scene("listen", {"task.duration_s": 0.05})
-    runs = run_many(scene, seeds=60, bus="direct", workers=1, out=tmp_path, progress=False)
-    assert [outcome["summary"]["seed"] for outcome in runs.outcomes] == list(range(60))
+    process.communicate(timeout=30)  # ends when no worker can print any more
+    lines = [kept.read_bytes().count(b"\n")]
+
+    def run():
+        scene = canprobe.load_scene("listen", {"task.duration_s": 0.05})
+        return run_many(scene, seeds=60, bus="direct", workers=1, out=tmp_path, progress=False)
+
+    def kill_a_worker():
+        multiprocessing.active_children()[0].kill()
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    put = CellStore.put
+    for end, error in ((kill_a_worker, StudyError), (interrupt, KeyboardInterrupt)):
+        more = []
+
+        def put_and_end(store, *what, end=end, more=more):
+            put(store, *what)  # Ctrl-C comes when the line is written, and its run not yet counted as kept
+            more.append(what)
+            if len(more) == 9:
+                end()
+
+        monkeypatch.setattr(CellStore, "put", put_and_end)
+        with pytest.raises(error):
+            run()
+        assert not multiprocessing.active_children()
+        lines.append(kept.read_bytes().count(b"\n"))
+    assert 8 < lines[0] < lines[1] < lines[2] < 60
+    monkeypatch.undo()
+    assert [outcome["summary"]["seed"] for outcome in run().outcomes] == list(range(60))
     store = CellStore(tmp_path)
     assert len(store.keys()) == 60 == kept.read_bytes().count(b"\n") - store.damaged  # no run twice
     store.close()

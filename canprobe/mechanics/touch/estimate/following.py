@@ -37,11 +37,13 @@ class FollowingEstimator(OuterEstimator):
         inner: the estimator.
         memory_m: path that it remembers, m.
         scale: relative error that all curvatures have in common, one standard deviation.
+        offset: error of the probe's centre along the normal while the probe turns with the surface, m, one standard
+            deviation. The contacts then lie on an offset surface, whose curvature differs by `offset · K²`.
     """
 
-    def __init__(self, inner: Estimator, memory_m: float, scale: float = 0.0) -> None:
+    def __init__(self, inner: Estimator, memory_m: float, scale: float = 0.0, offset: float = 0.0) -> None:
         super().__init__(inner)
-        self._scale = scale
+        self._scale, self._offset = scale, offset
         self._memory = memory_m
         self._past: deque[tuple[float, Floats]] = deque()
         self._place: Floats | None = None
@@ -67,6 +69,8 @@ class FollowingEstimator(OuterEstimator):
         errors = [] if late is None else [late]
         if self._scale != 0.0:
             errors.append(self._scale * tensor)
+        if self._offset != 0.0:
+            errors.append(self._offset * tensor.dot(tensor))
         return less_certain(answer, *errors)
 
     def _late(self, tensor: Floats) -> Floats | None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
 from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.map.noise import MapNoise
-from canprobe.mechanics.touch.patch.creep import PadMemory
+from canprobe.mechanics.touch.patch.creep import PadMemory, overlapping
 from canprobe.mechanics.types import Floats
 
 NODE_M = 1e-3
@@ -170,7 +170,8 @@ class Traces:
         was = self._memory.add(sample.t_s, *direction_to_pad((x / reach, y / reach, z / reach), radius))
         if sample.moments is None:
             return math.nan
-        uu, uv, vv = (now - self._share * then for now, then in zip(sample.moments, was, strict=True))
+        shown = overlapping(was, sample.moments)
+        uu, uv, vv = (now - self._share * trace for now, trace in zip(sample.moments, shown, strict=True))
         return math.sqrt(max(uu * vv - uv * uv, 0.0))
 
 

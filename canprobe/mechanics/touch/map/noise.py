@@ -12,6 +12,10 @@ from canprobe.mechanics.types import Floats
 
 USUAL_SIGMA_M = 50e-6
 """Usual standard deviation of a contact, m."""
+REPEATED_SHARE = 0.1
+"""Share of a pad's variance that every pass over the same ground repeats: gains of the taxels under the patch, and
+hysteresis of the same way. On scans that go 3 to 25 times over a rod, a wave and a free form normals stay off by 0.4 to
+1.2 mrad; as if all passes were independent, 0.4 mrad would be stated on the rod and 0.9 mrad be true."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +60,17 @@ class MapNoise:
         """Variance of the height of a contact, m²."""
         return (self.height if sample.sigma_height is None else sample.sigma_height) ** 2
 
-    def independent(self, count: Floats, path: Floats) -> tuple[Floats, Floats]:
-        """Independent heights and normals in nodes of some contacts (n,) along some path (n,), m."""
+    def independent(self, count: Floats, path: Floats, once: float) -> tuple[Floats, Floats]:
+        """Independent heights and normals in nodes of some contacts (n,) along some path (n,), m.
+
+        One pass over a node is of the path `once`, m. Errors that are alike along a path are alike on the next pass: n
+        passes with a correlation ρ (`REPEATED_SHARE`) are worth n / (1 + (n − 1) ρ), at most 1/ρ.
+        """
+        passes = np.maximum(path / once, 1.0)
+        worth = 1.0 / (1.0 + REPEATED_SHARE * (passes - 1.0))
         heights, normals = (
-            count if each == 0.0 else np.minimum(count, path / each) for each in (self.height_path, self.normal_path)
+            count if each == 0.0 else worth * np.minimum(count, path / each)
+            for each in (self.height_path, self.normal_path)
         )
         return heights, normals
 

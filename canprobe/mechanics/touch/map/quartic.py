@@ -27,6 +27,20 @@ USUAL_CHANGE, CHANGE_SPREAD = 10.0**2.5, 1.5
 """Median of that deviation, 1/m², and standard deviation of its logarithm."""
 
 
+def _second_derivatives() -> Floats:
+    found = np.zeros((2, 2, TERMS, TERMS))
+    for a, b in np.ndindex(2, 2):
+        for t, (i, j) in enumerate(POWERS):
+            lower = (i - (a == 0) - (b == 0), j - (a == 1) - (b == 1))
+            if lower in POWERS:
+                found[a, b, POWERS.index(lower), t] = 1.0
+    return found
+
+
+SECOND_DERIVATIVES = _second_derivatives()
+"""(2, 2, 15, 15): the terms times one of these are their second derivatives along two of the axes x, y."""
+
+
 def _powers(x: Floats) -> list[Floats]:
     """1, x, x²/2, x³/6, x⁴/24: each is the derivative of the next."""
     found = [np.ones_like(x)]

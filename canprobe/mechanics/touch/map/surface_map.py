@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, ContactSample, at_depth, indentation_from_force
 from canprobe.mechanics.touch.linear_algebra import checked, positive, real
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.cells import Cells, LayerEvidence, solve_cells
@@ -150,6 +150,24 @@ class SurfaceMap:
             if sample.slope is not None:
                 self._evidence.touch = sample.slope, sample.p_base
         self._add(rows_of(samples, self.pad.radius, self.noise, self._traces))
+
+    def settled(self, samples: Sequence[ContactSample]) -> list[ContactSample]:
+        """Contacts of the pad with the depth that stiffness and curvature of the map give them.
+
+        Where the map did not observe all of the curvature contacts stay as they are.
+        """
+        if self.pad is None or not samples or not len(self.nodes):
+            return list(samples)
+        K = self.curvature(np.array([sample.p_base for sample in samples])).K
+        known = np.flatnonzero(np.isfinite(K[:, 0, 0]))
+        kappa = np.maximum(np.linalg.eigvalsh(K[known]), -HOLLOW_LIMIT_SHARE / self.pad.radius)
+        found = list(samples)
+        stiffness = self.solved().stiffness
+        assert stiffness is not None
+        for i, of_place in zip(known.tolist(), kappa, strict=True):
+            depth = indentation_from_force(samples[i].force_n, stiffness.value, self.pad.radius, of_place)
+            found[i] = at_depth(samples[i], depth, self.pad.radius)
+        return found
 
     def closest(self, points: ArrayLike) -> Feet:
         """The points of the surface that are closest to given points (n, 3), m; NaN beyond reach of the contacts."""

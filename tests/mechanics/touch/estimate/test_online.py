@@ -55,6 +55,20 @@ def test_a_region_grows_by_the_change_over_the_lag():
     assert np.array_equal(found.K, bare.K)
 
 
+def test_a_region_holds_the_curvature_of_the_surface_that_an_offset_of_the_probe_shifts():
+    """A centre that is 0.2 mm off along the normal shows a ball of radius 12 mm as one of 12.2 mm."""
+    radius, offset = 0.012, 2e-4
+    t = np.linspace(-1.0, 0.0, 120)
+    points, normals = sphere(1.0 / radius, 0.006 * t, 0.003 * np.sin(9.0 * t))
+    bare = fit_surface(points + offset * normals, normals, **SIGMAS)
+    once = SimpleNamespace(estimate=lambda: bare, reset=lambda: None)
+    found = FollowingEstimator(once, MEMORY, offset=offset).estimate()
+    shown = bare.K - np.eye(2) / radius
+    assert np.diag(shown) == pytest.approx(1.0 / (radius + offset) - 1.0 / radius, rel=0.2)
+    added = np.sqrt(np.diag(found.covariance - bare.covariance))
+    assert added[[0, 2]] == pytest.approx(np.abs(np.diag(shown)), rel=0.2)
+
+
 def test_a_jump_is_doubted_for_as_long_as_the_span():
     n = round(SPAN_SHARE * MEMORY / 1e-3)
     soon, bare = followed([5.0] * 12 + [30.0] * 3, 1e-3)

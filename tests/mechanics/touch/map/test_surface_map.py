@@ -12,8 +12,8 @@ from canprobe.mechanics.touch.map import discs, local_fits, nodes, surface_map
 from canprobe.mechanics.touch.map.fit import fit_map
 from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.noise import PAD_NOISE, MapNoise
-from canprobe.mechanics.touch.map.quartic import LENGTH_M, fourth_of, heights_and_slopes, terms
-from canprobe.mechanics.touch.map.stiffness import SLOPE_BIAS
+from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND_DERIVATIVES, fourth_of, heights_and_slopes, terms
+from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
 from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.image_model import ImageModel
@@ -221,7 +221,7 @@ def pad_samples(radius, stiffness, true_stiffness, model):
     p, n, _ = on_sphere(RASTER, 0.05)
     depth = indentation_from_force(2.0, true_stiffness, radius, (20.0, 20.0))
     shown = model.with_stiffness(true_stiffness).moments((20.0, 0.0, 20.0), 2.0)
-    slope = Slope(math.sqrt(2.0) / depth * math.exp(-0.5 * SLOPE_BIAS), 20.0)
+    slope = Slope(math.sqrt(2.0) / depth, 20.0)
     for i, (place, up) in enumerate(zip(p, n, strict=True)):
         T = np.eye(4)
         x = np.array([1.0, 0.0, 0.0]) - up[0] * up
@@ -243,6 +243,21 @@ def test_the_scan_shows_the_stiffness_of_its_layer(true_share):
     at = on_sphere(PLACES, 0.05)[0]
     assert np.abs(found.distance(at)[0]).max() < 5e-6
     assert found.stiffness.value == pytest.approx(true_share * model.stiffness, rel=0.02)
+
+
+def test_images_of_a_patch_that_does_not_fit_into_the_window_say_nothing_of_the_stiffness():
+    radius = 0.04
+    parameters = ImageParameters(stiffness=1.24e8, scale=1.0, blur=1.5e-3, crosstalk=0.0, memory=0.0)
+    errors = MomentErrors(moment=1e-3, both=5e-4, shear=1e-3, frame_sigma=0.01)
+    model = ImageModel(parameters, radius, 1.6e-3, level=1e3, count=500.0, side=16, seen=4, errors=errors)
+    found = SurfaceMap(PadLayer(radius, model.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
+    larger = (
+        replace(sample, moments=tuple(1.1 * moment for moment in sample.moments))
+        for sample in pad_samples(radius, model.stiffness, model.stiffness, model)
+    )
+    found.add_samples(list(larger))
+    assert found.stiffness.value == pytest.approx(model.stiffness, rel=0.02)
+    assert found.stiffness.sigma == SOURCE_SIGMA
 
 
 def test_an_error_that_the_scan_has_in_common_is_found_and_taken_off():
@@ -286,15 +301,64 @@ def test_the_map_shows_where_passes_disagree():
     assert apart.distance(at)[1][1] > 0.1e-3  # half of the step between them
 
 
+def test_what_every_pass_repeats_is_not_averaged_away_and_no_disagreement():
+    """Taxels under the patch lift a pad by up to 6 µm, every 3 mm, and on each of 200 passes by the same."""
+    p, n, _ = on_sphere(RASTER, 0.05)
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    lift = 6e-6 * np.sin(2.0 * np.pi * p[:, 0] / 3e-3)
+    samples = []
+    for i, (place, up) in enumerate(zip(p + lift[:, None] * n, n, strict=True)):
+        at = T.copy()
+        at[:3, 3] = place + 0.04 * up
+        samples.append(ContactSample(0.005 * i, place, up, at, np.array([0.0, 0.0, 0.04]), 0.0, 30e-6))
+    once = SurfaceMap(PadLayer(0.04, 1e8), PAD_NOISE)
+    once.add_samples(samples)
+    rows = once.nodes.rows
+    rows[:, nodes.COUNT :] *= 200.0
+    often = SurfaceMap.of_nodes(rows, once.pad, PAD_NOISE, once.stiffness)
+    at = on_sphere(PLACES, 0.05)[0]
+    assert (often.disagreement(at) == 0.0).all()
+    less = np.sqrt(np.trace(often.normal(at)[1], axis1=1, axis2=2) / np.trace(once.normal(at)[1], axis1=1, axis2=2))
+    assert (less > 0.25).all()  # 0.07 where all passes count as independent
+    assert (less < 0.6).all()
+
+
+def test_contacts_are_placed_by_what_the_map_knows_in_the_end():
+    """A pad on a ball whose contacts were placed as if the ball were flat, and its layer a fifth too soft."""
+    radius, stiffness = 0.04, 1.2e8
+    p, n, _ = on_sphere(RASTER, 0.05)
+    forces = np.linspace(1.0, 3.0, len(p))
+    samples = []
+    for i, (place, up, force) in enumerate(zip(p, n, forces.tolist(), strict=True)):
+        depth, wrong = (
+            indentation_from_force(force, k, radius, kappa)
+            for k, kappa in ((stiffness, (20.0, 20.0)), (0.8 * stiffness, (0.0, 0.0)))
+        )
+        T = np.diag([1.0, -1.0, -1.0, 1.0])
+        T[:3, 3] = place + (radius - depth) * up
+        r = np.array([0.0, 0.0, radius - wrong])
+        samples.append(ContactSample(0.005 * i, place + (wrong - depth) * up, up, T, r, force, 30e-6))
+    found = SurfaceMap(PadLayer(radius, stiffness), PAD_NOISE)
+    found.add_samples(samples)
+    off = [np.linalg.norm(sample.p_base - np.array([0.0, 0.0, -0.05])) - 0.05 for sample in found.settled(samples)]
+    assert np.abs(off).max() < 5e-6
+    alone = SurfaceMap(PadLayer(radius, stiffness), PAD_NOISE)
+    alone.add_samples(samples[:1])
+    assert alone.settled(samples[:1]) == samples[:1]  # one contact shows no curvature
+
+
 def test_terms_are_the_derivatives_of_the_height():
     a = np.random.default_rng(0).normal(size=15)
     x, y, d = np.array([0.3, -0.7]), np.array([0.5, 0.2]), 1e-5
-    f, fx, fxy = (one @ a for one in terms(x, y, (0, 0), (1, 0), (1, 1)))
+    here, *others = terms(x, y, (0, 0), (1, 0), (1, 1), (2, 0), (0, 2))
+    f, fx, fxy = (one @ a for one in (here, *others[:2]))
     h, hx, hy = heights_and_slopes(a[:, None], x, y)
     np.testing.assert_allclose([h, hx], [f, fx], atol=1e-12)
     up, low = heights_and_slopes(a[:, None], x, y + d), heights_and_slopes(a[:, None], x, y - d)
     np.testing.assert_allclose(hy, (up[0] - low[0]) / (2 * d), rtol=1e-6)
     np.testing.assert_allclose(fxy, (up[1] - low[1]) / (2 * d), rtol=1e-6)
+    for (i, j), second in zip(((0, 1), (0, 0), (1, 1)), others[1:], strict=True):
+        np.testing.assert_allclose(here @ SECOND_DERIVATIVES[i, j], second, atol=1e-12)
 
 
 def test_the_prior_of_fourth_derivatives_is_that_of_a_ball():

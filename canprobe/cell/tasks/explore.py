@@ -1,0 +1,201 @@
+"""Exploration: a scan whose path goes where the map of the surface is least sure.
+
+The servo, the supervision and all that a scan does are those of `TouchTask`. Here a stretch is chosen behind the
+commands of each cycle, and the scan ends where the map is sure enough. At an edge, and in a hollow as tight as the
+probe, the contact brakes and goes back on the path that it came; the ground ahead is closed. A contact that is lost
+there is found again on that path, to which the probe returns in the air.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.regain import SEARCH_SPEED, Search
+from canprobe.cell.tasks.task import Exploration, TaskRecord
+from canprobe.cell.tasks.touch import RAMP_S, TouchTask
+from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
+from canprobe.mechanics.touch.explore.forecast import UNKNOWN_M, Forecast
+from canprobe.mechanics.touch.explore.ground import GroundCells
+from canprobe.mechanics.touch.explore.stretches import STEP_M
+from canprobe.mechanics.touch.map.cells import STATED_STIFFNESS_SIGMA
+from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
+from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
+from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.strategies import Rectangle, turn_radius
+
+SHARES_AHEAD = 40
+"""Cycles before the end of a stretch from which on the next one is looked for: a path is judged in each."""
+SAMPLE_AGE_CYCLES = 4
+"""Usual age of a contact when it is taken, in cycles: the array's latency and its transfer."""
+LIFT_M = 1.5e-3
+"""Distance off the surface at which the probe returns to where it had contact, m."""
+
+
+class ExploreTask(TouchTask):
+    """Approach an object, touch it, and explore a rectangle round the first contact; arguments as for `TouchTask`.
+
+    Attributes:
+        explorer: what leads the contact; None before the touch.
+    """
+
+    explorer: Explorer | None = None
+    _brake_from: float | None = None
+    _ends = False
+
+    def _follower(self) -> Explorer:
+        scan, contact = self._task.scan, self._contact
+        assert scan is not None and isinstance(scan.strategy, Rectangle) and contact is not None
+        surface_map = self.shape.surface_map if self.shape is not None else None
+        assert surface_map is not None
+        area = scan.strategy
+        shown = self.sensing.slope is not None or self._task.array.mode != "features"
+        ground = GroundCells(
+            surface_map,
+            contact.p_base,
+            self._task.approach.axes,
+            area,
+            stiffness_sigma=SOURCE_SIGMA if shown else STATED_STIFFNESS_SIGMA,
+        )
+        forecast = Forecast(ground.places, self.sensing.radius, self._target_depth(), surface_map.noise)
+        radius = turn_radius(scan.speed, self._task.gains.tilt_hz)
+        self.explorer = Explorer(
+            ground,
+            forecast,
+            (area.length, area.width),
+            radius=radius,
+            ahead=SHARES_AHEAD * self._period_s * scan.speed,
+            lag=(self._lead_s + SAMPLE_AGE_CYCLES * self._period_s) * scan.speed,
+        )
+        self._gone: deque[ProbePose] = deque(maxlen=round(BACK_M / STEP_M))
+        return self.explorer
+
+    def record(self) -> TaskRecord:
+        """The results so far."""
+        explored = None if self.explorer is None else _end_of(self.explorer, self._scan_t, over=not self._ends)
+        return replace(super().record(), explored=explored)
+
+    def update(self) -> None:
+        """The work of estimator and map, and one share of the exploration's."""
+        due = not self._updated
+        super().update()
+        if due and self.phase is Phase.SCAN and self.explorer is not None:
+            self.explorer.work()
+
+    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+        super()._feel(sample, patch)
+        if self.phase is Phase.SCAN and (contact := self._contact) is not None and self.explorer is not None:
+            self.explorer.walk(contact.p_base, contact.n_base, contact.force_n / self._target_force)
+            self._columns = self._columns | {
+                "explored_mm": 1e3 * self.explorer.path,
+                "explored_sigma_um": 1e6 * self.explorer.ground.largest,
+            }
+
+    def _watch(self) -> None:
+        if self.phase is Phase.SCAN and self.explorer is not None and self.explorer.at_edge:
+            self._brake()
+        super()._watch()
+
+    def _at_hollow(self, radius: float) -> None:
+        self._brake()
+
+    def _brake(self) -> None:
+        """Begin to turn back, unless the contact goes back already."""
+        if self._brake_from is None and self.explorer is not None and not self.explorer.going_back:
+            self._brake_from = self._scan_t
+
+    def _pace(self, left: float) -> float:
+        assert self.explorer is not None
+        if not self._ends and not self.explorer.ground.wanting.any():
+            self._ends = True
+            self._task = replace(self._task, duration_s=self._scan_t + RAMP_S)
+        pace = super()._pace(left)
+        if self._brake_from is None:
+            return pace
+        slower = 1.0 - (self._scan_t - self._brake_from) / RAMP_S
+        if slower > 0.0:
+            return min(pace, slower)
+        self._brake_from, self._t = None, 0.0
+        self.explorer.turn_back()
+        return 0.0
+
+    def _scan(self) -> ProbePose:
+        assert self.explorer is not None
+        pose = super()._scan()
+        if not self._gone or np.linalg.norm(pose.centre - self._gone[-1].centre) > STEP_M:
+            self._gone.append(pose)
+        return pose
+
+    def _search_from(self, pose: ProbePose) -> Search:
+        assert self.explorer is not None
+        self._brake_from = None
+        self.explorer.turn_back(without=BACK_M)
+        back = [pose, *reversed(self._gone)]
+        self._gone.clear()
+        return Return(back)
+
+
+class Return(Search):
+    """Off the object, back in the air over poses that had contact, and down again at the last of them.
+
+    Args:
+        poses: poses of the probe, that where the contact was lost first.
+    """
+
+    def __init__(self, poses: list[ProbePose]) -> None:
+        raised = [ProbePose(pose.centre - LIFT_M * pose.pole, pose.pole) for pose in poses]
+        self._poses = [poses[0], *raised]
+        steps = [float(np.linalg.norm(b.centre - a.centre)) for a, b in zip(self._poses, self._poses[1:], strict=False)]
+        self._times = np.concatenate([[0.0], np.cumsum(steps)]) / RETREAT_SPEED_M_S
+
+    def pose(self, t: float) -> ProbePose:
+        """Pose ``t`` seconds after the loss."""
+        centre, pole = (
+            np.array([np.interp(t, self._times, column) for column in zip(*values, strict=True)])
+            for values in ([pose.centre for pose in self._poses], [pose.pole for pose in self._poses])
+        )
+        pole /= np.linalg.norm(pole)
+        return ProbePose(centre + SEARCH_SPEED * max(0.0, t - self._times[-1]) * pole, pole)
+
+    def searched(self, t: float) -> float:
+        """Distance beyond the known surface that was searched by then, m."""
+        return max(0.0, SEARCH_SPEED * (t - float(self._times[-1])) - LIFT_M)
+
+
+def _end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
+    """The end of an exploration of a duration, s, whose time was over or which had nothing more to gain."""
+    ground = explorer.ground
+    target, sigma, is_open = ground.target, ground.sigma, ~ground.closed
+    within = is_open & (sigma <= target)
+    rough = is_open & (ground.floor > target) & (ground.floor > 1.01 * ground.common)
+    causes = []
+    if ground.common > target:
+        causes.append(
+            f"{1e6 * ground.common:.0f} µm of the deviation, from the stiffness of the layer, are common to the scan"
+        )
+    if ground.closed.any():
+        causes.append(f"{100 * ground.closed.mean():.0f} % of the rectangle lie beyond an edge or in a hollow")
+    if rough.any():
+        causes.append(
+            f"on {100 * rough.mean():.0f} % the contacts contradict a smooth surface: a probe of this radius does not"
+            " touch all of that ground"
+        )
+    if over and ground.wanting.any():
+        causes.append(f"the time was over with {100 * ground.wanting.mean():.0f} % still above what can be reached")
+    return Exploration(
+        target=target,
+        sigma_max=ground.largest if ground.largest < UNKNOWN_M else None,
+        common=ground.common,
+        path=explorer.path,
+        seconds=seconds,
+        done=float(within.mean()),
+        closed=float(ground.closed.mean()),
+        rough=float(rough.mean()),
+        reached=bool(within.all()),
+        why=None if within.all() else "; ".join(causes) or "the last cells are within a tenth of what can be reached",
+    )

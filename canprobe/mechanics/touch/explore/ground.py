@@ -1,0 +1,143 @@
+"""The ground of a rectangle: in each cell the deviation of the height that the surface map states.
+
+A cell is fitted as the map fits its own: one quartic to the nodes round it. Its variance is that of the quartic, more
+where the contacts scatter more than their noise explains, and what no path can shrink: the height by the error of the
+layer's stiffness, which is common to the scan, and the scatter of contacts on ground that the probe cannot follow.
+One cell is fitted at a time, that beside which most path was walked since its last fit.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.mechanics.touch.explore.forecast import UNKNOWN_M
+from canprobe.mechanics.touch.map import nodes as column
+from canprobe.mechanics.touch.map.discs import Discs
+from canprobe.mechanics.touch.map.local_fits import fit_discs
+from canprobe.mechanics.touch.map.quartic import LENGTH_M
+from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
+from canprobe.mechanics.touch.strategies import Rectangle
+from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.types import Floats
+
+CELL_M = 3e-3
+"""Largest side of a cell, m."""
+FIT_REACH_M = 6e-3
+"""Distance from a cell at which new path makes its fit stale, m: the least radius of a fit."""
+NEAR_FLOOR = 1.1
+"""A cell whose deviation is within this factor of what no path can shrink is as good as it gets."""
+
+
+class GroundCells:
+    """The cells of a rectangle of the scan plane, and what is known in each.
+
+    Args:
+        surface_map: map of the contacts, of a pad; it grows.
+        origin: (3,) place on the surface over which the middle of the rectangle lies, m.
+        axes: (3, 3) rows: length, width and outward normal of the scan plane.
+        rectangle: its size, and the deviation of the height that is wanted in every cell.
+        stiffness_sigma: standard deviation of the logarithm of the layer's stiffness.
+
+    Attributes:
+        places: (m, 2) middles of the cells in the scan plane, from the middle of the rectangle, m.
+        sigma: (m,) stated deviation of the height, m; `UNKNOWN_M` where nothing was touched.
+        floor: (m,) the part of it that no path can shrink, m.
+        closed: (m,) cells that the probe cannot touch.
+        counts: numbers of cells along and across.
+        target: deviation that is wanted, m.
+        common: deviation of all heights by the stiffness of the layer, m.
+    """
+
+    def __init__(
+        self,
+        surface_map: SurfaceMap,
+        origin: Floats,
+        axes: Floats,
+        rectangle: Rectangle,
+        *,
+        stiffness_sigma: float,
+    ) -> None:
+        size = rectangle.length, rectangle.width
+        self.counts = tuple(math.ceil(side / CELL_M - 1e-9) for side in size)
+        along, across = (side * ((np.arange(n) + 0.5) / n - 0.5) for side, n in zip(size, self.counts, strict=True))
+        self.places: Floats = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
+        m = len(self.places)
+        self.sigma, self.floor = np.full(m, UNKNOWN_M), np.zeros(m)
+        self.closed: NDArray[np.bool_] = np.zeros(m, bool)
+        self.common = 0.0
+        self.target, self._stiffness_sigma = rectangle.target_sigma, stiffness_sigma
+        self._map, self._origin, self._axes = surface_map, origin, axes
+        self._stale = np.zeros(m)
+        self._height = np.full(m, math.nan)
+
+    def in_plane(self, point: Floats) -> tuple[float, float]:
+        """Place of a point (3,), m, in the scan plane, m."""
+        x, y = (self._axes[:2] @ (point - self._origin)).tolist()
+        return x, y
+
+    def walk(self, point: Floats, distance: float) -> None:
+        """Take path of some length, m, that was walked at a contact (3,), m."""
+        x, y, height = (self._axes @ (point - self._origin)).tolist()
+        near = np.hypot(self.places[:, 0] - x, self.places[:, 1] - y) < FIT_REACH_M
+        self._stale[near] += distance
+        self._height[near & np.isnan(self._height)] = height
+
+    def fit_one(self) -> bool:
+        """Fit the cell whose fit is most out of date; whether there was one."""
+        i = int(self._stale.argmax())
+        if self._stale[i] == 0.0:
+            return False
+        self._stale[i] = 0.0
+        pad = self._map.pad
+        assert pad is not None
+        up = self._axes[2]
+        place = self._origin + self.places[i] @ self._axes[:2] + self._height[i] * up
+        rows = self._map.nodes.near(place)
+        if not len(rows):
+            return True
+        points = rows[:, column.CENTRE] - pad.radius * rows[:, column.NORMAL]
+        beside = np.hypot(*(self._axes[:2] @ (points - place).T))
+        nearest = int(beside.argmin())
+        if beside[nearest] > REACH_M:
+            return True
+        normal = rows[nearest, column.NORMAL]
+        place = place + up * float((points[nearest] - place) @ normal) / max(float(up @ normal), 0.2)
+        disc = Discs.at(place, tangent_rotation(normal.tolist()), points, rows)
+        try:
+            fits, _, _ = fit_discs(rows, disc, pad, self._map.noise, K_ref=np.zeros((1, 2, 2)), weight=disc.weight)
+        except np.linalg.LinAlgError:  # of contacts that no surface explains
+            return True
+        excess = float(fits.excess[0])
+        weights = disc.weight[0]
+        root_force = float(weights @ rows[disc.nodes[0], column.ROOT_FORCE] / weights.sum())
+        det = max(float(np.linalg.det(np.eye(2) / pad.radius + fits.K[0])), 1e-9)
+        depth = root_force * math.sqrt(math.sqrt(det) / (math.pi * pad.stiffness))
+        self.common = 0.5 * self._stiffness_sigma * depth
+        variance = float(fits.V[0, 0, 0]) * LENGTH_M**2 * (1.0 + excess)
+        floor2 = self.common**2 + 2.0 * excess * self._map.noise.height**2
+        self.floor[i] = min(math.sqrt(floor2), UNKNOWN_M)
+        self.sigma[i] = min(math.sqrt(floor2 + variance), UNKNOWN_M)
+        return True
+
+    def close(self, x: float, y: float, radius: float) -> None:
+        """Close the cells within a distance, m, of a place of the scan plane, m, that were not touched."""
+        self.closed |= (np.hypot(self.places[:, 0] - x, self.places[:, 1] - y) < radius) & (self.sigma >= UNKNOWN_M)
+
+    @property
+    def largest(self) -> float:
+        """Largest stated deviation in the cells that are open, m."""
+        return float(self.sigma.max(where=~self.closed, initial=0.0))
+
+    @property
+    def goal(self) -> Floats:
+        """(m,) deviation at which a cell is done, m."""
+        return np.maximum(self.target, NEAR_FLOOR * self.floor)
+
+    @property
+    def wanting(self) -> NDArray[np.bool_]:
+        """(m,) cells that are open and above their goal."""
+        result: NDArray[np.bool_] = ~self.closed & (self.sigma > self.goal)
+        return result

@@ -1,0 +1,116 @@
+"""Exploration in a whole cell: it ends with its target, at edges it turns back, and the plan checks all of it."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.results.text import summary_text
+from canprobe.cell.scene.model import ObjectSettings
+from canprobe.errors import PlanError
+
+SMALL = {"task.length_mm": 20.0, "task.width_mm": 14.0, "task.target_sigma_um": 15.0}
+
+
+def run(keys, seconds=12.0, **changes):
+    scene = canprobe.load_scene("explore", keys)
+    scene = replace(
+        scene,
+        bus=replace(scene.bus, interface="direct"),
+        scene=replace(scene.scene, figures=False),
+        shape=replace(scene.shape, also=()),
+        **changes,
+    )
+    return canprobe.run(scene, duration_s=seconds)
+
+
+@pytest.fixture(scope="module")
+def reached():
+    return run(SMALL)
+
+
+def test_it_ends_when_the_map_is_as_sure_as_was_asked(reached):
+    summary, explored = reached.summary, reached.summary["explore"]
+    assert summary["completed"]
+    assert explored["reached"]
+    assert explored["sigma_max_um"] <= 15.0
+    assert explored["time_s"] < 12.0
+    assert explored["why_not"] is None
+    assert "reached after" in summary_text(summary, None)
+    contact = summary["contact"]
+    assert contact["contact_fraction"] == 1.0
+    assert contact["force_rms_error_n"] < 0.1 * contact["force_target_n"]
+
+
+def test_the_map_says_the_same_and_the_truth_is_as_near(reached):
+    """Heights over the rectangle against the true surface: no path of the study and no cell of the explorer is used."""
+    shape, task = reached.plan.setup.truth.object, reached.plan.setup.task
+    x, y = np.meshgrid(np.linspace(-9e-3, 9e-3, 7), np.linspace(-6e-3, 6e-3, 5))
+    start, axes = task.approach.start, task.approach.axes
+    points = start + np.column_stack([x.ravel(), y.ravel()]) @ axes[:2]
+    feet = np.array([shape.nearest(tuple(point)).point for point in points.tolist()])
+    height, sigma = reached.surface_map.distance(feet)
+    assert np.isfinite(height).all()
+    assert sigma.max() < 1.3 * 15e-6
+    assert np.sqrt(np.mean(height**2)) < 2.0 * 15e-6
+
+
+def test_the_log_shows_the_deviation_over_the_path(reached):
+    path, sigma = reached.log["explored_mm"], reached.log["explored_sigma_um"]
+    known = np.isfinite(path)
+    assert (np.diff(path[known]) >= 0.0).all()
+    assert sigma[known][0] == 1000.0
+    assert sigma[known][-1] <= 15.0
+
+
+def test_a_target_below_what_the_scan_has_in_common_is_not_reached_and_it_says_why():
+    explored = run(SMALL | {"task.target_sigma_um": 3.0}, 3.0).summary["explore"]
+    assert not explored["reached"]
+    assert explored["common_sigma_um"] > 3.0
+    assert "common to the scan" in explored["why_not"]
+
+
+def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
+    side, end = np.arange(-13, 13.1, 0.5)[:, None], np.arange(-25, 25.1, 0.5)[None]
+    np.savez(tmp_path / "plate.npz", heights=-(side**2 + end**2) / 300.0, spacing=0.5)
+    plate = ObjectSettings(
+        kind="heights",
+        file=str(tmp_path / "plate.npz"),
+        position_mm=(-170.0, -175.0, 300.0),
+        rotation_deg=(0.0, 0.0, 30.0),
+    )
+    result = run({"task.length_mm": 36.0, "task.width_mm": 12.0, "task.target_sigma_um": 30.0}, 4.0, object=plate)
+    assert result.summary["completed"], result.summary["stop_reason"]
+    assert result.summary["explore"]["closed_fraction"] > 0.0
+    assert "edge" in result.summary["explore"]["why_not"]
+    assert result.summary["contact"]["force_max_n"] < 5.0
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (
+            {"task.start_mm": (-120.0, -122.5, 374.0)},
+            r"% of the rectangle cannot be reached, within 10 to 18 mm along the heading",
+        ),
+        ({"task.width_mm": 5.0}, r"an exploration at 25 mm/s needs 7.96 mm to turn round.* task.speed_mm_s to 15.7"),
+        ({"limits.joint_speed_share": 0.05}, r"joint \d would need .* lower task.speed_mm_s"),
+    ],
+)
+def test_the_plan_checks_the_whole_rectangle(keys, message):
+    scene = canprobe.load_scene("explore", keys)
+    scene = replace(scene, object=replace(scene.object, position_mm=scene.task.start_mm, rotation_deg=(0.0, 0.0, 0.0)))
+    with pytest.raises(PlanError, match=message):
+        canprobe.plan(scene)
+
+
+def test_other_scenes_load_nothing_of_it():
+    code = (
+        "import sys, canprobe; from canprobe.cell.tasks.from_plan import make_task;"
+        "make_task(canprobe.plan('cylinder')); print([m for m in sys.modules if 'explore' in m])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert found.stdout.strip() == "[]"
