@@ -40,6 +40,8 @@ IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
 LONG = ("faults", "soak", "growth", "held", "canopen_node")
+FORMS = {"soak": "realtime --soak", "recover_vcan": "recover --vcan"}
+"""Studies of another form, as they are typed."""
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
 """Of a picture in the documentation."""
@@ -199,8 +201,8 @@ def _scan_figures(summary: Row) -> dict[str, float]:
 
 def study(name: str) -> Entry:
     """Findings and table of a study; its pictures, where the pages show them, are drawn anew."""
-    command = "canprobe study " + ("realtime --soak" if name == "soak" else name)
-    if name in ("realtime", "soak"):
+    command = f"canprobe study {FORMS.get(name, name)}"
+    if name in ("realtime", *FORMS):
         command = IN_GUEST + command
     out = RUNS / name
     printed(f"{command} --out {out}")
@@ -305,7 +307,7 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
 def main(wanted: Sequence[str]) -> None:
     """Measure what is named, or all; the rest keeps its figures. The file is written after each."""
     scenes = [name for name, _ in packaged_scenes()]
-    known = [*scenes, *OTHERS, *(name for name in STUDIES if name not in scenes)]
+    known = [*scenes, *OTHERS, *(name for name in STUDIES if name not in scenes), *FORMS]
     if unknown := set(wanted) - set(known):
         raise SystemExit(f"expected names among {', '.join(known)}; got {', '.join(sorted(unknown))}")
     for name in wanted or [name for name in known if name not in LONG]:

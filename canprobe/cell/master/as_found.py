@@ -1,4 +1,4 @@
-"""Nodes as a check found them: their NMT state and what bring-up changes in them, read before and put back after.
+"""Nodes as a check found them: their NMT state and what bring-up writes in them, read before and put back after.
 
 A node that is not reset keeps the rest: its zero, and what another tool has set up. An entry that it did not give, or
 does not take back, is named.
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.master.bringup import PDO_PARAMETERS, read_entry, write_entry
+from canprobe.cell.master.bringup import read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.scene.hardware import BringUpSettings
@@ -21,7 +21,6 @@ from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState, pack_nmt
 
 STATUSWORD = 0x6041
-_SYNC_OBJECTS = (0x1006, 0x1019)
 _COMMANDS = {NmtState.OPERATIONAL: NmtCommand.START, NmtState.STOPPED: NmtCommand.STOP}
 
 
@@ -86,7 +85,7 @@ class FoundNodes:
                 raise  # else bring-up says that the node does not answer
 
     def _write(self, setup: NodeSetup) -> Dialogue:
-        for write in self._changes(setup):
+        for write in self._writes_back(setup):
             try:
                 yield from write_entry(setup, write)
             except NodeError as error:
@@ -94,22 +93,15 @@ class FoundNodes:
                 if isinstance(error.__cause__, SdoTimeoutError):
                     return
 
-    def _changes(self, setup: NodeSetup) -> Iterator[Write]:
-        """The writes of bring-up in their order, the last to each entry with the value that was found."""
+    def _writes_back(self, setup: NodeSetup) -> Iterator[Write]:
+        """The writes of bring-up in their order, the last to each entry with the value that was found.
+
+        Also where that is the value that bring-up writes: it may have been interrupted while a PDO was switched off.
+        """
         found = self._values[setup.node_id]
         last = {(write.index, write.subindex): number for number, write in enumerate(setup.writes)}
-        wrote = {place: setup.writes[number].value for place, number in last.items()}
-        changed = {_group(place[0]) for place, value in found.items() if wrote[place] != value}
         for number, write in enumerate(setup.writes):
             place = write.index, write.subindex
-            if place not in found or not (_group(write.index) in changed or write.index == 0x1016):
-                continue
-            value = found[place] if last[place] == number else write.value
-            yield Write(write.index, write.subindex, value, "as it was found", own_bits=write.own_bits)
-
-
-def _group(index: int) -> int:
-    """Objects that can only be changed together: communication and mapping of a PDO; SYNC's period and counter."""
-    if index in _SYNC_OBJECTS:
-        return _SYNC_OBJECTS[0]
-    return index & ~0x0200 if index in PDO_PARAMETERS else index
+            if place in found:
+                value = found[place] if last[place] == number else write.value
+                yield Write(write.index, write.subindex, value, "as it was found", own_bits=write.own_bits)

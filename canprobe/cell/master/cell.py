@@ -39,7 +39,7 @@ from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.model import Plan
-from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
+from canprobe.errors import BusError, CanprobeError, NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import Port, PortCounters, TimedFrame
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
@@ -312,7 +312,11 @@ class Cell:
         return False
 
     def idle(self, seconds: float) -> None:
-        """Cycle with disabled drives and without a controller; nothing is supervised, and no row is kept."""
+        """Cycle with disabled drives and without a controller; nothing is supervised, and no row is kept.
+
+        Raises:
+            BusError: another master has come.
+        """
         assert self.cycle is not None
         if self.drives is not None:
             self.drives.goal = DriveState.SWITCH_ON_DISABLED
@@ -321,6 +325,8 @@ class Cell:
             self._look(self._recorded)
             self.cycle.end(None)
             self.cycle.count_work()
+            if self.watch.another_master is not None:
+                raise BusError(self.watch.another_master)
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:

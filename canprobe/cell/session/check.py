@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from canprobe.cell.session.first_second import link_limits
 from canprobe.cell.session.links import SOCKETCAN
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.port import ControllerState, Port
 from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
@@ -28,11 +28,11 @@ from canprobe.fieldbus.tools.link import (
     LinkVerdict,
     judge_link,
 )
-from canprobe.fieldbus.tools.link.figures import quantile, us
+from canprobe.fieldbus.tools.link.figures import IDLE_FAST_NS, quantile, us
 from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, wake_lateness
 
-IDLE_S = 1.0
-"""Time of the loop that does nothing."""
+IDLE_S = 2.0
+"""Time of each loop that does nothing."""
 MIN_SECONDS = 1.0
 SETTLE_S = 0.3
 """Time of cycles before the measurement, until both sides run at their usual speed."""
@@ -105,6 +105,24 @@ class LinkReport:
         return "\n".join([*lines, *(f"  warning: {remark}" for remark in self.remarks)])
 
 
+class IdleLoops:
+    """Two loops that do nothing but wake, before anything is sent: of the cycle's period, and a fast one."""
+
+    def __init__(self) -> None:
+        self.slow_ns: list[int] = []
+        self.fast_ns: list[int] = []
+
+    def run(self, clock: Clock, period_ns: int) -> None:
+        """Run both, one after the other."""
+        self.slow_ns = wake_lateness(clock, period_ns, round(IDLE_S * 1e9 / period_ns))
+        self.fast_ns = wake_lateness(clock, IDLE_FAST_NS, round(IDLE_S * 1e9 / IDLE_FAST_NS))
+
+    def text(self) -> str:
+        """Lateness of the loop of the cycle's period."""
+        shown = [_us(us(quantile(self.slow_ns, share))) for share in (0.5, 0.99, 1.0)]
+        return "p50 {}, p99 {}, at most {}, without a bus".format(*shown)
+
+
 def _us(value: float | None) -> str:
     return "–" if value is None else f"{value:.0f} µs"
 
@@ -146,13 +164,17 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     """
     plan, around, failure = session.plan, session.around, None
     meters: list[LinkMeter] = []
+    idle = IdleLoops()
 
     def metered(port: Port) -> Port:
-        meters.append(LinkMeter(around(port), **_traffic(plan)))
+        port = around(port)
+        with realtime(MASTER_PRIORITY, quiet) if plan.setup.realtime and not session.virtual else nullcontext():
+            idle.run(port.clock, plan.sync.period_ns)
+        meters.append(LinkMeter(port, **_traffic(plan)))
         return meters[0]
 
     session.around = metered
-    machine = {} if session.virtual else _machine(plan)
+    machine = {} if session.virtual else machine_facts(plan.buses[0].channel)
     with session:
         cell, meter = session.cell, meters[0]
         session.options.say(f"measure for {seconds:g} s, with the drives disabled")
@@ -181,8 +203,12 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
             error_frames=counters.error_frames,
             passive=meter.state in (ControllerState.PASSIVE, ControllerState.BUS_OFF),
             failure=failure,
+            work_ns=meter.work_ns,
+            idle_ns=idle.slow_ns,
+            idle_fast_ns=idle.fast_ns,
         )
     if not session.virtual:
+        machine = {"wakes_late_by": idle.text(), **machine}
         machine["controller"] = _controller(plan)
     found = session.cell.found
     return LinkReport(
@@ -193,15 +219,6 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
         machine,
         tuple(found.remarks) if found is not None else (),
     )
-
-
-def _machine(plan: Plan) -> dict[str, str]:
-    """Facts of the machine, with the lateness of a loop that does nothing, before anything is opened."""
-    with realtime(MASTER_PRIORITY, quiet) if plan.setup.realtime else contextlib.nullcontext():
-        late = wake_lateness(MonotonicClock(), plan.sync.period_ns, round(IDLE_S * 1e9 / plan.sync.period_ns))
-    shown = [_us(us(quantile(late, share))) for share in (0.5, 0.99, 1.0)]
-    text = "p50 {}, p99 {}, at most {}, without a bus".format(*shown)
-    return {"wakes_late_by": text, **machine_facts(plan.buses[0].channel)}
 
 
 def _controller(plan: Plan) -> str:

@@ -2,11 +2,11 @@
 
 What is lost, when, for how long, alone or in pairs, follows from a seed, while the arm holds, moves, presses or scans
 (`recover_cases`). A run fails where a drive is enabled with a target more than one count beside its position, where the
-force exceeds the limit, where the cell does not come back or takes more than a second from the boot-up of the last node
-to the hold, or where its log lacks a cycle. Behind a loss without a boot-up the cell may take as long again as its
-nodes may take to stop. A stop that somebody has to look at, such as a probe that is left pressing, is counted by
-itself. `canprobe study recover --seed N` carries out one run again; a failure is shrunk to the fewest losses that still
-fail.
+force exceeds the limit at another time than between loss and stop (study `faults` judges that time), where the cell
+does not come back or takes more than a second from the boot-up of the last node to the hold, or where its log lacks a
+cycle. Behind a loss without a boot-up the cell may take as long again as its nodes may take to stop. A stop that
+somebody has to look at, such as a probe that is left pressing, is counted by itself. `canprobe study recover --seed N`
+carries out one run again; a failure is shrunk to the fewest losses that still fail.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ COLUMNS = (
     Column("refused", "somebody has to look", "d"),
     Column("jump_counts", "largest jump, counts", "d"),
     Column("force_max_n", "highest force N", ".2f"),
+    Column("force_calm_n", "but for the stop N", ".2f"),
     Column("late_s", "longest from return to hold s", ".2f"),
     Column("rows_lost", "cycles without a row", "d"),
     Column("failures", "failures", "d"),
@@ -84,7 +85,10 @@ def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
     for run in runs:
         sums.update({key: int(run[key]) for key in ("lost", "back", "refused", "rows_lost")})
         sums["failures"] += bool(run["failures"])
-    most = {key: max((run[key] for run in runs), default=0) for key in ("jump_counts", "force_max_n", "late_s")}
+    most = {
+        key: max((run[key] for run in runs), default=0)
+        for key in ("jump_counts", "force_max_n", "force_calm_n", "late_s")
+    }
     return {
         "work": name,
         "runs": len(runs),
@@ -96,13 +100,13 @@ def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
 def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     """The figures, and every failure with the line that runs it again."""
     failed = [run for run in runs if run["failures"]]
-    all_of_them = _row("all", runs)
+    most = _row("all", runs)
     lines = [
-        f"{len(runs)} runs with {all_of_them['lost']} losses: the cell came back from {all_of_them['back']}, in"
-        f" {all_of_them['refused']} runs somebody has to look; {len(failed)} runs failed.",
-        f"Largest distance of a first target from the position: {all_of_them['jump_counts']} counts; highest force:"
-        f" {all_of_them['force_max_n']:.2f} N; longest time from the last return to the hold:"
-        f" {all_of_them['late_s']:.2f} s; {all_of_them['rows_lost']} cycles without a row in the log.",
+        f"{len(runs)} runs with {most['lost']} losses: the cell came back from {most['back']}, in"
+        f" {most['refused']} runs somebody has to look; {len(failed)} runs failed.",
+        f"Largest distance of a first target from the position: {most['jump_counts']} counts; highest force:"
+        f" {most['force_max_n']:.2f} N between loss and stop, {most['force_calm_n']:.2f} N else; longest time from the"
+        f" last return to the hold: {most['late_s']:.2f} s; {most['rows_lost']} cycles without a row in the log.",
     ]
     for run in failed[:20]:
         why = "; ".join(run["failures"])

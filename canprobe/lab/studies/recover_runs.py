@@ -6,7 +6,7 @@ The score looks at the emulated nodes and the plant, not at what the master beli
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -182,7 +182,12 @@ class RecoverScore:
                     break  # it ended for good, or somebody has to look
 
     def outcome(
-        self, boot_ups: dict[int, list[float]], times_s: Sequence[float], syncs: int, force: float, jump_counts: int
+        self,
+        boot_ups: Mapping[int, Sequence[float]],
+        times_s: Sequence[float],
+        syncs: int,
+        forces: Sequence[tuple[float, float]],
+        jump_counts: int,
     ) -> dict[str, Any]:
         """What came of it, and what failed.
 
@@ -190,21 +195,24 @@ class RecoverScore:
             boot_ups: times of all boot-ups, s, by node.
             times_s: times of the log.
             syncs: number of SYNCs on the bus.
-            force: highest force of the plant, N.
+            forces: force of the plant: (time, s; force, N).
             jump_counts: largest distance of target and position after an enabling, counts.
         """
         limit = self.plan.setup.limits.force_max
         lost = [time for time, text in self._said if text.startswith("lost: ")]
         back = [time for time, text in self._said if text.startswith("the cell is back")]
+        calm = [force for time, force in forces if not self._reacts(time, lost)]
+        force, calm_n = max((force for _, force in forces), default=0.0), max(calm, default=0.0)
         refused = bool(self.errors) and self.errors[-1].exit_status == 1
         failures = []
         if jump_counts > 1:
             failures.append(f"a target {jump_counts} counts beside the position at enabling")
-        if force > limit:
-            failures.append(f"a force of {force:.2f} N, with a limit of {limit:.2f} N")
+        if calm_n > limit:
+            failures.append(f"a force of {calm_n:.2f} N, with a limit of {limit:.2f} N")
         if len(back) < len(lost) and not refused:
             failures.append(f"it did not come back: {self.errors[-1] if self.errors else 'no error'}")
-        late = [self._late_s(*times, boot_ups) for times in zip(lost, back, strict=False)]
+        since = [0.0, *back]
+        late = [self._late_s(*times, boot_ups) for times in zip(since, lost, back, strict=False)]
         failures += [
             f"{late_s:.2f} s from the last return to the hold" for late_s, budget_s in late if late_s > budget_s
         ]
@@ -221,6 +229,7 @@ class RecoverScore:
             "back": len(back),
             "jump_counts": jump_counts,
             "force_max_n": force,
+            "force_calm_n": calm_n,
             "force_limit_n": limit,
             "late_s": max((late_s for late_s, _ in late), default=0.0),
             "rows_lost": missing,
@@ -229,15 +238,24 @@ class RecoverScore:
             "failures": failures,
         }
 
-    def _late_s(self, lost_s: float, back_s: float, boot_ups: dict[int, list[float]]) -> tuple[float, float]:
+    def _reacts(self, time_s: float, lost_s: Sequence[float]) -> bool:
+        """Whether an outage has begun, and the cell has not stopped: how far the force rises then, `faults` judges."""
+        begun = [(self.first_s or 0.0) + loss.after_s for loss in self.case.outages]
+        return any(begin <= time_s < min((t for t in lost_s if t >= begin), default=begin) for begin in begun)
+
+    def _late_s(
+        self, since_s: float, lost_s: float, back_s: float, boot_ups: Mapping[int, Sequence[float]]
+    ) -> tuple[float, float]:
         """Time from the return of what was lost to the hold, and how long it may be, s.
 
         That is a second and the SDO times of the nodes. The cell begins to come back when it has stopped, which may
         take as long again as its nodes may take to stop; a node that has booted is not waited for.
         """
-        begun = [loss for loss in self.case.outages if (self.first_s or 0.0) + loss.after_s < back_s]
+        first_s = self.first_s or 0.0
+        begun = [o for o in self.case.outages if first_s + o.after_s < back_s and first_s + o.ends_s > since_s]
         ready_s = [lost_s, *(self._ready_s(loss, boot_ups) for loss in begun)]
-        stops_s = 0.0 if all(loss.name in BOOTING for loss in begun) else 2 * self.plan.setup.bring_up.stop_s
+        booted = bool(begun) and all(loss.name in BOOTING for loss in begun)
+        stops_s = 0.0 if booted else 2 * self.plan.setup.bring_up.stop_s
         return back_s - max(ready_s), SLACK_S + stops_s + self._sdo_s(lost_s, back_s)
 
     def _sdo_s(self, lost_s: float, back_s: float) -> float:
@@ -247,7 +265,7 @@ class RecoverScore:
         end = [time for time, text in said if text.startswith("start all nodes")]
         return end[-1] - begin[-1] if begin and end else 0.0
 
-    def _ready_s(self, loss: Outage, boot_ups: dict[int, list[float]]) -> float:
+    def _ready_s(self, loss: Outage, boot_ups: Mapping[int, Sequence[float]]) -> float:
         """Time at which what was lost is there again: the end of the outage, or the boot-up behind it."""
         end_s = (self.first_s or 0.0) + loss.ends_s
         if loss.name not in BOOTING:
@@ -321,11 +339,10 @@ class RecoverRun:
 
     def outcome(self) -> dict[str, Any]:
         """What came of it, and what failed; with files, the hash of the bus log too."""
-        session, truth = self._session, self._session.truth
-        force = float(max(truth["force_n"], default=0.0)) if "force_n" in truth else 0.0
+        session = self._session
         boot_ups = {node_id: [t_ns * 1e-9 for t_ns in times] for node_id, times in self._drives.boot_ups.items()}
         times_s = session.cell.log.arrays()["t_s"].tolist() if len(session.cell.log) else list[float]()
-        found = self._score.outcome(boot_ups, times_s, self._drives.syncs, force, self._drives.jump_counts)
+        found = self._score.outcome(boot_ups, times_s, self._drives.syncs, forces_of(session), self._drives.jump_counts)
         if session.out is not None:
             found["bus_log_sha256"] = hashlib.sha256((session.out / "bus.log").read_bytes()).hexdigest()
         return found
@@ -334,3 +351,9 @@ class RecoverRun:
 def run_case(case: RecoverCase, say: Callable[[str], None] = lambda _: None, out: Path | None = None) -> dict[str, Any]:
     """Carry out a run, and score it."""
     return RecoverRun(case, say, out).outcome()
+
+
+def forces_of(session: Session) -> list[tuple[float, float]]:
+    """Force of the plant of a finished session: (time, s; force, N)."""
+    truth = session.truth
+    return list(zip(truth["t_s"].tolist(), truth["force_n"].tolist(), strict=True)) if "force_n" in truth else []

@@ -32,7 +32,7 @@ from canprobe.lab.studies.harness import CHANNEL, StudyResult
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
 from canprobe.lab.studies.recover_cases import END_S, REPLUG, SCENES, STALL, RecoverCase, draw_case
-from canprobe.lab.studies.recover_runs import RecoverScore, WatchedDrives
+from canprobe.lab.studies.recover_runs import RecoverScore, WatchedDrives, forces_of
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
@@ -54,7 +54,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         sweep.say(f"{seed + 1} of {total}: {case}: {'; '.join(runs[-1]['failures']) or 'no failure'}")
     patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
     facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
-    return StudyResult("recover", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_runs, runs))
+    return StudyResult("recover_vcan", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_runs, runs))
 
 
 class ServedRun:
@@ -113,11 +113,9 @@ class ServedRun:
             watch.push(can_id, data)
             if HEARTBEAT_BASE < can_id < HEARTBEAT_BASE + MASTER_NODE_ID and data == b"\0":
                 boot_ups[can_id - HEARTBEAT_BASE].append(t_ns * 1e-9)
-        truth = self._session.truth
-        force = float(max(truth["force_n"], default=0.0)) if "force_n" in truth else 0.0
         log = self._session.cell.log
         times_s = log.arrays()["t_s"].tolist() if len(log) else list[float]()
-        return self._score.outcome(boot_ups, times_s, syncs, force, watch.jump_counts)
+        return self._score.outcome(boot_ups, times_s, syncs, forces_of(self._session), watch.jump_counts)
 
 
 class FirstTargets:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 
 import pytest
@@ -41,30 +42,72 @@ VOLATILE = {0x6041, 0x6064, 0x607A, 0x606C, 0x6077, 0x2006, 0x2120}
 """Objects that a device changes by itself, and the target, which follows the position of a disabled drive."""
 
 
-def test_nodes_are_left_as_they_were_found_and_no_drive_is_enabled():
-    session = session_of("cylinder")
-    nodes = {node.node_id: node for node in session.world.nodes}
-    nodes[3].dictionary.put(0x1A01, 0, 0)
-    found = {}
+class FoundCell:
+    """A session of a check whose nodes are somebody's: other values than the plan's, node 3 operational."""
 
-    def around(port):
+    def __init__(self, scene="cylinder", **overrides):
+        self.session = session_of(scene, **overrides)
+        self.nodes = {node.node_id: node for node in self.session.world.nodes}
+        self.nodes[3].dictionary.put(0x1A01, 0, 0)
+        self.found = {}
+        self.session.around = self.around
+
+    def around(self, port):
         port.send_batch([(0x603, bytes.fromhex("2b17100046000000")), pack_nmt(NmtCommand.START, 3)])
         port.clock.sleep_until_ns(port.clock.now_ns() + 5_000_000)
         port.drain()
-        found.update({i: dict(node.dictionary.values) for i, node in nodes.items()})
+        self.found = {i: dict(node.dictionary.values) for i, node in self.nodes.items()}
         return port
 
-    session.around = around
-    report = measure_link(session, 0.5)
+    def assert_left_as_found(self, but=frozenset()):
+        for i, node in self.nodes.items():
+            now, found = node.dictionary.values, self.found[i]
+            changed = {key: (found.get(key), now.get(key)) for key in now if now.get(key) != found.get(key)}
+            assert {key >> 8 for key in changed} <= VOLATILE | but, (i, {hex(k): v for k, v in changed.items()})
+            assert state_of(node.dictionary.number(0x6041)) not in POWERED_STATES or i == 16
+        assert self.nodes[3].state is NmtState.OPERATIONAL and self.nodes[2].state is NmtState.PRE_OPERATIONAL
+
+
+def test_nodes_are_left_as_they_were_found_and_no_drive_is_enabled():
+    cell = FoundCell()
+    report = measure_link(cell.session, 0.5)
     assert report.fit and not report.remarks
-    for i, node in nodes.items():
-        now = node.dictionary.values
-        changed = {key >> 8 for key in now.keys() | found[i].keys() if now.get(key) != found[i].get(key)}
-        assert changed <= VOLATILE, [
-            (hex(k), found[i].get(k), now.get(k)) for k in now if now.get(k) != found[i].get(k)
-        ]
-        assert state_of(node.dictionary.number(0x6041)) not in POWERED_STATES or i == 16
-    assert nodes[3].state is NmtState.OPERATIONAL and nodes[2].state is NmtState.PRE_OPERATIONAL
+    cell.assert_left_as_found()
+
+
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.35, 0.4, 0.6, 0.8])
+def test_a_check_that_is_interrupted_leaves_the_nodes_as_they_were_found(share, monkeypatch):
+    """Ctrl-C in a call of the port: while listening, reading, configuring, cycling, putting back."""
+    monkeypatch.setattr("canprobe.cell.session.check.IDLE_S", 0.01)
+    calls = 0
+
+    def counted(cell, most):
+        nonlocal calls
+        calls, around = 0, cell.session.around
+
+        def wrapped(port):
+            port = around(port)
+            for name in ("send_batch", "drain", "wait"):
+                method = getattr(port, name)
+
+                def call(*arguments, method=method):
+                    nonlocal calls
+                    calls += 1
+                    if calls == most:
+                        raise KeyboardInterrupt
+                    return method(*arguments)
+
+                setattr(port, name, call)
+            return port
+
+        cell.session.around = wrapped
+        return cell
+
+    measure_link(counted(FoundCell("free", **{"bus.timed": False}), -1).session, 0.05)
+    cell = counted(FoundCell("free", **{"bus.timed": False}), round(share * calls))
+    with contextlib.suppress(KeyboardInterrupt):  # one while it puts back is held until that is done
+        measure_link(cell.session, 0.05)
+    cell.assert_left_as_found()
 
 
 def test_an_array_that_sends_no_image_is_not_fit():
@@ -95,14 +138,21 @@ def test_a_drive_under_power_is_refused_and_nothing_is_written():
     assert changed <= VOLATILE
 
 
-def test_another_master_is_refused():
-    def say(text):
-        if text == "listen for another master":
-            session.lockstep.port().send_batch([(0x080, b"\1")])
+FOREIGN = [(0x080, b"\1"), pack_nmt(NmtCommand.START, 3), (0x77F, b"\5")]
+"""Frames by which another master shows itself: SYNC, NMT, a heartbeat of its own id."""
 
-    session = session_of(say=say)
-    with pytest.raises(BusError, match="another master is at work"):
-        measure_link(session, 0.5)
+
+@pytest.mark.parametrize("step", ["listen for another master", "identify and configure the nodes", "measure for"])
+@pytest.mark.parametrize("frame", FOREIGN)
+def test_another_master_is_refused_whenever_it_comes(frame, step):
+    def say(text):
+        if text.startswith(step):
+            cell.session.lockstep.port().send_batch([frame])
+
+    cell = FoundCell("free", say=say, **{"bus.timed": False})
+    with pytest.raises(BusError, match="another master is"):
+        measure_link(cell.session, 0.5)
+    cell.assert_left_as_found(but={0x1001, 0x1003})  # a SYNC of another length is an error of the nodes
 
 
 def test_a_node_that_is_not_there_is_status_3(capsys, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from random import Random
 
 import pytest
@@ -55,6 +56,43 @@ def test_a_lateness_that_outlasts_the_drives_patience_is_unfit_even_if_it_is_rar
     assert judge_link(LinkFigures(PERIOD_NS, lateness, WAIT_NS, (answers(),)), LIMITS).fitness is Fitness.UNFIT
     short = sorted([10_000] * 3970 + [PERIOD_NS // 2 + 50_000] * 30)
     assert judge_link(LinkFigures(PERIOD_NS, short, WAIT_NS, (answers(),)), LIMITS).fitness is Fitness.MARGINAL
+
+
+def woken(rng, period_ns, seconds, kind):
+    """Lateness of a loop on a machine whose wake-ups are late one by one, or that stands still for times."""
+    lateness, deadline, begin, end = [], period_ns, 0, 0
+    while deadline < seconds * 1e9:
+        late = 0
+        if kind == "single":
+            late = rng.expovariate(1 / 3e6) if rng.random() < 0.1 else 0
+        else:
+            while end < deadline:
+                begin = end + rng.expovariate(20e-9)
+                end = begin + rng.expovariate(1 / 4e6)
+            late = max(0, end - deadline) if begin <= deadline else 0
+        lateness.append(late)
+        deadline += period_ns * (1 + (late // period_ns if late > period_ns / 2 else 0))
+    return sorted(lateness)
+
+
+@pytest.mark.parametrize("kind", ["single", "still"])
+@pytest.mark.parametrize("rate_hz", [100, 200, 800, 1000])
+def test_overruns_at_another_rate_follow_from_what_makes_the_machine_late(kind, rate_hz):
+    rng = Random(rate_hz)
+    slow, fast = woken(rng, PERIOD_NS, 2, kind), woken(rng, 1_000_000, 2, kind)
+    measured = figures(nodes=(answers(),), idle_ns=slow, idle_fast_ns=fast)
+    measured = replace(measured, lateness_ns=woken(rng, PERIOD_NS, 10, kind))
+    seen = share_of(woken(rng, round(1e9 / rate_hz), 60, kind), 1e9 / rate_hz)
+    assert judge_link(measured, LIMITS).overruns[rate_hz] == pytest.approx(seen, rel=0.5)
+
+
+def share_of(lateness, period_ns):
+    return sum(late > period_ns / 2 for late in lateness) / len(lateness)
+
+
+def test_where_the_work_fills_the_period_every_cycle_overruns():
+    verdict = judge_link(figures(work_ns=900_000), LIMITS)
+    assert verdict.overruns[1000.0] == 1.0 and verdict.overruns[800.0] == 0.0 and verdict.fit_rate_hz == 800.0
 
 
 @pytest.mark.parametrize("seed", range(6))

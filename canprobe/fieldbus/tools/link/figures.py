@@ -62,6 +62,9 @@ class LinkFigures:
         error_frames: number of bus errors.
         passive: whether the CAN controller was error-passive or bus-off at the end.
         failure: error of the interface that ended the measurement; None where it went to its end.
+        work_ns: usual time from the last answer to the end of the commands, ns.
+        idle_ns: lateness of a loop of the same period that does nothing, ascending, ns; empty: not measured.
+        idle_fast_ns: lateness of one of `IDLE_FAST_NS`.
     """
 
     period_ns: int
@@ -78,6 +81,9 @@ class LinkFigures:
     error_frames: int = 0
     passive: bool = False
     failure: str | None = None
+    work_ns: int = 0
+    idle_ns: Sequence[int] = ()
+    idle_fast_ns: Sequence[int] = ()
 
     @property
     def cycles(self) -> int:
@@ -89,10 +95,14 @@ class LinkFigures:
         """Length of the measurement, s."""
         return self.cycles * self.period_ns * 1e-9
 
-    def late_share(self, period_ns: int | None = None) -> float:
-        """Share of SYNCs that are later than half a period; by default of the period that was measured."""
-        limit = (self.period_ns if period_ns is None else period_ns) // 2
-        return sum(late > limit for late in self.lateness_ns) / max(1, self.cycles)
+    @property
+    def usual_ns(self) -> int:
+        """Time that the work of a usual cycle takes, ns: to the answer of the slowest node, and to the commands."""
+        return max((one.at(0.5) or 0 for one in self.answers), default=0) + self.work_ns
+
+    def late_share(self) -> float:
+        """Share of SYNCs that are later than half a period."""
+        return late_share(self.lateness_ns, self.period_ns)
 
     def as_document(self) -> dict[str, Any]:
         """The figures for JSON."""
@@ -104,13 +114,21 @@ class LinkFigures:
             "sync_late_us": {name: us(quantile(self.lateness_ns, share)) for name, share in QUANTILES.items()},
             "overruns_percent": 100.0 * self.late_share(),
             "waits_us": us(self.wait_ns),
+            "cycle_us": us(self.usual_ns),
             "nodes": [one.as_document() for one in self.answers],
             **{name: getattr(self, name) for name in names},
             "failure": self.failure,
         }
 
 
+IDLE_FAST_NS = 1_000_000
+"""Period of the faster loop that does nothing."""
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
+
+
+def late_share(lateness_ns: Sequence[int], period_ns: int) -> float:
+    """Share of wake-ups that are later than half a period."""
+    return sum(late > period_ns // 2 for late in lateness_ns) / max(1, len(lateness_ns))
 
 
 def quantile(ascending: Sequence[int], share: float) -> int | None:

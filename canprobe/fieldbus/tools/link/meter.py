@@ -72,7 +72,8 @@ class LinkMeter(TappedPort):
         self._measures = False
         self._sync_ns: int | None = None
         self._sync_before_ns: int | None = None
-        self._begin_ns = self._end_ns = 0
+        self._begin_ns = self._end_ns = self._heard_ns = 0
+        self._works_ns: list[int] = []
         self.bits = self.foreign = 0
 
     def defer(self, can_ids: Collection[int]) -> None:
@@ -87,6 +88,9 @@ class LinkMeter(TappedPort):
         """Note frames of the master; a SYNC begins a cycle."""
         if not self._measures:
             return
+        if self._heard_ns and all(can_id != SYNC_ID for can_id, _ in frames):
+            self._works_ns.append(self.clock.now_ns() - self._heard_ns)
+            self._heard_ns = 0
         for can_id, data in frames:
             self._count(data)
             if can_id == SYNC_ID:
@@ -99,6 +103,7 @@ class LinkMeter(TappedPort):
         """Note frames of others: each counts for the last SYNC before it."""
         if not self._measures or self._sync_ns is None:
             return
+        self._heard_ns = self.clock.now_ns() if frames else self._heard_ns
         for can_id, data, t_ns in frames:
             self._count(data)
             node_id = self._answers.get(can_id)
@@ -120,6 +125,11 @@ class LinkMeter(TappedPort):
     def answers(self) -> tuple[AnswerFigures, ...]:
         """Figures of the nodes."""
         return tuple(one.figures(node_id) for node_id, one in self._nodes.items())
+
+    @property
+    def work_ns(self) -> int:
+        """Usual time from the last frame that was read to the end of the commands, ns."""
+        return sorted(self._works_ns)[len(self._works_ns) // 2] if self._works_ns else 0
 
     @property
     def seconds(self) -> float:

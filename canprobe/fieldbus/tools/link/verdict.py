@@ -1,7 +1,7 @@
 """From the figures of a link to a verdict: fit, marginal or unfit for a rate, why, and what to type. Pure.
 
-Overruns: the share of SYNCs that were later than half a period. A machine's lateness hangs little on the rate, so the
-same distribution predicts the overruns at other rates; it stops being true where the work of a cycle fills its period.
+Overruns: the share of SYNCs that were later than half a period. What that is at other rates follows from the same
+lateness; see `overruns`.
 A SYNC that is later than the drives wait stops the cell: how many a minute has follows from the late ones, whose tail
 is taken for exponential.
 
@@ -24,6 +24,7 @@ from enum import StrEnum
 from typing import Any
 
 from canprobe.fieldbus.tools.link.figures import LinkFigures, quantile
+from canprobe.fieldbus.tools.link.overruns import predict_overruns
 
 MINUTE_S = 60.0
 FIT_SHARE, UNFIT_SHARE = 0.001, 0.02
@@ -115,7 +116,7 @@ def judge_link(figures: LinkFigures, limits: LinkLimits) -> LinkVerdict:
         Fitness.MARGINAL if figures.torn or figures.dropped else Fitness.FIT,
     ]
     worst = max(findings, key=_ORDER.index)
-    overruns = {rate: figures.late_share(round(1e9 / rate)) for rate in sorted({*RATES_HZ, rate_hz}) if rate >= 100.0}
+    overruns = {rate: predict_overruns(figures, rate) for rate in sorted({*RATES_HZ, rate_hz}) if rate >= 100.0}
     if worst is Fitness.FIT:
         return LinkVerdict(worst, rate_hz, fit_rate_hz=_fit_rate(figures, limits, rate_hz), overruns=overruns)
     late = _ORDER.index(lateness) >= _ORDER.index(answers) and lateness is not Fitness.FIT
@@ -128,7 +129,7 @@ def judge_link(figures: LinkFigures, limits: LinkLimits) -> LinkVerdict:
 
 def _lateness(figures: LinkFigures, limits: LinkLimits, period_ns: int | None = None) -> Fitness:
     period_ns = figures.period_ns if period_ns is None else period_ns
-    share = figures.late_share(period_ns)
+    share = predict_overruns(figures, 1e9 / period_ns)
     if share > min(UNFIT_SHARE, limits.late_share) or _gaps_expected(figures, limits, period_ns) > STOPS_EXPECTED:
         return Fitness.UNFIT
     return Fitness.MARGINAL if share > FIT_SHARE else Fitness.FIT
