@@ -56,6 +56,8 @@ def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_
     lost_s, back_s, went_on_s = (float(re.search(rf"{one}, at ([\d.]+) s", kinds)[1]) for one in words)
     assert times[LOSS_CYCLE] < lost_s < times[LOSS_CYCLE] + 0.05
     assert 2.5 < back_s - lost_s < 3.0, "half a second after it booted"
+    (back,) = run.steps("the cell is back after")
+    assert float(back.split()[5]) == pytest.approx(back_s - lost_s, abs=0.1)
     assert went_on_s == pytest.approx(back_s + HELD_CYCLES * 0.0025, abs=0.02)
 
 

@@ -92,10 +92,10 @@ class Cell(Nodes):
 class Bench:
     """A recovery whose nodes are always there, on a clock that cells move on."""
 
-    def __init__(self, monkeypatch, cells):
+    def __init__(self, monkeypatch, cells, lasts_ns=STEADY_NS):
         monkeypatch.setattr(recovery, "_Wait", lambda *_: self)
         self.now, self.said, self.opened = 0, [], 0
-        self.clock, self.cells = self, [Cell(self, lasts_ns=STEADY_NS), *(Cell(self, **one) for one in cells)]
+        self.clock, self.cells = self, [Cell(self, lasts_ns=lasts_ns), *(Cell(self, **one) for one in cells)]
         left = iter(self.cells[1:])
         self.recovery = Recovery(
             canprobe.plan("free"),
@@ -132,12 +132,21 @@ UP, FAILED = ["enter", "start"], ["enter", "stop"]
 
 
 def test_a_cell_that_fails_to_come_up_is_stopped_and_another_one_tried(monkeypatch):
-    bench = Bench(monkeypatch, [{"fails": LOST}, {"fails": DOWN}, {}])
+    bench = Bench(monkeypatch, [{"fails": LOST}, {"fails": LOST}, {"fails": DOWN}, {}])
     bench.run()
-    assert bench.told() == [["start", "stop"], FAILED, FAILED, UP]
+    assert bench.told() == [["start", "stop"], FAILED, FAILED, FAILED, UP]
     assert bench.recovery.cell is bench.cells[-1] and bench.opened == 1
-    assert [line for line in bench.said if line.startswith("not back")] == [f"not back yet: {e}" for e in (LOST, DOWN)]
+    assert [line for line in bench.said if line.startswith("not back")] == [
+        f"not back yet: {e}" for e in (LOST, LOST, DOWN)
+    ]
     assert all(cell.doubted == {2} for cell in bench.cells[1:])
+
+
+@pytest.mark.parametrize("lasts_ns", [STEADY_NS, STEADY_NS + 1])
+def test_the_last_of_so_many_tries_may_succeed(monkeypatch, lasts_ns):
+    bench = Bench(monkeypatch, [*[{"fails": LOST}] * (TRIES - 1), {}], lasts_ns)
+    bench.run()
+    assert bench.told()[1:] == [FAILED] * (TRIES - 1) + [UP]
 
 
 @pytest.mark.parametrize("error", [UnhomedError(3, "is not homed"), STOP])
