@@ -17,6 +17,7 @@ from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 from canprobe.lab.bridge.sample import SurfacePatch
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
@@ -31,6 +32,7 @@ class Received:
         phase: column `phase` of the command, None without one.
         depth: column `depth_at_1n_mm`: indentation at 1 N with which its contact was placed, None without one.
         patch: estimate of the command.
+        ahead: column `explored_ahead_mm`: path ahead of an exploration (n, 3), None without one.
         dropped: number of observations that were lost before this one.
     """
 
@@ -39,6 +41,7 @@ class Received:
     phase: float | None
     depth: float | None
     patch: SurfacePatch | None
+    ahead: Floats | None
     frames: list[TimedFrame]
     dropped: int
 
@@ -60,6 +63,7 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
             _number(columns.get("phase")),
             _number(columns.get("depth_at_1n_mm")),
             _pack_estimate(estimate) if estimate is not None else None,
+            ahead.tobytes() if isinstance(ahead := columns.get("explored_ahead_mm"), np.ndarray) else None,
             observation.frames,
             dropped,
         )
@@ -73,13 +77,14 @@ def _number(value: object) -> float | None:
 
 def unpack_observation(data: bytes) -> Received:
     """The inverse of `pack_observation`."""
-    t_ns, measurement, phase, depth, estimate, frames, dropped = marshal.loads(data)
+    t_ns, measurement, phase, depth, estimate, ahead, frames, dropped = marshal.loads(data)
     return Received(
         t_ns,
         _unpack_measurement(measurement) if measurement is not None else None,
         phase,
         depth,
         _unpack_estimate(t_ns, *estimate) if estimate is not None else None,
+        np.frombuffer(ahead).reshape(-1, 3) if ahead is not None else None,
         frames,
         dropped,
     )

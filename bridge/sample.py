@@ -149,6 +149,7 @@ class Sample:
         q: joint positions (n,) at the SYNC, rad or m; None without an arm, or before all joints have reported.
         touch: a tactile frame that became usable in this cycle.
         patch: a new answer of the estimator.
+        ahead: path ahead of an exploration (n, 3), base frame, m; None in other tasks.
         frames: frames on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
         diagnostics: states of all nodes and of the bridge, about once a second.
         dropped: number of samples that this bridge has lost so far.
@@ -160,6 +161,7 @@ class Sample:
     q: Floats | None = None
     touch: TouchFrame | None = None
     patch: SurfacePatch | None = None
+    ahead: Floats | None = None
     frames: Sequence[TimedFrame] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     dropped: int = 0

@@ -56,6 +56,7 @@ class SampleSource:
             q=measurement.q if self._has_arm else None,
             touch=self._touch(measurement, t_ns - measurement.t_ns),
             patch=received.patch,
+            ahead=None if received.ahead is None else 1e-3 * received.ahead,
         )
 
     def _touch(self, m: Measurement, shift_ns: int) -> TouchFrame | None:

@@ -12,7 +12,7 @@ from canprobe.lab.bridge.sample import Sample
 from canprobe.lab.bridge.view.instants import Follower, Moment
 from canprobe.lab.bridge.view.panel import Panel
 from canprobe.lab.bridge.view.path import OFF_PATH, Trail, deviation_scale
-from canprobe.lab.bridge.view.path_nodes import GrowingPath
+from canprobe.lab.bridge.view.path_nodes import GrowingPath, PathAhead
 from canprobe.lab.bridge.view.plots import curves_of, row_of
 from canprobe.lab.bridge.view.server import address, open_server
 from canprobe.lab.bridge.view.stage import Stage
@@ -37,13 +37,13 @@ class LiveView:
     def __init__(self, context: Context) -> None:
         scene, settings = context.plan.scene, context.settings
         shape = None if scene.object is None else true_object(scene.object)
-        errors = deviation_scale(shape)
+        errors = deviation_scale(shape, context.plan.setup.scan)
         self._stack = ExitStack()
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
         self._stage = Stage(server, context.plan.setup)
         self._panel = Panel(server, scene, errors, self._stage)
         self._trail = Trail()
-        self._path = GrowingPath(server.scene, self._trail)
+        self._path, self._ahead = GrowingPath(server.scene, self._trail), PathAhead(server.scene)
         setup = context.plan.setup
         self._surface = None if setup.shape is None else GrowingSurface(server.scene, errors, setup.probe.radius)
         self._follower = Follower(shape)
@@ -67,6 +67,8 @@ class LiveView:
             self._trail.add(moment.t_s, contact.point, contact.normal)
             if self._surface is not None:
                 self._surface.add(contact)
+        if sample.ahead is not None:
+            self._ahead.take(sample.ahead)
         if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
             self._rows.append(row_of(moment))
         now_ns = self._clock.now_ns()
@@ -86,6 +88,7 @@ class LiveView:
         with self._server.atomic():
             self._stage.show(moment)
             self._path.refresh()
+            self._ahead.refresh()
             self._panel.show(moment, curves)
 
     def close(self, summary: str | None) -> None:

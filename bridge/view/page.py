@@ -60,7 +60,7 @@ def _record(run: RecordedRun, times: Floats) -> tuple[str, list[str]]:
     """Viser's page with every frame in it, and lines about parts that cannot be drawn."""
     with open_server(0) as server:
         stage = Stage(server, run.setup)
-        errors = deviation_scale(shape_of(run))
+        errors = deviation_scale(shape_of(run), run.setup.scan)
         path = LoadedPath(server.scene, trail := trail_of(run))
         surface = LoadedSurface(server.scene, run.surface_map, trail, errors)
         recorder = server.get_scene_serializer()

@@ -8,9 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from canprobe.cell.scene.setup import Scan
 from canprobe.cell.tasks.probing import Phase
 from canprobe.lab.bridge.view.colours import Colours, scale
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.touch.strategies import Rectangle
 from canprobe.mechanics.types import Floats
 
 SPACING_M = 4e-4
@@ -21,6 +23,8 @@ GAP_M = 8e-3
 """Distance of two contacts above which they are not joined, m: the probe was lifted between them."""
 OFF_PATH = (Phase.APPROACH, Phase.RETREAT, Phase.DONE)
 """Phases whose contacts are not points of the path."""
+EXPLORED_TARGETS = 4.0
+"""Deviation of the last colour of an exploration, in targets."""
 SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
 
 
@@ -29,24 +33,32 @@ class DeviationScale:
     """Scale of the colours of the recovered surface.
 
     Attributes:
-        high: value of the last colour, 1/m; the first is 0.
-        text: name of the coloured quantity, for a legend.
+        high: value of the last colour; the first is 0.
+        text: name of the coloured quantity with its unit, for a legend.
+        of_height: it is the deviation of the height, in µm; else of the curvature, in 1/m.
     """
 
     high: float
     text: str
+    of_height: bool = False
 
     def colours(self, values: Floats) -> Colours:
-        """Colours (n, 3) of values (n,), 1/m: bright for a small deviation, grey where a value is not finite."""
+        """Colours (n, 3) of values (n,): bright for a small deviation, grey where a value is not finite."""
         return scale(self.high - np.asarray(values), 0.0, self.high)
 
 
-def deviation_scale(shape: PlacedShape | None) -> DeviationScale:
+def deviation_scale(shape: PlacedShape | None, scan: Scan | None = None) -> DeviationScale:
     """Up to five per cent of the object's curvature; up to 2 1/m where no object is known.
+
+    Of an exploration the height's deviation, up to some times the target.
 
     Args:
         shape: the true object, or None.
+        scan: the scan that is shown, if any.
     """
+    if scan is not None and isinstance(scan.strategy, Rectangle):
+        high = EXPLORED_TARGETS * 1e6 * scan.strategy.target_sigma
+        return DeviationScale(high, "stated deviation of the height (µm)", of_height=True)
     high = UNCERTAIN_PER_M
     if shape is not None:
         kappa = shape.closest(shape.T_base_object[:3, 3]).kappa

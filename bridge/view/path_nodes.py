@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from canprobe.lab.bridge.view.path import Trail
+from canprobe.mechanics.types import Floats
 
-PATH = (40, 44, 52)
+PATH, AHEAD = (40, 44, 52), (214, 94, 0)
 THICKNESS_M = 4e-4
 STRETCH = 150
 """Number of segments in one node of a live path."""
@@ -71,6 +72,30 @@ class GrowingPath:
             self._sent = end
             if end - self._done == STRETCH:
                 self._done = end
+
+
+class PathAhead:
+    """The path ahead of an exploration, which is drawn anew where it changes.
+
+    Args:
+        api: viser's scene.
+    """
+
+    def __init__(self, api: Any) -> None:
+        self._api, self._points, self._shown = api, np.zeros((0, 3)), np.zeros((0, 3))
+
+    def take(self, points: Floats) -> None:
+        """Take the points (n, 3) of the path ahead, m."""
+        self._points = points
+
+    def refresh(self) -> None:
+        """Send it if it has changed."""
+        if self._points is not self._shown and len(self._points) > 1:
+            self._shown = self._points
+            segments = np.stack([self._shown[:-1], self._shown[1:]], axis=1).astype(np.float32)
+            self._api.add_line_segments(
+                "/ahead", segments, AHEAD, thickness=2.0 * THICKNESS_M, thickness_units="world", visible=True
+            )
 
 
 def _add(api: Any, name: str, trail: Trail, chunk: slice, *, visible: bool) -> Any:

@@ -70,7 +70,7 @@ class Player:
     def __init__(self, server: Any, run: RecordedRun) -> None:
         self._server = server
         self._run = run
-        errors = deviation_scale(shape_of(run))
+        errors = deviation_scale(shape_of(run), run.setup.scan)
         self._stage = Stage(server, run.setup)
         trail = trail_of(run)
         self._path = LoadedPath(server.scene, trail)

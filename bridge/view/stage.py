@@ -20,7 +20,7 @@ from canprobe.lab.bridge.view.instants import Moment
 from canprobe.lab.bridge.view.links import arm_links
 from canprobe.lab.bridge.view.meshes import TriangleMesh
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
-from canprobe.lab.bridge.view.path_nodes import PATH
+from canprobe.lab.bridge.view.path_nodes import AHEAD, PATH
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
@@ -48,6 +48,8 @@ def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
         rows.append((OBJECT, "true object"))
     if scene.probe is not None:
         rows += [(PATH, "path of the contact"), (FORCE, "contact force")]
+    if scene.task.strategy == "explore":
+        rows.append((AHEAD, "path ahead"))
     return rows
 
 

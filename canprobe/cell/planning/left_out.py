@@ -60,7 +60,7 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     elif not setup.arm.torque:
         yield "motor torque (6077h)", "arm.torque is false, or the bus has no room for it beside what the task needs"
     if array is None:
-        yield "tactile node and its PDOs", f'no [sensor]: task.kind = "{kind}" feels nothing'
+        yield "tactile node and its PDOs", f'no [sensor]: task.kind = "{kind}" touches nothing'
     elif array.raw is not None:
         yield ARRAY_NODE_PARTS, 'wire.kind = "frames": the device knows no CANopen'
     elif array.mode == "window":

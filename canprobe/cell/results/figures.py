@@ -20,6 +20,7 @@ from canprobe.cell.results.picture import (
     box,
     drawn_rows,
     legend,
+    log_scale,
     parts,
     picture,
     sheet,
@@ -77,6 +78,8 @@ def _rows(result: RunData) -> list[list[tuple[Panel, float]]]:
     if scanning:
         path = [(_draw_trajectory, 3.0)] if "contact_mm" in log else []
         rows = [[*path, *force], [(_draw_curvature, 3.0), *taxels]]
+        if "explored_mm" in log:
+            rows.append([(_draw_exploration, 1.0)])
     else:
         rows = [[*force, *taxels]]
         if result.summary.get("calibration") is not None:
@@ -179,6 +182,22 @@ def _draw_curvature(part: SubFigure, result: RunData) -> None:
         spare = max(0.12 * (high - low), 0.5 * (MIN_SPAN_PER_M - (high - low)))
         axes.set_ylim(low - spare, high + spare)
     axes.set(title="principal curvatures", xlabel="path of the contact (mm)", ylabel="curvature (1/m)")
+    legend(part)
+
+
+def _draw_exploration(part: SubFigure, result: RunData) -> None:
+    """Draw over the path the largest deviation of the height in the rectangle, and the share within the target."""
+    (axes, within), explored = part.subplots(1, 2), result.summary["explore"]
+    every = drawn_rows(len(result.log["t_s"]))
+    path = result.log["explored_mm"][every]
+    axes.plot(path, result.log["explored_sigma_um"][every], color=ORANGE, label="largest; 1000 µm: not touched yet")
+    axes.axhline(explored["target_sigma_um"], color=GREEN, linestyle="--", label="target")
+    log_scale(axes, "y")
+    axes.set(title="stated deviation of the height", xlabel="path of the contact (mm)", ylabel="σ (µm)")
+    within.plot(path, 100.0 * result.log["explored_within"][every], color=BLUE)
+    within.set(
+        title="rectangle within the target", xlabel="path of the contact (mm)", ylabel="share (%)", ylim=(0, 102)
+    )
     legend(part)
 
 

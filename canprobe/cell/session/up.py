@@ -17,6 +17,8 @@ from canprobe.cell.tasks.from_plan import make_task
 
 ROWS_OF_UP = 4000
 """Number of cycles whose rows are kept: `up` runs for days."""
+EARLY_CYCLES = 25
+"""Cycles after a return in which nobody lets motion go on: a key that is read then was pressed before it."""
 
 
 def up(
@@ -34,7 +36,7 @@ def up(
         bridge: names of bridges to other tools, besides those of the scene.
         say: called with each step, with each new kind of fault, and at the end with the number of each.
         recover: come back after a node or the bus was lost; see `canprobe.cell.session.recovery`.
-        asked: called in each cycle; after a loss, True lets motion go on.
+        asked: called in each cycle; after a loss, True lets motion go on, but not in the first `EARLY_CYCLES`.
 
     Raises:
         UsageError: when the scene does not fit or is on a lockstep bus.
@@ -48,9 +50,14 @@ def up(
             resume = "; after a loss, r and Enter let motion go on" if recover else ""
             say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it{resume}")
 
+            cell, age = session.cell, EARLY_CYCLES
+
             def after_cycle(measurement: Measurement) -> None:
+                nonlocal cell, age
                 report_news(measurement)
-                if asked():
+                age = age + 1 if session.cell is cell else 0
+                cell = session.cell
+                if asked() and age >= EARLY_CYCLES:
                     session.resume()
 
             task = bridges.open_to_requests(None, lambda: make_task(plan))

@@ -28,9 +28,12 @@ from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import Rectangle, turn_radius
+from canprobe.mechanics.types import Floats
 
 SHARES_AHEAD = 40
 """Cycles before the end of a stretch from which on the next one is looked for: a path is judged in each."""
+AHEAD = 8
+"""Number of points of the path ahead that are logged."""
 SAMPLE_AGE_CYCLES = 4
 """Usual age of a contact when it is taken, in cycles: the array's latency and its transfer."""
 LIFT_M = 1.5e-3
@@ -94,7 +97,15 @@ class ExploreTask(TouchTask):
             self._columns = self._columns | {
                 "explored_mm": 1e3 * self.explorer.path,
                 "explored_sigma_um": 1e6 * self.explorer.ground.largest,
+                "explored_within": float(np.mean(self.explorer.ground.sigma <= self.explorer.ground.target)),
+                "explored_ahead_mm": 1e3 * self._ahead(self.explorer),
             }
+
+    def _ahead(self, explorer: Explorer) -> Floats:
+        """(AHEAD, 3) points of the path ahead on the servo's local surface, base frame, m."""
+        assert self._servo is not None
+        places = explorer.ground.in_base(explorer.ahead(AHEAD))
+        return np.array([self._servo.surface.foot(place)[0] for place in places.tolist()])
 
     def _watch(self) -> None:
         if self.phase is Phase.SCAN and self.explorer is not None and self.explorer.at_edge:

@@ -64,6 +64,7 @@ class HeldTask(Controller):
         self._place = place
         self._asked, self._resumed = asked, resumed
         self.held = asked is not None
+        self._begun = False
 
     def inspect(self, q: Floats) -> str | None:
         """Refuse an arm that stands elsewhere than before the loss."""
@@ -75,7 +76,8 @@ class HeldTask(Controller):
         if self.held:
             assert self._asked is not None
             wanted = self._controller.asks_to_go_on()  # which also drops what was asked of it during the hold
-            if not (self._asked() or wanted):
+            before, self._begun = not self._begun, True  # what was asked for before the hold does not count
+            if before or not (self._asked() or wanted):
                 return Command()
             self.held = False
             self._controller.go_on(measurement)

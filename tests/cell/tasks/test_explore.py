@@ -10,7 +10,10 @@ import pytest
 import canprobe
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.model import ObjectSettings
+from canprobe.cell.tasks.explore import LIFT_M, Return
 from canprobe.errors import PlanError
+from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
+from canprobe.mechanics.touch.servo import ProbePose
 
 SMALL = {"task.length_mm": 20.0, "task.width_mm": 14.0, "task.target_sigma_um": 15.0}
 
@@ -87,6 +90,22 @@ def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
     assert result.summary["explore"]["closed_fraction"] > 0.0
     assert "edge" in result.summary["explore"]["why_not"]
     assert result.summary["contact"]["force_max_n"] < 5.0
+
+
+def test_the_probe_returns_in_the_air_and_searches_from_the_known_surface_on():
+    poses = [ProbePose(np.array([x, 0.0, 0.04]), np.array([0.0, 0.0, -1.0])) for x in (0.0, -2e-3, -5e-3)]
+    way = Return(poses)
+    times = np.linspace(0.0, 2.0, 401)
+    x, _, z = np.array([way.pose(t).centre for t in times]).T
+    assert z[0] == 0.04
+    assert z.max() == pytest.approx(0.04 + LIFT_M)
+    assert x.min() == x[-1] == pytest.approx(-5e-3)
+    assert (np.hypot(np.diff(x), np.diff(z)) <= 1.01 * RETREAT_SPEED_M_S * 5e-3).all()
+    touches = int(np.flatnonzero(z <= 0.04 + 1e-9)[-1]) if (z[1:] <= 0.04).any() else len(z) - 1
+    assert x[touches] == pytest.approx(-5e-3)
+    assert all(
+        way.searched(t) == pytest.approx(max(0.0, 0.04 - h), abs=1e-9) for t, h in zip(times[60:], z[60:], strict=True)
+    )
 
 
 @pytest.mark.parametrize(

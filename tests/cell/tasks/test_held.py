@@ -54,8 +54,9 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
     held = HeldTask(Working(), None, lambda: bool(asked))
     held.update()
     assert done == [] and not held.lets_go and held.restarts == 3
-    asked.append(True)
     held.step(Measurement(0, 0))
+    asked.append(True)
+    held.step(Measurement(1, 0))
     held.update()
     held.retreat("the force")
     assert done == ["update", "the force"] and held.lets_go
@@ -74,8 +75,9 @@ def test_a_bridge_asks_for_motion_and_what_came_before_is_dropped():
     queue, made = deque(), []
     task = RequestedTask(None, lambda: made.append(Mine()) or made[-1], [queue], 0.0025)
     held = HeldTask(task, None, lambda: False)
-    queue.append(Request("start"))
+    queue += [Request("resume"), Request("start")]
     held.step(Measurement(0, 0))
+    assert held.held, "what was asked for while the cell was lost does not count"
     queue.append(Request("resume"))
     held.step(Measurement(1, 2_500_000))
     assert not held.held and not made, "the start that came in the hold is dropped"

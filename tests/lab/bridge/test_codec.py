@@ -56,6 +56,10 @@ def test_frames_alone_and_a_command_without_an_arm():
     command = Command(columns={"phase": 3.0, "force_n": 1.0})
     got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), command, [])))
     assert got.phase == 3.0 and got.measurement.q is None
+    assert got.ahead is None
+    command = Command(columns={"explored_ahead_mm": np.arange(6.0).reshape(2, 3)})
+    got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), command, [])))
+    np.testing.assert_array_equal(got.ahead, [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
 
 
 @pytest.mark.parametrize(("value", "phase"), [(np.float64(2.5), 2.5), (np.int64(3), 3.0), (np.zeros(3), None)])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from puma_arm import MODELS
 
+import canprobe
 from canprobe.cell.plant.pressure import pad_coordinates
 from canprobe.cell.scene.load import read_cell
 from canprobe.lab.bridge.sample import ContactFrame
@@ -16,7 +17,8 @@ from canprobe.lab.bridge.view import bodies as arm
 from canprobe.lab.bridge.view import colours, meshes
 from canprobe.lab.bridge.view import object_sheet as objects
 from canprobe.lab.bridge.view.path import deviation_scale
-from canprobe.lab.bridge.view.surface import LIFT_M, GrowingSurface
+from canprobe.lab.bridge.view.path_nodes import PathAhead
+from canprobe.lab.bridge.view.surface import LIFT_M, GrowingSurface, drawn, map_of_points
 from canprobe.mechanics.robot.chain import forward, posture
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
@@ -261,6 +263,31 @@ def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_k
     assert half.area < 0.6 * solid.area
     known = (solid.visual.vertex_colors[:, :3] != scale.colours(np.array([math.inf]))).any(axis=1)
     assert known.mean() > 0.9  # three passes show both curvatures
+
+
+def test_an_exploration_is_coloured_by_what_it_does_not_know_and_shows_the_path_ahead():
+    class Scene:
+        def __init__(self):
+            self.lines = {}
+
+        def add_line_segments(self, name, segments, *_, **__):
+            self.lines[name] = segments
+
+    scale = deviation_scale(None, canprobe.plan("explore").setup.scan)
+    surface = map_of_points(0.04)
+    contacts = list(touched(np.arange(-0.2, 0.2, 0.005)))
+    surface.add([one.point for one in contacts], [one.normal for one in contacts])
+    mesh, colours = drawn(surface, scale)
+    sure, unsure = mesh.sigma.argmin(), mesh.sigma.argmax()
+    assert colours[sure].sum() > colours[unsure].sum()  # bright for a small deviation of the height
+    assert "height" in scale.text
+    scene = Scene()
+    ahead = PathAhead(scene)
+    ahead.refresh()
+    assert not scene.lines
+    ahead.take(np.arange(12.0).reshape(4, 3))
+    ahead.refresh()
+    assert scene.lines["/ahead"].shape == (3, 2, 3)
 
 
 # colours

@@ -49,7 +49,7 @@ class Explorer(PathFollower):
     Attributes:
         ground: as given.
         path: path that was walked, m.
-        stretch: present stretch; `upcoming` the next one where it is known.
+        stretch, upcoming: present stretch, and the next one where it is known.
     """
 
     def __init__(
@@ -94,6 +94,18 @@ class Explorer(PathFollower):
         self.path += distance_m
         self._led.append((self.path, (x, y)))
         return super().step(x, y, distance_m)
+
+    def ahead(self, count: int) -> Floats:
+        """(count, 2) places that it will lead to, evenly over the rest of its stretch and the next, m."""
+        rest, upcoming = max(self._left, 0.0), self.upcoming
+        total = rest + (upcoming.length if upcoming is not None else 0.0)
+        places = []
+        for way in np.linspace(0.0, total, count).tolist():
+            if way <= rest or upcoming is None:
+                places.append(self.stretch.point(self.stretch.length - rest + way))
+            else:
+                places.append(upcoming.point(way - rest))
+        return np.array(places)
 
     def walk(self, point: Floats, normal: Floats, force_share: float) -> None:
         """Take a contact of the path.

@@ -78,6 +78,11 @@ class GroundCells:
         x, y = (self._axes[:2] @ (point - self._origin)).tolist()
         return x, y
 
+    def in_base(self, places: Floats) -> Floats:
+        """Points (n, 3) of the scan plane by their places in it (n, 2), m."""
+        result: Floats = self._origin + places @ self._axes[:2]
+        return result
+
     def walk(self, point: Floats, distance: float) -> None:
         """Take path of some length, m, that was walked at a contact (3,), m."""
         x, y, height = (self._axes @ (point - self._origin)).tolist()

@@ -19,7 +19,7 @@ from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.types import Floats
 
 SOURCE_SIGMA = 0.035
-"""Standard deviation of ln k from either source. Both together err by 2.5 % over 68 development shapes and draws of
+"""Standard deviation of ln k from either source. Both together err by 2.3 % over 68 development shapes and draws of
 `study shapes`; on grooves the slope is 30 % too small."""
 MAX_IMAGES = 30
 """Most images whose moments are compared."""
