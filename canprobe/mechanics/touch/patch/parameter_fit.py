@@ -130,9 +130,15 @@ def curvature_errors(
     for dwell, s, force in zip(dwells, shown, forces, strict=True):
         v = tuple((s.moments - model.memory * s.remembered).tolist())
         v = (v[0], 0.0, v[2])
-        k = model.start(v, force) or (dwell.kappa[0], 0.0, dwell.kappa[1])
+        shows = (dwell.kappa[0], 0.0, dwell.kappa[1])
+        k = model.start(v, force) or shows
         for _ in range(20):
-            J, r, _ = model.linearised(v, force, 100.0, k)
+            try:
+                J, r, _ = model.linearised(v, force, 100.0, k)
+            except ValueError:  # nothing would be above the level: half the way back to where something is
+                k = (0.5 * (k[0] + shows[0]), 0.0, 0.5 * (k[2] + shows[2]))
+                continue
+            shows = k
             step = np.clip(np.linalg.solve(J[[0, 2]][:, [0, 2]], r[[0, 2]]), -20.0, 20.0)
             least = MIN_CURVATURE_SHARE / model.radius
             k = (max(k[0] + float(step[0]), least), 0.0, max(k[2] + float(step[1]), least))
