@@ -27,7 +27,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_surface_map, make_task
-from canprobe.errors import SafetyStop
+from canprobe.errors import PlanError, SafetyStop, StudyError
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.shapes.scans import DEVELOPMENT, drawn, form_of, scene_of
@@ -116,10 +116,16 @@ def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
     cases = [ExploreCase(shape, name, 2.0 if quick else SECONDS) for shape in shapes for name in strategies]
     sweep.say(f"{len(cases)} scans")
     found = sweep.map(measure, cases, model=_MODEL)
-    each = {name: found[k :: len(strategies)] for k, name in enumerate(strategies)}
+    by_shape = {shape: found[k * len(strategies) :][: len(strategies)] for k, shape in enumerate(shapes)}
+    left_out = {shape: why for shape, scans in by_shape.items() for scan in scans if (why := scan.get("refused"))}
+    shapes = [shape for shape in shapes if shape not in left_out]
+    if not shapes:
+        raise StudyError(f"every shape has a strategy whose plan refuses it, such as: {next(iter(left_out.values()))}")
+    each = {name: [by_shape[shape][k] for shape in shapes] for k, name in enumerate(strategies)}
     rows = [row_of(name, scans) for name, scans in each.items()]
     facts = measuring_facts(quick, len(shapes), _MODEL) | {"shapes": ", ".join(shapes)}
     words = findings(rows, each, shapes)
+    words += [f"Left out: {shape}, {_kind(shape)}, where a plan says: {why}" for shape, why in left_out.items()]
     return StudyResult("explore", COLUMNS, rows, words, facts, partial(draw_paths, each))
 
 
@@ -137,7 +143,7 @@ COLUMNS = (
 
 
 def measure(case: ExploreCase) -> dict[str, Any]:
-    """Paths, times and errors of one scan; its force and contact."""
+    """Paths, times and errors of one scan, its force and contact; or the reason of a plan that refuses it."""
     with TemporaryDirectory() as folder:
         scene = scene_of(case.shape, Path(folder), case.seconds)
         assert scene.object is not None
@@ -149,7 +155,10 @@ def measure(case: ExploreCase) -> dict[str, Any]:
         assert isinstance(touch, Touch) and touch.scan is not None
         if case.strategy != "explore":
             touch = replace(touch, scan=replace(touch.scan, strategy=fixed(case.strategy), name=case.strategy))
-        plan = make_plan(replace(setup, task=touch))
+        try:
+            plan = make_plan(replace(setup, task=touch))
+        except PlanError as refusal:
+            return {"refused": str(refusal).splitlines()[0]}
         controller: Any = make_task(plan)
         stopped = None
         with Session(plan) as session:

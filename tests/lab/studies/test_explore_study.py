@@ -44,3 +44,7 @@ def test_a_scan_shows_more_as_its_path_grows():
     assert found["contact"] == 1.0
     assert found["path"][-1] > 0.03
     assert found["height"][0] > found["height"][-1] > 0.0
+
+
+def test_a_strategy_that_a_plan_refuses_says_why_and_leaves_its_shape_out():
+    assert "the path leaves the object" in measure(ExploreCase("drawn-44-10", "raster 8 mm", 1.0))["refused"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
 from canprobe.errors import PlanError, UsageError
 from canprobe.lab.studies.random_scenes import CELLS, KINDS, SceneSeed, random_scene
-from canprobe.lab.studies.region_scores import ScoredScan, behind_jump, scored
+from canprobe.lab.studies.region_scores import ScoredScan, behind_jump, measure, scored
 from canprobe.lab.studies.regions import TRIES, compared, earlier_rows, findings, row_of, rows_of, scan_all
 
 ROW = 400
@@ -193,3 +194,10 @@ def test_a_small_draw_with_the_whole_sensor(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "regions.png").stat().st_size > 10_000
     lines = (tmp_path / "regions_scenes.csv").read_text().splitlines()
     assert lines[1].startswith("200000,plane,plane,")
+
+
+def test_a_model_that_turned_over_on_a_straight_path_begins_again():
+    """Contacts of a straight path do not tell how the gradient grows along it: here it passed zero, by 2.1 s."""
+    scan = measure(106001)
+    assert scan.share > 0.6  # 0.01 where the normal of the answers points the other way
+    assert math.sqrt(float(np.mean(scan.scores[:, 1]))) < 5.0  # 50 1/m then

@@ -235,8 +235,7 @@ class RecursiveEstimator:
                 agree = np.flatnonzero(compared.squares[:-1] <= CHI2_99 * self._change.usual)
                 for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
                     self._pending.popleft()
-                self._spread.fade(0.0)
-                self._start = Start(self._memory, self._prior)
+                self._begin_again()
             else:
                 compared = explained
         if self._start is not None:
@@ -247,6 +246,19 @@ class RecursiveEstimator:
             self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved, slow)
             if self._last is not None:
                 self._filter.follow(self._last.point)
+                if self._filter.T[:3, 2].dot(self._last.normal) > 0.0:
+                    self._change.alarm()
+                    self._settled = False
+                    self._begin_again()
+
+    def _begin_again(self) -> None:
+        """Forget the surface: it has changed, or the model has turned over.
+
+        On a straight path gradients that grow along it change neither the surface below it nor its normals. Where they
+        pass zero the quadric's other side is up, and its normal points the wrong way.
+        """
+        self._spread.fade(0.0)
+        self._start = Start(self._memory, self._prior)
 
     def _compared(self) -> _Compared:
         rows, residuals = self._filter.equations([p.touch for p in self._pending])

@@ -48,6 +48,8 @@ MIN_AGE_DIFFERENCE_FRAMES = 4.0
 """Least difference of the ages of both means, in frames, from which a drift is computed."""
 OUTLIER_SHARE = 0.2
 """Largest departure from the mean, over its trace, of an image that counts in full: ten times the noise of a frame."""
+FORGOTTEN_AFTER_M = 4e-3
+"""Way of the contact since the last image, m, beyond which images say nothing about its place: that of the mean."""
 MAX_ROUNDS = 6
 """Most Gauss–Newton steps; from the last answer one or two suffice."""
 SLOPE_SIGMA = 0.08
@@ -160,13 +162,18 @@ class PatchCurvature:
 
     def reset(self) -> None:
         """Forget all images: contact was lost."""
-        self.frames = 0
-        self.force = 0.0
         self._memory = PadMemory()
         self._axes: tuple[Vec, Vec] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
         self._last: Floats | None = None
         self._slope: Slope | None = None
         self._touched = False
+        self._forget_mean()
+
+    def _forget_mean(self) -> None:
+        """Forget the images of other places."""
+        self.frames = 0
+        self.force = 0.0
+        self._place: list[float] | None = None
         self._traces: Moments = (0.0, 0.0, 0.0)
         self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(MAX_RECENT_FRAMES, RECENT_OUTLIER_SHARE)
 
@@ -182,7 +189,10 @@ class PatchCurvature:
         was = self._memory.add(sample.t_s, *direction_to_pad(direction, self.model.radius))
         if sample.moments is None:
             self.refused += 1
+            if self._place is not None and math.dist(sample.p_base.tolist(), self._place) > FORGOTTEN_AFTER_M:
+                self._forget_mean()
             return
+        self._place = sample.p_base.tolist()
         nx, ny, nz = sample.n_base.tolist()
         inward = -nx, -ny, -nz
         x_axis = self._axes[0] if self.frames else tangent_rotation(inward)[:, 0].tolist()

@@ -305,6 +305,20 @@ def test_contacts_without_moments_are_counted_and_change_nothing():
     np.testing.assert_allclose(patch_estimate(touches[-1], patch, 0.02).K, before, atol=1e-2)
 
 
+def test_images_of_a_place_that_the_contact_has_left_say_nothing():
+    """A patch that leaves the pad has no moments; 5 mm on, the surface may be another one."""
+    patch = PatchCurvature(model())
+    touches = samples(base_tensor(tensor(20.0, 0.0, 0.0)), NORMAL, FORCE, exact, 10)
+    for touch in touches:
+        patch.add(touch)
+    gone = replace(touches[-1], moments=None, p_base=touches[-1].p_base + np.array([3e-3, 0.0, 0.0]))
+    patch.add(gone)
+    assert patch_estimate(gone, patch, 0.02) is not None
+    gone = replace(gone, p_base=touches[-1].p_base + np.array([5e-3, 0.0, 0.0]))
+    patch.add(gone)
+    assert patch_estimate(gone, patch, 0.02) is None
+
+
 def test_one_image_in_twenty_that_is_far_off_moves_the_answer_by_little():
     touches = samples(base_tensor(tensor(27.8, 0.0, 0.3)), NORMAL, FORCE, exact, 200)
     patch = PatchCurvature(model())
