@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _list(args: argparse.Namespace) -> int:
     from canprobe.cell.emulated.array_faults import CELL_FAULTS
+    from canprobe.fieldbus.tools.faults.fault import number_text
 
     rows = [
         {
@@ -80,7 +81,7 @@ def _list(args: argparse.Namespace) -> int:
             ("fault", "what happens", "clause", "expected reaction"),
             *(
                 (
-                    " ".join([kind.name, *(f"{name}={one.default:g}" for name, one in kind.parameters.items())]),
+                    " ".join([kind.name, *(number_text(name, one.default) for name, one in kind.parameters.items())]),
                     kind.what,
                     kind.clause,
                     kind.reaction,

@@ -80,7 +80,7 @@ class ExploreTask(TouchTask):
 
     def record(self) -> TaskRecord:
         """The results so far."""
-        explored = None if self.explorer is None else _end_of(self.explorer, self._scan_t, over=not self._ends)
+        explored = None if self.explorer is None else end_of(self.explorer, self._scan_t, over=not self._ends)
         return replace(super().record(), explored=explored)
 
     def update(self) -> None:
@@ -178,12 +178,13 @@ class Return(Search):
         return max(0.0, SEARCH_SPEED * (t - float(self._times[-1])) - LIFT_M)
 
 
-def _end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
+def end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
     """The end of an exploration of a duration, s, whose time was over or which had nothing more to gain."""
     ground = explorer.ground
     target, sigma, is_open = ground.target, ground.sigma, ~ground.closed
     within = is_open & (sigma <= target)
-    rough = is_open & (ground.floor > target) & (ground.floor > 1.01 * ground.common)
+    scatter2 = ground.floor**2 - ground.common**2
+    rough = is_open & (ground.floor > target) & (scatter2 > ground.common**2)
     causes = []
     if ground.common > target:
         causes.append(

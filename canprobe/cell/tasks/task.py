@@ -68,7 +68,7 @@ class Exploration:
 
     Attributes:
         target: deviation of the height that was wanted.
-        sigma_max: largest stated deviation in the cells that can be touched; None before the first is known.
+        sigma_max: largest stated deviation in the cells that can be touched; None if one was not touched.
         common: deviation that the whole scan has in common.
         path: path that was walked.
         seconds: time of the scan, s.

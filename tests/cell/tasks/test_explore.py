@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 import canprobe
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.model import ObjectSettings
-from canprobe.cell.tasks.explore import LIFT_M, Return
+from canprobe.cell.tasks.explore import LIFT_M, Return, end_of
 from canprobe.errors import PlanError
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
 from canprobe.mechanics.touch.servo import ProbePose
@@ -74,6 +75,17 @@ def test_a_target_below_what_the_scan_has_in_common_is_not_reached_and_it_says_w
     assert not explored["reached"]
     assert explored["common_sigma_um"] > 3.0
     assert "common to the scan" in explored["why_not"]
+
+
+@pytest.mark.parametrize(("scatter_um", "rough"), [(0.0, 0.0), (2.0, 0.0), (20.0, 1.0)])
+def test_contacts_contradict_a_smooth_surface_where_they_scatter_more_than_the_scan_has_in_common(scatter_um, rough):
+    floor = np.full(6, np.hypot(8e-6, 1e-6 * scatter_um))
+    none = np.zeros(6, dtype=bool)
+    ground = SimpleNamespace(
+        target=6e-6, sigma=floor, floor=floor, common=8e-6, closed=none, wanting=none, largest=floor[0]
+    )
+    explored = end_of(SimpleNamespace(ground=ground, path=0.1), 4.0, over=False)
+    assert explored.rough == rough and ("contradict" in explored.why) == (rough > 0.0)
 
 
 def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):

@@ -48,7 +48,8 @@ def test_a_fault_as_people_write_it():
     fault = parse_fault("node 3: delay ms=2 share=0.5 seed=7 count=9 direction=in at 5 s for 200 ms", BUS_FAULTS, S)
     assert (fault.kind.name, fault.node_id, fault.start_ns, fault.duration_ns) == ("delay", 3, 6 * S, 200 * MS)
     assert (fault.value("ms"), fault.share, fault.seed, fault.hits, fault.hears) == (2, 0.5, 7, 9, True)
-    assert parse_fault(" node 16 : sdo-abort index=0x6060 on enabled", BUS_FAULTS).event == "enabled"
+    aborted = parse_fault(" node 16 : sdo-abort index=0x6060 code=0x08000020 on enabled", BUS_FAULTS)
+    assert str(aborted) == "sdo-abort index=0x6060 code=0x8000020 at node 16, on enabled, 100 %"
     assert str(fault) == "delay incoming ms=2 at node 3, 6.0000 s for 200.0 ms, 50 %"
 
 

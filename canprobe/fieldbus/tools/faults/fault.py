@@ -112,10 +112,15 @@ class Fault:
     def words(self, now_ns: int) -> str:
         """The fault in words; its time counts from `now_ns`, and is negative where it has begun before."""
         way = " incoming" if self.hears and self.kind.incoming is None else ""
-        given = "".join(f" {name}={value:g}" for name, value in self.values.items())
+        given = "".join(f" {number_text(name, value)}" for name, value in self.values.items())
         begins = f"on {self.event}" if self.event else f"{(self.start_ns - now_ns) * 1e-9:.4f} s"
         lasts = "" if self.duration_ns >= FOREVER_NS else f" for {self.duration_ns * 1e-6:.1f} ms"
         return f"{self.kind.name}{way}{given} at node {self.node_id}, {begins}{lasts}, {100 * self.share:.0f} %"
+
+
+def number_text(name: str, value: float) -> str:
+    """A number of a fault as it is typed: indices and codes of CANopen in hexadecimal."""
+    return f"{name}=0x{int(value):X}" if name in ("index", "code") else f"{name}={value:g}"
 
 
 class Host(Protocol):
