@@ -118,7 +118,7 @@ def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
     found = sweep.map(measure, cases, model=_MODEL)
     by_shape = {shape: found[k * len(strategies) :][: len(strategies)] for k, shape in enumerate(shapes)}
     left_out = {shape: why for shape, scans in by_shape.items() for scan in scans if (why := scan.get("refused"))}
-    shapes = [shape for shape in shapes if shape not in left_out]
+    shapes = tuple(shape for shape in shapes if shape not in left_out)
     if not shapes:
         raise StudyError(f"every shape has a strategy whose plan refuses it, such as: {next(iter(left_out.values()))}")
     each = {name: [by_shape[shape][k] for shape in shapes] for k, name in enumerate(strategies)}
