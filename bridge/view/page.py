@@ -81,7 +81,7 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))
     shape = shape_of(run)
-    errors = deviation_scale(shape)
+    errors = deviation_scale(shape, run.setup.scan)
     task = run.scene.task
     sensor = run.scene.sensor
     blank = np.zeros((1, 1) if sensor is None else (sensor.rows, sensor.columns), np.uint8)

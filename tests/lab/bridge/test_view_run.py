@@ -336,6 +336,11 @@ def test_scenes_without_a_shape_have_a_page_too(scene, tmp_path):
     assert (data["taxels"] != "") is (scene == "press")
 
 
+def test_an_exploration_is_coloured_by_the_height_in_its_page_too(tmp_path):
+    result = canprobe.run(canprobe.load_scene("explore", {"scene.figures": False}), out=tmp_path, duration_s=0.1)
+    assert panel_data(page_of_run(tmp_path, result.plan))["scale"]["text"] == "stated deviation of the height (µm)"
+
+
 # what cannot be read
 
 
