@@ -50,7 +50,7 @@ def test_its_own_calibration_is_not_doubted():
     [
         (TaxelConfig(blur_pitch=1.0), Pad(), r"blurred by 1\.[5-8]. mm"),
         (TaxelConfig(full_scale_pa=150e3), Pad(), "its layer has"),  # gains of 2/3
-        (TaxelConfig(), Pad(pitch_m=1.7e-3), "its images show a layer of"),
+        (TaxelConfig(), Pad(pitch_m=1.75e-3), "its images show a layer of"),
     ],
     ids=["more blur", "other gains", "other pitch"],
 )
