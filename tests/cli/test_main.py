@@ -243,7 +243,8 @@ def test_run_passes_everything_on(calls, tmp_path, capsys):
     assert (name, scene.name) == ("run", "free")
     assert bus_of(scene) == ("socketcan", "vcan3", 500_000)
     assert (scene.seed, scene.task.duration_s, kwargs["out"]) == (7, 2.5, tmp_path / "out")
-    assert capsys.readouterr().out == f"all went well\nnext: canprobe view {tmp_path / 'out'}\n"
+    out = tmp_path / "out"
+    assert capsys.readouterr().out == f"all went well\n  files      {out}\nnext: canprobe view {out}\n"
 
 
 @pytest.mark.parametrize("command", ["run", "up"])
