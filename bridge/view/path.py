@@ -47,7 +47,7 @@ class DeviationScale:
         return scale(self.high - np.asarray(values), 0.0, self.high)
 
 
-def deviation_scale(shape: PlacedShape | None, scan: Scan | None = None) -> DeviationScale:
+def deviation_scale(shape: PlacedShape | None, scan: Scan | None) -> DeviationScale:
     """Up to five per cent of the object's curvature; up to 2 1/m where no object is known.
 
     Of an exploration the height's deviation, up to some times the target.

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
     from canprobe import api
     from canprobe.cell.planning.bridges import BRIDGES
-    from canprobe.cell.results.text import bridge_lines, method_lines, summary_text
+    from canprobe.cell.results.text import bridge_lines, folder_line, method_lines, summary_text
 
     folder = api.results_folder(scene, args.out)
 
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         of_others = dict(list(result.summary["shape"].get("methods", {}).items())[1:])
         print_lines([*method_lines(of_others), *bridge_lines(result.summary.get("bridges") or {}), *_expected(args)])
-        print(f"  files      {folder}")
+        print(folder_line(folder))
         view = BRIDGES["view"]
         print(f"next: {f'{view.pip} && ' if view.missing else ''}canprobe view {shlex.quote(str(folder))}")
     return 0

@@ -51,8 +51,13 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     lines += [f"  noted      {fault}" for fault in summary["faults"]]
     lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
     if out is not None:
-        lines.append(f"  files      {out}")
+        lines.append(folder_line(out))
     return "\n".join(lines)
+
+
+def folder_line(out: Path) -> str:
+    """The folder of a run's files, the last line of its summary."""
+    return f"  files      {out}"
 
 
 def force_lines(contact: Mapping[str, Any]) -> list[str]:

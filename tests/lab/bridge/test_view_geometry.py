@@ -247,7 +247,7 @@ def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_k
         def add_mesh_trimesh(self, name, solid, **_):
             self.solids.append((name, solid))
 
-    scene, scale = Scene(), deviation_scale(None)
+    scene, scale = Scene(), deviation_scale(None, None)
     surface = GrowingSurface(scene, scale, 0.04)
     surface.refresh()
     assert not scene.solids  # nothing was touched

@@ -191,10 +191,10 @@ def test_the_path_of_a_run_stays_on_its_object(run):
 
 def test_colours_of_the_surface_span_five_per_cent_of_the_curvature():
     shape = make_object("sphere", T_base_object=np.eye(4), radius=0.05)
-    assert deviation_scale(shape).high == pytest.approx(0.05 * math.sqrt(2) / 0.05)
-    assert deviation_scale(make_object("plane", T_base_object=np.eye(4))).high == 0.5
-    assert "stated" in deviation_scale(None).text
-    known, unsure = deviation_scale(shape).colours(np.array([0.0, 9.0])).tolist()
+    assert deviation_scale(shape, None).high == pytest.approx(0.05 * math.sqrt(2) / 0.05)
+    assert deviation_scale(make_object("plane", T_base_object=np.eye(4)), None).high == 0.5
+    assert "stated" in deviation_scale(None, None).text
+    known, unsure = deviation_scale(shape, None).colours(np.array([0.0, 9.0])).tolist()
     assert sum(known) > sum(unsure)
 
 

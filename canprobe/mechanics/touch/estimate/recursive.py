@@ -248,7 +248,6 @@ class RecursiveEstimator:
                 self._filter.follow(self._last.point)
                 if self._filter.T[:3, 2].dot(self._last.normal) > 0.0:
                     self._change.alarm()
-                    self._settled = False
                     self._begin_again()
 
     def _begin_again(self) -> None:
@@ -258,7 +257,7 @@ class RecursiveEstimator:
         pass zero the quadric's other side is up, and its normal points the wrong way.
         """
         self._spread.fade(0.0)
-        self._start = Start(self._memory, self._prior)
+        self._start, self._settled = Start(self._memory, self._prior), False
 
     def _compared(self) -> _Compared:
         rows, residuals = self._filter.equations([p.touch for p in self._pending])

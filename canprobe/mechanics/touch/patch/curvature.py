@@ -173,7 +173,7 @@ class PatchCurvature:
         """Forget the images of other places."""
         self.frames = 0
         self.force = 0.0
-        self._place: list[float] | None = None
+        self._place: Floats | None = None
         self._traces: Moments = (0.0, 0.0, 0.0)
         self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(MAX_RECENT_FRAMES, RECENT_OUTLIER_SHARE)
 
@@ -189,10 +189,10 @@ class PatchCurvature:
         was = self._memory.add(sample.t_s, *direction_to_pad(direction, self.model.radius))
         if sample.moments is None:
             self.refused += 1
-            if self._place is not None and math.dist(sample.p_base.tolist(), self._place) > FORGOTTEN_AFTER_M:
+            if self._place is not None and math.dist(sample.p_base, self._place) > FORGOTTEN_AFTER_M:
                 self._forget_mean()
             return
-        self._place = sample.p_base.tolist()
+        self._place = sample.p_base
         nx, ny, nz = sample.n_base.tolist()
         inward = -nx, -ny, -nz
         x_axis = self._axes[0] if self.frames else tangent_rotation(inward)[:, 0].tolist()
