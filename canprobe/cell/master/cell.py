@@ -566,6 +566,8 @@ class Cell:
         lift.begin()
         assert self.cycle is not None
         try:
+            if not self.cycle.begun:  # the controller's update failed: the commands of this cycle are out
+                self._look(self._begin_cycle())
             while (command := lift.command(supervisor)) is not None:
                 self.cycle.end(command)
                 self._record(supervisor.seen.measurement, command)
