@@ -321,12 +321,20 @@ class Cell:
         if self.drives is not None:
             self.drives.goal = DriveState.SWITCH_ON_DISABLED
         for _ in range(max(1, round(seconds * 1e9 / self._plan.sync.period_ns))):
-            self._recorded = self.cycle.begin()
+            self._recorded = self._begin_cycle()
             self._look(self._recorded)
             self.cycle.end(None)
             self.cycle.count_work()
             if self.watch.another_master is not None:
                 raise BusError(self.watch.another_master)
+
+    def _begin_cycle(self) -> Measurement:
+        """Begin a cycle. One that an error has left before its commands and its row gets both first."""
+        assert self.cycle is not None
+        self._record_last()
+        if self.cycle.begun:  # the next SYNC keeps the period
+            self.cycle.end(None)
+        return self.cycle.begin()
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
@@ -360,7 +368,7 @@ class Cell:
     def _run_cycle(self, interrupts: Interrupts, progress: Callable[[Measurement], None]) -> bool:
         """Run one cycle of the controller; True where the controller is done."""
         assert self.cycle is not None
-        measurement = self.cycle.begin()
+        measurement = self._begin_cycle()
         held = self._supervise(measurement)
         step = _hold if held else self._controller.step
         command = self._or_lift_off(self._ask, step, measurement, interrupts)
@@ -465,7 +473,7 @@ class Cell:
         """Cycle with held targets until every drive is in one of the states; False after the time-out."""
         assert self.cycle is not None and self.drives is not None
         for _ in range(int(timeout_s * 1e9 / self._plan.sync.period_ns)):
-            measurement = self.cycle.begin()
+            measurement = self._begin_cycle()
             self._look(measurement)
             check()
             reached = bool(states) and measurement.q is not None and not self._drives_beside(states)
@@ -558,10 +566,12 @@ class Cell:
         lift.begin()
         assert self.cycle is not None
         try:
+            if not self.cycle.begun:  # the controller's update failed: the commands of this cycle are out
+                self._look(self._begin_cycle())
             while (command := lift.command(supervisor)) is not None:
                 self.cycle.end(command)
                 self._record(supervisor.seen.measurement, command)
-                self._look(self.cycle.begin())
+                self._look(self._begin_cycle())
         except CanprobeError as failure:
             self.notes.add(f"while lifting off: {failure}")
 
@@ -622,7 +632,7 @@ class Cell:
             self._try(self.found.restore)
 
     def _record_last(self) -> None:
-        """Record the cycle in which the reason of the stop was found: the error left it before its row."""
+        """Record the last cycle, where an error left it before its row."""
         if self.cycle is not None and (seen := self.supervisor.seen.measurement) is not self._recorded:
             self._record(seen, None)
 
@@ -665,8 +675,6 @@ class Cell:
         failure: CanprobeError | None = None
         while (left_ns := end_ns - self._port.clock.now_ns()) > 0:
             try:
-                if self.cycle.begun:  # its commands are the first to stop; the next SYNC keeps the period
-                    self.cycle.end(None)
                 return self._cycle_until(states, left_ns * 1e-9)
             except CanprobeError as error:
                 failure = error

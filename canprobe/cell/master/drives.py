@@ -343,11 +343,6 @@ class DriveGroup:
         """Let the target of each drive be its reported position again, as before the first one was set."""
         self._targets = self._aimed = None
 
-    def targets(self) -> Floats:
-        """Last targets of the motors (n,), counts; their positions where no target was set."""
-        targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
-        return np.array(targets, dtype=float)
-
     def aim(self, targets: Sequence[int]) -> None:
         """Note the `targets` (counts) of this cycle: they bound the motion that the drives may report next."""
         before, periods = self._aimed, max((self._deadline_ns - self._aimed_ns) / self._period_ns, 1.0)

@@ -18,7 +18,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.errors import NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
-from canprobe.mechanics.robot.model import ArmModel, units_to_joints
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.robot.remaining_drives import lifting_step
 from canprobe.mechanics.types import Floats
 
@@ -33,19 +33,19 @@ ARRIVAL_S = 0.02
 class WayBack:
     """The way of the tool's point off the object, cycle by cycle: targets of the motors from the measured joints.
 
+    It begins where the arm stands, not at its last targets. In a motion those lie ahead of it: where one joint has
+    stopped, the others would go on to them without it, and into the object.
+
     Args:
         model: the arm's geometry.
         flange_probe: transform (4, 4) from the probe's centre frame to the flange.
         period_s: period of the cycle.
         free: drives (n,) that may move.
-        targets: last targets of the drives (n,), drive units.
     """
 
-    def __init__(
-        self, model: ArmModel, flange_probe: Floats, period_s: float, free: NDArray[np.bool_], targets: Floats
-    ) -> None:
-        self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
-        self._free, self._targets = free, targets
+    def __init__(self, model: ArmModel, flange_probe: Floats, period_s: float, free: NDArray[np.bool_]) -> None:
+        self._model, self._flange_probe, self._period_s, self._free = model, flange_probe, period_s, free
+        self._targets: Floats | None = None
         self._away: Floats | None = None
         self._t = 0.0
 
@@ -56,8 +56,8 @@ class WayBack:
             measured: joint positions (n,), rad or m.
         """
         T, J = forward_jacobian(self._model.chain, measured, self._flange_probe)
-        if self._away is None:
-            self._away = -T[:3, 2]
+        if self._away is None or self._targets is None:
+            self._away, self._targets = -T[:3, 2], joints_to_units(self._model, measured)
         before, self._t = self._gone(self._t), self._t + self._period_s
         if self._t > LIFT_WAY / LIFT_SPEED + ARRIVAL_S:
             return None
@@ -95,7 +95,6 @@ class LiftOff:
             plan.setup.probe.T_flange_probe,
             plan.sync.period_ns * 1e-9,
             self._free,
-            drives.targets(),
         )
         self._force_known_from: int | None = None
         self._highest = 0.0

@@ -9,6 +9,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.master.controller import Command
+from canprobe.cell.npz import read_npz
 from canprobe.cell.planning.measured import expected_messages
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -16,7 +17,7 @@ from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtState
 
 SHORT = {"free": 1.0, "listen": 0.5, "press": 0.5}
 
@@ -146,6 +147,23 @@ def test_an_exception_in_the_controller_leaves_the_cell_safe():
     with pytest.raises(ZeroDivisionError), session:
         session.run(_once(fail))
     assert_safe(session)
+
+
+def test_a_controller_behind_an_error_keeps_the_period_and_the_log_has_every_cycle(tmp_path):
+    scene = canprobe.load_scene("free", {"bus.timed": False, "scene.figures": False})
+
+    def fails(measurement):
+        raise ArithmeticError("a bug")
+
+    with canprobe.open_cell(scene, out=tmp_path) as cell:
+        with pytest.raises(ArithmeticError):
+            cell.run(fails)
+        cell.run(lambda _: Command(done=True))
+        times = cell.session.cell.log.arrays()["t_s"]
+    syncs = [t_ns for t_ns, _, can_id, _ in read_candump(tmp_path / "bus.log") if can_id == SYNC_ID]
+    assert np.diff(syncs).min() == 2_500_000
+    assert np.diff(times).min() > 0.0
+    assert len(read_npz(tmp_path / "log.npz")["t_s"]) == len(syncs)
 
 
 def test_an_interrupt_leaves_the_cell_safe():

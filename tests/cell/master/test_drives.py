@@ -184,7 +184,8 @@ def test_what_a_frame_has_beyond_its_mapping_is_not_read(beyond):
     group = make_group(torque=())
     group.begin(0)
     group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 77) + beyond)
-    assert group.malformed == 0 and group.statuswords[0] == ENABLED and group.targets()[0] == 77
+    assert group.malformed == 0 and group.statuswords[0] == ENABLED
+    assert dict(group.frames())[0x201][2:6] == (77).to_bytes(4, "little")
     group.push(0x182, group.axes[1].feedback[0].pack(ENABLED, 77)[:-1])
     assert group.malformed == 1
 

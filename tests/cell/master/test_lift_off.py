@@ -18,7 +18,7 @@ from canprobe.errors import NodeError, SafetyStop
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
 from canprobe.mechanics.robot.chain import forward
-from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
+from canprobe.mechanics.robot.model import joints_to_units
 
 PLAN = canprobe.plan("press")
 MODEL, T_FLANGE_PROBE = PLAN.setup.arm.model, PLAN.setup.probe.T_flange_probe
@@ -29,8 +29,7 @@ NODES = range(1, 7)
 @pytest.mark.parametrize("still", [None, 0, 2, 5])
 def test_the_way_is_straight_back_and_fast_at_first(still):
     free = np.arange(6) != (9 if still is None else still)
-    targets = joints_to_units(MODEL, ELBOW_FORM)
-    way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, free, targets)
+    way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, free)
     joints = [ELBOW_FORM]
     while (q := way.step(joints[-1])) is not None:
         joints.append(q)
@@ -44,12 +43,12 @@ def test_the_way_is_straight_back_and_fast_at_first(still):
     assert speed[0] == pytest.approx(2 * LIFT_SPEED, rel=0.02) and np.diff(speed).max() < 1e-4
     moving = round(LIFT_WAY / LIFT_SPEED / PERIOD_S)
     assert np.abs(speed[moving:]).max() < 1e-9 < speed[moving - 1]
-    moved = np.abs(joints_to_units(MODEL, joints[-1]) - targets) > 1e-6
+    moved = np.abs(joints_to_units(MODEL, joints[-1]) - joints_to_units(MODEL, ELBOW_FORM)) > 1e-6
     assert moved.any() and not moved[~free].any()
 
 
 def test_a_way_that_the_remaining_drives_cannot_make_ends():
-    way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, np.arange(6) == 5, joints_to_units(MODEL, ELBOW_FORM))
+    way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, np.arange(6) == 5)
     assert way.step(ELBOW_FORM) is None
 
 
@@ -68,9 +67,6 @@ class Drives:
 
     def enabled_ones(self):
         return tuple(self.on)
-
-    def targets(self):
-        return joints_to_units(MODEL, ELBOW_FORM)
 
 
 def a_watch():
@@ -200,6 +196,6 @@ def test_what_was_pressed_before_the_motion_is_felt_for_a_while_and_is_no_growth
 
 def test_the_command_is_the_guarded_one():
     drives, cell = Drives(), Cell()
-    nearer = Command(units_to_joints(MODEL, drives.targets()))
+    nearer = Command(ELBOW_FORM)
     cell.guard_target = lambda command: (nearer, None)
     assert lift(drives).command(cell) is nearer

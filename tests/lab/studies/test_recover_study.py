@@ -20,6 +20,12 @@ def test_a_cell_comes_back_from_what_a_seed_takes(seed):
     assert outcome["rows_lost"] == 0 and outcome["back"] + outcome["refused"] == outcome["lost"]
 
 
+@pytest.mark.parametrize("seed", [182, 272])
+def test_a_joint_that_stops_in_a_scan_does_not_press_the_others_into_the_object(seed):
+    outcome = run_case(draw_case(seed))
+    assert outcome["lost"] >= 1 and outcome["force_max_n"] <= outcome["force_limit_n"]
+
+
 def test_the_same_seed_is_the_same_run():
     first, second = run_case(draw_case(3)), run_case(draw_case(3))
     assert first == second and table_rows([first])[-1]["runs"] == 1 and findings([first])
