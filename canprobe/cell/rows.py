@@ -104,7 +104,7 @@ class Rows:
 
     def blocks(self) -> Iterator[NDArray[Any]]:
         """All rows, in structured arrays that follow each other."""
-        start = len(self._header(self._written))
+        start = len(self._header(self._written)) if self._written else 0
         for first in range(0, self._written, _ROWS_READ):
             assert self._path is not None
             count = min(_ROWS_READ, self._written - first)

@@ -1,7 +1,7 @@
-"""A cell that is held and watched, in a process: `python held_child.py SECONDS` prints its memory by the minute.
+"""A cell that is held and watched, in a process: `python held_child.py MINUTES` prints its memory by the minute.
 
-It runs for SECONDS of real time and prints a line of JSON: resident memory, KiB, after each minute of virtual time, and
-the processor time of all, s.
+It runs for MINUTES of virtual time and prints a line of JSON: resident memory, KiB, after each of them, and the
+processor time of all, s.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from time import monotonic, process_time
+from time import process_time
 
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement
@@ -30,10 +30,10 @@ def resident() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE_KIB
 
 
-def held(seconds: float) -> list[float]:
+def held(minutes: int) -> list[float]:
     """Hold a cell as `up` does, with a screen of its monitor ten times a second."""
     plan = canprobe.plan("cylinder", {"bus.interface": "lockstep"})
-    monitor, memory, until = Monitor(plan), [], monotonic() + seconds
+    monitor, memory = Monitor(plan), []
     next_screen_ns = 0
 
     def watch(observation: Observation) -> None:
@@ -46,7 +46,7 @@ def held(seconds: float) -> list[float]:
     def hold(measurement: Measurement) -> Command:
         if measurement.t_ns >= MINUTE_NS * (len(memory) + 1):
             memory.append(resident())
-        return Command(done=monotonic() > until)
+        return Command(done=len(memory) == minutes)
 
     session = Session(plan, RunOptions(None, quiet, (watch,), ROWS_OF_UP))
     with reporting_notes(session, quiet) as report_news:
@@ -55,4 +55,4 @@ def held(seconds: float) -> list[float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps({"kib": held(float(sys.argv[1])), "s": process_time()}))
+    print(json.dumps({"kib": held(int(sys.argv[1])), "s": process_time()}))

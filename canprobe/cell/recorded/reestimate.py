@@ -271,7 +271,8 @@ def replay(
     source = path if folder is None or run is None else folder
     if not contacts.tracker.samples:
         raise UsageError(f"{source}: nothing was touched in it: no contact to estimate from")
-    estimates = estimates_of(plan.setup, contacts.tracker, methods)
+    tracker = contacts.tracker
+    estimates = estimates_of(plan.setup, tracker.records, tracker.settled(plan.setup.probe.radius), methods)
     summary = _summarise(plan, source, contacts, estimates, folder)
     on_clock = {name: on_run_clock(records, contacts.start_s) for name, records in estimates.items()}
     return ReplayResult(plan, summary, on_clock, contacts.tracker)

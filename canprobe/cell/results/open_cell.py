@@ -21,8 +21,9 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE
+from canprobe.cell.results.scores import score_shape
 from canprobe.cell.results.summary import (
-    score_methods,
+    methods_table,
     summarise,
     truth_of,
     without_nan,
@@ -30,19 +31,17 @@ from canprobe.cell.results.summary import (
     write_summary,
 )
 from canprobe.cell.rows import ROWS_FOLDER
-from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
-from canprobe.cell.tasks.task import TaskRecord, record_of
+from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.cell.results.contacts import Contacts
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.patch.image import Patch
 
@@ -246,22 +245,23 @@ class OpenCell:
             tactile=tactile,
             surface_map=surface_map,
             out=self._out,
-            contacts=self._contacts(record, start_s),
+            tracker=record.shape,
+            start_s=start_s,
         )
 
     def _estimate_again(self, data: RunData) -> None:
         """Add the answers of the scene's other estimators on the same contacts, and their scores."""
-        setup, tracker = self.plan.setup, record_of(self._last).shape
-        if setup.shape is None or tracker is None:
+        setup = self.plan.setup
+        if setup.shape is None or data.tracker is None:
             return
         for method in setup.shape.also:
             self._say(f"estimate again with {method}")
-            found = estimates_of(setup, tracker, [method], MOST_REPLAYED)
+            found = estimates_of(setup, data.tracker.records, data.settled, [method], MOST_REPLAYED)
             if truth := truth_of(self.session):
-                scores = score_methods(found, truth, since_first_sync(data.log["t_s"], self.cell.log.start_s))
-                data.summary["shape"]["methods"] |= without_nan(scores)
-            start_s = self.cell.start_ns * 1e-9
-            data.estimates.update({name: on_run_clock(records, start_s) for name, records in found.items()})
+                times = since_first_sync(data.log["t_s"], self.cell.log.start_s)
+                scores = {name: score_shape(records, truth, times) for name, records in found.items()}
+                data.summary["shape"]["methods"] |= without_nan(methods_table(scores))
+            data.estimates.update({name: on_run_clock(records, data.start_s) for name, records in found.items()})
 
     def _write(self, write: Callable[[Path], None]) -> None:
         """Write files into the run's folder; a failure is noted, and raised at the end."""
@@ -283,14 +283,6 @@ class OpenCell:
 
         shape = self.plan.setup.truth.object if truth_of(self.session) else None
         return tracker.surface_map, summarise_map(tracker.surface_map, shape)
-
-    def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
-        task = self.plan.setup.task
-        if record.shape is None or not isinstance(task, Touch):
-            return None
-        from canprobe.cell.results.contacts import contacts_of
-
-        return contacts_of(record.shape.settled(task.probe.radius), task, start_s)
 
 
 def _drawings(data: RunData, out: Path) -> dict[str, Callable[[], None]]:

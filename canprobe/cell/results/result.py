@@ -6,7 +6,6 @@ import importlib.util
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
     from canprobe.cell.results.page import Page
     from canprobe.cell.tasks.own_estimators import OwnEstimator
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-
-_FIELDS = frozenset(field.name for field in fields(RunData))
 
 
 class RunResult:
@@ -96,12 +93,12 @@ class RunResult:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name not in _FIELDS:
+            if name not in RunResult.__annotations__:
                 raise AttributeError(f"RunResult has no attribute {name!r}")
             return getattr(self._known(name), name)
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *_FIELDS]
+        return [*super().__dir__(), *RunResult.__annotations__]
 
     def text(self) -> str:
         """The summary as text."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.scene.setup import Touch
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
@@ -18,9 +21,14 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RunData:
-    """All data of a finished run; `RunResult` explains each attribute."""
+    """All data of a finished run; `RunResult` explains each attribute but those of the contacts.
+
+    Attributes:
+        tracker: tracker of the scan's contacts; None without a shape.
+        start_s: time of the first SYNC on the clock of the log, s.
+    """
 
     plan: Plan
     summary: dict[str, Any]
@@ -31,4 +39,21 @@ class RunData:
     tactile: dict[str, NDArray[Any]] = field(default_factory=dict)
     surface_map: SurfaceMap | None = None
     out: Path | None = None
-    contacts: Contacts | None = None
+    tracker: ShapeTracker | None = None
+    start_s: float = 0.0
+
+    @cached_property
+    def settled(self) -> list[ContactSample]:
+        """The contacts of the scan, with the depths that are known at its end (`ShapeTracker.settled`)."""
+        task = self.plan.setup.task
+        return [] if self.tracker is None or not isinstance(task, Touch) else self.tracker.settled(task.probe.radius)
+
+    @cached_property
+    def contacts(self) -> Contacts | None:
+        """The measured contacts of the scan; None without a shape."""
+        task = self.plan.setup.task
+        if self.tracker is None or not isinstance(task, Touch):
+            return None
+        from canprobe.cell.results.contacts import contacts_of
+
+        return contacts_of(self.settled, task, self.start_s)

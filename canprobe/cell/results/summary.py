@@ -219,23 +219,21 @@ def summarise_shape(
         shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
     if not truth:
         return shape
-    of_method = score_shape(records, truth, sync_times)
-    score = asdict(of_method)
+    scores = {name: score_shape(answers, truth, sync_times) for name, answers in estimates.items()}
+    score = asdict(scores[method])
     score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
     shape |= {name: value for name, value in score.items() if name in names}
-    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, of_method, truth, sync_times)
-    shape["methods"] = score_methods(estimates, truth, sync_times)
+    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, scores[method], truth, sync_times)
+    shape["methods"] = methods_table(scores)
     return shape
 
 
-def score_methods(
-    estimates: Mapping[str, Sequence[ShapeRecord]], truth: Mapping[str, Floats], sync_times: Floats
-) -> dict[str, dict[str, Any]]:
-    """The table ``shape.methods`` of ``summary.json``; arguments as for `summarise_shape`."""
+def methods_table(scores: Mapping[str, ShapeScore]) -> dict[str, dict[str, Any]]:
+    """The table ``shape.methods`` of ``summary.json`` from the scores of methods, by name."""
     of_run = ("kappa_true_per_m", "kappa_est_per_m")
-    scores = {method: asdict(score_shape(records, truth, sync_times)) for method, records in estimates.items()}
     return {
-        method: {name: value for name, value in score.items() if name not in of_run} for method, score in scores.items()
+        method: {name: value for name, value in asdict(score).items() if name not in of_run}
+        for method, score in scores.items()
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Controller
@@ -14,7 +14,7 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
-from canprobe.mechanics.touch.contact import indentation_from_force
+from canprobe.mechanics.touch.contact import ContactSample, indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.patch.moments import MomentImage
@@ -157,13 +157,18 @@ def make_shape_tracker(setup: Setup, *, with_map: bool = True) -> ShapeTracker |
 
 
 def estimates_of(
-    setup: Setup, tracker: ShapeTracker, methods: Iterable[str], most: int | None = None
+    setup: Setup,
+    online: list[ShapeRecord],
+    settled: Sequence[ContactSample],
+    methods: Iterable[str],
+    most: int | None = None,
 ) -> dict[str, list[ShapeRecord]]:
-    """The answers of ``methods`` on the tracker's settled contacts; those of its own estimator are the tracker's.
+    """The answers of methods on the contacts of a scan.
 
     Args:
-        setup: of the scan.
-        tracker: with the contacts.
+        setup: setup of the scan.
+        online: answers of the estimator in the loop, which are not computed again.
+        settled: contacts of the scan, as `ShapeTracker.settled` places them.
         methods: names of estimators.
         most: number of answers of a method beyond which they are further apart than 0.1 s; None for no such number.
     """
@@ -171,10 +176,9 @@ def estimates_of(
     assert isinstance(task, Touch) and task.shape is not None
     every = max(1, round(0.1 * task.array.rate_hz))
     if most is not None:
-        every = max(every, math.ceil(len(tracker.samples) / most))
-    settled = tracker.settled(task.probe.radius)
+        every = max(every, math.ceil(len(settled) / most))
     return {
-        method: tracker.records
+        method: online
         if method == task.shape.method
         else replay_samples(make_shape_estimator(task, method), settled, every)
         for method in dict.fromkeys(methods)

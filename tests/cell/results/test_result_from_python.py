@@ -43,6 +43,7 @@ class LastSphere:
 def test_contacts_lie_on_the_true_object_within_their_covariances(result):
     contacts = result.contacts
     n = len(contacts)
+    assert result.contacts is contacts
     assert n == len(contacts.samples) > 300 and f"{n} contacts over " in repr(contacts)
     shapes = [a.shape for a in (contacts.t_s, contacts.points, contacts.normals, contacts.forces)]
     assert shapes == [(n,), (n, 3), (n, 3), (n,)]
