@@ -37,13 +37,16 @@ class FollowingEstimator(OuterEstimator):
         inner: the estimator.
         memory_m: path that it remembers, m.
         scale: relative error that all curvatures have in common, one standard deviation.
+        drag: error of the way of a contact over the pad, over this way, one standard deviation (`drag_errors`).
         offset: error of the probe's centre along the normal while the probe turns with the surface, m, one standard
             deviation. The contacts then lie on an offset surface, whose curvature differs by `offset · K²`.
     """
 
-    def __init__(self, inner: Estimator, memory_m: float, scale: float = 0.0, offset: float = 0.0) -> None:
+    def __init__(
+        self, inner: Estimator, memory_m: float, *, scale: float = 0.0, drag: float = 0.0, offset: float = 0.0
+    ) -> None:
         super().__init__(inner)
-        self._scale, self._offset = scale, offset
+        self._scale, self._drag, self._offset = scale, drag, offset
         self._memory = memory_m
         self._past: deque[tuple[float, Floats]] = deque()
         self._place: Floats | None = None
@@ -71,6 +74,8 @@ class FollowingEstimator(OuterEstimator):
             errors.append(self._scale * tensor)
         if self._offset != 0.0:
             errors.append(self._offset * tensor.dot(tensor))
+        if self._drag != 0.0:
+            errors += drag_errors(answer, self._drag)
         return less_certain(answer, *errors)
 
     def _late(self, tensor: Floats) -> Floats | None:
@@ -83,6 +88,24 @@ class FollowingEstimator(OuterEstimator):
         then, before = past[0]
         result: Floats = (tensor - before) * (LAG_SHARE * self._memory / (self._travelled - then))
         return result
+
+
+def drag_errors(answer: SurfaceEstimate, drag: float) -> list[Floats]:
+    """Errors (3, 3) of curvature, 1/m, of a probe that keeps its orientation, each times a standard normal variate.
+
+    Model: the contact seems to go `(I + M) w` over the pad where it goes w, and each entry of M (2, 2) has the standard
+    deviation `drag`. So the normal seems to turn too far or not far enough, and about another axis: the centroid lags
+    behind a contact that goes round, for instance, which turns the principal directions. Of `M K` the symmetrical part
+    is a curvature. The other part is none, and contradicts the places of the contacts.
+    """
+    P = answer.T_frame_contact[:3, :2]
+    errors = []
+    for i in range(2):
+        for row in answer.K:
+            MK = np.zeros((2, 2))
+            MK[i] = drag * row
+            errors.append(P.dot(0.5 * (MK + MK.T)).dot(P.T))
+    return errors
 
 
 def less_certain(answer: SurfaceEstimate, *errors: Floats) -> SurfaceEstimate:

@@ -7,6 +7,9 @@ mean over the last memory, from half of the stated variance to three times. So a
 mean. It begins at 1, what is stated, and does not fall below a half: what all contacts of a scan have in common, no
 innovation shows.
 
+Where the curvature varies within a patch, images do not fit a quadric either, and no innovation of theirs shows it. So
+an answer that motion and patch gave together is levelled once more, by the root of the mean, and never narrower.
+
 Source: Birge, "The calculation of errors by the method of least squares", Phys. Rev. 40, 1932, the ratio of external to
 internal consistency.
 """
@@ -32,14 +35,17 @@ class LevelledEstimator(OuterEstimator):
     Args:
         inner: the estimator.
         memory_m: path over which the mean falls to 1/e, m.
+        least: least level.
+        power: power of the level by which variances are multiplied.
 
     Attributes:
-        level: the mean, from `MIN_LEVEL` on.
+        level: the mean, from `least` on.
     """
 
-    def __init__(self, inner: Estimator, memory_m: float) -> None:
+    def __init__(self, inner: Estimator, memory_m: float, *, least: float = MIN_LEVEL, power: float = 1.0) -> None:
         super().__init__(inner)
         self._memory = memory_m
+        self._least, self._power = least, power
         self._restart()
 
     def _restart(self) -> None:
@@ -59,5 +65,5 @@ class LevelledEstimator(OuterEstimator):
         moved = 0.0 if self._place is None else float(np.linalg.norm(answer.point - self._place))
         self._place = answer.point
         self._mean += (1.0 - math.exp(-moved / self._memory)) * (answer.innovation - self._mean)
-        self.level = max(self._mean, MIN_LEVEL)
-        return widened(answer, math.sqrt(self.level))
+        self.level = max(self._mean, self._least)
+        return widened(answer, self.level ** (0.5 * self._power))

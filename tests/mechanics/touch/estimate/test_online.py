@@ -9,6 +9,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.following import LAG_SHARE, SPAN_SHARE, FollowingEstimator, less_certain
+from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.patch.curvature import MAX_RECENT_FRAMES, MIN_FRAMES, RECENT_OUTLIER_SHARE, _Mean
 
 MEMORY = 0.02
@@ -67,6 +68,28 @@ def test_a_region_holds_the_curvature_of_the_surface_that_an_offset_of_the_probe
     assert np.diag(shown) == pytest.approx(1.0 / (radius + offset) - 1.0 / radius, rel=0.2)
     added = np.sqrt(np.diag(found.covariance - bare.covariance))
     assert added[[0, 2]] == pytest.approx(np.abs(np.diag(shown)), rel=0.2)
+
+
+@pytest.mark.parametrize("error", [[[0.0, -0.05], [0.05, 0.0]], [[0.05, 0.0], [0.0, -0.05]], [[0.0, 0.05], [0.0, 0.0]]])
+def test_a_region_holds_the_curvature_that_a_pad_with_wrong_ways_shows(error):
+    """A probe that keeps its orientation goes round on a saddle; its array turns, stretches or shears the ways."""
+    K, (x, y) = np.diag([12.0, -9.0]), 6e-3 * np.array([np.cos(a := np.linspace(0.0, 12.0, 240)), np.sin(a)])
+    way = np.stack([x, y], axis=1) @ K
+    heights = 0.5 * np.einsum("ij,ij->i", np.stack([x, y], axis=1), way)
+    slopes = way @ (np.eye(2) + error).T
+    normals = np.concatenate([slopes, -np.ones((len(x), 1))], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    bare = fit_surface(np.stack([x, y, heights], axis=1), normals, sigma_point=2e-4, sigma_normal=1e-3, coupling=25.0)
+    P = bare.T_frame_contact[:3, :2]
+    off = (bare.K - P[:2].T @ K @ P[:2])[[0, 0, 1], [0, 1, 1]]
+    once = SimpleNamespace(estimate=lambda: bare, reset=lambda: None)
+
+    def square(**errors):
+        covariance = FollowingEstimator(once, MEMORY, **errors).estimate().covariance
+        return float(off @ np.linalg.solve(covariance - bare.covariance + 1e-4 * np.eye(3), off))
+
+    assert square(scale=0.084) > CHI2_95  # an error that all curvatures have in common does not turn directions
+    assert square(drag=0.03) < CHI2_95
 
 
 def test_a_jump_is_doubted_for_as_long_as_the_span():
