@@ -18,9 +18,10 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.regain import SEARCH_SPEED, Search
 from canprobe.cell.tasks.task import Exploration, TaskRecord
 from canprobe.cell.tasks.touch import RAMP_S, TouchTask
+from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
-from canprobe.mechanics.touch.explore.forecast import UNKNOWN_M, Forecast
-from canprobe.mechanics.touch.explore.ground import GroundCells
+from canprobe.mechanics.touch.explore.ground import UNKNOWN_M, GroundCells
+from canprobe.mechanics.touch.explore.spacing import LaneForecast
 from canprobe.mechanics.touch.explore.stretches import STEP_M
 from canprobe.mechanics.touch.map.cells import STATED_STIFFNESS_SIGMA
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
@@ -51,6 +52,10 @@ class ExploreTask(TouchTask):
     _brake_from: float | None = None
     _ends = False
 
+    def _middle_of_path(self, contact: ContactSample) -> Floats:
+        """The end of the approach: beside it an inclined surface is touched first, and the rectangle stays."""
+        return self._task.approach.start
+
     def _follower(self) -> Explorer:
         scan, contact = self._task.scan, self._contact
         assert scan is not None and isinstance(scan.strategy, Rectangle) and contact is not None
@@ -60,17 +65,18 @@ class ExploreTask(TouchTask):
         shown = self.sensing.slope is not None or self._task.array.mode != "features"
         ground = GroundCells(
             surface_map,
-            contact.p_base,
+            self._task.approach.start,
             self._task.approach.axes,
             area,
             stiffness_sigma=SOURCE_SIGMA if shown else STATED_STIFFNESS_SIGMA,
         )
-        forecast = Forecast(ground.places, self.sensing.radius, self._target_depth(), surface_map.noise)
+        forecast = LaneForecast(self.sensing.radius, self._target_depth(), surface_map.noise)
         radius = turn_radius(scan.speed, self._task.gains.tilt_hz)
         self.explorer = Explorer(
             ground,
             forecast,
             (area.length, area.width),
+            start=ground.in_plane(contact.p_base),
             radius=radius,
             ahead=SHARES_AHEAD * self._period_s * scan.speed,
             lag=(self._lead_s + SAMPLE_AGE_CYCLES * self._period_s) * scan.speed,
