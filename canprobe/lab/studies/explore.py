@@ -39,9 +39,9 @@ from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Circle, Strategy, Weave
 from canprobe.mechanics.types import Floats
 
-DRAW = 44
+DRAW = 45
 """Draw of the published figures."""
-LENGTH_MM, WIDTH_MM, TARGET_UM, SECONDS = 30.0, 20.0, 10.0, 10.0
+LENGTH_MM, WIDTH_MM, TARGET_UM, SECONDS = 30.0, 20.0, 15.0, 10.0
 MARK_M, TRUTH_M, LONGEST_M = 5e-3, 1.5e-3, 0.25
 """Path between two comparisons, spacing of the true surface's points, longest path, m."""
 UNKNOWN = (1e-3, 0.1, 20.0)
