@@ -65,9 +65,10 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
     # a ball bridges gaps into which a point would fall
     radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
     _check_approach(approach, _along(shape, approach.start, down, radius))
-    if not task.array.pad.is_flat:
-        plane = plane + _first_contact(shape, approach, task.probe.radius)
     explores = isinstance(strategy, Rectangle)
+    if not task.array.pad.is_flat:
+        begins = _first_contact(shape, approach, task.probe.radius)
+        plane = np.concatenate([plane[:1] + begins, plane[1:] if explores else plane[1:] + begins])
     if explores:
         plane = touchable(shape, plane, down, task.probe.radius)
     path = _contacts(shape, plane, down, radius)
@@ -107,7 +108,10 @@ def touchable(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> F
 
 
 def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Floats:
-    """Place where a ball first touches (3,), m, across the approach from its end: the path begins there."""
+    """Place where a ball first touches (3,), m, across the approach from its end: the path begins there.
+
+    A curve lies round it; a rectangle stays where it is.
+    """
     height = _along(shape, approach.start, approach.normal, radius)
     if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
         return np.zeros(3)  # in a tighter hollow it touches in two places, which is refused elsewhere

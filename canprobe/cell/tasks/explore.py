@@ -1,9 +1,10 @@
 """Exploration: a scan whose path goes where the map of the surface is least sure.
 
 The servo, the supervision and all that a scan does are those of `TouchTask`. Here a stretch is chosen behind the
-commands of each cycle, and the scan ends where the map is sure enough. At an edge, and in a hollow as tight as the
-probe, the contact brakes and goes back on the path that it came; the ground ahead is closed. A contact that is lost
-there is found again on that path, to which the probe returns in the air.
+commands of each cycle, and the scan ends where the map is sure enough. At an edge, in a hollow as tight as the probe,
+before a joint's limit, and before it runs off the array, the contact brakes and goes back on the path that it
+came; the ground ahead is closed. A contact that is lost there is found again on that path, to which the probe returns
+in the air.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from dataclasses import replace
 import numpy as np
 
 from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.regain import SEARCH_SPEED, Search
 from canprobe.cell.tasks.task import Exploration, TaskRecord
 from canprobe.cell.tasks.touch import RAMP_S, TouchTask
+from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
-from canprobe.mechanics.touch.explore.forecast import UNKNOWN_M, Forecast
-from canprobe.mechanics.touch.explore.ground import GroundCells
+from canprobe.mechanics.touch.explore.ground import UNKNOWN_M, GroundCells
+from canprobe.mechanics.touch.explore.spacing import LaneForecast
 from canprobe.mechanics.touch.explore.stretches import STEP_M
 from canprobe.mechanics.touch.map.cells import STATED_STIFFNESS_SIGMA
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
@@ -36,6 +39,10 @@ AHEAD = 8
 """Number of points of the path ahead that are logged."""
 SAMPLE_AGE_CYCLES = 4
 """Usual age of a contact when it is taken, in cycles: the array's latency and its transfer."""
+LIMIT_S = 0.2
+"""Time before a joint would come to its limit at which the contact turns back: four times that of braking."""
+RIM_M = 1.5e-3
+"""Distance on the array, m, before the place from which on it has lost a part of the force: there the contact turns."""
 LIFT_M = 1.5e-3
 """Distance off the surface at which the probe returns to where it had contact, m."""
 
@@ -49,7 +56,12 @@ class ExploreTask(TouchTask):
 
     explorer: Explorer | None = None
     _brake_from: float | None = None
+    _near_rim = False
     _ends = False
+
+    def _middle_of_path(self, contact: ContactSample) -> Floats:
+        """The end of the approach: beside it an inclined surface is touched first, and the rectangle stays."""
+        return self._task.approach.start
 
     def _follower(self) -> Explorer:
         scan, contact = self._task.scan, self._contact
@@ -60,21 +72,24 @@ class ExploreTask(TouchTask):
         shown = self.sensing.slope is not None or self._task.array.mode != "features"
         ground = GroundCells(
             surface_map,
-            contact.p_base,
+            self._task.approach.start,
             self._task.approach.axes,
             area,
             stiffness_sigma=SOURCE_SIGMA if shown else STATED_STIFFNESS_SIGMA,
         )
-        forecast = Forecast(ground.places, self.sensing.radius, self._target_depth(), surface_map.noise)
+        forecast = LaneForecast(self.sensing.radius, self._target_depth(), surface_map.noise)
         radius = turn_radius(scan.speed, self._task.gains.tilt_hz)
         self.explorer = Explorer(
             ground,
             forecast,
             (area.length, area.width),
+            start=ground.in_plane(contact.p_base),
             radius=radius,
             ahead=SHARES_AHEAD * self._period_s * scan.speed,
             lag=(self._lead_s + SAMPLE_AGE_CYCLES * self._period_s) * scan.speed,
         )
+        reach = self._task.array.pad.reach_m  # of an array that is as small as the patch, no place is near its edge
+        self._rim = rim if (rim := edge_margin(self._task) + RIM_M) < reach else 0.0
         self._gone: deque[ProbePose] = deque(maxlen=round(BACK_M / STEP_M))
         return self.explorer
 
@@ -93,6 +108,8 @@ class ExploreTask(TouchTask):
     def _feel(self, sample: TactileSample, patch: Patch) -> None:
         super()._feel(sample, patch)
         if self.phase is Phase.SCAN and (contact := self._contact) is not None and self.explorer is not None:
+            from_edge = self._task.array.pad.reach_m - max(abs(patch.u), abs(patch.v))
+            self._near_rim = from_edge < self._rim
             self.explorer.walk(contact.p_base, contact.n_base, contact.force_n / self._target_force)
             self._columns = self._columns | {
                 "explored_mm": 1e3 * self.explorer.path,
@@ -108,9 +125,17 @@ class ExploreTask(TouchTask):
         return np.array([self._servo.surface.foot(place)[0] for place in places.tolist()])
 
     def _watch(self) -> None:
-        if self.phase is Phase.SCAN and self.explorer is not None and self.explorer.at_edge:
-            self._brake()
+        if self.phase is Phase.SCAN and self.explorer is not None:
+            if self.explorer.astray and self._touch.limits.regain > 0.0:
+                self._look_for_contact()
+            elif self._ground_ends(self.explorer):
+                self._brake()
         super()._watch()
+
+    def _ground_ends(self, explorer: Explorer) -> bool:
+        """Whether the probe turns round an edge, the contact comes to the array's edge, or a joint to its limit."""
+        assert self._motion is not None
+        return explorer.at_edge or self._near_rim or self._motion.near_limit(LIMIT_S)
 
     def _at_hollow(self, radius: float) -> None:
         self._brake()
@@ -191,7 +216,10 @@ def end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
             f"{1e6 * ground.common:.0f} µm of the deviation, from the stiffness of the layer, are common to the scan"
         )
     if ground.closed.any():
-        causes.append(f"{100 * ground.closed.mean():.0f} % of the rectangle lie beyond an edge or in a hollow")
+        causes.append(
+            f"{100 * ground.closed.mean():.0f} % of the rectangle lie beyond an edge, in a hollow, or where a joint or"
+            " the array ends"
+        )
     if rough.any():
         causes.append(
             f"on {100 * rough.mean():.0f} % the contacts contradict a smooth surface: a probe of this radius does not"

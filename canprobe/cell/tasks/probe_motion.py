@@ -49,6 +49,7 @@ class ProbeMotion:
         margin = safety.joint_margin
         self._low, self._high = model.q_min + margin, model.q_max - margin
         self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
+        self._last: list[float] = [0.0] * len(self._range)
         self.limit: str | None = None
         self.slowed = 0
 
@@ -74,11 +75,18 @@ class ProbeMotion:
         if share > 1.0:
             dq = [step / share for step in dq]
             self.slowed += 1
+        self._last = dq
         targets = [q + step for q, step in zip(before, dq, strict=True)]
         self.q = np.array(targets)
         if not all([low <= q <= high for q, (low, high) in zip(targets, self._range, strict=True)]):
             self._stop_at_limit()
         return self.q
+
+    def near_limit(self, time_s: float) -> bool:
+        """Whether a joint comes to its limit within a time, s, if it goes on as in the last step."""
+        steps = time_s / self._period_s
+        ahead = [q + steps * step for q, step in zip(self.q.tolist(), self._last, strict=True)]
+        return not all([low <= q <= high for q, (low, high) in zip(ahead, self._range, strict=True)])
 
     def _stop_at_limit(self) -> None:
         joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])

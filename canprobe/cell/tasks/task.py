@@ -72,8 +72,8 @@ class Exploration:
         common: deviation that the whole scan has in common.
         path: path that was walked.
         seconds: time of the scan, s.
-        done, closed, rough: shares of the rectangle: within the target, beyond edges or in hollows, and where contacts
-            contradict every smooth surface.
+        done, closed, rough: shares of the rectangle: within the target, beyond where the contact turned back, and where
+            contacts contradict every smooth surface.
         reached: whether all of the rectangle is within the target.
         why: why it is not, in words; None where it is.
     """

@@ -291,12 +291,16 @@ class TouchTask(ProbingTask):
             surface,
             self._follower(),
             axes=self._task.approach.axes,
-            origin=contact.p_base,
+            origin=self._middle_of_path(contact),
             probe_radius=self.sensing.radius,
             rolling_share=scan.rolling_share if scan is not None else 0.0,
         )
         self._sink_from(contact, pose)
         self._enter(Phase.SETTLE)
+
+    def _middle_of_path(self, contact: ContactSample) -> Floats:
+        """Place (3,), m, over which the curve's origin lies: the first contact."""
+        return contact.p_base
 
     def _follower(self) -> PathFollower | None:
         """What leads the contact over the surface; None holds it where it is."""

@@ -2,7 +2,7 @@
 
 Every strategy touches the same shapes through the whole emulated sensor, without a bus, with the same array, force and
 speed, for 10 s, or until it ends by itself. The shapes are those of study `shapes`: a draw names twelve that no
-setting was found on. After every centimetre the map of the contacts so far is compared with the true surface all over
+setting was found on. After every 5 mm the map of the contacts so far is compared with the true surface all over
 the rectangle: ground that the map does not have counts as 1 mm, 0.1 rad and 20 1/m. A strategy that never reaches an
 error counts with the longest path.
 """
@@ -39,10 +39,10 @@ from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Circle, Strategy, Weave
 from canprobe.mechanics.types import Floats
 
-DRAW = 44
+DRAW = 45
 """Draw of the published figures."""
-LENGTH_MM, WIDTH_MM, TARGET_UM, SECONDS = 30.0, 20.0, 10.0, 10.0
-MARK_M, TRUTH_M, LONGEST_M = 10e-3, 1.5e-3, 0.25
+LENGTH_MM, WIDTH_MM, TARGET_UM, SECONDS = 30.0, 20.0, 15.0, 10.0
+MARK_M, TRUTH_M, LONGEST_M = 5e-3, 1.5e-3, 0.25
 """Path between two comparisons, spacing of the true surface's points, longest path, m."""
 UNKNOWN = (1e-3, 0.1, 20.0)
 """Errors of ground that the map does not have: height (m), normal (rad), curvature (1/m)."""
@@ -97,8 +97,8 @@ def _serpentine(length: float, width: float, spacing: float) -> Floats:
     return np.array(found)
 
 
-STRATEGIES = ("explore", "weave 12 mm", "weave 9 mm", "raster 8 mm", "raster 6 mm", "circle")
-COLOURS = dict(zip(STRATEGIES, (ORANGE, BLUE, SKY, GREEN, PINK, GREY), strict=True))
+STRATEGIES = ("explore", "weave 12 mm", "weave 9 mm", "raster 10 mm", "raster 8 mm", "raster 6 mm", "circle")
+COLOURS = dict(zip(STRATEGIES, (ORANGE, BLUE, SKY, INK, GREEN, PINK, GREY), strict=True))
 
 
 class ExploreCase(NamedTuple):
@@ -168,8 +168,11 @@ def measure(case: ExploreCase) -> dict[str, Any]:
                 stopped = error.reason
         first, last = controller.scan_cycles
         scored = score_contact(session.truth, first, last, touch.force)
-        truth = TrueGround.of(shape, touch.approach)
-        errors = errors_over_path(make_surface_map(touch), list(controller.shape.samples), truth)
+        samples = list(controller.shape.samples)
+        # an exploration lays its rectangle round the end of the approach, a curve lies round the first contact
+        middle = touch.approach.start if case.strategy == "explore" else samples[0].p_base
+        truth = TrueGround.of(shape, touch.approach, middle)
+        errors = errors_over_path(make_surface_map(touch), samples, truth)
     return errors | {
         "force_percent": 100.0 * (scored["force_rms_error_n"] or 0.0) / touch.force,
         "contact": scored["contact_fraction"],
@@ -195,13 +198,13 @@ class TrueGround(NamedTuple):
     tensors: Floats
 
     @classmethod
-    def of(cls, shape: PlacedShape, approach: Approach) -> TrueGround:
-        """The surface of an object under the rectangle round the end of an approach."""
+    def of(cls, shape: PlacedShape, approach: Approach, middle: Floats) -> TrueGround:
+        """The surface of an object under the rectangle of an approach's plane round a place (3,), m."""
         sides = (1e-3 * LENGTH_MM, 1e-3 * WIDTH_MM)
         x, y = (np.arange(-0.5 * side + 0.5 * TRUTH_M, 0.5 * side, TRUTH_M) for side in sides)
         flat = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
         feet = []
-        for place in approach.start + flat @ approach.axes[:2]:
+        for place in middle + flat @ approach.axes[:2]:
             height = 0.0
             for _ in range(20):  # Newton, along the approach
                 foot = shape.closest(place + height * approach.normal)

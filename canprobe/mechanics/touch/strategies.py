@@ -94,7 +94,7 @@ class Rectangle:
     """A rectangle that is explored: no curve, the path follows from what is known (`mechanics.touch.explore`).
 
     Attributes:
-        length: full size along the heading, m; its middle is the first contact.
+        length: full size along the heading, m; its middle is the end of the approach.
         width: full size across it, m.
         target_sigma: standard deviation of the height that is wanted everywhere in it, m.
     """

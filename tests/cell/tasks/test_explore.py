@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.model import ObjectSettings
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.explore import LIFT_M, Return, end_of
+from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import PlanError
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
 from canprobe.mechanics.touch.servo import ProbePose
@@ -19,16 +23,31 @@ from canprobe.mechanics.touch.servo import ProbePose
 SMALL = {"task.length_mm": 20.0, "task.width_mm": 14.0, "task.target_sigma_um": 15.0}
 
 
-def run(keys, seconds=12.0, **changes):
+def scene_with(keys, **changes):
     scene = canprobe.load_scene("explore", keys)
-    scene = replace(
+    return replace(
         scene,
         bus=replace(scene.bus, interface="direct"),
         scene=replace(scene.scene, figures=False),
         shape=replace(scene.shape, also=()),
         **changes,
     )
-    return canprobe.run(scene, duration_s=seconds)
+
+
+def run(keys, seconds=12.0, **changes):
+    return canprobe.run(scene_with(keys, **changes), duration_s=seconds)
+
+
+def explored_by(plan):
+    """The end of an exploration by a plan, however the cell that it meets differs from the one that was planned."""
+    task = make_task(plan)
+    with Session(plan) as session:
+        session.run(task)
+    return task.record().explored
+
+
+def ball(radius_mm):
+    return ObjectSettings(kind="sphere", radius_mm=radius_mm, position_mm=(-170.0, -175.0, 300.0))
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +121,43 @@ def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
     assert result.summary["explore"]["closed_fraction"] > 0.0
     assert "edge" in result.summary["explore"]["why_not"]
     assert result.summary["contact"]["force_max_n"] < 5.0
+
+
+def test_it_turns_back_from_a_hollow_as_tight_as_the_probe(tmp_path):
+    """Beyond 8 mm the hollow has a radius of 31 mm: the probe of 40 mm would touch both of its walls."""
+    x = np.arange(-25, 25.1, 0.5)
+    bend = np.clip((x - 4.0) / 4.0, 0.0, 1.0) / 28.0 - 1.0 / 250.0
+    slope = 0.5 * (np.cumsum(bend) - np.cumsum(bend)[50])
+    trough = 0.5 * (np.cumsum(slope) - np.cumsum(slope)[50])
+    np.savez(tmp_path / "hollow.npz", heights=trough[:, None] - x[None] ** 2 / 300.0, spacing=0.5)
+    hollow = ObjectSettings(
+        kind="heights",
+        file=str(tmp_path / "hollow.npz"),
+        position_mm=(-170.0, -175.0, 300.0),
+        rotation_deg=(0.0, 0.0, 30.0),
+    )
+    result = run({"task.length_mm": 30.0, "task.width_mm": 20.0, "task.target_sigma_um": 20.0}, 3.0, object=hollow)
+    assert result.summary["completed"], result.summary["stop_reason"]
+    assert result.summary["explore"]["closed_fraction"] > 0.0
+    assert result.summary["contact"]["force_max_n"] < 5.0
+
+
+def test_it_turns_back_before_the_contact_runs_off_the_array():
+    """The pad does not follow the surface, and the object is rounder than the scene says."""
+    keys = {"task.length_mm": 30.0, "task.width_mm": 20.0, "task.rolling_share": 1.0, "task.duration_s": 2.5}
+    planned, met = (resolve(scene_with(keys, object=ball(radius))) for radius in (400.0, 45.0))
+    plan = make_plan(planned)
+    explored = explored_by(replace(plan, setup=replace(planned, truth=met.truth)))
+    assert 0.0 < explored.closed < 0.6
+
+
+def test_it_turns_back_before_a_joint_comes_to_its_limit():
+    """The margin of joint 1 is set so that a part of the rectangle lies beyond it, which the plan did not see."""
+    plan = make_plan(resolve(scene_with(SMALL | {"task.duration_s": 3.0}, object=ball(60.0))))
+    margin = plan.setup.limits.joint_margin.copy()
+    margin[0] = plan.setup.arm.model.q_max[0] - np.radians(84.0)
+    limited = replace(plan, setup=replace(plan.setup, limits=replace(plan.setup.limits, joint_margin=margin)))
+    assert 0.0 < explored_by(limited).closed < 0.6
 
 
 def test_the_probe_returns_in_the_air_and_searches_from_the_known_surface_on():

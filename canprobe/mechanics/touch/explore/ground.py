@@ -13,16 +13,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.mechanics.touch.explore.forecast import UNKNOWN_M
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs
 from canprobe.mechanics.touch.map.local_fits import fit_discs
-from canprobe.mechanics.touch.map.quartic import LENGTH_M
+from canprobe.mechanics.touch.map.quartic import LENGTH_M, THIRD
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.strategies import Rectangle
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
+UNKNOWN_M = 1e-3
+"""Deviation of the height where nothing was touched, m: more says nothing about where to go."""
 CELL_M = 3e-3
 """Largest side of a cell, m."""
 FIT_REACH_M = 6e-3
@@ -36,7 +37,7 @@ class GroundCells:
 
     Args:
         surface_map: map of the contacts, of a pad; it grows.
-        origin: (3,) place on the surface over which the middle of the rectangle lies, m.
+        origin: (3,) middle of the rectangle, m.
         axes: (3, 3) rows: length, width and outward normal of the scan plane.
         rectangle: its size, and the deviation of the height that is wanted in every cell.
         stiffness_sigma: standard deviation of the logarithm of the layer's stiffness.
@@ -45,6 +46,7 @@ class GroundCells:
         places: (m, 2) middles of the cells in the scan plane, from the middle of the rectangle, m.
         sigma: (m,) stated deviation of the height, m; `UNKNOWN_M` where nothing was touched.
         floor: (m,) the part of it that no path can shrink, m.
+        change: (m,) change of the curvature that the map sees there, 1/m²; NaN where nothing was touched.
         closed: (m,) cells that the probe cannot touch.
         counts: numbers of cells along and across.
         target: deviation that is wanted, m.
@@ -66,6 +68,7 @@ class GroundCells:
         self.places: Floats = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
         m = len(self.places)
         self.sigma, self.floor = np.full(m, UNKNOWN_M), np.zeros(m)
+        self.change: Floats = np.full(m, math.nan)
         self.closed: NDArray[np.bool_] = np.zeros(m, bool)
         self.common = 0.0
         self.target, self._stiffness_sigma = rectangle.target_sigma, stiffness_sigma
@@ -115,6 +118,7 @@ class GroundCells:
             fits, _, _ = fit_discs(rows, disc, pad, self._map.noise, K_ref=np.zeros((1, 2, 2)), weight=disc.weight)
         except np.linalg.LinAlgError:  # of contacts that no surface explains
             return True
+        self.change[i] = math.sqrt(float(np.mean(fits.a[0, THIRD] ** 2))) / LENGTH_M**2
         excess = float(fits.excess[0])
         weights = disc.weight[0]
         root_force = float(weights @ rows[disc.nodes[0], column.ROOT_FORCE] / weights.sum())

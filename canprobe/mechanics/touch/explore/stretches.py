@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +14,6 @@ from canprobe.mechanics.types import Floats
 
 STEP_M = 1e-3
 """Distance between the points at which a stretch is looked at, m."""
-LONGEST_M = 24e-3
-"""Longest straight part of a stretch, m."""
-TURNS = tuple(math.radians(angle) for angle in (0, 20, 45, 75, 110, 150, 200))
-"""Angles of turn to either side, rad."""
-RADII = (1.0, 3.0)
-"""Radii of turns, in smallest radii."""
 
 
 class Heading(NamedTuple):
@@ -75,8 +69,9 @@ class Stretch(NamedTuple):
         )
 
     def ways(self) -> Floats:
-        """(n,) paths from the start, m, a step apart, of the points at which it is looked at."""
-        return STEP_M * np.arange(1.0, max(1, round(self.length / STEP_M)) + 1.0)
+        """(n,) paths from the start to the end, m, at most a step apart, of the points at which it is looked at."""
+        count = max(1, math.ceil(self.length / STEP_M))
+        return self.length / count * np.arange(1.0, count + 1.0)
 
     def point(self, phase: float) -> tuple[float, float]:
         """Place at a path from the start, m."""
@@ -123,33 +118,50 @@ class WalkedBack:
         return math.cos(angle), math.sin(angle)
 
 
-def fan(start: Heading, radius: float, target: tuple[float, float]) -> Iterator[Stretch]:
-    """The stretches that may begin at a place, those that lead to a target (m, m) first.
+def stretches_to(start: Heading, end: Heading, radius: float, onward: float) -> list[tuple[Stretch, Stretch]]:
+    """Smooth paths from a place and direction to another and straight on, the shortest first.
+
+    Each is a turn, a straight line, a turn, and the line onward.
 
     Args:
-        start: place and direction.
-        radius: smallest radius of a turn, m.
-        target: place that is to be reached.
+        start, end: places and directions.
+        radius: radius of the turns, m.
+        onward: length of the line behind the end, m.
+
+    Source: Dubins, "On curves of minimal length with a constraint on average curvature", 1957 (paths CSC).
     """
-    for side in (1.0, -1.0):
-        if (leading := _leading_to(start, side, radius, target)) is not None:
-            yield leading
-    for turn in TURNS:
-        for factor in RADII if turn else RADII[:1]:
-            for side in (1.0, -1.0) if turn else (1.0,):
-                yield Stretch(start, side * turn, factor * radius, LONGEST_M)
+    found = []
+    for first in (1.0, -1.0):
+        for second in (1.0, -1.0):
+            a, b = start.centre(radius, first), end.centre(radius, second)
+            apart = math.dist(a, b)
+            bearing = math.atan2(b[1] - a[1], b[0] - a[0]) if apart > 1e-6 else start.angle  # one and the same circle
+            beside = radius * (first - second)  # 0, or ± a diameter where the line crosses from circle to circle
+            if apart < abs(beside):
+                continue
+            angle = bearing + (math.asin(beside / apart) if beside else 0.0)
+            turn, straight = _turned(angle - start.angle, first), math.sqrt(apart**2 - beside**2)
+            to_end = Stretch(start, turn, radius, straight)
+            found.append(
+                (to_end, Stretch(to_end.at(to_end.length), _turned(end.angle - angle, second), radius, onward))
+            )
+    return sorted(found, key=lambda path: path[0].length + path[1].length)
 
 
-def _leading_to(start: Heading, side: float, radius: float, target: tuple[float, float]) -> Stretch | None:
-    """The turn to a side, and straight to a target; None where that lies within the circle."""
+def _turned(angle: float, side: float) -> float:
+    """The angle, rad, as a turn to a side, +1: left, −1: right; less than a full one."""
+    turn = (side * angle) % (2.0 * math.pi)
+    return side * (turn if turn < 2.0 * math.pi - 1e-6 else 0.0)
+
+
+def leading_to(start: Heading, side: float, radius: float, target: tuple[float, float]) -> Stretch | None:
+    """The turn to a side, +1: left, −1: right, and straight to a target (m, m); None: it lies within the circle."""
     cx, cy = start.centre(radius, side)
     away, bearing = math.dist((cx, cy), target), math.atan2(target[1] - cy, target[0] - cx)
     if away <= radius:
         return None
     leaves = bearing + side * math.asin(radius / away)  # direction of the tangent through the target
-    return Stretch(
-        start, side * ((side * (leaves - start.angle)) % (2.0 * math.pi)), radius, math.sqrt(away**2 - radius**2)
-    )
+    return Stretch(start, _turned(leaves - start.angle, side), radius, math.sqrt(away**2 - radius**2))
 
 
 class Room:
@@ -177,6 +189,10 @@ class Room:
             apart = np.linalg.norm(points[:, None] - self._closed, axis=2).min(axis=1)
             within = within & (apart >= self._clearance + margin)
         return within
+
+    def holds(self, stretch: Stretch) -> bool:
+        """Whether all of a stretch is inside."""
+        return bool(self.inside(np.array([stretch.point(way) for way in stretch.ways().tolist()])).all())
 
     def reach(self, stretch: Stretch) -> float:
         """Length of a stretch up to its last point, m, that is inside and behind which it can turn; 0: none."""

@@ -1,4 +1,4 @@
-"""The explorer on exact and noisy contacts of a ball: it covers its rectangle, smoothly, with a forecast that holds."""
+"""The explorer on exact and noisy contacts of a ball: it covers its rectangle, smoothly, and turns back from edges."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.explore.explorer import Explorer
-from canprobe.mechanics.touch.explore.forecast import UNKNOWN_M, Forecast
 from canprobe.mechanics.touch.explore.ground import GroundCells
+from canprobe.mechanics.touch.explore.spacing import LaneForecast
 from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.nodes import COLUMNS
 from canprobe.mechanics.touch.map.noise import PAD_NOISE
@@ -16,7 +16,8 @@ from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.strategies import Rectangle
 
 PAD = PadLayer(0.04, 1.27e8)
-DEPTH, BALL, RADIUS, STEP = 0.43e-3, 0.06, 2e-3, 2.5e-4
+DEPTH, BALL, RADIUS, STEP = 0.43e-3, 0.06, 2e-3, 6.25e-5
+BEGIN = (1e-3, -0.5e-3)
 
 
 class Scanned:
@@ -38,10 +39,10 @@ class Scanned:
 def explore(rectangle, edge=math.inf):
     """Explore up to an edge, round which the probe turns; the places and headings of the path, and how often back."""
     scanned = Scanned(rectangle)
-    forecast = Forecast(scanned.cells.places, PAD.radius, DEPTH, PAD_NOISE)
+    forecast = LaneForecast(PAD.radius, DEPTH, PAD_NOISE)
     size = rectangle.length, rectangle.width
-    explorer = Explorer(scanned.cells, forecast, size, radius=RADIUS, ahead=1e-2, lag=0.0)
-    x = y = 0.0
+    explorer = Explorer(scanned.cells, forecast, size, start=BEGIN, radius=RADIUS, ahead=2.5e-3, lag=0.0)
+    x, y = BEGIN
     path, backs = [], 0
     while scanned.cells.wanting.any() and explorer.path < 0.5:
         along, across = explorer.step(x, y, STEP)
@@ -53,7 +54,6 @@ def explore(rectangle, edge=math.inf):
         if explorer.at_edge and not explorer.going_back:
             explorer.turn_back()
             backs += 1
-        explorer.work()
         explorer.work()
     return scanned, explorer, np.array(path), backs
 
@@ -96,28 +96,3 @@ def test_it_turns_back_from_an_edge_and_closes_what_lies_beyond():
     closed = scanned.cells.places[scanned.cells.closed]
     assert (closed[:, 0] > edge - 1e-3).all()
     assert np.count_nonzero(closed[:, 0] > 9e-3) == 6  # the outermost row, all of it
-
-
-def test_one_line_leaves_the_height_open_and_a_second_one_beside_it_does_not():
-    """The depth of the layer depends on the curvature across a line, which the line does not show."""
-    forecast = Forecast(np.array([[0.0, 0.0]]), PAD.radius, DEPTH, PAD_NOISE)
-    assert forecast.variance[0] == UNKNOWN_M**2
-    line = np.column_stack([1e-3 * np.arange(-8.0, 9.0), np.zeros(17)])
-    for x, y in line:
-        forecast.walk(x, y)
-    alone = math.sqrt(forecast.variance[0])
-    with_second = forecast.after(np.add(line, (0.0, 4e-3)), line[:0], [17], np.array([0]))
-    assert alone > 40e-6
-    assert math.sqrt(with_second[0, 0]) < 0.3 * alone
-
-
-def test_a_forecast_is_what_comes_true():
-    forecast = Forecast(np.array([[0.0, 0.0], [3e-3, 0.0]]), PAD.radius, DEPTH, PAD_NOISE)
-    path = np.random.default_rng(4).uniform(-6e-3, 6e-3, (12, 2))
-    ahead = forecast.after(path[5:], path[:5], [1, 7], np.array([0, 1]))
-    for x, y in path[:6]:
-        forecast.walk(x, y)
-    assert forecast.variance == pytest.approx(ahead[0], rel=1e-6)
-    for x, y in path[6:]:
-        forecast.walk(x, y)
-    assert forecast.variance == pytest.approx(ahead[1], rel=1e-6)

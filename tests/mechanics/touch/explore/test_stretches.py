@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.mechanics.touch.explore.stretches import Heading, Room, Stretch, WalkedBack, fan
+from canprobe.mechanics.touch.explore.stretches import Heading, Room, Stretch, WalkedBack, leading_to, stretches_to
 
 RADIUS = 2e-3
 
@@ -25,13 +25,37 @@ def test_the_direction_is_the_derivative_of_the_place(x, y, angle, turn, straigh
     assert half.point(half.length) == pytest.approx(stretch.point(half.length), abs=1e-12)
 
 
-@given(st.floats(-0.015, 0.015), st.floats(-0.015, 0.015), st.floats(-3.0, 3.0))
-def test_the_first_stretches_of_a_fan_lead_to_the_target(x, y, angle):
-    start = Heading(0.0, 0.0, angle)
-    leading = [stretch for stretch in fan(start, RADIUS, (x, y)) if stretch.straight != 24e-3]
-    assert leading or math.hypot(x, y) <= 2.0 * RADIUS
-    for stretch in leading:
-        assert stretch.point(stretch.length) == pytest.approx((x, y), abs=1e-9)
+PLACES = st.builds(Heading, st.floats(-0.015, 0.015), st.floats(-0.015, 0.015), st.floats(-3.0, 3.0))
+
+
+@given(PLACES, PLACES)
+def test_smooth_paths_lead_from_one_place_and_direction_to_another(start, end):
+    paths = stretches_to(start, end, RADIUS, 5e-3)
+    assert len(paths) >= 2
+    for first, second in paths:
+        assert first.start == start
+        assert second.start == pytest.approx(first.at(first.length), abs=1e-9)
+        assert second.at(second.length - 5e-3)[:2] == pytest.approx(end[:2], abs=1e-8)
+        assert math.cos(second.at(second.length).angle - end.angle) == pytest.approx(1.0, abs=1e-9)
+    lengths = [first.length + second.length for first, second in paths]
+    assert lengths == sorted(lengths)
+    assert lengths[0] >= math.dist(start[:2], end[:2]) + 5e-3 - 1e-9
+
+
+@pytest.mark.parametrize(("x", "y", "turn"), [(8e-3, 0.0, 0.0), (8e-3 + RADIUS, 8e-3 + RADIUS, 0.5 * math.pi)])
+def test_the_shortest_path_is_the_obvious_one(x, y, turn):
+    first, second = stretches_to(Heading(0.0, 0.0, 0.0), Heading(x, y, turn), RADIUS, 0.0)[0]
+    straight = x + y - 2.0 * RADIUS * (turn > 0.0)
+    assert first.length + second.length <= straight + turn * RADIUS + 1e-12
+
+
+@given(PLACES, st.sampled_from([1.0, -1.0]), st.floats(-0.015, 0.015), st.floats(-0.015, 0.015))
+def test_a_turn_and_a_line_lead_to_a_place_outside_the_circle(start, side, x, y):
+    way = leading_to(start, side, RADIUS, (x, y))
+    if way is None:
+        assert math.dist(start.centre(RADIUS, side), (x, y)) <= RADIUS
+    else:
+        assert way.point(way.length) == pytest.approx((x, y), abs=1e-8)
 
 
 def test_what_is_left_of_a_stretch_is_inside_and_can_turn():
@@ -41,18 +65,19 @@ def test_what_is_left_of_a_stretch_is_inside_and_can_turn():
     went = 0
     for _ in range(25):
         start = Heading(*rng.uniform((-0.013, -0.008), (0.013, 0.008)), rng.uniform(-3, 3))
-        for stretch in fan(start, RADIUS, (-0.01, 0.005)):
+        for turn, factor in itertools.product((-2.6, -0.8, 0.0, 0.8, 2.6), (1.0, 3.0)):
+            stretch = Stretch(start, turn, factor * RADIUS, 24e-3)
             reach = room.reach(stretch)
             went += reach > 0.0
-            for way in np.arange(1e-3, reach + 1e-9, 1e-3):
+            for way in stretch.ways()[stretch.ways() <= reach].tolist():
                 x, y = stretch.point(way)
                 assert abs(x) < 0.0151
                 assert abs(y) < 0.0101
                 assert math.hypot(x - 0.01, y) > 1.99e-3
             if reach:
                 on = room.circle(stretch.at(reach))
-                turn = np.array([on.point(way) for way in np.linspace(0.0, on.length, 50)])
-                assert room.inside(turn, -1e-6).all()
+                full = np.array([on.point(way) for way in np.linspace(0.0, on.length, 50)])
+                assert room.inside(full, -1e-6).all()
     assert went > 100
 
 
