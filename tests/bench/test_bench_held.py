@@ -1,6 +1,6 @@
 """Memory of a lockstep cell that is held as `up` holds one, with a monitor; run it with --benchmark-only -s.
 
-The cell is held for CANPROBE_HELD_MIN minutes of virtual time, 15 by default, in a process by itself (`held_child.py`).
+The cell is held for CANPROBE_HELD_MIN minutes of virtual time, 12 by default, in a process by itself (`held_child.py`).
 What grows is the slope of a line through the memory after each minute but the first five, in which buffers fill. Why
 not a span of real time: on a busy machine it would hold too few minutes for a slope.
 `python docs/measure.py held` writes the table to docs/cost.md.
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 CHILD = Path(__file__).with_name("held_child.py")
-MINUTES = int(os.environ.get("CANPROBE_HELD_MIN", "15"))
+MINUTES = int(os.environ.get("CANPROBE_HELD_MIN", "12"))
 FILLING = 5
 """Minutes in which buffers fill."""
 
