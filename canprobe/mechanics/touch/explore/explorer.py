@@ -197,6 +197,9 @@ class Explorer(PathFollower):
                     self.upcoming = [turn, line.cut(reach)]
                     return
                 yield
+        for i in np.flatnonzero(self.ground.wanting & np.isfinite(self.ground.change)).tolist():
+            self.ground.fit(i)  # a lane beside it, too far to make its fit stale, may have shown it
+            yield
         best: tuple[bool, float, Stretch] | None = None
         nearest = self._nearest()
         for x, y in np.clip(nearest, -self._inner, self._inner).tolist():

@@ -98,6 +98,11 @@ class GroundCells:
         i = int(self._stale.argmax())
         if self._stale[i] == 0.0:
             return False
+        self.fit(i)
+        return True
+
+    def fit(self, i: int) -> None:
+        """Fit a cell by its index; nothing changes where no contact is near it."""
         self._stale[i] = 0.0
         pad = self._map.pad
         assert pad is not None
@@ -105,19 +110,19 @@ class GroundCells:
         place = self._origin + self.places[i] @ self._axes[:2] + self._height[i] * up
         rows = self._map.nodes.near(place)
         if not len(rows):
-            return True
+            return
         points = rows[:, column.CENTRE] - pad.radius * rows[:, column.NORMAL]
         beside = np.hypot(*(self._axes[:2] @ (points - place).T))
         nearest = int(beside.argmin())
         if beside[nearest] > REACH_M:
-            return True
+            return
         normal = rows[nearest, column.NORMAL]
         place = place + up * float((points[nearest] - place) @ normal) / max(float(up @ normal), 0.2)
         disc = Discs.at(place, tangent_rotation(normal.tolist()), points, rows)
         try:
             fits, _, _ = fit_discs(rows, disc, pad, self._map.noise, K_ref=np.zeros((1, 2, 2)), weight=disc.weight)
         except np.linalg.LinAlgError:  # of contacts that no surface explains
-            return True
+            return
         self.change[i] = math.sqrt(float(np.mean(fits.a[0, THIRD] ** 2))) / LENGTH_M**2
         excess = float(fits.excess[0])
         weights = disc.weight[0]
@@ -129,7 +134,6 @@ class GroundCells:
         floor2 = self.common**2 + 2.0 * excess * self._map.noise.height**2
         self.floor[i] = min(math.sqrt(floor2), UNKNOWN_M)
         self.sigma[i] = min(math.sqrt(floor2 + variance), UNKNOWN_M)
-        return True
 
     def close(self, x: float, y: float, radius: float) -> None:
         """Close the cells within a distance, m, of a place of the scan plane, m, that were not touched."""
