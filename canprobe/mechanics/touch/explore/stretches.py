@@ -135,7 +135,7 @@ def stretches_to(start: Heading, end: Heading, radius: float, onward: float) -> 
         for second in (1.0, -1.0):
             a, b = start.centre(radius, first), end.centre(radius, second)
             apart = math.dist(a, b)
-            bearing = math.atan2(b[1] - a[1], b[0] - a[0]) if apart > 1e-6 else start.angle  # one and the same circle
+            bearing = math.atan2(b[1] - a[1], b[0] - a[0]) if apart > 1e-9 else start.angle  # one and the same circle
             beside = radius * (first - second)  # 0, or ± a diameter where the line crosses from circle to circle
             if apart < abs(beside):
                 continue
@@ -151,7 +151,7 @@ def stretches_to(start: Heading, end: Heading, radius: float, onward: float) -> 
 def _turned(angle: float, side: float) -> float:
     """The angle, rad, as a turn to a side, +1: left, −1: right; less than a full one."""
     turn = (side * angle) % (2.0 * math.pi)
-    return side * (turn if turn < 2.0 * math.pi - 1e-6 else 0.0)
+    return side * (turn if turn < 2.0 * math.pi - 1e-7 else 0.0)
 
 
 def leading_to(start: Heading, side: float, radius: float, target: tuple[float, float]) -> Stretch | None:
