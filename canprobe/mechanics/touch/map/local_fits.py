@@ -3,13 +3,15 @@
 Rows of a node at (x, y, z) over the plane, p = c − (R_p − d) n, d = √(2 F √det A / (π k)), A = ½ (I/R_p + K_ref):
 
     height   z − (d/4) tr(M K_ref) = [φ + Lφ]·a,   L = (d/4) tr(M ∇²),   M = (I/R_p + K_ref)⁻¹
-    slopes   −n_xy/n_z = ∇[φ + s Lφ]·a + D θ,   δn = (1/R_p + H) [v, R_p (n + z_p), −x_p, −y_p] θ
+    slopes   −n_xy/n_z = ∇φ·a + D θ,   δn = (1/R_p + H) [v, R_p (n + z_p), −x_p, −y_p] θ
 
-since δ ln d = ¼ tr(M δK) and K = −∇²h: a depth that began with another curvature is right in the end. A pad shows what
-lies under its patch, of half-axes √(2 d M): where the curvature changes the centroid of its pressure moves, and the
-normal shows s = `PATCH_SHARE` of that. θ are the lag along the heading v, the pad's relative scale, and the offsets of
-the centroid. Each disc gives information about them,
+since δ ln d = ¼ tr(M δK) and K = −∇²h: a depth that began with another curvature is right in the end. θ are the lag
+along the heading v, the pad's relative scale, and the offsets of the centroid. Each disc gives information about them,
 I_θ += s (Λ_θθ − Λ_θa S⁻¹ Λ_aθ), S with the prior, s the share of its nodes that no other disc counts.
+
+A pad shows what lies under its patch: where the curvature changes within it, the centroid of its pressure moves. Why
+is that not in the slopes, as 2/3 ∇Lφ·a of a bare layer: it makes fine forms better, and jumps of the curvature, where
+no quartic is right, overshoot by more.
 
 For each deviation g of third derivatives the evidence is −½ ln|S_g| + ½ ln|P_g| + ½ ηᵀ S_g⁻¹ η, P the prior's
 information and η the pull of the data beyond the prior's mean. The answer is the mixture: a smooth surface is taken as
@@ -46,10 +48,6 @@ from canprobe.mechanics.types import Floats
 
 CHANCE_SIGMAS = 2.0
 """Standard deviations of χ² per degree of freedom by which it must be above 1 to be more than chance."""
-PATCH_SHARE = 1.0 / 3.0
-"""How much of the change of curvature within the patch turns the normal; a bare layer has 2/3. The value is the best on
-the development shapes of `study shapes` and on draws of it: with 2/3 free forms are better, jumps of the curvature,
-where a quartic overshoots, worse."""
 COMMON = 4
 """Number of common errors."""
 ROWS_AT_ONCE = 60_000
@@ -198,11 +196,9 @@ def _rows(rows: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, K_r
         M = np.asarray(np.linalg.inv(relative) / LENGTH_M, np.float64)
     x, y, z = np.moveaxis(at, -1, 0) / LENGTH_M
     f, fx, fy = terms(x, y, (0, 0), (1, 0), (0, 1))
-    spread = np.einsum("mij,ijpq->mpq", M, SECOND_DERIVATIVES)
-    Lf, Lfx, Lfy = (quarter[..., None] * (one @ spread) for one in (f, fx, fy))
     A, values = np.zeros((m, n, 3, TERMS + COMMON)), np.empty((m, n, 3))
-    A[..., 0, :TERMS] = f + Lf
-    A[..., 1, :TERMS], A[..., 2, :TERMS] = fx + PATCH_SHARE * Lfx, fy + PATCH_SHARE * Lfy
+    A[..., 0, :TERMS] = f + quarter[..., None] * (f @ np.einsum("mij,ijpq->mpq", M, SECOND_DERIVATIVES))
+    A[..., 1, :TERMS], A[..., 2, :TERMS] = fx, fy
     values[..., 0] = z - quarter * np.einsum("mij,mij->m", M, K_ref * LENGTH_M)[:, None]
     values[..., 1:] = -normal[..., :2] / np.maximum(normal[..., 2:], MIN_FACING)
     if pad is not None:
