@@ -97,6 +97,20 @@ def test_a_raster_gives_height_normal_and_curvature_with_their_errors(shape, sca
     assert 0.3 < rms < 1.6
 
 
+@pytest.mark.parametrize("twice", [False, True])
+@pytest.mark.parametrize("shape", ["ball", "small ball", "hollow"])
+def test_the_mean_of_contacts_on_an_arc_lies_on_the_arc(shape, twice):
+    """Without noise the points of a millimetre lie up to 4 µm off the surface in the mean, below it where convex."""
+    p, n, _ = SHAPES[shape](np.concatenate([RASTER, RASTER[::-1] + 0.4e-3]) if twice else RASTER)
+    points = fit_map(p, n, sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL)
+    pad = fit_map(
+        p, n, np.zeros(len(p)), sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL, probe_radius=0.04, stiffness=1e8
+    )
+    places, _, _ = SHAPES[shape](PLACES)
+    for found in (points, pad):
+        assert np.abs(found.distance(places)[0]).max() < 1e-6
+
+
 @pytest.mark.parametrize("scale", [1.0, 10.0])
 @SHAPE
 def test_one_straight_pass_says_nothing_of_the_curvature_across(shape, scale):
