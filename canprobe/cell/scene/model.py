@@ -288,7 +288,7 @@ class TaskSettings:
     search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCH_ONLY] = 8.0
     """Distance beyond `start_mm` at which the approach gives up."""
     strategy: Annotated[Strategy, SCAN_ONLY] = "weave"
-    """Path of the scan. With `explore` it goes where the map of the surface is least sure."""
+    """Path of the scan. With `explore` it goes where the map of the surface is not sure enough."""
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCAN_ONLY] = 25.0
     """Speed of the contact over the surface."""
     heading_deg: Annotated[float, Range(-360, 360), SCAN_ONLY] = 0.0

@@ -1,4 +1,4 @@
-"""Exploration: a scan whose path goes where the map of the surface is least sure.
+"""Exploration: a scan whose path goes where the map of the surface is not sure enough.
 
 The servo, the supervision and all that a scan does are those of `TouchTask`. Here a stretch is chosen behind the
 commands of each cycle, and the scan ends where the map is sure enough. At an edge, in a hollow as tight as the probe,
