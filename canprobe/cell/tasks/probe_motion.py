@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ class ProbeMotion:
         self._last = dq
         targets = [q + step for q, step in zip(before, dq, strict=True)]
         self.q = np.array(targets)
-        if not all([low <= q <= high for q, (low, high) in zip(targets, self._range, strict=True)]):
+        if not self._allows(targets):
             self._stop_at_limit()
         return self.q
 
@@ -86,7 +87,11 @@ class ProbeMotion:
         """Whether a joint comes to its limit within a time, s, if it goes on as in the last step."""
         steps = time_s / self._period_s
         ahead = [q + steps * step for q, step in zip(self.q.tolist(), self._last, strict=True)]
-        return not all([low <= q <= high for q, (low, high) in zip(ahead, self._range, strict=True)])
+        return not self._allows(ahead)
+
+    def _allows(self, joints: Sequence[float]) -> bool:
+        """Whether joints (n,), rad or m, are within their limits."""
+        return all([low <= q <= high for q, (low, high) in zip(joints, self._range, strict=True)])
 
     def _stop_at_limit(self) -> None:
         joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])

@@ -107,15 +107,20 @@ def test_contacts_contradict_a_smooth_surface_where_they_scatter_more_than_the_s
     assert explored.rough == rough and ("contradict" in explored.why) == (rough > 0.0)
 
 
-def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
-    side, end = np.arange(-13, 13.1, 0.5)[:, None], np.arange(-25, 25.1, 0.5)[None]
-    np.savez(tmp_path / "plate.npz", heights=-(side**2 + end**2) / 300.0, spacing=0.5)
-    plate = ObjectSettings(
+def height_field(folder, heights):
+    """The object of a grid of heights, mm, half a millimetre apart."""
+    np.savez(folder / "heights.npz", heights=heights, spacing=0.5)
+    return ObjectSettings(
         kind="heights",
-        file=str(tmp_path / "plate.npz"),
+        file=str(folder / "heights.npz"),
         position_mm=(-170.0, -175.0, 300.0),
         rotation_deg=(0.0, 0.0, 30.0),
     )
+
+
+def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
+    side, end = np.arange(-13, 13.1, 0.5)[:, None], np.arange(-25, 25.1, 0.5)[None]
+    plate = height_field(tmp_path, -(side**2 + end**2) / 300.0)
     result = run({"task.length_mm": 36.0, "task.width_mm": 12.0, "task.target_sigma_um": 30.0}, 4.0, object=plate)
     assert result.summary["completed"], result.summary["stop_reason"]
     assert result.summary["explore"]["closed_fraction"] > 0.0
@@ -129,13 +134,7 @@ def test_it_turns_back_from_a_hollow_as_tight_as_the_probe(tmp_path):
     bend = np.clip((x - 4.0) / 4.0, 0.0, 1.0) / 28.0 - 1.0 / 250.0
     slope = 0.5 * (np.cumsum(bend) - np.cumsum(bend)[50])
     trough = 0.5 * (np.cumsum(slope) - np.cumsum(slope)[50])
-    np.savez(tmp_path / "hollow.npz", heights=trough[:, None] - x[None] ** 2 / 300.0, spacing=0.5)
-    hollow = ObjectSettings(
-        kind="heights",
-        file=str(tmp_path / "hollow.npz"),
-        position_mm=(-170.0, -175.0, 300.0),
-        rotation_deg=(0.0, 0.0, 30.0),
-    )
+    hollow = height_field(tmp_path, trough[:, None] - x[None] ** 2 / 300.0)
     result = run({"task.length_mm": 30.0, "task.width_mm": 20.0, "task.target_sigma_um": 20.0}, 3.0, object=hollow)
     assert result.summary["completed"], result.summary["stop_reason"]
     assert result.summary["explore"]["closed_fraction"] > 0.0

@@ -176,7 +176,7 @@ class Explorer(PathFollower):
         self._follow(WalkedBack(back[-round(BACK_M / STEP_M) - 1 :] or [self._led[-1][1]]))
 
     def work(self) -> None:
-        """One share of the work: judge one path where a stretch is due, else fit one cell."""
+        """One share of the work: look for the next stretch where one is due, else fit one cell."""
         if not self.upcoming and self._left < self._ahead:
             if self._search is None:
                 self._search = self._look()
