@@ -42,8 +42,6 @@ PAD_DRAG = 0.03
 """Error of the way of a contact over the pad, over this way (`drag_errors`), by hysteresis and creep. A probe that
 keeps its orientation measures the normal by this way alone; else the rolling share is its part in the turn of the
 normal. The value has the best log score on 15 scenes of a gantry of a development draw."""
-FUSED_LEVEL_POWER = 0.5
-"""Power of the level of the innovations, from 1 on, by which variances of motion and patch together are multiplied."""
 TOOL_SIGMA_M = 0.2e-3
 """Standard deviation of the probe's centre along its pole, m, as a tool is known after its calibration."""
 PATCH_METHODS = ("recursive", "ml")
@@ -103,13 +101,14 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
     from canprobe.mechanics.touch.estimate.noise_level import LevelledEstimator
 
-    estimator = LevelledEstimator(estimator, memory)
+    fused = _with_patch(task, estimator, memory) if _uses_patch(task) else estimator
     rolling = task.scan.rolling_share
-    inner = estimator
-    if _uses_patch(task):
-        inner = LevelledEstimator(_with_patch(task, estimator, memory), memory, least=1.0, power=FUSED_LEVEL_POWER)
     following = FollowingEstimator(
-        inner, memory, scale=SCALE_ERROR, drag=PAD_DRAG * rolling, offset=TOOL_SIGMA_M * (1.0 - rolling)
+        LevelledEstimator(fused, memory),
+        memory,
+        scale=SCALE_ERROR,
+        drag=PAD_DRAG * rolling,
+        offset=TOOL_SIGMA_M * (1.0 - rolling),
     )
     if not task.shape.revisit:
         return following

@@ -221,6 +221,10 @@ class ContactSensing:
         way = ((contact.T_base_probe - earlier) @ point)[:3]
         return float(np.linalg.norm(way)) / (1e-9 * SPEED_OVER_NS)
 
+    def leave_out_moments(self) -> None:
+        """Give contacts no moments from here on: the images' model is another array's."""
+        self._moment_image = None
+
     def _moments(self, patch: Patch) -> Moments | None:
         """Second moments of the image; None where they are not wanted, or not those of the whole patch."""
         if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:

@@ -66,7 +66,7 @@ class ShapeTracker:
         travelled_m: path of the contact, m.
         restarts: how often the estimator diverged and started afresh.
         withheld: answers that could not be computed: of a matrix that is singular or not definite.
-        doubted: whether the calibration is another array's, so that answers are `widened`.
+        doubted: whether images mean another curvature than the calibration says, so that answers are `widened`.
     """
 
     def __init__(self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None) -> None:

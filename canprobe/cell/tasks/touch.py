@@ -157,7 +157,9 @@ class TouchTask(ProbingTask):
             return
         self.sensing.reader.widen(check.force_spread)
         if self.shape is not None:
-            self.shape.doubted = True
+            self.shape.doubted = check.image_model_off
+        if check.contradicted:
+            self.sensing.leave_out_moments()
         if not self._remarks:
             self._remarks.append(finding + CALIBRATE)
 

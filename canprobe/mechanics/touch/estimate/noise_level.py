@@ -8,7 +8,8 @@ mean. It begins at 1, what is stated, and does not fall below a half: what all c
 innovation shows.
 
 Where the curvature varies within a patch, images do not fit a quadric either, and no innovation of theirs shows it. So
-an answer that motion and patch gave together is levelled once more, by the root of the mean, and never narrower.
+the level belongs on the answer that motion and patch gave together. Why not on that of the motion before it: a misfit
+that its terms correct raises the innovations too, and would be counted twice in the weight of the motion.
 
 Source: Birge, "The calculation of errors by the method of least squares", Phys. Rev. 40, 1932, the ratio of external to
 internal consistency.
@@ -35,17 +36,14 @@ class LevelledEstimator(OuterEstimator):
     Args:
         inner: the estimator.
         memory_m: path over which the mean falls to 1/e, m.
-        least: least level.
-        power: power of the level by which variances are multiplied.
 
     Attributes:
-        level: the mean, from `least` on.
+        level: the mean, from `MIN_LEVEL` on.
     """
 
-    def __init__(self, inner: Estimator, memory_m: float, *, least: float = MIN_LEVEL, power: float = 1.0) -> None:
+    def __init__(self, inner: Estimator, memory_m: float) -> None:
         super().__init__(inner)
         self._memory = memory_m
-        self._least, self._power = least, power
         self._restart()
 
     def _restart(self) -> None:
@@ -65,5 +63,5 @@ class LevelledEstimator(OuterEstimator):
         moved = 0.0 if self._place is None else float(np.linalg.norm(answer.point - self._place))
         self._place = answer.point
         self._mean += (1.0 - math.exp(-moved / self._memory)) * (answer.innovation - self._mean)
-        self.level = max(self._mean, self._least)
-        return widened(answer, self.level ** (0.5 * self._power))
+        self.level = max(self._mean, MIN_LEVEL)
+        return widened(answer, math.sqrt(self.level))

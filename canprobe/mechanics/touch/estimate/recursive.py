@@ -50,6 +50,8 @@ larger errors. On 69 random scenes 1.4 gives 31 alarms and 1.75 gives 8, with er
 MIN_BELIEVED_INNOVATION = 0.5
 """Usual innovation below which the stated noise is replaced by the observed one when a misfit is looked for."""
 
+CHANGING_NOTE = "the surface may be changing: nothing is observed"
+
 
 class _Pending(NamedTuple):
     """A contact that waits for the end of its step, and its weight by its place alone (`Travel`)."""
@@ -164,6 +166,9 @@ class RecursiveEstimator:
         flat = self._flat(a)
         q = a.M[6:].dot(state.inverse) / C_PER_Q[:, None]
         decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
+        changing = self._change.changing
+        if changing:
+            decision, notes = nothing_observed(), (*notes, CHANGING_NOTE)
         # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
         noise = state.inverse.T.dot(state.left_out.score.matrix[:9, :9]).dot(state.inverse)
         believed = True
@@ -198,7 +203,7 @@ class RecursiveEstimator:
             method="recursive",
             prior=self._prior.name,
             notes=notes,
-            evidence=evidence,
+            evidence=None if changing else evidence,
         )
 
     def _flat(self, a: Anchor) -> Floats:

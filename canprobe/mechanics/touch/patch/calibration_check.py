@@ -1,20 +1,22 @@
-"""Does an array behave as its calibration says? Found while it scans: three signs tell the file of another array.
+"""Does an array behave as its calibration says? Found while it scans: four signs tell the file of another array.
 
 - **Blur.** Each image shows how far the cover blurs it (`blur_fit`), whatever is touched.
 - **Stiffness.** The slope of the touch, the images' moments and the motion show the stiffness of the layer, and
   estimators know it as `SurfaceEstimate.stiffness`. Another layer and other gains change it alike, as images alone do
-  not show newtons. So does an object or an arm that gives way, which the
-  message says.
+  not show newtons. So does an object or an arm that gives way, which the message says.
 - **Disagreement.** On a surface that is known, the slope of the touch gives a stiffness, and so does the bend of the
   pressure in an image. Another pitch makes one of them smaller and the other larger, each by its square.
+- **Contradiction.** Images mean another curvature than the motion shows, in most answers (`fused_estimator`).
 
 Each sign is a median of what was seen so far, from a least number on, and up to a number from which the array counts
 as the calibrated one: a check costs nothing after that. The limits come from a development draw of study `regions`,
 and study `calibrations` counts what they find.
 
-Until the array is calibrated, its answers are less certain: regions of curvature are wider (`estimate.widened`), and a
-force has the spread of a make and half of what stiffness and disagreement are off: two standard deviations reach the
-force that other gains would mean.
+Until the array is calibrated, its answers are less certain. A force has the spread of a make and half of what stiffness
+and disagreement are off: two standard deviations reach the force that other gains would mean. Regions of curvature are
+wider (`estimate.widened`) where any sign but the stiffness shows that images mean another curvature. Why not for
+another stiffness: estimators find it, and regions that were widened for it were three times the error. Images that
+contradict the motion in most answers are not asked for curvature any more.
 """
 
 from __future__ import annotations
@@ -57,6 +59,10 @@ MAX_DISAGREEMENT, MAX_TOUCH_SIGMA = 0.3, 0.08
 """Difference of the logarithms of two stiffnesses of one layer beyond which the calibration is another array's, and
 largest standard deviation of the touch's at which they are compared: a light touch shows it to 30 % only."""
 
+MAX_CONTRADICTED = 0.5
+"""Share of the answers that images contradict, beyond which the calibration is another array's: known ones have 3 % on
+the roughest surfaces."""
+
 
 class CalibrationCheck:
     """Compares the images and the stiffness of a scan with the calibration that it uses.
@@ -77,6 +83,7 @@ class CalibrationCheck:
         self._by_images: list[float] = []
         self._by_touch: list[float] = []
         self._bends: list[float] = []
+        self._contradicted: list[bool] = []
         self._curvature: float | None = None
         self._tries = 0
         self._next_s = -math.inf
@@ -129,8 +136,13 @@ class CalibrationCheck:
             answer: answer at the last contact.
             slope: slope of the root of the force over the push; None where the touch showed none.
         """
+        from canprobe.mechanics.touch.patch.fused_estimator import CONTRADICTION_NOTE  # only where a shape is asked for
+
         radius, kappa, self._curvature = self._pad.radius_m, answer.kappa, None
-        if self._tries >= MAX_TRIES or not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
+        if self._tries >= MAX_TRIES:
+            return
+        self._contradicted.append(CONTRADICTION_NOTE in answer.notes)
+        if not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
             return
         curvature = 0.5 / radius + 0.25 * float(kappa[0] + kappa[1])
         if curvature < MIN_BEND_SHARE * 0.5 / radius:
@@ -184,11 +196,25 @@ class CalibrationCheck:
         if self.disagreement:
             shown, by_touch = (self._stiffness * math.exp(median(by)) for by in (self._by_images, self._by_touch))
             found.append(f"its images show a layer of {shown:.3g} N/m³ and its touch one of {by_touch:.3g}")
+        if share := self.contradicted:
+            found.append(f"its images contradict {100.0 * share:.0f} % of the answers, which do without them")
         if not found:
             return None
         softer = (self.stiffness_off < 0.0 or self.disagreement > 0.0) and not self.blur_off
         soft = "; or the object or the arm gives way" if softer else ""
         return f"the array is not as its calibration says: {', and '.join(found)}{soft}"
+
+    @property
+    def image_model_off(self) -> bool:
+        """Whether images mean another curvature than the calibration says: another stiffness alone does not."""
+        return bool(self.blur_off or self.disagreement or self.contradicted)
+
+    @property
+    def contradicted(self) -> float:
+        """Share of the answers that images contradict; 0 as for the others."""
+        if len(self._contradicted) < MIN_ANSWERS:
+            return 0.0
+        return _beyond(sum(self._contradicted) / len(self._contradicted), MAX_CONTRADICTED)
 
     @property
     def force_spread(self) -> float:

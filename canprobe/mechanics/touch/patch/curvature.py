@@ -9,8 +9,8 @@ has little weight where a path excites all of K, and much where it does not. The
 unknown beside q. Why not a constant: an error of it looks like isotropic curvature. Its prior is the state of the scan
 (`ScanStiffness`): stated at first, then found from the slope of a touch together with the first images, and improved by
 every answer in which the motion knows curvature. Outside the calibrated range the patch counts less and less. Where
-patch and motion contradict each other both count less, by χ² over its 95 % point; where that lasts, nothing is called
-observed.
+patch and motion disagree both count less, by χ² over its 95 % point; where they contradict each other (99.9 %), nothing
+is called observed.
 
 Where the curvature changes along the path, a mean over some millimetres belongs to an earlier place. A second, shorter
 mean shows it: the difference of the two, extrapolated to now, counts as an error of the longer one.

@@ -21,8 +21,6 @@ from canprobe.mechanics.types import Floats
 MIN_NAMED_SHARE = 0.1
 """Least share of the patch in the information about K at which the estimate's method names it."""
 CONTRADICTION_NOTE = "the patch contradicts the motion"
-WITHDRAWAL_SHARE = 0.25
-"""Path, over the memory, along which a contradiction must last before nothing is called observed any more."""
 _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
@@ -41,7 +39,6 @@ class PatchedEstimator:
         self._length = length
         self._last: ContactSample | None = None
         self._place: Floats | None = None
-        self._contradicted = 0.0
 
     @property
     def dropped(self) -> Dropped:
@@ -66,28 +63,24 @@ class PatchedEstimator:
         found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
         moved = 0.0 if self._place is None else float(np.linalg.norm(motion.point - self._place))
         self._place = motion.point
-        if found is None or not found.contradicted:
-            self._contradicted = 0.0
-        else:
-            self._contradicted += moved
         if found is None:
             return motion
         if not found.contradicted:
             new = min(moved / self._length, 1.0)
             self.patch.stiffness.take(found.log_stiffness, found.stiffness_information, new)
-        answer = with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWAL_SHARE * self._length)
-        return replace(answer, stiffness=self.patch.stiffness.value)
+        return replace(with_patch(motion, found, self._length), stiffness=self.patch.stiffness.value)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._motion.reset()
         self.patch.reset()
         self._last = self._place = None
-        self._contradicted = 0.0
 
 
-def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdrawn: bool = False) -> SurfaceEstimate:
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceEstimate:
     """A motion estimate, with its curvature replaced by that of motion and patch together.
+
+    Where the two contradict each other nothing is observed.
 
     Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. The `method` ends in "+patch"
     where the patch gave at least `MIN_NAMED_SHARE`; a note gives its share.
@@ -96,14 +89,13 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdraw
         motion: the estimate, with its `evidence`.
         found: the curvature of both (`PatchCurvature.fuse`).
         length: memory of the estimator, m; curvatures below its inverse count as flat.
-        withdrawn: whether nothing is called observed.
     """
     assert motion.evidence is not None
     weight = CHI2_95 / max(found.cost, CHI2_95)
     evidence, patch = weight * motion.evidence.information, weight * found.patch
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
     data = weight * motion.information if has_prior else evidence
-    decision = nothing_observed() if withdrawn else _decide(data + patch, found.q, length)
+    decision = nothing_observed() if found.contradicted else _decide(data + patch, found.q, length)
     root = None
     if motion.model_root is not None:
         rows = np.zeros((3, 9))

@@ -13,11 +13,11 @@ RADIUS, MEMORY = 0.05, 0.02
 T = np.eye(4)
 
 
-def levelled(method, stated, **settings):
+def levelled(method, stated):
     inner = make_estimator(
         method, sigma_point=2e-5 * stated, sigma_normal=2e-3 * stated, memory_m=MEMORY, window=160, prior=None
     )
-    return LevelledEstimator(inner, MEMORY, **settings)
+    return LevelledEstimator(inner, MEMORY)
 
 
 def scanned(one, rng, path=0.08, step=1.25e-4):
@@ -57,14 +57,3 @@ def test_it_begins_at_what_is_stated_and_keeps_a_half():
     one.reset()
     assert one.level == 1.0
     assert one.estimate() is None
-
-
-@pytest.mark.parametrize(("stated", "wider"), [(0.6, True), (5.0, False)])
-def test_with_a_least_level_of_1_it_only_widens(stated, wider):
-    one = levelled("recursive", stated, least=1.0, power=0.5)
-    plain = make_estimator(
-        "recursive", sigma_point=2e-5 * stated, sigma_normal=2e-3 * stated, memory_m=MEMORY, window=160
-    )
-    found, bare = scanned(one, np.random.default_rng(0))[-1], scanned(plain, np.random.default_rng(0))[-1]
-    assert found.covariance == pytest.approx(bare.covariance * math.sqrt(one.level))
-    assert (one.level > 1.5) if wider else (one.level == 1.0)

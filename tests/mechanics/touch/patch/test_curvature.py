@@ -505,19 +505,20 @@ def lies(factor):
             yield one.estimate()
 
 
-def test_images_that_lie_widen_what_both_know_and_are_not_called_observed_for_long():
-    """However large the moments, the curvature along the path stays the motion's, ever less certain."""
+def test_images_that_lie_widen_what_both_know_until_nothing_is_observed():
+    """The curvature along the path stays the motion's, ever less certain."""
     before = 0.0
-    for factor in (1.0, 1.05, 1.1, 1.2, 1.33, 2.0):
-        answers = list(lies(factor))
-        ex = answers[1].T_frame_contact[:3, :2].T @ [1.0, 0.0, 0.0]
-        assert 2.0 * ex @ answers[1].S[:2, :2] @ ex == pytest.approx(0.0, abs=0.5)
+    for factor in (1.0, 1.01, 1.02, 1.03):
+        answer = list(lies(factor))[1]
+        ex = answer.T_frame_contact[:3, :2].T @ [1.0, 0.0, 0.0]
+        assert 2.0 * ex @ answer.S[:2, :2] @ ex == pytest.approx(0.0, abs=0.5)
         weights = np.array([ex[0] ** 2, 2.0 * ex[0] * ex[1], ex[1] ** 2])
-        sigma = math.sqrt(weights @ answers[1].covariance @ weights)
+        sigma = math.sqrt(weights @ answer.covariance @ weights)
         assert sigma > before
         before = sigma
-    assert "the patch contradicts the motion" in answers[1].notes
-    assert answers[-1].rank == 0
+    for answer in list(lies(2.0))[1:]:
+        assert "the patch contradicts the motion" in answer.notes
+        assert answer.rank == 0
 
 
 @pytest.fixture(scope="module")
