@@ -129,9 +129,9 @@ def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
 
 
 def test_it_turns_back_from_a_hollow_as_tight_as_the_probe(tmp_path):
-    """Beyond 8 mm the hollow has a radius of 31 mm: the probe of 40 mm would touch both of its walls."""
+    """Beyond 14 mm the hollow has a radius of 31 mm: the probe of 40 mm would touch both of its walls."""
     x = np.arange(-25, 25.1, 0.5)
-    bend = np.clip((x - 4.0) / 4.0, 0.0, 1.0) / 28.0 - 1.0 / 250.0
+    bend = np.clip((x - 2.0) / 12.0, 0.0, 1.0) / 28.0 - 1.0 / 250.0
     slope = 0.5 * (np.cumsum(bend) - np.cumsum(bend)[50])
     trough = 0.5 * (np.cumsum(slope) - np.cumsum(slope)[50])
     hollow = height_field(tmp_path, trough[:, None] - x[None] ** 2 / 300.0)

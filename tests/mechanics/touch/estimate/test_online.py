@@ -9,7 +9,8 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.following import LAG_SHARE, SPAN_SHARE, FollowingEstimator, less_certain
-from canprobe.mechanics.touch.estimate.noise import CHI2_95
+from canprobe.mechanics.touch.estimate.noise import CHI2_95, Correlation
+from canprobe.mechanics.touch.estimate.recursive import CHANGING_NOTE
 from canprobe.mechanics.touch.patch.curvature import MAX_RECENT_FRAMES, MIN_FRAMES, RECENT_OUTLIER_SHARE, _Mean
 
 MEMORY = 0.02
@@ -118,10 +119,9 @@ def test_all_that_is_known_agrees_after_an_error_is_added():
     assert np.allclose(grown, np.outer(to_q * v, to_q * v), rtol=1e-6, atol=1e-9)
 
 
-def test_ml_forgets_what_was_before_an_edge():
-    """From a plane into an arc of 30 mm: soon after the edge the window holds only the arc."""
+def over_an_edge(estimator, every):
+    """An answer to every such contact of 260 from a plane into an arc of 30 mm, which begins at the 176th."""
     rng = np.random.default_rng(3)
-    estimator = make_estimator("ml", memory_m=MEMORY, window=160, **SIGMAS)
     s = np.arange(260) * 0.125e-3
     x, y = s - 0.022, 0.003 * np.sin(s / 0.6e-3 * 0.5)
     angle = np.maximum(x, 0.0) / 0.03
@@ -130,14 +130,28 @@ def test_ml_forgets_what_was_before_an_edge():
     points += 2e-5 * rng.normal(size=points.shape)
     normals += 1e-3 * rng.normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    noted, found = False, None
     for i in range(260):
         estimator.add(ContactSample(5e-3 * i, points[i], normals[i], np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
-        if i % 8 == 7 and (found := estimator.estimate()) is not None:
-            noted |= any("surface changed" in note for note in found.notes)
-    assert noted
-    assert found.kappa[0] == pytest.approx(1.0 / 0.03, rel=0.05)
-    assert found.samples < 120
+        if i % every == every - 1:
+            yield estimator.estimate()
+
+
+def test_ml_forgets_what_was_before_an_edge():
+    """Soon after the edge the window holds only the arc."""
+    answers = list(over_an_edge(make_estimator("ml", memory_m=MEMORY, window=160, **SIGMAS), every=8))
+    assert any("surface changed" in note for found in answers if found is not None for note in found.notes)
+    assert answers[-1].kappa[0] == pytest.approx(1.0 / 0.03, rel=0.05)
+    assert answers[-1].samples < 120
+
+
+def test_nothing_is_observed_where_the_surface_may_be_changing():
+    """Between the edge and the alarm, which correlated noise puts off."""
+    settings = SIGMAS | {"correlation": Correlation(2e-3, 0.0, 0.2)}
+    answers = list(over_an_edge(make_estimator("recursive", memory_m=MEMORY, window=160, **settings), every=1))
+    doubtful = [i for i, found in enumerate(answers) if found is not None and CHANGING_NOTE in found.notes]
+    assert 176 < doubtful[0] <= doubtful[-1] < 200
+    assert all(answers[i].rank == 0 and answers[i].evidence is None for i in doubtful)
+    assert answers[-1].rank == 3 and answers[-1].kappa[0] == pytest.approx(1.0 / 0.03, rel=0.1)
 
 
 def test_a_mean_of_moments_takes_a_row_of_far_ones_for_a_change_and_a_single_one_for_wrong():
