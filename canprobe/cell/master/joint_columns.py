@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import astuple
 from pathlib import Path
-from typing import Any
+from struct import pack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,9 @@ def joint_positions(log: Mapping[str, Floats], name: str = "q") -> Floats | None
     return np.where(np.isnan(turning), sliding, turning)
 
 
+_NO_FEATURES = (math.nan,) * 7
+
+
 class TactileLog:
     """The tactile frames that the cell used: images and what belongs to them, for `tactile.npz`.
 
@@ -57,7 +61,6 @@ class TactileLog:
         self.rows: Rows | None = None
         self._kept = kept
         self._file = folder / "tactile.npy" if folder is not None else None
-        self._row: Any = None
         self._added = 0
 
     def add(self, t_s: float, start_s: float, sample: TactileSample) -> None:
@@ -65,19 +68,19 @@ class TactileLog:
 
         A device of raw frames has their values besides; features are NaN in a frame of taxels.
         """
-        frame, row = sample.frame, self._row
+        frame = sample.frame
         if self.rows is None:
             raw = [] if frame.raw is None else [("raw", frame.raw.dtype, frame.raw.shape)]
             times = [(name, np.float64) for name in ("t_s", "t_sample_s", "t_sigma_s")]
             of_frame = [("taxels", np.uint8, frame.taxels.shape), ("window", np.int64, 4), ("features", np.float64, 7)]
-            row = self._row = np.zeros(1, [*raw, *times, *of_frame])
-            self.rows = Rows(row.dtype, self._file, self._kept)
-        if frame.raw is not None:
-            row["raw"] = frame.raw
-        row["t_s"], row["t_sample_s"], row["t_sigma_s"] = t_s, sample.t_sample_ns * 1e-9 + start_s, sample.t_sigma_s
-        row["taxels"], row["window"] = frame.taxels, frame.window
-        row["features"] = np.nan if frame.features is None else astuple(frame.features)
-        self.rows.add(row.tobytes())
+            self.rows = Rows([*raw, *times, *of_frame], self._file, self._kept)
+        features = _NO_FEATURES if frame.features is None else astuple(frame.features)
+        self.rows.add(
+            (b"" if frame.raw is None else frame.raw.tobytes())
+            + pack("=3d", t_s, sample.t_sample_ns * 1e-9 + start_s, sample.t_sigma_s)
+            + frame.taxels.tobytes()
+            + pack("=4q7d", *frame.window, *features)
+        )
         self._added += 1
         if self._file is not None and self._added % BLOCK_ROWS == 0:
             self.rows.flush()

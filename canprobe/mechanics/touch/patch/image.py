@@ -192,14 +192,15 @@ def compute_patch(
     pad = calibration.pad
     if taxels.shape != pad.shape or taxels.dtype != np.uint8:
         raise UsageError(f"taxels: expected {pad.shape} uint8, got {taxels.shape} {taxels.dtype}")
-    counts, dead, edges = taxels.tobytes(), 0, (0, 0)
-    if pad.is_grid:  # a list has neither neighbours nor an edge
-        if may_be_dead(counts):
-            taxels, dead = mended(taxels)
-            counts = taxels.tobytes()
-        edges = _edges(counts, pad.shape, window)
+    counts, dead = taxels.tobytes(), 0
+    if pad.is_grid and may_be_dead(counts):  # the taxels of a list have no neighbours
+        taxels, dead = mended(taxels)
+        counts = taxels.tobytes()
     active = counts.translate(None, _ALL_COUNTS[: max(calibration.threshold_counts, 1)])
-    n_active, peak = len(active), max(active, default=0)
+    if not active:
+        return _nothing(0.0)._replace(dead=dead)
+    edges = _edges(counts, pad.shape, window) if pad.is_grid else (0, 0)
+    n_active, peak = len(active), max(active)
     pascals = calibration.pascals
     peak_pa, at_pad, at_window = [pascals.item(count) for count in (peak, *edges)]
     pressure = pascals.take(taxels)
