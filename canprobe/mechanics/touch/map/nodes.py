@@ -118,7 +118,7 @@ class NodeGrid:
             old = self._rows[number]
             share = row[PATH] / (row[PATH] + old[PATH])
             bent = float((self._point(row) - self._point(old)) @ (row[NORMAL] - old[NORMAL]))
-            old[_MEANS] += share * (row[_MEANS] - old[_MEANS])
+            old[_MEANS] = (1.0 - share) * old[_MEANS] + share * row[_MEANS]  # variances may be infinite
             old[COUNT:] += row[COUNT:]
             self._lift(old, share * (1.0 - share) * bent)
         else:

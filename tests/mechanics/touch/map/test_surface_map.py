@@ -154,6 +154,13 @@ def test_points_alone_give_the_curvature_and_normals_alone_all_but_the_height(sh
     assert np.isnan(one.normal(p)[0]).all()
 
 
+@pytest.mark.parametrize("unused", ["sigma_height", "sigma_normal"])
+def test_heights_or_normals_that_are_not_used_may_be_of_ground_that_was_touched_before(unused):
+    twice = np.concatenate([RASTER, RASTER])
+    p, _, tensor = SHAPES["ball"](PLACES)
+    assert np.abs(fitted("ball", twice, **{unused: math.inf}).curvature(p).tensor - tensor).max() < 3.0
+
+
 def test_both_sheets_of_a_thin_body_are_apart():
     """A plate of 1 mm, and two flat steps of 3 mm that face one way."""
     p, n, _ = on_quadratic(RASTER, 0.0, 0.0)
