@@ -117,12 +117,13 @@ def ground_at(surface_map: SurfaceMap, answer: SurfaceEstimate) -> KnownCurvatur
     fits, _, chi2 = fit_discs(rows, disc, pad, surface_map.noise, K_ref=K_ref, weight=disc.weight)
     weight = robust(disc.weight, chi2)
     fits, _, _ = fit_discs(rows, disc, pad, surface_map.noise, K_ref=fits.K, weight=weight)
-    if observed_of(fits)[1][0] < 3 or fits.excess[0] > MAX_EXCESS:
+    covariance = fits.covariance(fits.excess)
+    if observed_of(fits, covariance)[1][0] < 3 or fits.excess[0] > MAX_EXCESS:
         return None
     xxx, xxy, xyy, yyy = (fits.a[0, THIRD] / LENGTH_M**2).tolist()
     change2 = xxx**2 + 3.0 * (xxy**2 + xyy**2) + yyy**2  # of the tensor along both axes
     turn = TO_Q * _MIRRORED / LENGTH_M
-    V = fits.V[0, SECOND, SECOND] * (1.0 + fits.excess[0]) * np.outer(turn, turn)
+    V = covariance[0, SECOND, SECOND] * np.outer(turn, turn)
     return KnownCurvature(-turn * fits.a[0, SECOND], V + BLUR_M**2 * change2 / 3.0 * np.eye(3))
 
 

@@ -41,6 +41,7 @@ from canprobe.mechanics.touch.map.quartic import (
     SECOND,
     SECOND_DERIVATIVES,
     TERMS,
+    THIRD,
     fourth_of,
     terms,
 )
@@ -82,21 +83,36 @@ class Quartics(NamedTuple):
 
     Attributes:
         a: (m, 15) derivatives of the height.
-        V: (m, 15, 15) their covariance, that of the common errors included.
+        V: (m, 15, 15) their covariance by the noise, that of the common errors included.
         excess: (m,) χ² per degree of freedom above 1; 0 where the noise explains the contacts.
         spread: (m, 2, 2) covariance of the nodes in the plane over the variance of their places.
+        roughness: (m,) largest third or fourth derivative over the deviation that the roughest prior gives it.
     """
 
     a: Floats
     V: Floats
     excess: Floats
     spread: Floats
+    roughness: Floats
 
     @property
     def K(self) -> Floats:
         """(m, 2, 2) curvature at the origins along x and y, where the planes are tangent, 1/m."""
         xx, xy, yy = -self.a[:, SECOND].T / LENGTH_M
         return np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+
+    def covariance(self, excess: Floats) -> Floats:
+        """(m, 15, 15) stated covariance of `a`, at an excess of χ² (m,)."""
+        result: Floats = self.V * (1.0 + excess)[:, None, None]
+        return result
+
+
+def mean_depth(rows: Floats, discs: Discs, pad: PadLayer, K: Floats) -> Floats:
+    """(m,) depth of the layer, m, of the nodes (k, COLUMNS) in discs of curvature K (m, 2, 2), 1/m, at mean √force."""
+    root_force = (discs.weight * rows[discs.nodes, column.ROOT_FORCE]).sum(axis=1) / discs.weight.sum(axis=1)
+    det = np.maximum(np.linalg.det(np.eye(2) / pad.radius + K), 0.0)
+    result: Floats = root_force * np.sqrt(np.sqrt(det) / (math.pi * pad.stiffness))
+    return result
 
 
 def fit_discs(
@@ -135,8 +151,8 @@ def fit_discs(
     told = [part(k)[1].about_common(discs.share[here]) for k, here in enumerate(parts)] if sigma.any() else []
     common = CommonErrors.of(told, sigma)
     answers = [_answer(*part(k), weight[here], common, noise.used) for k, here in enumerate(parts)]
-    a, V, excess, spread, chi2 = (np.concatenate(values) for values in zip(*answers, strict=True))
-    return Quartics(a, V, excess, spread), common, chi2
+    *columns, chi2 = (np.concatenate(values) for values in zip(*answers, strict=True))
+    return Quartics(*columns), common, chi2
 
 
 def _answer(rows: _Rows, posterior: _Posterior, weight: Floats, common: CommonErrors, used: int) -> tuple[Floats, ...]:
@@ -153,7 +169,8 @@ def _answer(rows: _Rows, posterior: _Posterior, weight: Floats, common: CommonEr
     off = rows.places - np.einsum("mn,mni->mi", share, rows.places)[:, None]
     variance = np.maximum(np.einsum("mn,mn->m", share, rows.variance), 1e-300)
     spread = np.einsum("mn,mni,mnj->mij", share, off, off) / variance[:, None, None]
-    return a, V, excess, spread, chi2
+    roughness = np.abs(a * np.sqrt(PRIOR_INFORMATION[-1]))[:, THIRD.start :].max(axis=1)
+    return a, V, excess, spread, roughness, chi2
 
 
 def _followed(K: Floats, radius: float) -> Floats:

@@ -186,8 +186,7 @@ class SurfaceMap:
     def _normal(self, blend: _Blend) -> tuple[Floats, Floats]:
         cells, R = self.solved(), self.solved().discs.R[blend.cells]
         rows = np.stack(terms(*blend.xy, (1, 0), (0, 1)), axis=-2)
-        V = rows @ cells.fits.V[blend.cells] @ np.swapaxes(rows, -1, -2)
-        V = V * (1.0 + cells.excess[blend.cells])[..., None, None] / blend.slope_size[..., None, None] ** 2
+        V = rows @ cells.covariance[blend.cells] @ np.swapaxes(rows, -1, -2) / blend.slope_size[..., None, None] ** 2
         V = np.einsum("nk,nkip,nkpq,nkjq->nij", blend.weight, R[..., :2], V, R[..., :2])
         return blend.feet.normal, V + 0.0 * blend.feet.normal[:, :1, None]
 
@@ -216,8 +215,7 @@ class SurfaceMap:
         (p, q), (r, s) = np.moveaxis(Q, (-2, -1), (0, 1))
         turn = np.stack([p * p, 2 * p * q, q * q, p * r, p * s + q * r, q * s, r * r, 2 * r * s, s * s], axis=-1)
         rows = turn.reshape(*p.shape, 3, 3) @ second
-        V = rows @ cells.fits.V[blend.cells] @ np.swapaxes(rows, -1, -2)
-        V = np.einsum("nk,nkij->nij", share * (1.0 + cells.excess[blend.cells]), V)
+        V = np.einsum("nk,nkip,nkpq,nkjq->nij", share, rows, cells.covariance[blend.cells], rows, optimize=True)
         K = np.einsum("nip,nij,njq->npq", axes, tensor, axes)
         return MapCurvature(tensor, axes, K, V, np.where(total > 0.0, 3, np.minimum(rank, 2)))
 
@@ -321,12 +319,9 @@ class SurfaceMap:
             apart = height / np.maximum((up * normal[:, None]).sum(axis=-1), 0.5)
             above = ((q - foot) * normal).sum(axis=1) + (weight * apart).sum(axis=1)
             foot = q - above[:, None] * normal
-        excess = cells.excess[which]
         (f,) = terms(*xy, (0, 0))
-        variance = ((f[..., None, :] @ cells.fits.V[which])[..., 0, :] * f).sum(axis=-1) * LENGTH_M**2 / size**2
-        variance = variance * (1.0 + excess) + cells.offset[which] ** 2
-        if math.isfinite(self.noise.height):
-            variance += 2.0 * excess * self.noise.height**2
+        variance = ((f[..., None, :] @ cells.covariance[which])[..., 0, :] * f).sum(axis=-1) * LENGTH_M**2 / size**2
+        variance += cells.height2[which]
         spread = apart - (weight * apart).sum(axis=1, keepdims=True)
         sigma = np.sqrt((weight * (variance + spread**2)).sum(axis=1))
         finite: NDArray[np.bool_] = np.isfinite(foot[:, 0])
