@@ -111,7 +111,7 @@ class GroundCells:
         rows = self._map.nodes.near(place)
         if not len(rows):
             return
-        points = rows[:, column.CENTRE] - pad.radius * rows[:, column.NORMAL]
+        points = self._map.nodes.points_of(rows)
         beside = np.hypot(*(self._axes[:2] @ (points - place).T))
         nearest = int(beside.argmin())
         if beside[nearest] > REACH_M:

@@ -24,7 +24,6 @@ from canprobe.mechanics.touch.estimate.online import Estimator, OuterEstimator
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, parameters_of
 from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted, solved
-from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.cells import observed_of, robust
 from canprobe.mechanics.touch.map.discs import Discs
 from canprobe.mechanics.touch.map.local_fits import fit_discs
@@ -106,7 +105,7 @@ class RevisitingEstimator(OuterEstimator):
 def ground_at(surface_map: SurfaceMap, answer: SurfaceEstimate) -> KnownCurvature | None:
     """What a map says of the curvature at an answer, in its contact frame; None where it did not observe all of it."""
     rows, pad = surface_map.nodes.near(answer.point), surface_map.pad
-    points = rows[:, column.CENTRE] - (pad.radius if pad else 0.0) * rows[:, column.NORMAL]
+    points = surface_map.nodes.points_of(rows)
     if len(rows) < MIN_NODES or not np.linalg.norm(points - answer.point, axis=1).min() < REACH_M:
         return None
     R = answer.T_frame_contact[:3, :3] * _OUTWARD  # the same x axis, z outward
