@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs
-from canprobe.mechanics.touch.map.local_fits import fit_discs
+from canprobe.mechanics.touch.map.local_fits import fit_discs, mean_depth
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, THIRD
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.strategies import Rectangle
@@ -111,7 +111,7 @@ class GroundCells:
         rows = self._map.nodes.near(place)
         if not len(rows):
             return
-        points = rows[:, column.CENTRE] - pad.radius * rows[:, column.NORMAL]
+        points = self._map.nodes.points_of(rows)
         beside = np.hypot(*(self._axes[:2] @ (points - place).T))
         nearest = int(beside.argmin())
         if beside[nearest] > REACH_M:
@@ -124,14 +124,9 @@ class GroundCells:
         except np.linalg.LinAlgError:  # of contacts that no surface explains
             return
         self.change[i] = math.sqrt(float(np.mean(fits.a[0, THIRD] ** 2))) / LENGTH_M**2
-        excess = float(fits.excess[0])
-        weights = disc.weight[0]
-        root_force = float(weights @ rows[disc.nodes[0], column.ROOT_FORCE] / weights.sum())
-        det = max(float(np.linalg.det(np.eye(2) / pad.radius + fits.K[0])), 1e-9)
-        depth = root_force * math.sqrt(math.sqrt(det) / (math.pi * pad.stiffness))
-        self.common = 0.5 * self._stiffness_sigma * depth
-        variance = float(fits.V[0, 0, 0]) * LENGTH_M**2 * (1.0 + excess)
-        floor2 = self.common**2 + 2.0 * excess * self._map.noise.height**2
+        self.common = 0.5 * self._stiffness_sigma * float(mean_depth(rows, disc, pad, fits.K)[0])
+        variance = float(fits.covariance(fits.excess)[0, 0, 0]) * LENGTH_M**2
+        floor2 = self.common**2 + 2.0 * float(fits.excess[0]) * self._map.noise.height**2
         self.floor[i] = min(math.sqrt(floor2), UNKNOWN_M)
         self.sigma[i] = min(math.sqrt(floor2 + variance), UNKNOWN_M)
 

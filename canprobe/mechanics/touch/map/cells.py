@@ -1,5 +1,9 @@
 """Solved cells of a map: the fits of all discs, the errors that they have in common, and what of them was observed.
 
+What was observed is decided on the covariance that is stated: where contacts scatter more than their noise explains,
+curvature that a fit of their noise would have shown is not observed. Nor is it where a quartic had to be rougher than
+its prior allows: such are the sheets of a step that a disc took for one.
+
 Two solutions: the first as if the surface were flat, the second with the curvature that the first has found, with the
 stiffness of the pad's layer that follows from it, and with less weight for nodes that do not fit.
 """
@@ -18,7 +22,7 @@ from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, Slope
 from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs
-from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs
+from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs, mean_depth
 from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND
 from canprobe.mechanics.touch.map.stiffness import (
@@ -39,6 +43,9 @@ MAX_HEIGHT_SIGMA_M, MAX_SLOPE_SIGMA, MAX_CURVATURE_SIGMA = 1e-3, 0.1, 15.0
 """Standard deviations of height (m), slope and a combination of curvature (1/m) above which it was not observed; the
 last is compared with 0.3 times the curvature, too."""
 MAX_RELATIVE_SIGMA = 0.3
+MAX_ROUGHNESS = 2.0
+"""Roughness of a quartic above which it says nothing of the curvature: sheets that mix, or a surface that is not smooth
+over a disc. Over fillets and edges of 10° of the development shapes it is at most 1.6."""
 STATED_STIFFNESS_SIGMA = 0.2
 """Standard deviation of ln k where neither a slope nor an image shows it."""
 
@@ -82,8 +89,10 @@ class Cells(NamedTuple):
     Attributes:
         discs: places of the cells, and the nodes round each.
         fits: quartic of each.
-        excess: (m,) χ² per degree of freedom above 1, the largest within the size of a patch.
-        offset: (m,) standard deviation of the height by the error of the layer's stiffness, m.
+        covariance: (m, 15, 15) stated covariance of the quartics, with the largest excess of χ² within the size of a
+            patch.
+        height2: (m,) variance of the height beside that of the quartic, m²: the scatter of contacts that noise does not
+            explain, and the error of the layer's stiffness.
         known: (m, 3) whether height, slopes and all of the curvature were observed.
         rank: (m,) number of combinations of curvature that were observed.
         tree, contacts: search trees of the places of the cells, and of the points of the nodes.
@@ -93,8 +102,8 @@ class Cells(NamedTuple):
 
     discs: Discs
     fits: Quartics
-    excess: Floats
-    offset: Floats
+    covariance: Floats
+    height2: Floats
     known: NDArray[np.bool_]
     rank: NDArray[np.intp]
     tree: cKDTree
@@ -122,14 +131,15 @@ def solve_cells(rows: Floats, points: Floats, pad: PadLayer | None, noise: MapNo
         pad = pad._replace(stiffness=stiffness.value)
     weight = robust(weight, chi2)
     fits, common, _ = fit_discs(rows, discs, pad, noise, K_ref=fits.K, weight=weight)
-    tree, offset = cKDTree(discs.origin), np.zeros(m)
+    tree = cKDTree(discs.origin)
     excess = np.array([fits.excess[near].max() for near in tree.query_ball_point(discs.origin, EXCESS_REACH_M)])
+    covariance, height2 = fits.covariance(excess), np.zeros(m)
+    if math.isfinite(noise.height):
+        height2 += 2.0 * excess * noise.height**2
     if pad is not None and stiffness is not None:
-        det = np.linalg.det(np.eye(2) / pad.radius + fits.K)
-        force = (discs.weight * rows[discs.nodes, column.ROOT_FORCE]).sum(axis=1) / discs.weight.sum(axis=1)
-        depth = force * np.sqrt(np.sqrt(np.maximum(det, 0.0)) / (math.pi * pad.stiffness))
-        offset = 0.5 * stiffness.sigma * depth
-    return Cells(discs, fits, excess, offset, *observed_of(fits), tree, cKDTree(points), common, stiffness)
+        height2 += (0.5 * stiffness.sigma * mean_depth(rows, discs, pad, fits.K)) ** 2
+    seen = observed_of(fits, covariance)
+    return Cells(discs, fits, covariance, height2, *seen, tree, cKDTree(points), common, stiffness)
 
 
 def robust(weight: Floats, chi2: Floats) -> Floats:
@@ -138,9 +148,8 @@ def robust(weight: Floats, chi2: Floats) -> Floats:
     return result
 
 
-def observed_of(fits: Quartics) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
-    """Whether height, slopes and all of K were observed (m, 3), and the rank of K (m,)."""
-    V = fits.V
+def observed_of(fits: Quartics, V: Floats) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Whether height, slopes and all of K were observed (m, 3), and the rank of K (m,), at a stated covariance V."""
     height = V[:, 0, 0] * LENGTH_M**2 < MAX_HEIGHT_SIGMA_M**2
     slopes = np.maximum(V[:, 1, 1], V[:, 2, 2]) < MAX_SLOPE_SIGMA**2
     to_q = np.array([1.0, math.sqrt(2.0), 1.0])
@@ -149,5 +158,5 @@ def observed_of(fits: Quartics) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
     certain = (np.linalg.eigvalsh(of_K) < limit[:, None] ** 2).sum(axis=1)
     low, high = np.linalg.eigvalsh(fits.spread).T
     spread = (np.stack([low, 0.5 * (low + high), high]) >= MIN_SPREAD).sum(axis=0)
-    rank = np.minimum(certain, spread)
+    rank = np.where(fits.roughness < MAX_ROUGHNESS, np.minimum(certain, spread), 0)
     return np.stack([height, slopes, rank == 3], axis=1), rank

@@ -30,7 +30,8 @@ def fit_map(
     """The surface that contacts show, with its uncertainty.
 
     The surface must be smooth over about 3 mm; contacts a few mm apart make one surface, and it ends 4 mm from them.
-    Errors of contacts count as independent.
+    Where it is rougher, or two sheets mix, its curvature is not observed; points without normals do not tell a step
+    between two passes from a bend. Errors of contacts count as independent.
 
         found = fit_map(points, normals, sigma_point=30e-6, sigma_normal=1e-3)
         height, sigma = found.distance(places)

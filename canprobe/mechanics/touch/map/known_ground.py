@@ -24,7 +24,6 @@ from canprobe.mechanics.touch.estimate.online import Estimator, OuterEstimator
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, parameters_of
 from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted, solved
-from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.cells import observed_of, robust
 from canprobe.mechanics.touch.map.discs import Discs
 from canprobe.mechanics.touch.map.local_fits import fit_discs
@@ -106,7 +105,7 @@ class RevisitingEstimator(OuterEstimator):
 def ground_at(surface_map: SurfaceMap, answer: SurfaceEstimate) -> KnownCurvature | None:
     """What a map says of the curvature at an answer, in its contact frame; None where it did not observe all of it."""
     rows, pad = surface_map.nodes.near(answer.point), surface_map.pad
-    points = rows[:, column.CENTRE] - (pad.radius if pad else 0.0) * rows[:, column.NORMAL]
+    points = surface_map.nodes.points_of(rows)
     if len(rows) < MIN_NODES or not np.linalg.norm(points - answer.point, axis=1).min() < REACH_M:
         return None
     R = answer.T_frame_contact[:3, :3] * _OUTWARD  # the same x axis, z outward
@@ -117,12 +116,13 @@ def ground_at(surface_map: SurfaceMap, answer: SurfaceEstimate) -> KnownCurvatur
     fits, _, chi2 = fit_discs(rows, disc, pad, surface_map.noise, K_ref=K_ref, weight=disc.weight)
     weight = robust(disc.weight, chi2)
     fits, _, _ = fit_discs(rows, disc, pad, surface_map.noise, K_ref=fits.K, weight=weight)
-    if observed_of(fits)[1][0] < 3 or fits.excess[0] > MAX_EXCESS:
+    covariance = fits.covariance(fits.excess)
+    if observed_of(fits, covariance)[1][0] < 3 or fits.excess[0] > MAX_EXCESS:
         return None
     xxx, xxy, xyy, yyy = (fits.a[0, THIRD] / LENGTH_M**2).tolist()
     change2 = xxx**2 + 3.0 * (xxy**2 + xyy**2) + yyy**2  # of the tensor along both axes
     turn = TO_Q * _MIRRORED / LENGTH_M
-    V = fits.V[0, SECOND, SECOND] * (1.0 + fits.excess[0]) * np.outer(turn, turn)
+    V = covariance[0, SECOND, SECOND] * np.outer(turn, turn)
     return KnownCurvature(-turn * fits.a[0, SECOND], V + BLUR_M**2 * change2 / 3.0 * np.eye(3))
 
 

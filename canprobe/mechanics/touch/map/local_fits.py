@@ -9,9 +9,10 @@ since δ ln d = ¼ tr(M δK) and K = −∇²h: a depth that began with another 
 along the heading v, the pad's relative scale, and the offsets of the centroid. Each disc gives information about them,
 I_θ += s (Λ_θθ − Λ_θa S⁻¹ Λ_aθ), S with the prior, s the share of its nodes that no other disc counts.
 
-A pad shows what lies under its patch: where the curvature changes within it, the centroid of its pressure moves. Why
-is that not in the slopes, as 2/3 ∇Lφ·a of a bare layer: it makes fine forms better, and jumps of the curvature, where
-no quartic is right, overshoot by more.
+A pad shows what lies under its patch: where the curvature changes within it, the centroid of its pressure moves, and
+the slopes that it shows are those of h + 2/3 Lh (bare layer). Why is that not in the rows: it makes fine forms better,
+and jumps of the curvature, where no quartic is right, overshoot by more. It is stated as an error of slopes and
+curvature instead, of the size that the fitted quartic itself gives it.
 
 For each deviation g of third derivatives the evidence is −½ ln|S_g| + ½ ln|P_g| + ½ ηᵀ S_g⁻¹ η, P the prior's
 information and η the pull of the data beyond the prior's mean. The answer is the mixture: a smooth surface is taken as
@@ -41,6 +42,7 @@ from canprobe.mechanics.touch.map.quartic import (
     SECOND,
     SECOND_DERIVATIVES,
     TERMS,
+    THIRD,
     fourth_of,
     terms,
 )
@@ -48,6 +50,8 @@ from canprobe.mechanics.types import Floats
 
 CHANCE_SIGMAS = 2.0
 """Standard deviations of χ² per degree of freedom by which it must be above 1 to be more than chance."""
+PATCH_SHARE = 2.0 / 3.0
+"""Share of Lh in the slopes that a bare layer shows."""
 COMMON = 4
 """Number of common errors."""
 ROWS_AT_ONCE = 60_000
@@ -82,21 +86,38 @@ class Quartics(NamedTuple):
 
     Attributes:
         a: (m, 15) derivatives of the height.
-        V: (m, 15, 15) their covariance, that of the common errors included.
+        V: (m, 15, 15) their covariance by the noise, that of the common errors included.
         excess: (m,) χ² per degree of freedom above 1; 0 where the noise explains the contacts.
         spread: (m, 2, 2) covariance of the nodes in the plane over the variance of their places.
+        patch_error: (m, 15) usual error of slopes and higher derivatives where the curvature changes under the patch.
+        roughness: (m,) largest third or fourth derivative over the deviation that the roughest prior gives it.
     """
 
     a: Floats
     V: Floats
     excess: Floats
     spread: Floats
+    patch_error: Floats
+    roughness: Floats
 
     @property
     def K(self) -> Floats:
         """(m, 2, 2) curvature at the origins along x and y, where the planes are tangent, 1/m."""
         xx, xy, yy = -self.a[:, SECOND].T / LENGTH_M
         return np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+
+    def covariance(self, excess: Floats) -> Floats:
+        """(m, 15, 15) stated covariance of `a`, at an excess of χ² (m,): noise, and the error of the patch."""
+        result: Floats = self.V * (1.0 + excess)[:, None, None]
+        return result + self.patch_error[:, :, None] * self.patch_error[:, None]
+
+
+def mean_depth(rows: Floats, discs: Discs, pad: PadLayer, K: Floats) -> Floats:
+    """(m,) depth of the layer, m, of the nodes (k, COLUMNS) in discs of curvature K (m, 2, 2), 1/m, at mean √force."""
+    root_force = (discs.weight * rows[discs.nodes, column.ROOT_FORCE]).sum(axis=1) / discs.weight.sum(axis=1)
+    det = np.maximum(np.linalg.det(np.eye(2) / pad.radius + K), 0.0)
+    result: Floats = root_force * np.sqrt(np.sqrt(det) / (math.pi * pad.stiffness))
+    return result
 
 
 def fit_discs(
@@ -135,8 +156,8 @@ def fit_discs(
     told = [part(k)[1].about_common(discs.share[here]) for k, here in enumerate(parts)] if sigma.any() else []
     common = CommonErrors.of(told, sigma)
     answers = [_answer(*part(k), weight[here], common, noise.used) for k, here in enumerate(parts)]
-    a, V, excess, spread, chi2 = (np.concatenate(values) for values in zip(*answers, strict=True))
-    return Quartics(a, V, excess, spread), common, chi2
+    *columns, chi2 = (np.concatenate(values) for values in zip(*answers, strict=True))
+    return Quartics(*columns), common, chi2
 
 
 def _answer(rows: _Rows, posterior: _Posterior, weight: Floats, common: CommonErrors, used: int) -> tuple[Floats, ...]:
@@ -153,7 +174,10 @@ def _answer(rows: _Rows, posterior: _Posterior, weight: Floats, common: CommonEr
     off = rows.places - np.einsum("mn,mni->mi", share, rows.places)[:, None]
     variance = np.maximum(np.einsum("mn,mn->m", share, rows.variance), 1e-300)
     spread = np.einsum("mn,mni,mnj->mij", share, off, off) / variance[:, None, None]
-    return a, V, excess, spread, chi2
+    patch_error = PATCH_SHARE * np.einsum("mpq,mq->mp", rows.layer, a)
+    patch_error[:, 0] = 0.0  # the height is measured beside the slopes
+    roughness = np.abs(a * np.sqrt(PRIOR_INFORMATION[-1]))[:, THIRD.start :].max(axis=1)
+    return a, V, excess, spread, patch_error, roughness, chi2
 
 
 def _followed(K: Floats, radius: float) -> Floats:
@@ -167,14 +191,16 @@ def _followed(K: Floats, radius: float) -> Floats:
 class _Rows(NamedTuple):
     """Whitened rows A (m, 3n, 15 + 4) of (a, θ) and y (m, 3n); places (m, n, 2), m, and their variances (m, n), m².
 
-    `usual` (m, n) is the χ² that is usual for a node: below one a row where nodes are shorter than the path of an
-    independent sample, as the noise within a node is then that of its neighbours.
+    `layer` (m, 15, 15) takes `a` to the derivatives of Lh at the mean depth. `usual` (m, n) is the χ² that is usual for
+    a node: below one a row where nodes are shorter than the path of an independent sample, as the noise within a node
+    is then that of its neighbours.
     """
 
     A: Floats
     y: Floats
     places: Floats
     variance: Floats
+    layer: Floats
     usual: Floats
 
 
@@ -197,7 +223,8 @@ def _rows(rows: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, K_r
     x, y, z = np.moveaxis(at, -1, 0) / LENGTH_M
     f, fx, fy = terms(x, y, (0, 0), (1, 0), (0, 1))
     A, values = np.zeros((m, n, 3, TERMS + COMMON)), np.empty((m, n, 3))
-    A[..., 0, :TERMS] = f + quarter[..., None] * (f @ np.einsum("mij,ijpq->mpq", M, SECOND_DERIVATIVES))
+    second = np.einsum("mij,ijpq->mpq", M, SECOND_DERIVATIVES)
+    A[..., 0, :TERMS] = f + quarter[..., None] * (f @ second)
     A[..., 1, :TERMS], A[..., 2, :TERMS] = fx, fy
     values[..., 0] = z - quarter * np.einsum("mij,mij->m", M, K_ref * LENGTH_M)[:, None]
     values[..., 1:] = -normal[..., :2] / np.maximum(normal[..., 2:], MIN_FACING)
@@ -215,7 +242,10 @@ def _rows(rows: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, K_r
     usual = math.isfinite(noise.height) * np.minimum(heights, 1.0)
     usual = usual + 2.0 * math.isfinite(noise.normal) * np.minimum(normals, 1.0)
     A *= scale[..., None]
-    return _Rows(A.reshape(m, -1, TERMS + COMMON), (values * scale).reshape(m, -1), at[..., :2], lateral2, usual)
+    total = np.maximum(discs.weight.sum(axis=1), 1e-300)
+    layer = ((discs.weight * quarter).sum(axis=1) / total)[:, None, None] * second
+    y = (values * scale).reshape(m, -1)
+    return _Rows(A.reshape(m, -1, TERMS + COMMON), y, at[..., :2], lateral2, layer, usual)
 
 
 class _Posterior(NamedTuple):

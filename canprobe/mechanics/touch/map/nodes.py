@@ -71,7 +71,7 @@ class NodeGrid:
 
     def add(self, rows: Floats) -> None:
         """Take contacts (n, COLUMNS), in the order of time; their number and path are set here."""
-        points = self._point(rows)
+        points = self.points_of(rows)
         begin = 0
         for i, (point, place) in enumerate(zip(points, points.tolist(), strict=True)):
             fresh = self._open[COUNT] == 0.0 and begin == i
@@ -100,12 +100,12 @@ class NodeGrid:
         if self._size == len(self._rows):
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
         self._rows[self._size] = row
-        self._blocks.setdefault(_block(self._point(row)), []).append(self._size)
+        self._blocks.setdefault(_block(self.points_of(row)), []).append(self._size)
         self._size += 1
 
     def _take(self, rows: Floats) -> None:
         self._open[_MEANS] += rows[:, _MEANS].sum(axis=0)
-        self._along_normals += float((self._point(rows) * rows[:, NORMAL]).sum())
+        self._along_normals += float((self.points_of(rows) * rows[:, NORMAL]).sum())
         self._open[COUNT] += len(rows)
 
     def _close(self) -> None:
@@ -117,8 +117,8 @@ class NodeGrid:
         if number < self._size:
             old = self._rows[number]
             share = row[PATH] / (row[PATH] + old[PATH])
-            bent = float((self._point(row) - self._point(old)) @ (row[NORMAL] - old[NORMAL]))
-            old[_MEANS] += share * (row[_MEANS] - old[_MEANS])
+            bent = float((self.points_of(row) - self.points_of(old)) @ (row[NORMAL] - old[NORMAL]))
+            old[_MEANS] = (1.0 - share) * old[_MEANS] + share * row[_MEANS]  # variances may be infinite
             old[COUNT:] += row[COUNT:]
             self._lift(old, share * (1.0 - share) * bent)
         else:
@@ -131,7 +131,7 @@ class NodeGrid:
         count = self._open[COUNT]
         row: Floats = self._open / count
         row[COUNT], row[PATH] = count, max(self._travel.total - self._begun_at, NODE_M)
-        self._lift(row, self._along_normals / count - float(self._point(row) @ row[NORMAL]))
+        self._lift(row, self._along_normals / count - float(self.points_of(row) @ row[NORMAL]))
         way = self._last - self._first
         row[HEADING] = way / max(float(np.linalg.norm(way)), 0.5 * NODE_M)
         return row
@@ -140,14 +140,14 @@ class NodeGrid:
         """Turn means of contacts with a mean Δp·Δn (m) into a node: on the surface, with a unit normal."""
         if math.isinf(row[NORMAL2]):
             bent = 0.0  # such normals only say on which side the body is
-        point = self._point(row)
+        point = self.points_of(row)
         row[NORMAL] /= np.linalg.norm(row[NORMAL])
         row[CENTRE] = point + (self._radius + 0.5 * bent) * row[NORMAL]
 
     def _voxel(self, row: Floats) -> tuple[int, ...]:
-        return (*np.floor(self._point(row) / NODE_M).astype(int).tolist(), facing(row[None, NORMAL])[0])
+        return (*np.floor(self.points_of(row) / NODE_M).astype(int).tolist(), facing(row[None, NORMAL])[0])
 
-    def _point(self, row: Floats) -> Floats:
+    def points_of(self, row: Floats) -> Floats:
         """Contact points (…, 3) of rows (…, COLUMNS), m, with the layer unsqueezed."""
         result: Floats = row[..., CENTRE] - self._radius * row[..., NORMAL]
         return result

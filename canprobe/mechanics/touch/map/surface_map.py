@@ -186,8 +186,7 @@ class SurfaceMap:
     def _normal(self, blend: _Blend) -> tuple[Floats, Floats]:
         cells, R = self.solved(), self.solved().discs.R[blend.cells]
         rows = np.stack(terms(*blend.xy, (1, 0), (0, 1)), axis=-2)
-        V = rows @ cells.fits.V[blend.cells] @ np.swapaxes(rows, -1, -2)
-        V = V * (1.0 + cells.excess[blend.cells])[..., None, None] / blend.slope_size[..., None, None] ** 2
+        V = rows @ cells.covariance[blend.cells] @ np.swapaxes(rows, -1, -2) / blend.slope_size[..., None, None] ** 2
         V = np.einsum("nk,nkip,nkpq,nkjq->nij", blend.weight, R[..., :2], V, R[..., :2])
         return blend.feet.normal, V + 0.0 * blend.feet.normal[:, :1, None]
 
@@ -196,29 +195,22 @@ class SurfaceMap:
         return MapCurvature(*self._answers(self._curvature, points))
 
     def _curvature(self, blend: _Blend) -> MapCurvature:
-        cells = self.solved()
-        R, a = cells.discs.R[blend.cells], cells.fits.a[blend.cells]
-        second = np.stack(terms(*blend.xy, (2, 0), (1, 1), (0, 2)), axis=-2) / LENGTH_M
-        xx, xy, yy = np.moveaxis(-(second @ a[..., None])[..., 0], -1, 0)
-        seen = blend.weight * cells.known[blend.cells, 2]
-        total = seen.sum(axis=1)
-        rank = np.where(np.isfinite(blend.feet.normal[:, 0]), cells.rank[blend.cells[:, 0]], 0)
-        with np.errstate(invalid="ignore"):
-            share = seen / total[:, None]
-        H = np.stack([xx, xy, xy, yy], axis=-1).reshape(*xx.shape, 2, 2) / blend.slope_size[..., None, None]
-        tensor = np.einsum("nk,nkip,nkpq,nkjq->nij", share, R[..., :2], H, R[..., :2])
-        n = blend.feet.normal
-        P = np.eye(3) - n[:, :, None] * n[:, None]
+        cells, n = self.solved(), blend.feet.normal
         axes = np.array([tangent_rotation(one)[:, :2] for one in n.tolist()]).reshape(-1, 3, 2)
-        tensor = P @ tensor @ P
         # the axes of a cell turned into those of the place: K' = Q K Qᵀ, written for (K11, K12, K22)
-        Q = np.einsum("nip,nkiq->nkpq", axes, R[..., :2])
+        Q = np.einsum("nip,nkiq->nkpq", axes, cells.discs.R[blend.cells][..., :2])
         (p, q), (r, s) = np.moveaxis(Q, (-2, -1), (0, 1))
         turn = np.stack([p * p, 2 * p * q, q * q, p * r, p * s + q * r, q * s, r * r, 2 * r * s, s * s], axis=-1)
-        rows = turn.reshape(*p.shape, 3, 3) @ second
-        V = rows @ cells.fits.V[blend.cells] @ np.swapaxes(rows, -1, -2)
-        V = np.einsum("nk,nkij->nij", share * (1.0 + cells.excess[blend.cells]), V)
-        K = np.einsum("nip,nij,njq->npq", axes, tensor, axes)
+        second = np.stack(terms(*blend.xy, (2, 0), (1, 1), (0, 2)), axis=-2) / blend.slope_size[..., None, None]
+        rows = turn.reshape(*p.shape, 3, 3) @ second / -LENGTH_M
+        seen = blend.weight * cells.known[blend.cells, 2]
+        total = seen.sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            share = seen / total[:, None]
+        K = np.einsum("nk,nkpi,nki->np", share, rows, cells.fits.a[blend.cells])[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        V = np.einsum("nk,nkip,nkpq,nkjq->nij", share, rows, cells.covariance[blend.cells], rows, optimize=True)
+        tensor = np.einsum("nip,npq,njq->nij", axes, K, axes)
+        rank = np.where(np.isfinite(n[:, 0]), cells.rank[blend.cells[:, 0]], 0)
         return MapCurvature(tensor, axes, K, V, np.where(total > 0.0, 3, np.minimum(rank, 2)))
 
     def disagreement(self, points: ArrayLike) -> Floats:
@@ -245,9 +237,7 @@ class SurfaceMap:
     @property
     def points(self) -> Floats:
         """(n, 3) contact points of the nodes, m, with the layer unsqueezed."""
-        rows = self.nodes.rows
-        result: Floats = rows[:, column.CENTRE] - (self.pad.radius if self.pad else 0.0) * rows[:, column.NORMAL]
-        return result
+        return self.nodes.points_of(self.nodes.rows)
 
     @property
     def normals(self) -> Floats:
@@ -321,12 +311,9 @@ class SurfaceMap:
             apart = height / np.maximum((up * normal[:, None]).sum(axis=-1), 0.5)
             above = ((q - foot) * normal).sum(axis=1) + (weight * apart).sum(axis=1)
             foot = q - above[:, None] * normal
-        excess = cells.excess[which]
         (f,) = terms(*xy, (0, 0))
-        variance = ((f[..., None, :] @ cells.fits.V[which])[..., 0, :] * f).sum(axis=-1) * LENGTH_M**2 / size**2
-        variance = variance * (1.0 + excess) + cells.offset[which] ** 2
-        if math.isfinite(self.noise.height):
-            variance += 2.0 * excess * self.noise.height**2
+        variance = ((f[..., None, :] @ cells.covariance[which])[..., 0, :] * f).sum(axis=-1) * LENGTH_M**2 / size**2
+        variance += cells.height2[which]
         spread = apart - (weight * apart).sum(axis=1, keepdims=True)
         sigma = np.sqrt((weight * (variance + spread**2)).sum(axis=1))
         finite: NDArray[np.bool_] = np.isfinite(foot[:, 0])
