@@ -26,6 +26,8 @@ from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.cell.scene.resolve import LAYER_STIFFNESS, resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
+from canprobe.errors import PlanError
+from canprobe.lab.studies.harness import Say
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
@@ -158,6 +160,20 @@ def scene_of(name: str, folder: Path, seconds: float = SECONDS) -> Scene:
         shape=replace(base.shape, also=()),
         plant=PlantSettings(stiffness_n_m3=LAYER_STIFFNESS * softer),
     )
+
+
+def reached(names: Sequence[str], say: Say) -> tuple[str, ...]:
+    """The shapes whose weave the arm reaches; the others, one in some hundred of a draw, are said and left out."""
+    found = []
+    for name in names:
+        with TemporaryDirectory() as folder:
+            try:
+                make_plan(resolve(scene_of(name, Path(folder))))
+            except PlanError as error:
+                say(f"{name} is left out: {str(error).splitlines()[0]}")
+            else:
+                found.append(name)
+    return tuple(found)
 
 
 class ScanCase(NamedTuple):

@@ -20,7 +20,7 @@ from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.shapes import revisits
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts, read_columns, read_contacts, write_contacts
 from canprobe.lab.studies.shapes.methods import METHODS, FittedSurface, Method
-from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, drawn, scan
+from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, drawn, reached, scan
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.meshing import Mesh, mesh_of
@@ -86,7 +86,7 @@ class MethodFit(NamedTuple):
 
 def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
     """Scan the shapes, fit every method within every budget, and score; with a draw on its shapes."""
-    develop, test = DEVELOPMENT, TEST if draw is None else drawn(draw)
+    develop, test = DEVELOPMENT, TEST if draw is None else reached(drawn(draw), sweep.say)
     if quick:
         develop, test = develop[:1], test[:1]
     whole = 1.2 if quick else SECONDS
