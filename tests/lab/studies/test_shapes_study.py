@@ -22,6 +22,7 @@ from canprobe.lab.studies.shapes.scans import (
     form_of,
     heights_mm,
     object_of,
+    reached,
     samples_of,
     scene_of,
     truth_under,
@@ -252,3 +253,10 @@ def test_a_short_run_of_every_method(tmp_path, capsys):
     digest = hashlib.sha256((tmp_path / "contacts.npz").read_bytes()).hexdigest()
     assert document["facts"]["contacts"] == digest[:16]
     assert (tmp_path / "shapes.png").stat().st_size > 10_000
+
+
+def test_a_drawn_shape_that_the_arm_does_not_reach_is_left_out_with_a_line():
+    said = []
+    assert reached(("drawn-21-0", "drawn-21-1"), said.append) == ("drawn-21-0",)
+    (line,) = said
+    assert line.startswith("drawn-21-1 is left out: task: contact at") and "out of reach" in line
