@@ -45,8 +45,7 @@ RETREAT_WAY = 6e-3
 RAMP_S = 0.05
 """Time to reach the scan's speed."""
 CALIBRATE = (
-    ": forces and regions are stated wider from here on; type `canprobe calibrate array CELL` and name its file as"
-    " sensor.calibration"
+    " are stated wider from here on; type `canprobe calibrate array CELL` and name its file as sensor.calibration"
 )
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
@@ -161,7 +160,8 @@ class TouchTask(ProbingTask):
         if check.contradicted:
             self.sensing.leave_out_moments()
         if not self._remarks:
-            self._remarks.append(finding + CALIBRATE)
+            wider = "forces and regions" if check.image_model_off else "forces"
+            self._remarks.append(f"{finding}: {wider}{CALIBRATE}")
 
     # sensing and supervision
 
