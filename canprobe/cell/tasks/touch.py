@@ -44,9 +44,7 @@ RETREAT_WAY = 6e-3
 """Way off the object, m."""
 RAMP_S = 0.05
 """Time to reach the scan's speed."""
-CALIBRATE = (
-    " are stated wider from here on; type `canprobe calibrate array CELL` and name its file as sensor.calibration"
-)
+CALIBRATE = "type `canprobe calibrate array CELL` and name its file as sensor.calibration"
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
@@ -161,7 +159,7 @@ class TouchTask(ProbingTask):
             self.sensing.leave_out_moments()
         if not self._remarks:
             wider = "forces and regions" if check.image_model_off else "forces"
-            self._remarks.append(f"{finding}: {wider}{CALIBRATE}")
+            self._remarks.append(f"{finding}: {wider} are stated wider from here on; {CALIBRATE}")
 
     # sensing and supervision
 
