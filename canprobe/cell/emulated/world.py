@@ -54,7 +54,6 @@ class TruthRecorder(Participant):
     name = "truth recorder"
     hears_every_sync = True
     listens = frozenset((SYNC_ID,))
-    next_deadline_ns = None
 
     def __init__(self, plant: Plant, *, at_once: bool = False, folder: Path | None = None) -> None:
         self._plant = plant

@@ -46,7 +46,6 @@ class PositionTrack:
     __slots__ = (
         "_asked",
         "_base",
-        "_carried_ns",
         "_heard",
         "_period_ns",
         "_periods",
@@ -66,7 +65,6 @@ class PositionTrack:
         self.rested_ns = 0
         self._base = base
         self._period_ns = period_ns
-        self._carried_ns = CARRIED_CYCLES * period_ns
         self._still: int | None = None
         self._still_ns = 0
         self._t_ns = 0
@@ -126,11 +124,11 @@ class PositionTrack:
 
     def _followed(self, periods: float) -> float:
         """Largest motion of a drive towards its last targets after so many periods, counts."""
-        return (periods if periods < FOLLOWED_CYCLES else FOLLOWED_CYCLES) * self._asked
+        return min(periods, FOLLOWED_CYCLES) * self._asked
 
     def _carried(self, passed_ns: int) -> float:
         """Estimated motion since the last report, counts."""
-        return self._rate * (passed_ns if passed_ns < self._carried_ns else self._carried_ns)
+        return self._rate * min(passed_ns, CARRIED_CYCLES * self._period_ns)
 
 
 def rest_counts(model: ArmModel) -> list[float]:

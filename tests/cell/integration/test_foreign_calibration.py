@@ -39,13 +39,11 @@ def test_a_harder_layer_is_said_once_and_widens_the_force_alone():
     result = canprobe.run(load_scene("cylinder", SCAN | {"plant.stiffness_n_m3": 1.9e8}), files=False)
     (line,) = said(result.summary["faults"])
     assert "its layer has 1.9" in line and "(calibration: 1.24e+08)" in line
-    assert (
-        ": forces are stated wider from here on; type `canprobe calibrate array CELL`" in line
-        and result.text().count(SAID) == 1
-    )
+    assert ": forces are stated wider from here on; type `canprobe calibrate array CELL`" in line
+    assert result.text().count(SAID) == 1
     sigma, force = result.log["force_sigma_n"], result.log["force_n"]
-    scan = np.flatnonzero(result.log["phase"] == 3)
-    first, last = scan[: len(scan) // 10], scan[-len(scan) // 10 :]
+    rows = np.flatnonzero(result.log["phase"] == 3)
+    first, last = rows[: len(rows) // 10], rows[-len(rows) // 10 :]
     assert np.nanmedian(sigma[first] / force[first]) < 0.03
     assert np.nanmedian(sigma[last] / force[last]) == pytest.approx(0.22, abs=0.04)  # ½ ln 1.53, and 5 %
     covariance = np.array([record.estimate.covariance for record in result.estimates["recursive"]])

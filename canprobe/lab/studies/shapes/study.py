@@ -86,9 +86,11 @@ class MethodFit(NamedTuple):
 
 def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
     """Scan the shapes, fit every method within every budget, and score; with a draw on its shapes."""
-    develop, test = DEVELOPMENT, TEST if draw is None else reached(drawn(draw), sweep.say)
+    develop, test = DEVELOPMENT, TEST if draw is None else drawn(draw)
     if quick:
         develop, test = develop[:1], test[:1]
+    if draw is not None:
+        test = reached(test, sweep.say)
     whole = 1.2 if quick else SECONDS
     cases = [ScanCase(name, whole) for name in (*develop, *test)]
     sweep.say(f"{len(cases)} scans of {whole:g} s")

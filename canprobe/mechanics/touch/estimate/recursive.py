@@ -165,10 +165,8 @@ class RecursiveEstimator:
         a = anchor(state.c, state.T, place, state.length)
         flat = self._flat(a)
         q = a.M[6:].dot(state.inverse) / C_PER_Q[:, None]
-        decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
         changing = self._change.changing
-        if changing:
-            decision, notes = nothing_observed(), (*notes, CHANGING_NOTE)
+        decision = nothing_observed() if changing else decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
         # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
         noise = state.inverse.T.dot(state.left_out.score.matrix[:9, :9]).dot(state.inverse)
         believed = True
@@ -226,7 +224,7 @@ class RecursiveEstimator:
         changes, doubtful = self._change.alarms, round(self._doubtful)
         notes = [f"the surface changed {changes} times: memory shortened"] if changes else []
         notes += [f"{doubtful} samples with reduced weight"] if doubtful else []
-        return (*notes, *self._gate.notes())
+        return (*notes, *self._gate.notes(), *((CHANGING_NOTE,) if self._change.changing else ()))
 
     def _step(self, moved: float) -> None:
         """Add the pending samples to the filter or its start; after a change of the surface, to a new start."""

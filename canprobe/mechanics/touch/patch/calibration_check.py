@@ -8,9 +8,9 @@
   pressure in an image. Another pitch makes one of them smaller and the other larger, each by its square.
 - **Contradiction.** Images mean another curvature than the motion shows, in most answers (`fused_estimator`).
 
-Each sign is a median of what was seen so far, from a least number on, and up to a number from which the array counts
-as the calibrated one: a check costs nothing after that. The limits come from a development draw of study `regions`,
-and study `calibrations` counts what they find.
+Each sign is a median or a share of what was seen so far, from a least number on, and up to a number from which the
+array counts as the calibrated one: a check costs nothing after that. The limits come from a development draw of study
+`regions`, and study `calibrations` counts what they find.
 
 Until the array is calibrated, its answers are less certain. A force has the spread of a make and half of what stiffness
 and disagreement are off: two standard deviations reach the force that other gains would mean. Regions of curvature are
