@@ -27,7 +27,7 @@ from canprobe.cell.master.controller import (
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.homing import Homing
-from canprobe.cell.master.joint_columns import TactileLog, joint_columns
+from canprobe.cell.master.joint_columns import joint_columns
 from canprobe.cell.master.lift_off import LiftOff
 from canprobe.cell.master.log import RunLog
 from canprobe.cell.master.notes import Notes
@@ -36,6 +36,7 @@ from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.master.raw_array_start import RawArrayStart
 from canprobe.cell.master.supervision import Condition, Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
+from canprobe.cell.master.tactile_log import TactileLog
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.model import Plan

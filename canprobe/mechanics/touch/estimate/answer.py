@@ -57,6 +57,7 @@ class SurfaceEstimate:
         prior: name of the prior that was assumed.
         notes: notes for a reader, one sentence each.
         stiffness: stiffness K/h of the probe's layer, N/m³, from an estimator that knows it; else None.
+        contradicted: the patch contradicts the motion, so that neither observes anything.
         problem_root: root of the information (`rootᵀ root`) of the whitened dimensionless least-squares problem.
         model_root: (n, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
             contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It includes the
@@ -86,6 +87,7 @@ class SurfaceEstimate:
     model_root: Floats | None = None
     evidence: CurvatureInformation | None = None
     stiffness: float | None = None
+    contradicted: bool = False
 
     def __post_init__(self) -> None:
         for name in _ARRAY_FIELDS:
@@ -208,6 +210,7 @@ def build_estimate(
     notes: tuple[str, ...] = (),
     evidence: CurvatureInformation | None = None,
     stiffness: float | None = None,
+    contradicted: bool = False,
 ) -> SurfaceEstimate:
     """An estimate from a solution in units of `length` (m)."""
     S = matrix_of(solution.c)
@@ -246,6 +249,7 @@ def build_estimate(
         model_root=None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
         evidence=evidence,
         stiffness=stiffness,
+        contradicted=contradicted,
     )
 
 

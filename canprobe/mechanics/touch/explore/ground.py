@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs
-from canprobe.mechanics.touch.map.local_fits import fit_discs, mean_depth
+from canprobe.mechanics.touch.map.local_fits import fit_discs, stiffness_error
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, THIRD
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.strategies import Rectangle
@@ -124,9 +124,9 @@ class GroundCells:
         except np.linalg.LinAlgError:  # of contacts that no surface explains
             return
         self.change[i] = math.sqrt(float(np.mean(fits.a[0, THIRD] ** 2))) / LENGTH_M**2
-        self.common = 0.5 * self._stiffness_sigma * float(mean_depth(rows, disc, pad, fits.K)[0])
+        self.common = float(stiffness_error(rows, disc, pad, fits.K, self._stiffness_sigma)[0])
         variance = float(fits.covariance(fits.excess)[0, 0, 0]) * LENGTH_M**2
-        floor2 = self.common**2 + 2.0 * float(fits.excess[0]) * self._map.noise.height**2
+        floor2 = self.common**2 + float(self._map.noise.scatter2(fits.excess)[0])
         self.floor[i] = min(math.sqrt(floor2), UNKNOWN_M)
         self.sigma[i] = min(math.sqrt(floor2 + variance), UNKNOWN_M)
 

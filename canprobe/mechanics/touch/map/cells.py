@@ -22,7 +22,7 @@ from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, Slope
 from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs
-from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs, mean_depth
+from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs, stiffness_error
 from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND
 from canprobe.mechanics.touch.map.stiffness import (
@@ -133,11 +133,9 @@ def solve_cells(rows: Floats, points: Floats, pad: PadLayer | None, noise: MapNo
     fits, common, _ = fit_discs(rows, discs, pad, noise, K_ref=fits.K, weight=weight)
     tree = cKDTree(discs.origin)
     excess = np.array([fits.excess[near].max() for near in tree.query_ball_point(discs.origin, EXCESS_REACH_M)])
-    covariance, height2 = fits.covariance(excess), np.zeros(m)
-    if math.isfinite(noise.height):
-        height2 += 2.0 * excess * noise.height**2
+    covariance, height2 = fits.covariance(excess), noise.scatter2(excess)
     if pad is not None and stiffness is not None:
-        height2 += (0.5 * stiffness.sigma * mean_depth(rows, discs, pad, fits.K)) ** 2
+        height2 += stiffness_error(rows, discs, pad, fits.K, stiffness.sigma) ** 2
     seen = observed_of(fits, covariance)
     return Cells(discs, fits, covariance, height2, *seen, tree, cKDTree(points), common, stiffness)
 

@@ -157,4 +157,5 @@ def joined(answer: SurfaceEstimate, known: KnownCurvature) -> SurfaceEstimate:
         notes=(*answer.notes, f"{100.0 * share:.0f} % {JOINED_NOTE}"),
         evidence=answer.evidence,
         stiffness=answer.stiffness,
+        contradicted=answer.contradicted,
     )

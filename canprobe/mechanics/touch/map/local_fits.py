@@ -112,12 +112,23 @@ class Quartics(NamedTuple):
         return result + self.patch_error[:, :, None] * self.patch_error[:, None]
 
 
-def mean_depth(rows: Floats, discs: Discs, pad: PadLayer, K: Floats) -> Floats:
-    """(m,) depth of the layer, m, of the nodes (k, COLUMNS) in discs of curvature K (m, 2, 2), 1/m, at mean √force."""
+def stiffness_error(rows: Floats, discs: Discs, pad: PadLayer, K: Floats, sigma: float) -> Floats:
+    """Error of heights by the layer's stiffness, whose depth is that at the mean √force of the nodes.
+
+    Args:
+        rows: (k, COLUMNS) nodes.
+        discs: places and their nodes.
+        pad: the probe.
+        K: (m, 2, 2) curvature of the discs, 1/m.
+        sigma: standard deviation of the logarithm of the stiffness.
+
+    Returns:
+        (m,) standard deviations, m.
+    """
     root_force = (discs.weight * rows[discs.nodes, column.ROOT_FORCE]).sum(axis=1) / discs.weight.sum(axis=1)
     det = np.maximum(np.linalg.det(np.eye(2) / pad.radius + K), 0.0)
-    result: Floats = root_force * np.sqrt(np.sqrt(det) / (math.pi * pad.stiffness))
-    return result
+    depth: Floats = root_force * np.sqrt(np.sqrt(det) / (math.pi * pad.stiffness))
+    return 0.5 * sigma * depth
 
 
 def fit_discs(

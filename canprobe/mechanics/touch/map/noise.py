@@ -60,6 +60,10 @@ class MapNoise:
         """Variance of the height of a contact, m²."""
         return (self.height if sample.sigma_height is None else sample.sigma_height) ** 2
 
+    def scatter2(self, excess: Floats) -> Floats:
+        """Variance of heights, m², which no path shrinks, where contacts scatter by `excess` more than their noise."""
+        return 2.0 * excess * self.height**2 if math.isfinite(self.height) else np.zeros_like(excess)
+
     def independent(self, count: Floats, path: Floats, once: float) -> tuple[Floats, Floats]:
         """Independent heights and normals in nodes of some contacts (n,) along some path (n,), m.
 

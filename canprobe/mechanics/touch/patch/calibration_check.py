@@ -136,12 +136,10 @@ class CalibrationCheck:
             answer: answer at the last contact.
             slope: slope of the root of the force over the push; None where the touch showed none.
         """
-        from canprobe.mechanics.touch.patch.fused_estimator import CONTRADICTION_NOTE  # only where a shape is asked for
-
         radius, kappa, self._curvature = self._pad.radius_m, answer.kappa, None
         if self._tries >= MAX_TRIES:
             return
-        self._contradicted.append(CONTRADICTION_NOTE in answer.notes)
+        self._contradicted.append(answer.contradicted)
         if not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
             return
         curvature = 0.5 / radius + 0.25 * float(kappa[0] + kappa[1])

@@ -20,7 +20,6 @@ from canprobe.mechanics.types import Floats
 
 MIN_NAMED_SHARE = 0.1
 """Least share of the patch in the information about K at which the estimate's method names it."""
-CONTRADICTION_NOTE = "the patch contradicts the motion"
 _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
@@ -105,7 +104,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceE
     share = float((inverse * patch).sum()) / 3.0
     notes = [f"{100.0 * share:.0f} % of the curvature from the patch"]
     if found.contradicted:
-        notes.append(CONTRADICTION_NOTE)
+        notes.append("the patch contradicts the motion")
     return build_estimate(
         _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
         length=1.0,
@@ -118,6 +117,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceE
         prior=motion.prior,
         notes=(*motion.notes, *notes),
         stiffness=found.stiffness,
+        contradicted=found.contradicted,
     )
 
 
