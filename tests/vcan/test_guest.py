@@ -131,6 +131,17 @@ def test_time_out_ends_command_and_guest(tmp_path: Path) -> None:
     assert b"canprobe: vcan: the command was stopped after 0.5 s" in err
 
 
+@needs_guest
+@pytest.mark.skipif(
+    os.geteuid() != 0 or len(os.sched_getaffinity(0)) < 2, reason="--realtime needs root and two processors"
+)
+def test_a_process_that_only_computes_does_not_hold_the_guest_up(tmp_path: Path) -> None:
+    """With --realtime too, where the kernel of the guest must go before the guest's own processes."""
+    script = f"{sys.executable} -c 'while True: pass' & sleep 1; kill $!; exit 7"
+    process = start(tmp_path, "--realtime", "--timeout", "60", "--", "sh", "-c", script)
+    assert (process.communicate()[1], process.returncode) == (b"", 7)
+
+
 @pytest.mark.skipif(has_socketcan(), reason="this kernel has SocketCAN: the command would not run in a guest")
 @needs_guest
 def test_a_killed_command_is_told_what_kills_there(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ class GuestJob:
     Args:
         command: program and arguments.
         environment: whole environment of the command.
-        realtime: whether to pin the guest to the last processor under SCHED_FIFO, and keep that processor awake.
+        realtime: whether to pin the guest to the last processor, its kernel under SCHED_FIFO, and keep that awake.
         shell: whether the command is a shell for the user, with the standard input, and the terminal, of this process.
 
     Raises:
@@ -401,14 +401,18 @@ def _favour_session(pid: int) -> None:
 
 
 def _pin() -> tuple[list[str], subprocess.Popen[bytes]]:
-    """Return the prefix that pins the guest, and the idle-class process that keeps its processor awake."""
+    """Return the prefix that pins the guest, and the idle-class process that keeps its processor awake.
+
+    The guest's kernel gets SCHED_FIFO, and its processes do not inherit that: each of them is a process of this machine,
+    and one that only computes would not let the kernel of the guest on that processor any more.
+    """
     pin = _on_last_processor()
     if not pin or shutil.which("chrt") is None:
         raise GuestError("--realtime needs two processors and util-linux (taskset, chrt)", False)
     if subprocess.run([*pin, "chrt", "-f", "40", "true"], capture_output=True, check=False).returncode:
         raise GuestError("--realtime needs the right to use SCHED_FIFO (root, or CAP_SYS_NICE)", False)
     spinner = subprocess.Popen([*pin, "chrt", "-i", "0", sys.executable, "-c", "while True: pass"])
-    return [*pin, "chrt", "-f", "40"], spinner
+    return [*pin, "chrt", "-R", "-f", "40"], spinner
 
 
 def _same_file(one: int, other: int) -> bool:

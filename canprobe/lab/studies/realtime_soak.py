@@ -1,13 +1,18 @@
 """Study `realtime --soak`: memory, clocks and counters of a cell over an hour on a real SocketCAN interface.
 
-The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus. For a nightly run:
+The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus, and `canprobe
+monitor` watches. For a nightly run:
 `canprobe vcan --realtime -- canprobe study realtime --soak`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import pty
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +22,7 @@ import numpy as np
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.results.picture import BLUE, ORANGE, legend, parts, picture
+from canprobe.cell.results.picture import BLUE, GREEN, ORANGE, legend, parts, picture
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.emulator_child import EmulatorChild
@@ -38,6 +43,7 @@ COLUMNS = (
     Column("t_s", "t s", ".0f"),
     Column("master_mib", "master MiB", ".2f"),
     Column("nodes_mib", "nodes MiB", ".2f"),
+    Column("monitor_mib", "monitor MiB", ".2f"),
     Column("cycles", "cycles", ".0f"),
     Column("overruns", "overruns", ".0f"),
     Column("missed_pdos", "missed", ".0f"),
@@ -49,11 +55,11 @@ COLUMNS = (
 
 
 class Soaker(Controller):
-    """Holds the joints, and takes a sample periodically."""
+    """Holds the joints, and takes a sample periodically, with the memory of the processes beside it."""
 
-    def __init__(self, session: Session, nodes_pid: int, seconds: float) -> None:
+    def __init__(self, session: Session, nodes_pid: int, monitor_pid: int, seconds: float) -> None:
         self.samples: list[Row] = []
-        self._session, self._nodes_pid, self._seconds = session, nodes_pid, seconds
+        self._session, self._nodes_pid, self._monitor_pid, self._seconds = session, nodes_pid, monitor_pid, seconds
         self._next_s = 0.0
         self._q: Any = None
         self._first_packets = self._first_counted = 0
@@ -79,6 +85,7 @@ class Soaker(Controller):
             "t_s": t_s,
             "master_mib": resident_mib(os.getpid()),
             "nodes_mib": resident_mib(self._nodes_pid),
+            "monitor_mib": resident_mib(self._monitor_pid),
             "cycles": cycle.number,
             "overruns": cycle.statistics.overruns,
             "missed_pdos": drives.missed,
@@ -101,15 +108,40 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def soak(seconds: float) -> list[Row]:
     """Hold the cell, and take a sample every sixtieth of the time."""
-    scene = load_scene("cylinder")
+    scene = load_scene("cylinder", {"cycle.realtime": True})
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
     child = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
-    with served(child):
+    with watched() as monitor_pid, served(child):
         session = Session(with_real_nodes(patient(scene)), RunOptions(rows_kept=ROWS_OF_UP))
-        soaker = Soaker(session, child.pid, seconds)
+        soaker = Soaker(session, child.pid, monitor_pid, seconds)
         with session:
             session.run(soaker)
     return soaker.samples
+
+
+@contextmanager
+def watched() -> Iterator[int]:
+    """`canprobe monitor` with a terminal of its own, which gets what the others leave; its process id."""
+    shown, terminal = pty.openpty()
+    words = ["monitor", "cylinder", "--bus", "socketcan", "--channel", CHANNEL]
+    monitor = subprocess.Popen(
+        ["nice", "-n", "19", sys.executable, "-m", "canprobe", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=terminal,
+        start_new_session=True,
+    )
+    os.close(terminal)
+    readers = []
+    try:
+        os.read(shown, 1)  # the first screen
+        readers.append(subprocess.Popen(["cat"], stdin=shown, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+        yield monitor.pid
+    finally:
+        monitor.kill()  # it sends nothing, so there is nothing to end
+        monitor.wait()
+        for reader in readers:  # it ends with the terminal
+            reader.wait()
+        os.close(shown)
 
 
 def resident_mib(pid: int) -> float:
@@ -133,7 +165,8 @@ def findings(samples: Sequence[Row]) -> list[str]:
     since = {name: last[name] - first[name] for name in ("dropped_frames", "cycles", "overruns", "missed_pdos")}
     return [
         f"memory of the master grew by {_growth(settled, 'master_mib'):+.2f} MiB/h, of the nodes by"
-        f" {_growth(settled, 'nodes_mib'):+.2f} MiB/h, after the first quarter",
+        f" {_growth(settled, 'nodes_mib'):+.2f} MiB/h, of a monitor by {_growth(settled, 'monitor_mib'):+.2f} MiB/h,"
+        " after the first quarter",
         f"SYNC → last TPDO by the kernel's stamps: {begin:.0f} µs in the first tenth, {end:.0f} µs in the last",
         f"{counted} frames counted by the master, {seen} by the interface in the same time:"
         f" {seen - counted:+d} under way or lost, {since['dropped_frames']} dropped by the kernel",
@@ -159,6 +192,7 @@ def draw_soak(samples: Sequence[Row], path: Path) -> None:
         minutes = [s["t_s"] / 60 for s in samples]
         memory.plot(minutes, [s["master_mib"] for s in samples], color=BLUE, label="master")
         memory.plot(minutes, [s["nodes_mib"] for s in samples], "--", color=ORANGE, label="emulated nodes")
+        memory.plot(minutes, [s["monitor_mib"] for s in samples], ":", color=GREEN, label="monitor")
         latency.plot(minutes, [s["latency_us"] for s in samples], ".-", color=BLUE)
         lost.plot(minutes, [s["overruns"] for s in samples], color=BLUE, label="overruns")
         lost.plot(minutes, [s["missed_pdos"] for s in samples], "--", color=ORANGE, label="PDOs missed")

@@ -181,7 +181,7 @@ def realtime(path):
 
 
 def soak(path):
-    still = {"master_mib": 128.0, "nodes_mib": 84.0, "missed_pdos": 0}
+    still = {"master_mib": 128.0, "nodes_mib": 84.0, "monitor_mib": 86.0, "missed_pdos": 0}
     samples = [still | {"t_s": 60.0 * k, "overruns": k // 9, "latency_us": 400.0 + 90 * np.sin(k)} for k in range(61)]
     draw_soak(samples, path)
 
