@@ -403,7 +403,7 @@ def _favour_session(pid: int) -> None:
 def _pin() -> tuple[list[str], subprocess.Popen[bytes]]:
     """Return the prefix that pins the guest, and the idle-class process that keeps its processor awake.
 
-    The guest's kernel gets SCHED_FIFO, and its processes do not inherit that: each of them is a process of this machine,
+    The guest's kernel gets SCHED_FIFO, and its processes do not inherit that: each is a process of this machine too,
     and one that only computes would not let the kernel of the guest on that processor any more.
     """
     pin = _on_last_processor()
