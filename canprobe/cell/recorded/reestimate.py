@@ -19,7 +19,7 @@ from canprobe.cell.results.map_score import estimate_columns, summarise_map
 from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, is_recorded, needed, read_log, read_scene, read_truth
 from canprobe.cell.results.summary import finite_or_none, summarise_shape
 from canprobe.cell.results.text import curvature_text, shape_lines
-from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.load import SAVED_AS, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.offers import find_offer
 from canprobe.cell.scene.resolve import resolve
@@ -296,6 +296,8 @@ def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) 
         return load_scene(scene)
     if folder is None:
         raise UsageError(f"{path}: a log alone does not describe its nodes: name the scene (--scene)")
+    if not (folder / SAVED_AS).exists():
+        raise UsageError(f"{folder}: no {SAVED_AS} in this folder: name the scene (--scene)")
     return read_scene(folder)
 
 

@@ -108,12 +108,13 @@ def read_scene(folder: Path) -> Scene:
     """The scene of a run.
 
     Raises:
-        UsageError: when the folder has none.
+        UsageError: when the folder has none, or is not there.
         SceneError: when it cannot be loaded; the message names the version that wrote it, where that is another one.
     """
     file = folder / SAVED_AS
     if not file.exists():
-        raise UsageError(f"{folder}: no {SAVED_AS} in this folder: name the scene (--scene)")
+        missing = f"no {SAVED_AS} in this folder" if folder.is_dir() else "no such folder"
+        raise UsageError(f"{folder}: {missing}; expected one that `canprobe run --out DIR` wrote")
     try:
         return load_scene(file)
     except SceneError as error:

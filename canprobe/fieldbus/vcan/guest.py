@@ -409,10 +409,11 @@ def _pin() -> tuple[list[str], subprocess.Popen[bytes]]:
     pin = _on_last_processor()
     if not pin or shutil.which("chrt") is None:
         raise GuestError("--realtime needs two processors and util-linux (taskset, chrt)", False)
-    if subprocess.run([*pin, "chrt", "-f", "40", "true"], capture_output=True, check=False).returncode:
+    favoured = [*pin, "chrt", "-R", "-f", "40"]
+    if subprocess.run([*favoured, "true"], capture_output=True, check=False).returncode:
         raise GuestError("--realtime needs the right to use SCHED_FIFO (root, or CAP_SYS_NICE)", False)
     spinner = subprocess.Popen([*pin, "chrt", "-i", "0", sys.executable, "-c", "while True: pass"])
-    return [*pin, "chrt", "-R", "-f", "40"], spinner
+    return favoured, spinner
 
 
 def _same_file(one: int, other: int) -> bool:

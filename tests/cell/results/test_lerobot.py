@@ -110,7 +110,8 @@ def test_one_result_at_a_divisor_of_the_rate(tmp_path):
     [
         (["scan0", "free"], [], "expected the arm and the array of"),
         (["scan0"], ["--fps", "300"], "expected a whole divisor of the 400 cycles a second (400, 200, 100, 80, 50"),
-        (["nothing"], [], "no scene.toml in this folder"),
+        (["nothing"], [], "no such folder; expected one that `canprobe run --out DIR` wrote"),
+        ([""], [], "no scene.toml in this folder; expected one that `canprobe run --out DIR` wrote"),
     ],
 )
 def test_what_is_no_dataset_is_refused_and_leaves_nothing(folders, tmp_path, capsys, case):
