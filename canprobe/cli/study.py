@@ -67,7 +67,9 @@ def add_arguments(parser: Parser) -> None:
         help="faults, recover: on a real vcan0; processes are killed (faults), and the link is taken down",
     )
     parser.add_argument(
-        "--soak", action="store_true", help="realtime: hold the cell for an hour, and watch memory, clocks and counters"
+        "--soak",
+        action="store_true",
+        help="realtime: hold the cell for half an hour, and watch memory, clocks and counters",
     )
     parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="number of processes [one for each core]")
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")

@@ -1,4 +1,4 @@
-"""Study `realtime --soak`: memory, clocks and counters of a cell over an hour on a real SocketCAN interface.
+"""Study `realtime --soak`: memory, clocks and counters of a cell over half an hour on a real SocketCAN interface.
 
 The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus, and `canprobe
 monitor` watches. For a nightly run:
@@ -29,13 +29,14 @@ from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
+from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult
 from canprobe.lab.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
-HOUR_S = 3600.0
+SOAK_S = 1800.0
 SAMPLES = 60
 SETTLED = 0.25
 """Share of the run after which memory should be constant."""
@@ -97,26 +98,35 @@ class Soaker(Controller):
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Hold the cell for an hour, or for ten seconds with `quick`."""
+    """Hold the cell for half an hour, or for ten seconds with `quick`."""
     check_interface(CHANNEL)
-    seconds = 10.0 if quick else HOUR_S
+    seconds = 10.0 if quick else SOAK_S
     sweep.say(f"hold the cell for {seconds:g} s")
-    rows = soak(seconds)
+    rows, ended = soak(seconds)
     facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds, **PATIENCE}
-    return StudyResult("soak", COLUMNS, rows, findings(rows), facts, partial(draw_soak, rows))
+    return StudyResult("soak", COLUMNS, rows, findings(rows, ended), facts, partial(draw_soak, rows))
 
 
-def soak(seconds: float) -> list[Row]:
-    """Hold the cell, and take a sample every sixtieth of the time."""
+def soak(seconds: float) -> tuple[list[Row], str]:
+    """Hold the cell, and take a sample every sixtieth of the time.
+
+    Returns:
+        The samples, and why the cell stopped before the time; empty where it did not.
+    """
     scene = load_scene("cylinder", {"cycle.realtime": True})
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
     child = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
     with watched() as monitor_pid, served(child):
         session = Session(with_real_nodes(patient(scene)), RunOptions(rows_kept=ROWS_OF_UP))
         soaker = Soaker(session, child.pid, monitor_pid, seconds)
-        with session:
-            session.run(soaker)
-    return soaker.samples
+        try:
+            with session:
+                session.run(soaker)
+        except CanprobeError as error:
+            if not soaker.samples:
+                raise
+            return soaker.samples, str(error)
+    return soaker.samples, ""
 
 
 @contextmanager
@@ -155,15 +165,17 @@ def packets_on(channel: str) -> int:
     return int(Path(f"/sys/class/net/{channel}/statistics/tx_packets").read_text(encoding="ascii"))
 
 
-def findings(samples: Sequence[Row]) -> list[str]:
-    """Growth of memory, change of latency, frames and cycles."""
+def findings(samples: Sequence[Row], ended: str = "") -> list[str]:
+    """Growth of memory, change of latency, frames and cycles; before them why the cell stopped early, if it did."""
     first, last = samples[0], samples[-1]
     settled = [s for s in samples if s["t_s"] >= SETTLED * last["t_s"]]
     tenth = max(1, len(samples) // 10)
     begin, end = (float(np.median([s["latency_us"] for s in part])) for part in (samples[:tenth], samples[-tenth:]))
     counted, seen = last["frames_counted"], last["frames_on_bus"]
     since = {name: last[name] - first[name] for name in ("dropped_frames", "cycles", "overruns", "missed_pdos")}
+    early = [f"the cell stopped after {last['t_s']:.0f} s: {ended}"] if ended else []
     return [
+        *early,
         f"memory of the master grew by {_growth(settled, 'master_mib'):+.2f} MiB/h, of the nodes by"
         f" {_growth(settled, 'nodes_mib'):+.2f} MiB/h, of a monitor by {_growth(settled, 'monitor_mib'):+.2f} MiB/h,"
         " after the first quarter",

@@ -206,7 +206,7 @@ def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "", **chosen:
         name: one of `STUDIES`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
-        form: variant of it: ``vcan`` of `faults` and `recover`, on a real vcan0; ``soak`` of `realtime`, an hour.
+        form: variant of it: ``vcan`` of `faults` and `recover`, on a real vcan0; ``soak`` of `realtime`, half an hour.
         chosen: arguments of this study only.
     """
     module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")

@@ -130,6 +130,12 @@ def test_a_leak_a_drift_and_a_loss_are_told():
     assert "+7 under way or lost" in frames
 
 
+def test_a_cell_that_stops_early_leaves_its_samples_and_the_reason():
+    first, memory, *_ = findings_of_soak(hour()[:11], "node 1: lost")
+    assert first == "the cell stopped after 600 s: node 1: lost"
+    assert "master grew by +0.00 MiB/h" in memory
+
+
 def test_resident_memory_is_that_of_the_process():
     before = resident_mib(os.getpid())
     with mmap.mmap(-1, 32 << 20) as ballast:  # pages of its own: what the allocator keeps or gives back has no say
