@@ -14,7 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.joint_columns import joint_positions
-from canprobe.cell.results.run_files import LOG, TACTILE, is_recorded, read_log, read_scene, read_summary, read_tactile
+from canprobe.cell.results.run_files import (
+    LOG,
+    TACTILE,
+    check_run_folder,
+    is_recorded,
+    read_log,
+    read_scene,
+    read_summary,
+    read_tactile,
+)
 from canprobe.cell.results.surface_file import SURFACE, load_surface_map
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.scene.model import Scene
@@ -126,11 +135,7 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
             be; with the file's name.
         SceneError: a scene that cannot be loaded.
     """
-    if not folder.is_dir():
-        raise UsageError(f"{folder}: no such folder; expected one that `canprobe run --out DIR` wrote")
-    for name in (SAVED_AS, LOG):
-        if not is_recorded(folder / name):
-            raise UsageError(f"{folder}: no {name} in this folder; expected one that `canprobe run --out DIR` wrote")
+    check_run_folder(folder, SAVED_AS, LOG)
     read_summary(folder)
     if setup is None:
         setup = resolve(read_scene(folder))

@@ -104,6 +104,16 @@ def read_summary(folder: Path) -> dict[str, Any] | None:
     return summary
 
 
+def check_run_folder(folder: Path, *names: str) -> None:
+    """Raise UsageError where a folder, or a file of these names in it, is not there."""
+    expected = "expected one that `canprobe run --out DIR` wrote"
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: no such folder; {expected}")
+    for name in names:
+        if not is_recorded(folder / name):
+            raise UsageError(f"{folder}: no {name} in this folder; {expected}")
+
+
 def read_scene(folder: Path) -> Scene:
     """The scene of a run.
 
@@ -111,10 +121,8 @@ def read_scene(folder: Path) -> Scene:
         UsageError: when the folder has none, or is not there.
         SceneError: when it cannot be loaded; the message names the version that wrote it, where that is another one.
     """
+    check_run_folder(folder, SAVED_AS)
     file = folder / SAVED_AS
-    if not file.exists():
-        missing = f"no {SAVED_AS} in this folder" if folder.is_dir() else "no such folder"
-        raise UsageError(f"{folder}: {missing}; expected one that `canprobe run --out DIR` wrote")
     try:
         return load_scene(file)
     except SceneError as error:

@@ -1,8 +1,7 @@
 """Study `realtime --soak`: memory, clocks and counters of a cell over half an hour on a real SocketCAN interface.
 
-The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus, and `canprobe
-monitor` watches. For a nightly run:
-`canprobe vcan --realtime -- canprobe study realtime --soak`.
+The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus, and
+`canprobe monitor` watches. For a nightly run: `canprobe vcan --realtime -- canprobe study realtime --soak`.
 """
 
 from __future__ import annotations
