@@ -16,6 +16,7 @@ from canprobe.fieldbus.tools.faults.frame_faults import tactile_ids
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
 from canprobe.fieldbus.tools.faults.row import make_kind
 from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.types import Floats
 
 _CRC_BYTE = 6
 """First byte of the CRC in a tactile header."""
@@ -73,6 +74,52 @@ class StuckImage(ImageFault):
         return self._kept
 
 
+class ReplayedImage(ImageFault):
+    """The array records a stretch of its own images, then replays it without an end, with noise of its own.
+
+    One image with fresh noise looks alive, and so does a recorded stretch: no image of it equals the one before.
+    """
+
+    def begin(self, t_ns: int) -> Sequence[Frame]:
+        """Record from now on."""
+        self._recorded: list[Raw] = []
+        self._replayed = 0
+        self._noise = np.random.default_rng(self.fault.seed)
+        return super().begin(t_ns)
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """The image itself while the stretch is recorded, then the next one of the stretch."""
+        if len(self._recorded) < int(self.fault.value("images")):
+            self._recorded.append(raw)
+            return raw
+        image = self._recorded[self._replayed % len(self._recorded)]
+        self._replayed += 1
+        return _as_sampled(_noisy(image, self.fault.value("noise"), self._noise), raw)
+
+
+class GainLost(ImageFault):
+    """Every taxel measures a share of its load."""
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """Scale all counts."""
+        return _as_sampled(self.fault.value("gain") * raw.astype(np.float64), raw)
+
+
+class StuckRows(ImageFault):
+    """Some rows of taxels keep their last values; the others go on."""
+
+    _kept: Raw | None = None
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """Put the first values of the fault into the rows."""
+        self._kept = raw if self._kept is None else self._kept
+        image = raw.copy()
+        first = int(self.fault.value("first"))
+        rows = slice(first, first + int(self.fault.value("rows")))
+        image[rows] = self._kept[rows]
+        return image
+
+
 class Drift(ImageFault):
     """All taxels drift upward."""
 
@@ -91,6 +138,19 @@ class Saturation(ImageFault):
         image = raw.copy()
         image[raw > 0] = COUNTS_MAX
         return image
+
+
+def _noisy(image: Raw, sigma_counts: float, rng: np.random.Generator) -> Floats:
+    """An image with fresh noise on its pressed taxels: what is below the threshold reads zero with noise, too."""
+    noise: Floats = sigma_counts * rng.standard_normal(image.shape)
+    return np.where(image > 0, image + noise, 0.0)
+
+
+def _as_sampled(counts: Floats, raw: Raw) -> Raw:
+    """Counts within the scale, and whole where those of the array are."""
+    image = raw.copy()
+    image[...] = np.clip(np.rint(counts) if raw.dtype == np.uint8 else counts, 0, COUNTS_MAX)
+    return image
 
 
 class Torn(Effect):
@@ -138,6 +198,38 @@ _ROWS = (
         "does not press on",
         incoming=False,
         needs="array",
+    ),
+    make_kind(
+        "replayed-image",
+        ReplayedImage,
+        "a recorded stretch of images again and again, or one image with fresh noise",
+        "tactile node, 2120h",
+        "does not press on",
+        incoming=False,
+        needs="array",
+        images=Parameter(1, 1, 1000, "images of the recorded stretch"),
+        noise=Parameter(1.3, 0, 255, "standard deviation of the fresh noise, counts"),
+    ),
+    make_kind(
+        "gain-lost",
+        GainLost,
+        "all taxels measure a share of their load",
+        "tactile node, 2003h",
+        "does not press on",
+        incoming=False,
+        needs="array",
+        gain=Parameter(0.3, 0, 10, "measured over true load"),
+    ),
+    make_kind(
+        "stuck-rows",
+        StuckRows,
+        "rows of taxels keep their last values",
+        "tactile node, 2100h",
+        "does not press on",
+        incoming=False,
+        needs="array",
+        first=Parameter(6, 0, 255, "first row, 0-based"),
+        rows=Parameter(4, 1, 256, "number of rows"),
     ),
     make_kind(
         "drift",

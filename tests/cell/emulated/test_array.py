@@ -5,6 +5,7 @@ import pytest
 from node_fuzz import Watched, rage
 
 from canprobe.cell.emulated.array import TactileApplication, make_tactile_node
+from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.master.tactile_frame import decode
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
@@ -12,6 +13,7 @@ from canprobe.fieldbus.node.stored_file import keep_in_file
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES, TactileMode, window_words
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
+from canprobe.fieldbus.tools.faults import FaultyNode, parse_fault
 
 MS = 1_000_000
 CYCLE = 2_500_000
@@ -22,9 +24,11 @@ TARE = 0x65726174
 class Sensor:
     """The node, a SYNC source and an assembler."""
 
-    def __init__(self, bench_class, plant, *, mode=TactileMode.WINDOW, start=0, latency=1, tare_images=4):
+    def __init__(self, bench_class, plant, *, mode=TactileMode.WINDOW, start=0, latency=1, tare_images=4, fault=None):
         node = SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant, latency, tare_images))
-        self.bench = bench_class(node)
+        self.node = node
+        faults = [] if fault is None else [parse_fault(f"node 16: {fault}", CELL_FAULTS)]
+        self.bench = bench_class(FaultyNode(node, faults))
         self.plant = plant
         self.k = 0
         node.start(0)
@@ -57,7 +61,7 @@ class Sensor:
 
     def go(self, t_ns=0):
         self.bench.nmt(0x01, t_ns)
-        assert self.bench.node.state is NmtState.OPERATIONAL
+        assert self.node.state is NmtState.OPERATIONAL
         return self
 
     def sync(self):
@@ -384,3 +388,46 @@ def connect_sensor(bench, plant, tmp_path):
         return type(bench)(node)
 
     return make
+
+
+def images_with(make, plant, fault, shown):
+    """Images that the master gets of an array with a fault from 10 ms on, while the plant shows one after another."""
+    sensor = make(mode=TactileMode.IMAGE, latency=0, fault=f"{fault} at 10 ms").go()
+    images = []
+    for image in shown:
+        plant.image = image
+        images += [frame.taxels.astype(int) for frame in sensor.frames(1)]
+    return images
+
+
+def changing(count):
+    """Images of which each taxel changes from one to the next, with a row that is not pressed."""
+    rows = np.arange(256, dtype=np.uint8).reshape(16, 16) // 2 + 40
+    rows[15] = 0
+    return [rows + np.uint8(image) * (rows > 0) for image in range(count)]
+
+
+def test_fault_a_replayed_stretch_repeats_itself_and_a_single_image_has_fresh_noise(make, plant):
+    shown = changing(9)
+    images = images_with(make, plant, "replayed-image images=3 noise=0", shown)
+    assert [int(image[0, 0]) for image in images] == [40, 41, 42, 43, 41, 42, 43, 41, 42]
+    images = images_with(make, plant, "replayed-image images=1 noise=2 seed=7", changing(40))
+    left = np.array(images[2:]) - images[1]
+    assert not left[:, 15].any()
+    assert left[:, :15].std(axis=(1, 2)) == pytest.approx(np.full(38, 2.0), rel=0.2)
+    assert abs(left[:, :15].mean()) < 0.1
+
+
+def test_fault_a_lost_gain_scales_every_taxel(make, plant):
+    shown = changing(4)
+    images = images_with(make, plant, "gain-lost gain=0.3", shown)
+    assert np.array_equal(images[0], shown[0])
+    assert np.array_equal(images[2], np.rint(0.3 * shown[2]))
+
+
+def test_fault_stuck_rows_keep_their_values_while_the_others_go_on(make, plant):
+    shown = changing(5)
+    images = images_with(make, plant, "stuck-rows first=4 rows=2", shown)
+    stuck = np.isin(np.arange(16), (4, 5))
+    assert np.array_equal(images[4][stuck], shown[1][stuck])
+    assert np.array_equal(images[4][~stuck], shown[4][~stuck])
