@@ -2,12 +2,13 @@
 
 Each motor position q (counts) follows its reference r: ``q'' = w^2 (r - q) - 2 z w q'``. References are ramps, for
 which the solution is closed: behind a steady ramp by the lag 2z/w, plus a decaying transient. The state is a function
-of time alone: calling ``advance`` more or less often changes nothing. Not modelled: gravity, coupling of the links,
-friction, contact force on the joints, saturation.
+of time alone: calling ``advance`` more or less often changes nothing. The object's push moves no joint: it only shows
+in the torque that the drives report. Not modelled: gravity, coupling of the links, saturation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from math import cos, exp, pi, sin, sqrt, tanh
 
 import numpy as np
@@ -111,6 +112,10 @@ class IdealArm:
         q0: (n,) joint positions at time 0, at rest, rad or m.
         bandwidth_hz: -3 dB frequency of every loop.
         damping_ratio: 1 is critical.
+
+    Attributes:
+        push: gives the object's push now, (n,) torques on the motors in motor coordinates, N m or N. It is asked for
+            only where a torque is: an arm whose drives report none costs no contact.
     """
 
     def __init__(
@@ -131,6 +136,8 @@ class IdealArm:
             for row, j, units in zip(rows, model.joints, own, strict=True)
         ]
         self._evaluated: list[State] | None = None
+        free = (0.0,) * model.n
+        self.push: Callable[[], Sequence[float]] = lambda: free
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Give one motor a ramp; it holds the end afterwards. Replaces whatever was to come from t0 on.
@@ -204,7 +211,8 @@ class IdealArm:
     def torque_permille(self, axis: int) -> int:
         """Torque of one joint over its continuous limit, as a drive reports it (6077h).
 
-        Model: reflected motor inertia, viscous and Coulomb friction; no gravity, no link inertia, no contact.
+        Model: reflected motor inertia, viscous and Coulomb friction, and what the motor gives against the object's
+        push; no gravity, no link inertia.
 
         Args:
             axis: number of the motor, from 0.
@@ -221,7 +229,7 @@ class IdealArm:
             rate += share * v
             acceleration += share * (stiffness * (r - q) - damping * v)
         torque = inertia * acceleration + viscous * rate
-        torque += coulomb * tanh(rate / STICTION_RATE)
+        torque += coulomb * tanh(rate / STICTION_RATE) - self.push()[axis]
         permille = round(1000.0 * torque / rated)
         if -PEAK_PERMILLE <= permille <= PEAK_PERMILLE:
             return permille

@@ -2,7 +2,7 @@
 
 Time only moves forward; several calls at one instant are the same as one. Contact is solved once per distinct time
 and only when somebody asks. Contact pushes the dynamic arm back, and the ideal one where its joints are compliant: its
-drives are taken as stiff.
+drives are taken as stiff, and report the torque that they give against the push.
 
 The times of all calls are those of the bus. The plant's own time is 0 at `begin`, so that nothing in it depends on how
 long the nodes took to be brought up.
@@ -30,6 +30,7 @@ from canprobe.errors import PlanError
 from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
 from canprobe.mechanics.robot.model import ArmModel, units_to_joints
+from canprobe.mechanics.robot.motors import joints_per_motor
 from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, TouchedPlaces
 from canprobe.mechanics.types import Floats
 
@@ -81,6 +82,9 @@ class Plant:
         if config.model is not None:
             self.arm = make_arm(config)
             self.motor_counts, self.torque_permille = self.arm.motor_counts, self.arm.torque_permille
+            if isinstance(self.arm, IdealArm) and config.object is not None:
+                self._joints_per_motor, self._unpushed = joints_per_motor(config.model), [0.0] * config.model.n
+                self.arm.push = self._push
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
             self._pressed = PressedProbe(config)
@@ -276,6 +280,21 @@ class Plant:
             self._solved = self._solve(self.state())
         return self._solved
 
+    def _push(self) -> Sequence[float]:
+        """The object's push now, (n,) torques on the motors, in motor coordinates.
+
+        Without friction every force on a ball acts through its centre, however many places touch:
+        `(∂q/∂θ)ᵀ Jᵀ f` with J at the centre and f their sum.
+        """
+        s = self._solution()
+        if s.torques is None:
+            s.torques = self._unpushed
+            if s.contact.force > 0.0:
+                assert self._chain is not None
+                at = posture(self._chain, s.q)
+                s.torques = (jacobian(at, at.flange)[:3].T @ s.push @ self._joints_per_motor).tolist()
+        return s.torques
+
     def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> ProbeState:
         if self._pressed is not None:
             return self._pressed.at(1e-9 * t_ns, self._first_image_s)
@@ -302,7 +321,7 @@ class Plant:
             q = tuple([a + b for a, b in zip(q, self._at_zero, strict=True)])
         probe = self._probe(state.t_ns, q, qd)
         if config.object is None:
-            return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
+            return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE, _ORIGIN)
         foot = config.object.nearest(probe.centre)
         if config.compliance is not None and foot.distance < config.radius_m:
             q = self._given_way(q, foot, config.compliance)
@@ -312,6 +331,7 @@ class Plant:
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
         k1, k2 = foot.kappa
+        push = None
         if config.object.by_gaps:
             several, contact = True, self._squeezed(config.object, probe, depth, rate)
         else:
@@ -326,12 +346,14 @@ class Plant:
                 damping=config.damping_s_m,
             )
             if touches is not None:
-                contact = self._resting(touches, probe)
+                contact, push = self._resting(touches, probe)
         # Contact direction on the probe: from its centre against the object's outward normal.
         (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
         d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
         uv = pad_coordinates(d, config.radius_m)
-        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, several)
+        force = contact.force
+        push = (force * nx, force * ny, force * nz) if push is None else push
+        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, push, several=several)
 
     def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Floats) -> tuple[float, ...]:
         """Joint positions (n,) after the contact has pushed each joint back by its torque over its stiffness.
@@ -362,12 +384,12 @@ class Plant:
         force = factor * config.stiffness_n_m3 * shape.squeezed(probe.centre, config.radius_m)
         return NO_CONTACT._replace(force=force, damping_factor=factor)
 
-    def _resting(self, touches: TouchedPlaces, probe: ProbeState) -> Indentation:
-        """Several places at once as one contact with the resultant force; it has no patch."""
+    def _resting(self, touches: TouchedPlaces, probe: ProbeState) -> tuple[Indentation, Vec]:
+        """Several places at once as one contact with the resultant force; it has no patch. And the resultant."""
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))
         force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
-        return NO_CONTACT._replace(force=float(np.linalg.norm(force)))
+        return NO_CONTACT._replace(force=float(np.linalg.norm(force))), tuple(force.tolist())
 
 
 def _joints_at_zero(model: ArmModel | None) -> list[float] | None:
@@ -391,6 +413,8 @@ class _Solution:
     kappa: tuple[float, float]
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame
+    push: Vec  # of the object on the probe's centre, N, base frame
+    torques: Sequence[float] | None = None  # on the motors by the push, once somebody has asked for them
     several: bool = False  # it touches in several places or all over, and these are of the deepest
 
 

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from canprobe.cell.plant.arms import make_arm, make_equations
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping
+from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.equations import Effects
 from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.plant import Plant
@@ -350,3 +351,43 @@ def test_an_ideal_arm_of_any_kind_follows_too(made):
 def test_an_arm_without_bodies_has_no_dynamics():
     with pytest.raises(PlanError, match="the masses of arm 'puma260' are not known"):
         make_arm(replace(config(), bodies=None))
+
+
+def puma():
+    return UPENN, ELBOW_FORM
+
+
+def pressed(made, force_n, fidelity, friction):
+    """A plant at rest with its probe on a plane; `friction`: share of the joints' and the contact's friction."""
+    model, q0 = made()
+    joints = tuple(replace(joint, coulomb=friction * joint.coulomb) for joint in model.joints)
+    depth = depth_for_force(force_n, (0.0, 0.0), 0.04, 1.27e8)
+    c = on_a_plane(replace(model, joints=joints), q0, depth)
+    if made is puma:
+        c = replace(c, bodies=BODIES["puma260"])
+    plant = Plant(replace(c, fidelity=fidelity, dynamics=Dynamics(friction=0.3 * friction)))
+    plant.advance(1_500_000_000)
+    return plant
+
+
+@pytest.mark.parametrize("force_n", [3.0, 30.0])
+@pytest.mark.parametrize("made", [puma, seven, gantry])
+def test_both_arms_report_the_torque_against_a_push(made, force_n):
+    """At rest the dynamic arm's torque is weight less push, but for what friction carries; the ideal one has no weight.
+
+    The wrist of the PUMA is coupled: its motors share the torques of its joints.
+    """
+    for friction in (1.0, 0.0):
+        ideal, dynamic = (pressed(made, force_n, fidelity, friction) for fidelity in ("ideal", "dynamic"))
+        model = dynamic.arm.model
+        ratio = dynamic.truth()["force"] / ideal.truth()["force"]
+        assert ratio == pytest.approx(1.0, abs=0.02)
+        weight = joints_per_motor(model).T @ dynamic.arm.equations.body.gravity(dynamic.arm.q)
+        rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]
+        found = [dynamic.torque_permille(i) for i in range(model.n)] - 1e3 * weight / rated
+        push = np.array([ideal.torque_permille(i) for i in range(model.n)])
+        J = forward_jacobian(model.chain, ideal.arm.q, TOOL)[1][:3] @ joints_per_motor(model)
+        assert push == pytest.approx(-1e3 * (J.T @ (ideal.truth()["force"] * np.array((0, 0, 1)))) / rated, abs=0.51)
+        bound = [1e3 * joint.coulomb / joint.rated_torque for joint in model.joints]
+        assert (np.abs(found - ratio * push) <= np.array(bound) + 0.01 * np.abs(push) + 1.0).all()
+        assert np.abs(push).max() > 5.0 * force_n

@@ -11,14 +11,17 @@ from canprobe.cell.plant.config import PlantConfig, PressMotion
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.pressure import pad_direction
+from canprobe.cell.plant.several_contacts import total_force
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
+from canprobe.mechanics.robot.motors import joints_per_motor, units_per_motor
 from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.touch.shapes import LIP_M
 
 PITCH_M = 1.5875e-3
 MS = 1_000_000
@@ -388,3 +391,22 @@ def test_a_plant_that_waits_does_to_the_last_bit_the_same_whenever_its_time_begi
         return states, images
 
     assert course(5 * MS) == course(314_159_265)
+
+
+def test_the_drives_report_the_torque_against_the_resultant_of_several_places():
+    """A probe beside the middle of a hollow tighter than itself rests on its lip: the push leans to the middle."""
+    pose = np.eye(4)
+    pose[:3, 3] = POINT
+    bowl = make_object("bowl", T_base_object=pose, radius=0.03)
+    T = forward(UPENN.chain, plant("plane").arm.q) @ TOOL
+    T[:3, 3] = POINT + np.array((4e-4, 2e-4, 0.03 + math.sqrt((0.04 + LIP_M) ** 2 - (0.03 + LIP_M) ** 2) - 3e-4))
+    p = Plant(PlantConfig(UPENN, posture_of(T), object=bowl))
+    truth, J = p.truth(), forward_jacobian(UPENN.chain, p.arm.q, TOOL)[1][:3]
+    touches = bowl.touches(T[:3, 3], 0.04)
+    force = total_force(touches, 0.04, p.config.stiffness_n_m3, np.zeros(len(touches.points)), 0.0)
+    assert truth["force"] == pytest.approx(np.linalg.norm(force), rel=1e-6)
+    assert np.linalg.norm(np.cross(force, truth["contact_normal"])) > 0.5
+    rated = np.sign(units_per_motor(UPENN)) * [joint.rated_torque for joint in UPENN.joints]
+    expected = -1e3 * (joints_per_motor(UPENN).T @ J.T @ force) / rated
+    assert [p.torque_permille(i) for i in range(6)] == pytest.approx(expected, abs=0.51)
+    assert np.abs(expected).max() > 50
