@@ -33,6 +33,7 @@ from canprobe.cell.master.log import RunLog
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
+from canprobe.cell.master.push_witness import PushWitness
 from canprobe.cell.master.raw_array_start import RawArrayStart
 from canprobe.cell.master.supervision import Condition, Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
@@ -123,7 +124,9 @@ class Cell:
         guard = JointGuard(plan) if setup.arm is not None else None
         seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
         self._reader: SampleReader | None = make_patch_reader(setup)
-        self.supervisor = Supervisor(seen, guard, None if guard is None or self._reader is None else self._patch)
+        touches = guard is not None and self._reader is not None
+        push = PushWitness(guard.model, guard.T_flange_tip, setup.limits.force_max) if guard and touches else None
+        self.supervisor = Supervisor(seen, guard, self._patch if touches else None, push)
         slides = setup.arm.model.chain.prismatic if setup.arm is not None else ()
         self._slides = np.array(slides, dtype=bool) if any(slides) else None
         self._plan = plan
@@ -289,6 +292,7 @@ class Cell:
         with self._one_at_a_time(), self._naming_another_master():
             self._controller, self._retreats_for, self._remarks_noted = runs, None, 0
             self.stopped_by = None
+            runs.array_alive = self.supervisor.array_alive
             if runs.reader is not None:
                 self._note_silent_taxels()
                 self._reader = runs.reader
@@ -544,6 +548,8 @@ class Cell:
 
     def _react(self, finding: Finding) -> None:
         self.stopped_by, reaction = finding.condition, finding.condition.reaction
+        if finding.condition.blind and self._controller.array_blind is None:
+            self._controller.array_blind = str(finding.error)
         if reaction is Reaction.RETREAT and self._controller.lets_go:
             self._retreats_for = self._retreats_for or finding.error
             self._controller.retreat(str(finding.error))
@@ -621,9 +627,7 @@ class Cell:
         self._stopped = True
         self._try(self._record_last)
         self._try(self._stop_drives)
-        if force := self.supervisor.pressing():
-            free = "free it; a run does not begin while the array measures a force"
-            self.notes.add(f"the probe is left pressing with {force:.1f} N: {free}")
+        self._note_pressing()
         if self._raw_array is not None:
             self._try(self._raw_array.stop)
         if self.homing is not None:
@@ -631,6 +635,18 @@ class Cell:
         self._try(self.bring_up.release)
         if self.found is not None and self.bring_up.took_over:
             self._try(self.found.restore)
+
+    def _note_pressing(self) -> None:
+        """Note whether the probe is left pressing, as far as that is known."""
+        free = "free it; a run does not begin while the array measures a force"
+        if self._controller.array_blind is not None:
+            self.notes.add(
+                f"the probe may be left pressing, with an unknown force: the array is not believed, as"
+                f" {self._controller.array_blind}; look, and {free}"
+            )
+        elif force := self.supervisor.pressing():
+            least = "at least " if self.supervisor.shows_a_part else ""
+            self.notes.add(f"the probe is left pressing with {least}{force:.1f} N: {free}")
 
     def _record_last(self) -> None:
         """Record the last cycle, where an error left it before its row."""

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from canprobe.cell.master.image_witness import UNSTATED_NS
+from canprobe.cell.master.push_witness import MEAN_NS
 from canprobe.cell.master.supervision import (
     CONTACT_LOST_NS,
     FORCE_HIDDEN_NS,
@@ -28,10 +30,12 @@ from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.mechanics.touch.depth_witness import CONTRADICTED_S
 
 NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
 ARRAY_RECOVERY_NS = 30 * NS_PER_MS
 """Time after a touch in which the array's creep and hysteresis may still show half of the touch force."""
+_BLIND_ADVICE = "look at the arm before anything moves, then press the array with a finger: `canprobe run listen`"
 Check = TypeVar("Check", bound=Callable[..., Any])
 _TABLE: list[Condition] = []
 
@@ -321,18 +325,94 @@ def _taxels_hidden(contact: TouchState) -> SafetyStop | None:
     )
 
 
+@_touch(
+    "image_dead",
+    "pressed array whose images do not change though the probe moves",
+    Reaction.RETREAT,
+    lambda limits: UNSTATED_NS + _sample(limits),
+    blind=True,
+)
+def _image_dead(contact: TouchState) -> SafetyStop | None:
+    since_ns = contact.images.dead_since_ns
+    if since_ns is None:
+        return None
+    return SafetyStop(f"{contact.images.words}: it does not measure any more; {_BLIND_ADVICE}")
+
+
+@_touch(
+    "force_fell",
+    "measured force that falls faster than the probe moves off",
+    Reaction.RETREAT,
+    lambda limits: round(NS_PER_S * CONTRADICTED_S) + _sample(limits),
+    blind=True,
+)
+def _force_fell(contact: TouchState) -> SafetyStop | None:
+    fall = contact.depth.fall if contact.depth is not None else None
+    if fall is None or fall.lasts_s < CONTRADICTED_S:
+        return None
+    return SafetyStop(
+        f"the measured force fell from {fall.before:.2f} to {fall.after:.2f} N within {fall.within_s * 1e3:.0f} ms,"
+        " faster than the probe can have moved off: the array reads too low or is blind, or the object was taken away;"
+        f" {_BLIND_ADVICE}"
+    )
+
+
+@_touch(
+    "depth",
+    "probe far deeper in what it touched before than the measured force means, or gone aside in a hold",
+    Reaction.RETREAT,
+    lambda limits: round(NS_PER_S * CONTRADICTED_S) + 4 * _sample(limits),
+    blind=True,
+)
+def _depth(contact: TouchState) -> SafetyStop | None:
+    depth = contact.depth
+    if depth is None or not depth.contradicts:
+        return None
+    if depth.wandered is not None:
+        return SafetyStop(
+            f"the probe has gone {depth.wandered * 1e3:.1f} mm aside in a touch of one place, as the array shows its"
+            f" contact elsewhere: the array does not measure, or the object moves; {_BLIND_ADVICE}"
+        )
+    return SafetyStop(
+        f"the array measures {contact.force:.2f} N where the probe's depth in the surface that it touched before means"
+        f" {depth.force:.1f} N: the array reads too low, the object has moved, or the layer is softer than stated;"
+        f" {_BLIND_ADVICE}"
+    )
+
+
+@_checked(
+    "push_unfelt",
+    "push in the drives' torques that the array does not measure",
+    Reaction.RETREAT,
+    _after(4 * MEAN_NS, 2),
+    blind=True,
+)
+def _push_unfelt(seen: Seen) -> SafetyStop | None:
+    if seen.unfelt is None:
+        return None
+    return SafetyStop(
+        f"the torques of the drives show a push of {seen.unfelt:.1f} N beyond the {seen.force:.2f} N that the array"
+        f" measures: the array may be blind, or the arm touches beside it; {_BLIND_ADVICE}"
+    )
+
+
 @_touch("contact_lost", "contact lost in a hold", Reaction.RETREAT, _lost)
 def _contact_lost(contact: TouchState) -> SafetyStop | None:
-    if contact.path and contact.limits.regain > 0.0:
+    if _is_doubtful(contact) or (contact.path and contact.limits.regain > 0.0):
         return None
     return SafetyStop("contact lost") if contact.lost_s * 1e9 > CONTACT_LOST_NS else None
 
 
 @_touch("contact_to_regain", "contact lost in a scan", Reaction.SEARCH, _lost)
 def _contact_to_regain(contact: TouchState) -> SafetyStop | None:
-    if not contact.path or contact.lost_s * 1e9 <= CONTACT_LOST_NS:
+    if not contact.path or _is_doubtful(contact) or contact.lost_s * 1e9 <= CONTACT_LOST_NS:
         return None
     return SafetyStop("contact lost")
+
+
+def _is_doubtful(contact: TouchState) -> bool:
+    """Whether it is not clear yet if the contact is lost or the array is blind."""
+    return contact.depth is not None and contact.depth.fall is not None
 
 
 @_touch("contact_not_regained", "lost contact not found again", Reaction.RETREAT, _cycles(1))

@@ -33,6 +33,15 @@ class TactileSample:
     cycle: int
     t_sigma_s: float = 0.0
 
+    @property
+    def image(self) -> object:
+        """The content of the frame, to be compared: what repeats where the array has stopped measuring."""
+        return self.frame.features or self.frame.taxels.tobytes()
+
+    def differs_from(self, other: TactileSample) -> bool:
+        """Whether the array shows something else than in another sample."""
+        return self.image != other.image
+
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
@@ -136,10 +145,14 @@ class Controller:
             called. False, the default: the cell does both.
         can_go_on: True: after the cell has come back from a loss (``recover`` of `canprobe.open_cell`) the controller
             goes on from where the arm stands, once motion is asked for. False, the default: a loss ends it.
+        array_alive: whether an image of the array has changed since bring-up; the cell sets it before the first step.
+        array_blind: why the controller does not believe the array any more; None while it does.
     """
 
     lets_go: bool = False
     can_go_on: bool = False
+    array_alive: bool = False
+    array_blind: str | None = None
 
     @property
     def reader(self) -> SampleReader | None:

@@ -13,16 +13,20 @@ from enum import Enum
 from typing import Any
 
 from canprobe.cell.master.array import ArrayReceiver
-from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.cell.master.drives import DriveGroup
+from canprobe.cell.master.image_witness import ImageWitness
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.mechanics.touch.depth_witness import DepthWitness
+from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.force_errors import upper_end
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
+from canprobe.mechanics.types import Floats
 
 HOLD_CYCLES = 3
 """Cycles without a TPDO of one drive after which all of them hold."""
@@ -103,6 +107,8 @@ class Seen:
         silent_taxels: number of taxels that were found not to measure.
         preload: highest force in the images before the drives are enabled, N.
         log_failure: why frames are no longer written down; None while they are.
+        unfelt: push in the drives' torques that the array does not measure, N; None without one.
+        force: force that the array measures, N.
     """
 
     limits: Limits
@@ -123,6 +129,8 @@ class Seen:
     silent_taxels: int = 0
     preload: float = 0.0
     log_failure: str | None = None
+    unfelt: float | None = None
+    force: float = 0.0
 
 
 @dataclass(slots=True, eq=False)
@@ -143,6 +151,8 @@ class TouchState:
         searched: distance towards the object that was searched since then, m.
         limit: message of a joint or workspace limit that is reached; None without one.
         force_sigma: standard deviation of the force, N; infinite where the array shows only a lower bound of it.
+        images: whether the images of the array live.
+        depth: depth of the probe in the surface that it has touched before; None where nobody follows it.
     """
 
     limits: Limits
@@ -157,6 +167,8 @@ class TouchState:
     searched: float = 0.0
     limit: str | None = None
     force_sigma: float = 0.0
+    images: ImageWitness = field(default_factory=ImageWitness)
+    depth: DepthWitness | None = None
     _hidden_since_ns: int | None = None
     _off_pad_since_ns: int | None = None
     _bridged_since_ns: int | None = None
@@ -184,6 +196,25 @@ class TouchState:
         bridged = patch.bridged > MAX_BRIDGED_SHARE and patch.force > TOUCH_FORCE / 2
         self._bridged_since_ns = _since(self._bridged_since_ns, bridged, t_ns)
         self.bridged_s = _passed_s(self._bridged_since_ns, t_ns)
+
+    def look(self, sample: TactileSample, patch: Patch, centre: Floats | None, sigma: float | None = None) -> None:
+        """Look whether the array lives, by a sample and its patch.
+
+        Args:
+            sample: the sample.
+            patch: patch that it shows.
+            centre: (3,) centre of the probe then, m; None where it is not known.
+            sigma: standard deviation of the centroid from image to image, m, where the calibration states it.
+        """
+        self.images.look(
+            sample.t_sample_ns,
+            sample.image,
+            pressed=patch.force > TOUCH_FORCE,
+            uv=(patch.u, patch.v),
+            highest=COUNTS_MAX if sample.frame.features else int(sample.frame.taxels.max()),
+            centre=centre,
+            sigma=sigma,
+        )
 
 
 def _since(since_ns: int | None, holds: bool, t_ns: int) -> int | None:
@@ -222,6 +253,7 @@ class Condition:
         count: function of a `Seen`; it returns how often a condition that does not stop the cell has happened.
         touch: the check takes a `TouchState`.
         enabling: the check holds already while the drives are enabled.
+        blind: the array is not believed any more: what it measures from then on is no force.
     """
 
     key: str
@@ -232,6 +264,7 @@ class Condition:
     count: Callable[[Seen], int] | None = None
     touch: bool = False
     enabling: bool = False
+    blind: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
+from canprobe.cell.master.push_witness import PushWitness
 from canprobe.cell.master.supervision import Finding, Reaction, Seen, TouchState
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
@@ -59,6 +60,8 @@ class JointGuard:
         low, high: range of the joint targets (n,), rad or m.
         count: joint motion of one drive unit (n,), rad or m.
         slowed: targets that were too far away for one cycle.
+        model: the arm.
+        T_flange_tip: transform (4, 4) from the probe's tip, z = pole, to the flange.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -70,9 +73,9 @@ class JointGuard:
         slides = set(model.chain.prismatic)
         self._si = "angles, rad" if slides == {False} else "positions, m" if slides == {True} else "positions, rad or m"
         self.slowed = 0
-        self._model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
-        self._T_flange_tip = probe.T_flange_probe.copy()
-        self._T_flange_tip[:3, 3] += probe.radius * self._T_flange_tip[:3, 2]
+        self.model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
+        self.T_flange_tip = probe.T_flange_probe.copy()
+        self.T_flange_tip[:3, 3] += probe.radius * self.T_flange_tip[:3, 2]
         # plain floats: a handful is compared before numpy has begun
         self._speed: list[float] = (model.qd_max * safety.speed_share).tolist()
         self._counts: list[float] = self.count.tolist()
@@ -83,7 +86,7 @@ class JointGuard:
 
     def T_base_tip(self, q: Floats) -> Floats:
         """Transform (4, 4) from the probe's tip (z = pole, towards the object) to base at joints (n,), rad or m."""
-        return forward(self._model.chain, q) @ self._T_flange_tip
+        return forward(self.model.chain, q) @ self.T_flange_tip
 
     def outside(self, q: Floats) -> str | None:
         """A message that the probe's tip is outside of the workspace at joint positions (n,), rad or m; None inside."""
@@ -103,7 +106,7 @@ class JointGuard:
         if max(beyond) <= 0.0:
             return None
         joint = beyond.index(max(beyond))
-        way = self._model.joints[joint].text(abs(self._q[joint] - before[joint]))
+        way = self.model.joints[joint].text(abs(self._q[joint] - before[joint]))
         return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
 
     def command(self, q_target: Floats, measurement: Measurement) -> GuardedTarget:
@@ -126,7 +129,7 @@ class JointGuard:
                 got = f"is {target}" if target.shape == (n,) else f"has shape {target.shape}"
                 return GuardedTarget(None, f"the controller's q_target {got}: expected {n} finite {self._si}")
             joint = inside.index(False)
-            where = self._model.joints[joint].text(wanted[joint])
+            where = self.model.joints[joint].text(wanted[joint])
             return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")
         if self._workspace is not None and (left := self.outside(target)) is not None:
             return GuardedTarget(None, left)
@@ -195,21 +198,29 @@ class Supervisor:
         seen: the cell; brought up to date by :meth:`step`.
         guard: guard of the joints; None without an arm.
         patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
+        push: witness of the force by the drives' torques; None without touch.
 
     Attributes:
         counts: how often each condition that does not stop the cell has happened.
         first: first cycle of each condition.
+        array_alive: whether an image of the array has changed since bring-up.
     """
 
     def __init__(
-        self, seen: Seen, guard: JointGuard | None, patch_from: Callable[[TactileSample], Patch] | None
+        self,
+        seen: Seen,
+        guard: JointGuard | None,
+        patch_from: Callable[[TactileSample], Patch] | None,
+        push: PushWitness | None = None,
     ) -> None:
         self.seen = seen
         self.counts: dict[str, int] = dict.fromkeys((key for key, _ in COUNTERS), 0)
         self.first: dict[str, int] = {}
+        self.array_alive = False
         self._patch_from = patch_from
         self._guard = guard
         self._contact = TouchState(seen.limits)
+        self._push = push
         self._sample: TactileSample | None = None
         self._press = PressDetector()
         self._look_ns = 0
@@ -240,11 +251,17 @@ class Supervisor:
         seen.passive_ns = measurement.t_ns - self._active_ns
         seen.controller_state, seen.log_failure = controller_state, log_failure
         seen.speeding = self._guard.measure(measurement) if self._guard is not None else None
-        self._sample = measurement.tactile or self._sample
+        if (sample := measurement.tactile) is not None:
+            self.array_alive = self.array_alive or (self._sample is not None and sample.differs_from(self._sample))
+            self._sample = sample
         if self._untouched:
             self._untouched = not measurement.enabled
             if measurement.tactile is not None:
                 seen.preload = max(seen.preload, self.felt())
+        if self._push is not None:
+            seen.force = self.felt()
+            self._push.step(measurement, seen.force)
+            seen.unfelt = self._push.unfelt
         if measurement.t_ns >= self._look_ns:
             self._look_ns = measurement.t_ns + LOOK_PERIOD_NS
             self._look()
@@ -292,6 +309,13 @@ class Supervisor:
             return 0.0
         return self._patch_from(self._sample).force
 
+    @property
+    def shows_a_part(self) -> bool:
+        """Whether the array shows only a part of the force: it is saturated, or the contact runs off it."""
+        if self._sample is None or self._patch_from is None:
+            return False
+        return not math.isfinite(self._patch_from(self._sample).sigma.total)
+
     def pressing(self) -> float:
         """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""
         self._look()
@@ -305,8 +329,12 @@ class Supervisor:
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
         """The first condition of a touch that holds, for a controller that does not guard its contact itself."""
-        if self._patch_from is not None and measurement.tactile is not None:
-            self._contact.feel(self._patch_from(measurement.tactile), measurement.tactile.t_sample_ns)
+        sample = measurement.tactile
+        if self._patch_from is not None and sample is not None:
+            patch = self._patch_from(sample)
+            self._contact.feel(patch, sample.t_sample_ns)
+            if measurement.q is not None and self._guard is not None:
+                self._contact.look(sample, patch, self._guard.T_base_tip(measurement.q)[:3, 3])
         self._contact.tactile_age = measurement.tactile_age
         return touch_finding(self._contact)
 

@@ -285,8 +285,9 @@ class TaskSettings:
     """Expected outward normal at `start_mm`, of any length. The probe approaches against it."""
     clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCH_ONLY] = 3.0
     """Distance from `start_mm` at which the approach begins."""
-    search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCH_ONLY] = 8.0
-    """Distance beyond `start_mm` at which the approach gives up."""
+    search_mm: Annotated[float | None, Range(0, 50, open_low=True), TOUCH_ONLY] = None
+    """Distance beyond `start_mm` at which the approach gives up. Left out: 8 mm; where the drives report no torque, and
+    as long as no image of the array has changed since bring-up, only as far as `limits.force_max_n` presses in."""
     strategy: Annotated[Strategy, SCAN_ONLY] = "weave"
     """Path of the scan. With `explore` it goes where the map of the surface is not sure enough."""
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCAN_ONLY] = 25.0

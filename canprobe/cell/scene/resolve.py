@@ -51,6 +51,7 @@ from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.tool_calibration import ball_approaches
+from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
@@ -261,7 +262,8 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             axes=scan_axes(settings),
             speed=settings.approach_mm_s * MM,
             clearance=settings.clearance_mm * MM,
-            search=settings.search_mm * MM,
+            search=SEARCH if settings.search_mm is None else settings.search_mm * MM,
+            blind_search=_blind_search(scene, probe) if settings.search_mm is None else settings.search_mm * MM,
         ),
         "force": settings.force_n,
         "duration_s": settings.duration_s,
@@ -284,6 +286,16 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             shape = Shape(s.method, s.also, s.memory_mm * MM, s.every_ms * 1e-3, s.patch, s.revisit)
     gains = SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz)
     return Touch(**touching, gains=gains, scan=scan, shape=shape)
+
+
+SEARCH = 8e-3
+"""Distance beyond the expected place at which an approach gives up, m."""
+
+
+def _blind_search(scene: Scene, probe: Probe) -> float:
+    """Way beyond the expected place, m, on which a plane is pressed with the limit of the force and no more."""
+    way = float(indentation_from_force(scene.limits.force_max_n, probe.stiffness, probe.radius, (0.0, 0.0)))
+    return min(SEARCH, way)
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:

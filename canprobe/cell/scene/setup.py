@@ -261,6 +261,7 @@ class Approach:
         speed: speed of the approach, m/s.
         clearance: distance of the probe's surface from `start` where it begins, m.
         search: distance beyond `start` where it gives up, m.
+        blind_search: the same where neither torques nor an image have shown that a contact would be noticed.
     """
 
     start: Floats
@@ -268,6 +269,7 @@ class Approach:
     speed: float
     clearance: float
     search: float
+    blind_search: float
 
     @property
     def normal(self) -> Floats:

@@ -45,7 +45,7 @@ class CalibrateTask(ProbingTask):
     """
 
     def __init__(self, plan: Plan, task: Calibrate, sensing: ContactSensing) -> None:
-        super().__init__(plan, task.lag_s, sensing)
+        super().__init__(plan, task.lag_s, sensing, holds=True)
         sensing.set_kappa(np.full(2, 1.0 / task.ball_radius))
         radii = sensing.radius + task.ball_radius
         self._ball = BallModel(sensing.flange_probe[:3, 3], task.ball_centre, radii, sigma_c=task.ball_sigma)
@@ -74,7 +74,7 @@ class CalibrateTask(ProbingTask):
         """The record of the calibration so far."""
         return replace(super().record(), tool=self.estimate)
 
-    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+    def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         self._touch.feel(patch, sample.t_sample_ns)
         contact = self.sensing.contact(sample, patch) if patch.force > TOUCH_FORCE / 2 else None
         if contact is not None and self.phase in (Phase.APPROACH, Phase.SETTLE):
@@ -84,6 +84,7 @@ class CalibrateTask(ProbingTask):
             if contact is not None and self._t > SETTLE_S:
                 self._felt.append(contact)
         self._columns = self._felt_columns(sample, patch, contact) | {"touch": float(self._number + 1)}
+        return contact
 
     # phases: each returns the pose for this cycle
 
@@ -99,6 +100,7 @@ class CalibrateTask(ProbingTask):
                 self.estimate = calibrate_tool(self._corrected(), self._ball)
             return self._enter(Phase.DONE)
         self._push = PushFit()
+        self.depth.restart()
         self._line = ArcMotion(self._ball.c_base, pose, self._at(self._task.approach.clearance), ROUND_SPEED_M_S)
         self._enter(Phase.MOVE)
 
@@ -109,11 +111,9 @@ class CalibrateTask(ProbingTask):
         self._gone = self._task.approach.speed * self._t - self._task.approach.clearance
         if self._touch.force > TOUCH_FORCE:
             self._enter(Phase.SETTLE)
-        elif self._gone > self._task.approach.search:
-            self.retreat(
-                f"touch {self._number + 1}: no ball found up to {self._task.approach.search * 1e3:.0f} mm beyond the"
-                " expected place: correct task.start_mm and task.ball_radius_mm, or raise task.search_mm"
-            )
+        elif self._gone > (way := self._search_way(self._task.approach)):
+            nothing = self._found_nothing(f"touch {self._number + 1}: no ball found", way)
+            self.retreat(f"{nothing}; or correct task.start_mm and task.ball_radius_mm, or raise task.search_mm")
         return self._at(-self._gone)
 
     def _settle(self) -> ProbePose:

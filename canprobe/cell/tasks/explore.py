@@ -105,9 +105,9 @@ class ExploreTask(TouchTask):
         if due and self.phase is Phase.SCAN and self.explorer is not None:
             self.explorer.work()
 
-    def _feel(self, sample: TactileSample, patch: Patch) -> None:
-        super()._feel(sample, patch)
-        if self.phase is Phase.SCAN and (contact := self._contact) is not None and self.explorer is not None:
+    def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
+        contact = super()._feel(sample, patch)
+        if self.phase is Phase.SCAN and contact is not None and self.explorer is not None:
             from_edge = self._task.array.pad.reach_m - max(abs(patch.u), abs(patch.v))
             self._near_rim = from_edge < self._rim
             self.explorer.walk(contact.p_base, contact.n_base, contact.force_n / self._target_force)
@@ -117,6 +117,7 @@ class ExploreTask(TouchTask):
                 "explored_within": float(np.mean(self.explorer.ground.sigma <= self.explorer.ground.target)),
                 "explored_ahead_mm": 1e3 * self._ahead(self.explorer),
             }
+        return contact
 
     def _ahead(self, explorer: Explorer) -> Floats:
         """(AHEAD, 3) points of the path ahead on the servo's local surface, base frame, m."""

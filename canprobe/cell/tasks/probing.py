@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from canprobe.cell.master.array import PatchReader, force_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.supervision import TouchState, limits_of
+from canprobe.cell.master.supervision import Finding, TouchState, limits_of
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
+from canprobe.cell.planning.witnesses import reports_torque
+from canprobe.cell.scene.setup import Approach
 from canprobe.cell.tasks.probe_motion import ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
 from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.depth_witness import DepthWitness
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S, ArcMotion, LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
@@ -47,23 +50,27 @@ class ProbingTask(Task):
         plan: plan of a cell with an arm; beyond its limits the probe retreats and the cell stops.
         lag_s: lag of the drives behind a ramp.
         sensing: contacts from measurements.
+        holds: each touch stays in one place.
 
     Attributes:
         phase: what it does now.
         sensing: source of the contacts, as given.
         reason: why it stopped; None as long as it goes on.
         taxels: last image of the touch itself.
+        depth: the depth of the probe in what it has touched before, as a witness of the force.
     """
 
     lets_go = True
 
-    def __init__(self, plan: Plan, lag_s: float, sensing: ContactSensing) -> None:
+    def __init__(self, plan: Plan, lag_s: float, sensing: ContactSensing, *, holds: bool = False) -> None:
         self.phase = Phase.MOVE
         self.sensing = sensing
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
         self._setup = plan.setup
         self._touch = TouchState(limits_of(plan))
+        self.depth = self._touch.depth = DepthWitness(sensing.radius, holds=holds)
+        self._drives_witness = reports_torque(plan)
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
         self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
@@ -105,7 +112,7 @@ class ProbingTask(Task):
             self._begin(self._motion.pose)
         patch = self.sensing.step(measurement)
         if patch is not None and measurement.tactile is not None:
-            self._feel(measurement.tactile, patch)
+            self._witness(measurement.tactile, patch, self._feel(measurement.tactile, patch))
         self._touch.tactile_age = measurement.tactile_age
         self._watch()
         pose = self._phases[self.phase]()
@@ -124,16 +131,34 @@ class ProbingTask(Task):
         """Start the first move, from where the probe is."""
         raise NotImplementedError
 
-    def _feel(self, sample: TactileSample, patch: Patch) -> None:
-        """Take a tactile sample."""
+    def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
+        """Take a tactile sample; the contact that it shows."""
         raise NotImplementedError
+
+    def _witness(self, sample: TactileSample, patch: Patch, contact: ContactSample | None) -> None:
+        """Ask what else knows of the force: whether the images live, and how deep the probe is."""
+        touch, sensing = self._touch, self.sensing
+        centre = contact.T_base_probe[:3, 3] if contact is not None else sensing.probe_centre(sample.t_sample_ns)
+        normal = contact.n_base if contact is not None else None
+        touch.look(sample, patch, centre, sensing.image_sigma if contact is not None else None)
+        self.array_alive = self.array_alive or touch.images.seen_alive
+        if centre is None or patch.saturated or patch.off_pad:
+            return  # of a force that is only a lower bound no depth follows
+        t_s, limit = sample.t_sample_ns * 1e-9, self._setup.limits.force_max
+        self.depth.step(t_s, centre, normal, patch.force, d1=sensing.depth(1.0), force_max=limit)
 
     def _watch(self) -> None:
         """Check the touch by the table of conditions."""
         if self.reason is None and self.phase is not Phase.DONE:
             finding = touch_finding(self._touch)
             if finding is not None:
+                self._doubt_array(finding)
                 self.retreat(str(finding.error))
+
+    def _doubt_array(self, finding: Finding) -> None:
+        """Do not believe the array any more, where that is what was found."""
+        if finding.condition.blind and self.array_blind is None:
+            self.array_blind = str(finding.error)
 
     def _command(self, pose: ProbePose) -> Command:
         """One step of the probe to a pose, as the cell takes it; a joint's limit on the way makes the task let go."""
@@ -181,6 +206,20 @@ class ProbingTask(Task):
 
     def _approach(self) -> ProbePose:
         raise NotImplementedError
+
+    def _search_way(self, approach: Approach) -> float:
+        """Way beyond the expected place up to which an approach goes, m: a blind array ends none."""
+        return approach.search if self.array_alive or self._drives_witness else approach.blind_search
+
+    def _found_nothing(self, what: str, way: float) -> str:
+        """Words for an approach that went a way beyond the expected place, m, without a contact."""
+        words = f"{what} up to {way * 1e3:.{1 if way < 1e-3 else 0}f} mm beyond the expected place"
+        if self.array_alive:
+            return words
+        return (
+            f"{words}, and no image of the array has changed since bring-up: the array may be blind; press it with a"
+            " finger (`canprobe run listen` shows what it measures), then try again"
+        )
 
     def _settle(self) -> ProbePose:
         raise NotImplementedError

@@ -15,6 +15,7 @@ from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.calibrate import PRESS_SPEED
 from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
@@ -126,7 +127,7 @@ class RollTask(ProbingTask):
         if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
             self._let_go()
 
-    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+    def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         self._touch.feel(patch, sample.t_sample_ns)
         pose = self.sensing.probe_at(sample.t_sample_ns)
         if self.phase is Phase.MOVE and not self._number and self._t < self._rest_s:
@@ -141,6 +142,7 @@ class RollTask(ProbingTask):
             mine.cycles.append(sample.cycle)
         contact = self.sensing.contact(sample, patch) if patch.force > TOUCH_FORCE / 2 else None
         self._columns = self._felt_columns(sample, patch, contact) | {"touch": float(self._number + 1)}
+        return contact
 
     # where the probe is
 
@@ -190,6 +192,7 @@ class RollTask(ProbingTask):
             self._set_axes(self._motion.pose_matrix[:3, 0])
         if self.reason is not None or self._number >= len(self.presses):
             return self._enter(Phase.DONE)
+        self.depth.restart()
         self._line = LineMotion(pose, self._pose((0.0, 0.0), -self._approach_of.clearance), TOUCH_TO_TOUCH_SPEED)
         self._enter(Phase.MOVE)
 
@@ -209,12 +212,9 @@ class RollTask(ProbingTask):
         if self._touch.force > TOUCH_FORCE + self._floor:
             self._touched_at = self._gone
             self._enter(Phase.SETTLE)
-        elif self._gone > self._approach_of.search:
-            far = self._approach_of.search * 1e3
-            self.retreat(
-                f"touch {self._number + 1}: no object found up to {far:.0f} mm beyond the expected place: move the"
-                " object there, or correct its place"
-            )
+        elif self._gone > (way := self._search_way(self._approach_of)):
+            nothing = self._found_nothing(f"touch {self._number + 1}: no object found", way)
+            self.retreat(f"{nothing}; or move the object there, or correct its place")
         return self._pose((0.0, 0.0), self._gone)
 
     def _settle(self) -> ProbePose:

@@ -118,6 +118,8 @@ class ContactSensing:
         self.set_kappa(np.zeros(2))
         self.patch: Patch | None = None
         self.dropped = 0
+        self.image_sigma: float | None = None
+        """Standard deviation of the last centroid from image to image, m; None where the calibration states none."""
         self.reader = PatchReader(calibration)
         self._noise = noise
         self._level_pa = MomentImage(calibration).level_pa
@@ -182,6 +184,11 @@ class ContactSensing:
         q = self._history.at(t_ns)
         return None if q is None else forward(self._chain, q)
 
+    def probe_centre(self, t_ns: int) -> Floats | None:
+        """Centre (3,) of the probe in base at a time of the last cycles, m; None where it is unknown."""
+        pose = self.probe_at(t_ns)
+        return None if pose is None else pose[:3, 3]
+
     def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""
         T_base_probe = self.probe_at(sample.t_sample_ns)
@@ -193,6 +200,7 @@ class ContactSensing:
         # over the peak of the layer at this depth: that of one image has the noise of one taxel, and steers the servo
         lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
         image_sigma = 0.0 if self._noise is None else self._noise.image(lightness)
+        self.image_sigma = image_sigma if self._noise is not None and not self._noise.assumed else None
         found = contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,

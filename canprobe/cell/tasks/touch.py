@@ -67,7 +67,7 @@ class TouchTask(ProbingTask):
         shape: ShapeTracker | None,
         check: CalibrationCheck | None = None,
     ) -> None:
-        super().__init__(plan, task.lag_s, sensing)
+        super().__init__(plan, task.lag_s, sensing, holds=task.scan is None)
         self.shape = shape
         self._check = check
         self._remarks: list[str] = []
@@ -163,7 +163,7 @@ class TouchTask(ProbingTask):
 
     # sensing and supervision
 
-    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+    def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         self._touch.feel(patch, sample.t_sample_ns, known=patch.saturated and self._push.certain(MAX_SLOPE_SIGMA_SHARE))
         if self.phase is Phase.SCAN:
             self.taxels = sample.frame.taxels
@@ -187,6 +187,7 @@ class TouchTask(ProbingTask):
                 self._check.see(contact.t_s, self.sensing.reader.image, sample.frame.window, patch)
         felt_columns = self._felt_columns(sample, patch, contact)
         self._columns = felt_columns | self._shape_columns | {"depth_at_1n_mm": depth_at_1n_mm}
+        return contact
 
     def _feel_stiffness(self, contact: ContactSample) -> None:
         """Learn from the growing force how stiff this touch is; what was measured so far moves with it, no bump."""
@@ -244,6 +245,7 @@ class TouchTask(ProbingTask):
         if finding.condition.reaction is Reaction.SEARCH:
             self._look_for_contact()
         else:
+            self._doubt_array(finding)
             self._leave(str(finding.error))
 
     def _least_force(self) -> float:
@@ -280,8 +282,8 @@ class TouchTask(ProbingTask):
         pose = self._above(distance)
         if self._contact is not None and self._touch.force > TOUCH_FORCE + self._floor:
             self._touch_down(self._contact, pose)
-        elif distance < -self._task.approach.search:
-            self._leave(f"no object found up to {self._task.approach.search * 1e3:.0f} mm beyond the expected point")
+        elif distance < -(way := self._search_way(self._task.approach)):
+            self._leave(self._found_nothing("no object found", way))
         return pose
 
     def _touch_down(self, contact: ContactSample, pose: ProbePose) -> None:
@@ -295,6 +297,7 @@ class TouchTask(ProbingTask):
             probe_radius=self.sensing.radius,
             rolling_share=scan.rolling_share if scan is not None else 0.0,
         )
+        self.depth.restart()
         self._sink_from(contact, pose)
         self._enter(Phase.SETTLE)
 
@@ -386,6 +389,7 @@ class TouchTask(ProbingTask):
         if self._contact is not None and self._touch.force > TOUCH_FORCE + self._floor:
             loss.regained_s = (self._cycle - loss.cycle) * self._period_s
             self._servo.rest_on(self._contact.p_base, self._contact.n_base)
+            self.depth.restart()
             self._sink_from(self._contact, pose)
             self._search = None
             self._enter(Phase.REGAIN)

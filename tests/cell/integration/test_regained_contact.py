@@ -15,11 +15,13 @@ from canprobe.lab.studies.witnessed_run import Witness
 
 TARGET = 2.0
 AT_CYCLE = 900
+MOVING_CYCLES = 60
+"""Time in which the object moves: 0.15 s. One that is gone at once looks as a blind array does."""
 NOMINAL = 1.27e8
 
 
 class Disturbed(Wrapped):
-    """A scan over the cylinder; in one cycle the object is put somewhere else, or taken away."""
+    """A scan over the cylinder; from one cycle on the object moves somewhere else, or it is taken away."""
 
     def __init__(self, move_mm, *, share=1.0, duration_s=3.0, **task):
         scene = canprobe.load_scene("cylinder", {"task.duration_s": duration_s})
@@ -39,15 +41,14 @@ class Disturbed(Wrapped):
         self.session.world.participants.insert(0, self.witness)
 
     def step(self, measurement):
-        if measurement.cycle == AT_CYCLE:
+        gone = (measurement.cycle - AT_CYCLE) / MOVING_CYCLES
+        if 0.0 <= gone <= 1.0:
             plant = self.session.world.plant
             there = None
             if self.move_mm is not None:
+                moved = np.add(self.session.scene.object.position_mm, np.multiply(gone, self.move_mm))
                 there = canprobe.cell.scene.geometry.true_object(
-                    replace(
-                        self.session.scene.object,
-                        position_mm=tuple(np.add(self.session.scene.object.position_mm, self.move_mm)),
-                    )
+                    replace(self.session.scene.object, position_mm=tuple(moved))
                 )
             plant.config = replace(plant.config, object=there)
             plant._solved = None
@@ -64,11 +65,11 @@ class Disturbed(Wrapped):
 
 @pytest.mark.parametrize("share", [1.0, 4.5], ids=["9 kN/m", "20 kN/m"])
 def test_an_object_that_gives_way_is_found_again_without_overshoot(share):
-    run = Disturbed((0.0, 0.0, -1.2), share=share)
+    run = Disturbed((0.0, 0.0, -1.8), share=share)
     times, forces = run.run()
     (loss,) = run.task.losses
     gap = times[(forces == 0) & (times > times[0] + 3.0)]
-    assert loss.searched == pytest.approx(1.2e-3, abs=0.6e-3)
+    assert loss.searched == pytest.approx(1.2e-3, abs=0.6e-3), "the rest it has followed"
     assert 0.2 < loss.regained_s < 0.9
     assert gap.size > 0, "contact was truly lost"
     lost_at = AT_CYCLE * 2.5e-3

@@ -21,6 +21,7 @@ from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
+from canprobe.mechanics.touch.depth_witness import Fall
 from canprobe.mechanics.touch.patch.force_errors import ForceSigma
 
 LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_000)
@@ -63,6 +64,16 @@ def heard(can_id, *data):
     return found
 
 
+def images(dead_since_ns):
+    return SimpleNamespace(dead_since_ns=dead_since_ns, words="the array has sent the same image")
+
+
+def depth(fallen_s=None, **more):
+    """The depth's witness, of a force that fell so long ago."""
+    fall = None if fallen_s is None else Fall(1.0, 5e-3, 2.0, 0.5, fallen_s)
+    return SimpleNamespace(**{"fall": fall, "contradicts": False, "wandered": None, "force": 6.0, **more})
+
+
 def felt(**patch):
     return SimpleNamespace(sigma=ForceSigma(), **patch)
 
@@ -94,6 +105,23 @@ def felt(**patch):
         ("contact_lost", touch(lost_s=0.03, path=True), touch(lost_s=0.0301, path=True), "contact lost"),
         ("contact_to_regain", scan(0.03), scan(0.0301), "contact lost"),
         ("contact_to_regain", touch(lost_s=0.1), scan(0.1), "contact lost"),
+        ("image_dead", touch(images=images(None)), touch(images=images(7)), "sent the same image: it does not measure"),
+        ("force_fell", touch(depth=depth(0.0499)), touch(depth=depth(0.0501)), "fell from 2.00 to 0.50 N within 5 ms"),
+        ("contact_lost", touch(lost_s=0.1, depth=depth(0.01)), touch(lost_s=0.1), "contact lost"),
+        ("contact_to_regain", scan(0.1, depth=depth(0.01)), scan(0.1), "contact lost"),
+        (
+            "depth",
+            touch(depth=depth()),
+            touch(depth=depth(contradicts=True)),
+            "measures 2.00 N where the probe's depth",
+        ),
+        (
+            "depth",
+            touch(depth=depth()),
+            touch(depth=depth(contradicts=True, wandered=1.2e-3)),
+            "1.2 mm aside in a touch",
+        ),
+        ("push_unfelt", seen(), seen(unfelt=3.4, force=0.2), "a push of 3.4 N beyond the 0.20 N that the array"),
         ("contact_not_regained", scan(searched=3e-3), scan(searched=3.01e-3), "not found again within 3.0 mm"),
         ("joint_stop", touch(), touch(limit="joint 1 at 90 deg, its stop"), "joint 1 at 90 deg, its stop"),
         ("preload", seen(TARING, preload=0.15), seen(TARING, preload=0.151), "measures 0.15 N before the run"),
@@ -247,7 +275,7 @@ def test_a_press_between_two_retreats_is_not_forgotten():
     for cycle in range(80):
         force[0] = 4.0 if 4 <= cycle < 16 else 0.3 * (cycle >= 16)
         back[0] = max(cycle - 16, 0) / 64 * 4e-3
-        sample = SimpleNamespace(cycle=cycle, t_sample_ns=0)
+        sample = SimpleNamespace(cycle=cycle, t_sample_ns=0, differs_from=lambda _: True)
         measurement = Measurement(cycle, cycle * 2_500_000, q=np.zeros(6), q_age=(0,) * 6, tactile=sample)
         more = {"counters": PortCounters(), "controller_state": ControllerState.ACTIVE}
         watched.step(measurement, sync_ns=0, overruns=0, **more)

@@ -1,0 +1,105 @@
+"""The drives as a witness of the force: a push that grows in their torques and not in the array's force.
+
+One-sided and coarse: a push that the array measures needs no torque that shows it, and what friction may hide is stated
+as standard deviation (`canprobe.mechanics.robot.tool_push`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from canprobe.cell.master.controller import Measurement
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.tool_push import PushGeometry, TorqueMean, push_since
+from canprobe.mechanics.types import Floats
+
+MEAN_NS = 25_000_000
+"""Time over which torques are averaged; two in a row must show a push."""
+LATEST, OLDEST = 4, 20
+"""Ages of the means that the present one is compared with, in means: 0.1 to 0.5 s."""
+LEAST_LIKE, MOST_LIKE, LIKE_SHARE, LIKE_COUNTS = 3, 8, 0.3, 1.5
+"""Number of means from which on only those count in which the motors turned as they do now, the last of them; and by
+how much their way in `LATEST` means may differ: relative, and in counts of the drive. Friction differs elsewhere."""
+CERTAIN_SIGMAS = 4.0
+"""Standard deviations from which on a push is none by chance: it is looked for forty times a second."""
+SHARE_OF_LIMIT = 0.5
+"""Share of the force limit below which no push counts, however well the torques are known."""
+
+
+class PushWitness:
+    """Compares the push in the drives' torques with the force that the array measures.
+
+    Args:
+        model: the arm.
+        flange_tip: transform (4, 4) of the probe's tip, z = pole, to the flange.
+        force_max: limit of the force, N.
+
+    Attributes:
+        sigma: standard deviation of the last comparison, N; infinite before one.
+        unfelt: push beyond the measured force, N, where it is certain; None otherwise.
+    """
+
+    def __init__(self, model: ArmModel, flange_tip: Floats, force_max: float) -> None:
+        self._geometry = PushGeometry(model, flange_tip)
+        self._least = SHARE_OF_LIMIT * force_max
+        self._least_way = LIKE_COUNTS / np.abs(units_per_motor(model))
+        self._means: deque[TorqueMean] = deque(maxlen=OLDEST + 1)
+        self.sigma = float("inf")
+        self.unfelt: float | None = None
+        self._showed = False
+        self._restart(None)
+
+    def step(self, measurement: Measurement, force: float) -> None:
+        """Take the torques of a cycle and the force that the array measures, N."""
+        q = measurement.q
+        if q is None or any(measurement.q_age) or not measurement.torque_permille:
+            return
+        if self._since is None or not measurement.enabled:
+            self._restart(measurement)
+            return
+        self._torques.append(measurement.torque_permille)
+        self._force += force
+        since_ns = measurement.t_ns - self._since.t_ns
+        if since_ns < MEAN_NS:
+            return
+        torques = np.array(self._torques) * self._geometry.newton_metres
+        x = self._geometry.motors(q)
+        earlier = self._means[-LATEST] if len(self._means) >= LATEST else None
+        self._means.append(
+            TorqueMean(
+                torques.mean(axis=0),
+                torques.var(axis=0),
+                len(torques),
+                q,
+                x,
+                x - earlier.x if earlier is not None else np.full_like(x, np.nan),
+                LATEST * MEAN_NS * 1e-9,
+                x - self._means[-1].x if self._means else np.full_like(x, np.nan),
+                self._force / len(torques),
+                since_ns * 1e-9,
+            )
+        )
+        self._restart(measurement)
+        if len(self._means) > 2 * LATEST + LEAST_LIKE:
+            self._compare()
+
+    def _restart(self, measurement: Measurement | None) -> None:
+        self._since = measurement
+        self._torques: list[tuple[float, ...]] = []
+        self._force = 0.0
+
+    def _compare(self) -> None:
+        means = list(self._means)
+        now, before = means[-1], [one for one in means[:-LATEST] if np.isfinite(one.way[0])]
+        like = [
+            one for one in before if np.all(np.abs(one.way - now.way) <= LIKE_SHARE * np.abs(now.way) + self._least_way)
+        ]
+        before = like[-MOST_LIKE:] if len(like) >= LEAST_LIKE else before
+        push, self.sigma = push_since(self._geometry, now, before)
+        unfelt = push - (now.force - float(np.mean([one.force for one in before])))
+        shows = unfelt > max(CERTAIN_SIGMAS * self.sigma, self._least)
+        self.unfelt = unfelt if shows and self._showed else None
+        self._showed = shows

@@ -1,0 +1,133 @@
+"""The depth of a probe in what it touched before, against spheres and planes whose depth is known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from canprobe.mechanics.touch.depth_witness import CONTRADICTED_S, WANDER, DepthWitness, sigma_ahead
+
+R, D1, LIMIT, STEP_S = 40e-3, 0.25e-3, 5.0, 5e-3
+OBJECT = 60e-3
+"""Radius of the touched ball, m; its top is the origin."""
+rng = np.random.default_rng(7)
+
+
+def touch_ball(witness, x, depth, shown, t):
+    """Show the witness the contact over a place x of the ball, at a depth, with a force that the array shows."""
+    angle = x / OBJECT
+    normal = np.array([math.sin(angle), 0.0, math.cos(angle)])
+    normal[:2] += rng.normal(0.0, 2e-3, 2)
+    centre = np.array([0.0, 0.0, -OBJECT]) + (OBJECT + R - depth) * np.array([math.sin(angle), 0.0, math.cos(angle)])
+    centre = centre + rng.normal(0.0, 5e-6, 3)
+    witness.step(t, centre, normal / np.linalg.norm(normal), shown, d1=D1, force_max=LIMIT)
+
+
+def scan(witness, seconds, speed, depth_of, shown_of):
+    """Times at which the witness contradicts, in a scan at constant speed."""
+    times = []
+    for k in range(round(seconds / STEP_S)):
+        t = k * STEP_S
+        touch_ball(witness, speed * t, depth_of(t), shown_of(t), t)
+        if witness.contradicts or (witness.fall is not None and witness.fall.lasts_s >= CONTRADICTED_S):
+            times.append(t)
+    return times
+
+
+def depth(force):
+    return D1 * math.sqrt(force)
+
+
+@pytest.mark.parametrize("speed", [0.0, 3e-3, 25e-3, 100e-3])
+def test_a_true_scan_is_never_contradicted(speed):
+    witness = DepthWitness(R, holds=speed == 0.0)
+    assert not scan(witness, 2.0, speed, lambda t: depth(2.0), lambda t: 2.0 + 0.05 * math.sin(40 * t))
+
+
+def test_the_depth_is_that_of_the_probe():
+    witness = DepthWitness(R)
+    scan(witness, 1.0, 10e-3, lambda t: depth(2.0), lambda t: 2.0)
+    touch_ball(witness, 10e-3, depth(4.0), 2.0, 1.0)
+    assert witness.depth == pytest.approx(depth(4.0), abs=3 * witness.sigma)
+    assert witness.force == pytest.approx(4.0, rel=0.2)
+    assert witness.sigma < 40e-6
+
+
+@pytest.mark.parametrize(("speed", "inward"), [(0.0, 0.2e-3), (10e-3, 1.5e-3)])
+def test_a_force_that_does_not_grow_with_the_depth_is_contradicted_below_the_limit(speed, inward):
+    """The probe goes in slowly from one second on; the array shows 2 N all the time."""
+    witness = DepthWitness(R, holds=speed == 0.0)
+
+    def sunk(t):
+        return depth(2.0) + inward * max(t - 1.0, 0.0)
+
+    times = scan(witness, 2.0, speed, sunk, lambda t: 2.0)
+    assert times, "never noticed"
+    true_force = (sunk(times[0]) / D1) ** 2
+    assert true_force < LIMIT
+    assert times[0] - 1.0 >= CONTRADICTED_S
+
+
+def test_moving_out_is_no_contradiction():
+    witness = DepthWitness(R, holds=True)
+    assert not scan(witness, 2.0, 0.0, lambda t: depth(2.0) - 0.05e-3 * t, lambda t: 2.0)
+
+
+def test_a_better_depth_at_1_n_places_all_contacts_anew():
+    witness = DepthWitness(R, holds=True)
+    scan(witness, 1.0, 0.0, lambda t: 1.3 * depth(2.0), lambda t: 2.0)
+    centre = np.array([0.0, 0.0, R - 1.3 * depth(2.0)])
+    witness.step(1.0, centre, np.array([0.0, 0.0, 1.0]), 2.0, d1=1.3 * D1, force_max=LIMIT)
+    assert witness.depth == pytest.approx(1.3 * depth(2.0), abs=20e-6)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.3])
+def test_a_force_that_falls_at_once_is_told_after_its_time(gain):
+    witness = DepthWitness(R)
+    shown = {False: 2.0, True: 2.0 * gain}
+    times = scan(witness, 1.0 + CONTRADICTED_S + 2 * STEP_S, 25e-3, lambda t: depth(2.0), lambda t: shown[t >= 1.0])
+    assert times[0] == pytest.approx(1.0 + CONTRADICTED_S, abs=2 * STEP_S)
+    assert witness.fall.before == pytest.approx(2.0)
+    assert witness.fall.within_s == pytest.approx(STEP_S)
+
+
+def test_one_bad_image_is_no_fall():
+    witness = DepthWitness(R)
+    assert not scan(witness, 1.2, 25e-3, lambda t: depth(2.0), lambda t: 0.5 if t == 200 * STEP_S else 2.0)
+    assert witness.fall is None
+
+
+def test_a_probe_that_moves_off_lowers_the_force():
+    witness = DepthWitness(R, holds=True)
+
+    def off(t):
+        return max(depth(2.0) - 40e-3 * max(t - 1.0, 0.0), 0.0)
+
+    assert not scan(witness, 1.1, 0.0, off, lambda t: (off(t) / D1) ** 2)
+
+
+def test_a_hold_that_wanders_aside_is_told():
+    witness = DepthWitness(R, holds=True)
+    scan(witness, 0.6, 0.0, lambda t: depth(2.0), lambda t: 2.0)
+    for k in range(300):
+        touch_ball(witness, 5e-3 * k * STEP_S, depth(2.0), 2.0, 0.6 + k * STEP_S)
+        if witness.contradicts:
+            break
+    assert WANDER < witness.wandered < 2 * WANDER
+
+
+def test_new_ground_is_known_the_less_the_farther_it_is():
+    assert sigma_ahead(0.0) < sigma_ahead(2e-3) < sigma_ahead(10e-3)
+    witness = DepthWitness(R)
+    scan(witness, 0.5, 25e-3, lambda t: depth(2.0), lambda t: 2.0)
+    near = witness.sigma
+    touch_ball(witness, 0.5 * 25e-3 + 8e-3, depth(2.0), 2.0, 0.8)
+    assert witness.sigma > 5 * near
+
+
+def test_a_new_touch_begins_without_the_old_surface():
+    witness = DepthWitness(R)
+    scan(witness, 0.5, 25e-3, lambda t: depth(2.0), lambda t: 2.0)
+    witness.restart()
+    touch_ball(witness, 0.0, depth(2.0), 2.0, 1.0)
+    assert math.isnan(witness.depth) and not witness.contradicts
