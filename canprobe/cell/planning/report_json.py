@@ -17,6 +17,7 @@ from canprobe.cell.planning.model import (
     PlannedPdo,
 )
 from canprobe.cell.planning.timeline import timeline
+from canprobe.cell.planning.witnesses import witness_rows
 from canprobe.cell.scene.setup import Setup
 
 SCHEMA = 1
@@ -52,6 +53,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "choices": [{"key": one.key, "value": one.written, "why": one.why} for one in plan.choices],
         "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
+        "witnesses": dict(witness_rows(plan)),
         "estimator": shape.method if shape is not None else None,
         "offline_estimators": list(shape.also) if shape is not None else [],
         "strategy": setup.scan.name if setup.scan is not None else None,

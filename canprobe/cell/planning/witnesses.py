@@ -10,7 +10,7 @@ import math
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.pdos import TORQUE
-from canprobe.cell.scene.setup import Probe, Touch
+from canprobe.cell.scene.setup import Calibrate, Probe, Touch
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.depth_witness import CERTAIN_SIGMAS, SUSPECT_S, sigma_ahead
 
@@ -33,53 +33,48 @@ def reports_torque(plan: Plan) -> bool:
     )
 
 
-def _depth(probe: Probe, force: float) -> float:
-    """Depth at a force, N, on a plane at the stated stiffness, m."""
-    return float(indentation_from_force(force, probe.stiffness, probe.radius, (0.0, 0.0)))
-
-
-def witness_lines(plan: Plan) -> list[str]:
-    """What else than the array bounds the force, a line each; none without a touch."""
+def witness_rows(plan: Plan) -> list[tuple[str, str]]:
+    """What else than the array bounds the force, by name; nothing without a touch."""
     touch, limits, probe = plan.setup.touch, plan.setup.limits, plan.setup.probe
     if touch is None:
         return []
     within = "0.4 s, on the move only" if touch.array.calibration.noise.assumed else "0.2 s"
-    lines = [f"image   one that repeats or does not scatter is noticed within {within}"]
     margin = _depth(probe, limits.force_max) - _depth(probe, touch.force)
-    scan = touch.scan if isinstance(touch, Touch) else None
-    speed = scan.speed if scan is not None else 0.0
+    speed = touch.scan.speed if isinstance(touch, Touch) and touch.scan is not None else 0.0
     error = CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * speed)
-    if error <= margin:
-        moving = f" at {speed * 1e3:g} mm/s" if speed else ""
-        lines.append(
-            f"depth   {touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to"
-            f" {error * 1e3:.2f} mm{moving}"
+    known = f"{touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm" + (
+        f" on new ground at {speed * 1e3:g} mm/s" if speed else ""
+    )
+    if error > margin:
+        known += f": silent there, up to {math.floor(_fastest(margin) * 1e3)} mm/s it watches"
+    return [
+        ("images", f"one that repeats or does not scatter is noticed within {within}"),
+        ("depth", known),
+        ("torques", _torques(plan, touch)),
+    ]
+
+
+def _torques(plan: Plan, touch: Touch | Calibrate) -> str:
+    """What the torques of the drives show of the force."""
+    approach, probe = touch.approach, plan.setup.probe
+    if not reports_torque(plan):
+        blind, unseen = _force(probe, approach.search), _force(probe, approach.blind_search)
+        return (
+            "none, as not each drive sends 6077h: a blind array would let the search press with up to"
+            f" {blind:.0f} N, {unseen:.0f} N as long as no image has changed since bring-up"
         )
-    else:
-        fastest = math.floor(_fastest(margin) * 1e3)
-        lines.append(
-            f"depth   silent on new ground at {speed * 1e3:g} mm/s: {touch.force:g} to {limits.force_max:g} N are"
-            f" {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm; up to {fastest} mm/s it watches"
+    steady_s = approach.clearance / approach.speed
+    if steady_s < STEADY_S:
+        return (
+            f"silent at the first contact, as {steady_s:.2f} s of approach are too short to know the torques without"
+            f" it: raise task.clearance_mm to {math.ceil(STEADY_S * approach.speed * 1e4) / 10:g}"
         )
-    if reports_torque(plan):
-        approach = touch.approach
-        steady_s = approach.clearance / approach.speed
-        if steady_s >= STEADY_S:
-            lines.append("torque  a push that the array does not measure, beyond 4σ of what friction may hide")
-        else:
-            lines.append(
-                f"torque  silent at the first contact, as {steady_s:.2f} s of approach are too short to know the torques"
-                f" without it: raise task.clearance_mm to {math.ceil(STEADY_S * approach.speed * 1e4) / 10:g}"
-            )
-    else:
-        approach = touch.approach
-        blind = _force(probe, approach.search)
-        seen = _force(probe, approach.blind_search)
-        lines.append(
-            "torque  none, as not each drive sends 6077h: a blind array would let the search press with up to"
-            f" {blind:.0f} N, {seen:.0f} N as long as no image has changed since bring-up"
-        )
-    return lines
+    return "a push that the array does not measure, beyond 4σ of what friction may hide"
+
+
+def _depth(probe: Probe, force: float) -> float:
+    """Depth at a force, N, on a plane at the stated stiffness, m."""
+    return float(indentation_from_force(force, probe.stiffness, probe.radius, (0.0, 0.0)))
 
 
 def _force(probe: Probe, depth: float) -> float:
@@ -90,7 +85,7 @@ def _force(probe: Probe, depth: float) -> float:
 def _fastest(margin: float) -> float:
     """Highest speed, m/s, at which the depth on new ground is known to a margin, m."""
     low, high = 0.0, 1.0
-    for _ in range(40):
+    while high - low > 1e-4:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * middle) <= margin else (low, middle)
     return low

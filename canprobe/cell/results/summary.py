@@ -14,6 +14,7 @@ import numpy as np
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.log import since_first_sync
+from canprobe.cell.planning.witnesses import reports_torque
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import (
@@ -83,6 +84,7 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "newtons": None if session.plan.setup.array is None else session.plan.setup.array.newtons,
         "contact": contact,
+        "witnesses": _witnesses(session, record),
         "shape": summarise_shape(
             session.plan.setup,
             record.shape,
@@ -163,6 +165,17 @@ def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) ->
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, **error} | {
         "losses": summarise_losses(record.losses)
+    }
+
+
+def _witnesses(session: Session, record: TaskRecord) -> dict[str, Any] | None:
+    """What else than the array knew of the force; None without a touch."""
+    if session.plan.setup.touch is None:
+        return None
+    return {
+        "array_seen_alive": session.cell.supervisor.array_alive,
+        "depth_watched_fraction": record.depth_watched,
+        "torques_reported": reports_torque(session.plan),
     }
 
 

@@ -99,7 +99,9 @@ class ProbingTask(Task):
     def record(self) -> TaskRecord:
         """The results so far."""
         slowed = self._motion.slowed if self._motion is not None else 0
-        return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed)
+        contacts = self.depth.watched + self.depth.silent
+        watched = self.depth.watched / contacts if contacts else None
+        return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed, depth_watched=watched)
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""

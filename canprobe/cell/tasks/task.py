@@ -118,6 +118,7 @@ class TaskRecord:
         unplaced: contacts that were not used because the joints of their instant are unknown.
         slowed: cycles in which a joint could not keep up with the probe's path.
         explored: end of an exploration; None where nothing was explored.
+        depth_watched: share of the contacts at which the depth said something of the force; None without contacts.
     """
 
     shape: ShapeTracker | None = None
@@ -128,6 +129,7 @@ class TaskRecord:
     unplaced: int = 0
     slowed: int = 0
     explored: Exploration | None = None
+    depth_watched: float | None = None
 
 
 class Task(Controller):
