@@ -11,11 +11,14 @@ from importlib import resources
 import foxglove
 
 from canprobe.errors import UsageError
+from canprobe.lab.bridge.front import Front, hidden_address
 from canprobe.lab.bridge.interface import Context
 from canprobe.lab.bridge.messages import Encoder
 from canprobe.lab.bridge.sample import Sample
 from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
 
+ORIGINS = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "https://embed.foxglove.dev", "file://")
+"""Origins of Foxglove's pages; its desktop application is a page from a file. A page of a website is none."""
 LAYOUT = "foxglove_layout.json"
 STATIC_EVERY_NS = 1_000_000_000
 """Period of the fixed frames, ns: the protocol keeps no last message for viewers that connect later."""
@@ -36,22 +39,22 @@ class FoxgloveSink:
         room = self._room = foxglove.Context()  # its channels are gone when nobody holds it
         self._channels = {topic.name: _channel(topic, encoder, room) for topic in TOPICS}
         self._messages = Messages(context.plan, encoder, self._is_watched, STATIC_EVERY_NS)
+        where = f"{settings.foxglove_host}:{settings.foxglove_port}"
         try:
+            self._front = Front(settings.foxglove_host, settings.foxglove_port, settings.origins, ORIGINS)
+            hidden = hidden_address()
             self._server = foxglove.start_server(
-                name=f"canprobe {context.plan.scene.name}",
-                host=settings.foxglove_host,
-                port=settings.foxglove_port,
-                context=room,
+                name=f"canprobe {context.plan.scene.name}", host=hidden, port=0, context=room
             )
         except (RuntimeError, OSError) as error:
-            where = f"{settings.foxglove_host}:{settings.foxglove_port}"
             raise UsageError(f"{where}: {error}; set bridge.foxglove_port, 0 takes any that is free") from error
+        self._front.forward_to(hidden, self._server.port)
         self._host = settings.foxglove_host
 
     @property
     def where(self) -> str:
         """The address for Foxglove's “open connection”, and the layout to import there."""
-        return f"ws://{self._host}:{self._server.port}, layout {resources.files('canprobe') / 'bridge' / LAYOUT}"
+        return f"ws://{self._host}:{self._front.port}, layout {resources.files('canprobe') / 'bridge' / LAYOUT}"
 
     def start(self, epoch_ns: int) -> None:
         """Take the epoch."""
@@ -64,6 +67,7 @@ class FoxgloveSink:
 
     def close(self, summary: str | None) -> None:
         """Stop the server."""
+        self._front.close()
         self._server.stop()
 
     def _is_watched(self, topic: Topic) -> bool:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 from typing import Any
 
 from cyclonedds.core import DDSException, Policy, Qos
@@ -57,6 +58,9 @@ class Ros2Node:
         domain: domain, as in ROS_DOMAIN_ID.
         loopback: whether to stay on this machine; else Cyclone's configuration decides (`CYCLONEDDS_URI`).
         encoder: the one encoder.
+
+    Raises:
+        UsageError: the system does not let the sockets stay on this machine.
     """
 
     def __init__(self, domain: int, loopback: bool, encoder: Encoder) -> None:
@@ -64,6 +68,8 @@ class Ros2Node:
         self._encoder = encoder
         self._domain = Domain(domain, LOOPBACK) if loopback else None
         self.participant = DomainParticipant(domain)
+        if loopback:
+            _bind_to_loopback(domain)  # before there is a reader that could take a command
         self._publisher = Publisher(self.participant)
         self._subscriber = Subscriber(self.participant)
 
@@ -180,6 +186,34 @@ class Ros2Sink:
         assert self._status is not None
         cdr = self._encoder.encode(STRING, self._encoder.store.types[STRING](data=text))
         self._status.write(self._node.types.carry(STRING, cdr))
+
+
+def _bind_to_loopback(domain: int) -> None:
+    """Let the sockets of a domain receive from the loopback interface only.
+
+    Whatever its configuration, Cyclone binds those that receive to 0.0.0.0, where every machine on the network reaches
+    them. They are its own: they are found among this process's by the ports of the domain.
+
+    Source: DDSI-RTPS 9.6.2.3, ports 7400 + 250 domain + 0 … 249.
+    """
+    first = 7400 + 250 * domain
+    for descriptor in map(int, os.listdir("/proc/self/fd")):
+        try:
+            found = socket.socket(fileno=descriptor)
+        except OSError:  # it is no socket
+            continue
+        try:
+            if found.type is socket.SOCK_DGRAM and found.family is socket.AF_INET:
+                address, port = found.getsockname()
+                if first <= port < first + 250 and not address.startswith("127."):
+                    found.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+        except OSError as error:
+            raise UsageError(
+                f"bridge.ros2_loopback: the sockets of domain {domain} cannot be kept on this machine:"
+                f" {error.strerror}; Linux 5.7 and later can, earlier ones as root"
+            ) from error
+        finally:
+            found.detach()  # it stays Cyclone's
 
 
 def domain_of(wanted: int | None) -> int:

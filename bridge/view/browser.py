@@ -14,7 +14,7 @@ from canprobe.lab.bridge.view.panel import Panel
 from canprobe.lab.bridge.view.path import OFF_PATH, Trail, deviation_scale
 from canprobe.lab.bridge.view.path_nodes import GrowingPath, PathAhead
 from canprobe.lab.bridge.view.plots import curves_of, row_of
-from canprobe.lab.bridge.view.server import address, open_server
+from canprobe.lab.bridge.view.server import open_server
 from canprobe.lab.bridge.view.stage import Stage
 from canprobe.lab.bridge.view.surface import GrowingSurface
 
@@ -39,7 +39,10 @@ class LiveView:
         shape = None if scene.object is None else true_object(scene.object)
         errors = deviation_scale(shape, context.plan.setup.scan)
         self._stack = ExitStack()
-        server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
+        server, self._address = self._stack.enter_context(
+            open_server(settings.view_port, settings.view_host, settings.origins)
+        )
+        self._server = server
         self._stage = Stage(server, context.plan.setup)
         self._panel = Panel(server, scene, errors, self._stage)
         self._trail = Trail()
@@ -54,7 +57,7 @@ class LiveView:
     @property
     def where(self) -> str:
         """Address of the page."""
-        return address(self._server)
+        return self._address
 
     def start(self, epoch_ns: int) -> None:
         """Do nothing: times are shown from the opening of the bus."""

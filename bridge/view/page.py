@@ -58,7 +58,7 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
 
 def _record(run: RecordedRun, times: Floats) -> tuple[str, list[str]]:
     """Viser's page with every frame in it, and lines about parts that cannot be drawn."""
-    with open_server(0) as server:
+    with open_server(0) as (server, _):
         stage = Stage(server, run.setup)
         errors = deviation_scale(shape_of(run), run.setup.scan)
         path = LoadedPath(server.scene, trail := trail_of(run))

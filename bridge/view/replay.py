@@ -14,7 +14,7 @@ from canprobe.lab.bridge.view.path import Trail, deviation_scale
 from canprobe.lab.bridge.view.path_nodes import LoadedPath
 from canprobe.lab.bridge.view.plots import curves_of, row_of
 from canprobe.lab.bridge.view.recorded import RecordedRun
-from canprobe.lab.bridge.view.server import address, open_server
+from canprobe.lab.bridge.view.server import open_server
 from canprobe.lab.bridge.view.stage import Stage
 from canprobe.lab.bridge.view.surface import LoadedSurface
 from canprobe.mechanics.touch.shapes import PlacedShape
@@ -42,11 +42,11 @@ def serve_run(
         say: called with a line for each part that cannot be drawn.
         whole: block that must not be interrupted: libraries that draw pictures fail then.
     """
-    with open_server(port, host) as server:
+    with open_server(port, host, run.setup.bridge.origins) as (server, address):
         player = Player(server, run)
         for note in player.notes:
             say(note)
-        ready(address(server))
+        ready(address)
         clock = MonotonicClock()
         next_ns = clock.now_ns()
         while True:

@@ -1,4 +1,8 @@
-"""Columns in an ``.npz`` file, which is written whole and read with care."""
+"""Columns in an ``.npz`` file, which is written whole and read with care.
+
+A compressed file can hold a thousand times its size. What it unpacks to stands in its directory, and is refused before
+anything is unpacked; a directory that says less is found out, because no more is unpacked than it says.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +21,15 @@ from canprobe.fieldbus.bus.files import whole_file
 
 _MAPPED_BYTES = 1 << 20
 """Size from which an array is mapped from its file instead of read into memory."""
+MAX_UNPACKED_BYTES = 1 << 30
+"""Most bytes of one file that are read into memory. The files of a run are not compressed, and their arrays are mapped
+where they are large: they take next to none of it."""
 _LOCAL_HEADER, _FIELD = struct.Struct("<26xHH"), struct.Struct("<HH")
 """Header of an entry, which ends with the lengths of its name and its fields; head of a field. Source: PKWARE APPNOTE
 6.3.10, 4.3.7 and 4.5.1."""
 _ZIP64_FIELD_BYTES = 20
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Those of numpy. Of others zipfile unpacks all that it has read, whatever it was asked for."""
 
 
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -50,17 +59,40 @@ def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArra
         expected: what the file should be, in words, for the message.
 
     Raises:
-        UsageError: there is no such file, or it is cut off, empty or of another kind. Memory is allocated for the bytes
-            in the file, whatever its headers say; large arrays that are not compressed are mapped.
+        UsageError: there is no such file, or it is cut off, empty or of another kind, or it unpacks to more than
+            `MAX_UNPACKED_BYTES`. Large arrays that are not compressed are mapped.
     """
     try:
         with regular_file(path).open("rb") as opened:
-            if opened.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
-                raise ValueError("a single array")
-            with zipfile.ZipFile(opened) as saved:
-                return {e.filename.removesuffix(".npy"): _read_array(opened, saved, e) for e in saved.infolist()}
+            return unpack_npz(opened)
     except Exception as error:  # zip files, their compression and numpy's headers each have their own
         raise UsageError(f"{path}: expected {expected}; cannot be read: {_why(error)}") from error
+
+
+def unpack_npz(opened: IO[bytes], *, mapped: bool = True) -> dict[str, NDArray[Any]]:
+    """Every array of an open ``.npz`` file.
+
+    Args:
+        opened: the file.
+        mapped: whether large arrays that are not compressed are mapped; it has to be a file of the system then.
+
+    Raises:
+        Exception: what numpy and zipfile raise of a damaged file; ValueError where it unpacks to too much.
+    """
+    if opened.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+        raise ValueError("a single array")
+    with zipfile.ZipFile(opened) as saved:
+        entries = saved.infolist()
+        if other := next((e for e in entries if e.compress_type not in _COMPRESSIONS), None):
+            raise ValueError(f"{other.filename} is compressed in another way than numpy's")
+        maps = [mapped and e.compress_type == zipfile.ZIP_STORED and e.file_size >= _MAPPED_BYTES for e in entries]
+        unpacked = sum(e.file_size for e, is_mapped in zip(entries, maps, strict=True) if not is_mapped)
+        if unpacked > MAX_UNPACKED_BYTES:
+            raise ValueError(f"it unpacks to {unpacked} bytes, expected {MAX_UNPACKED_BYTES} at most")
+        return {
+            entry.filename.removesuffix(".npy"): _read_array(opened, saved, entry, is_mapped)
+            for entry, is_mapped in zip(entries, maps, strict=True)
+        }
 
 
 def _why(error: Exception) -> str:
@@ -69,7 +101,7 @@ def _why(error: Exception) -> str:
     return (text or str(error) or type(error).__name__).partition("\n")[0]
 
 
-def _read_array(opened: IO[bytes], saved: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+def _read_array(opened: IO[bytes], saved: zipfile.ZipFile, entry: zipfile.ZipInfo, is_mapped: bool) -> NDArray[Any]:
     """One array of plain values, whose header and size agree; a large one is mapped."""
     with saved.open(entry) as file:
         version = np.lib.format.read_magic(file)
@@ -79,8 +111,9 @@ def _read_array(opened: IO[bytes], saved: zipfile.ZipFile, entry: zipfile.ZipInf
             raise ValueError(f"{entry.filename} holds Python objects")
         if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
             raise ValueError(f"{entry.filename} is no array of shape {shape}, as its header says")
-        if entry.compress_type != zipfile.ZIP_STORED or entry.file_size < _MAPPED_BYTES:
-            flat = np.frombuffer(bytearray(file.read()), dtype)
+        if not is_mapped:
+            left = entry.file_size - file.tell()  # without a number, zipfile unpacks all that there is
+            flat = np.frombuffer(bytearray(file.read(left)), dtype)
         else:
             header_bytes = file.tell()
             opened.seek(entry.header_offset)

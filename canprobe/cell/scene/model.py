@@ -449,6 +449,12 @@ class BridgeSettings:
     """Port of the 3-D view; the next free one if it is taken. 0: the system chooses."""
     view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"
     """Address of the 3-D view. 0.0.0.0 serves other machines."""
+    origins: Annotated[
+        tuple[Annotated[str, Pattern(r"[a-z][a-z0-9+.-]*://[^\s/]*", 'such as "https://viewer.lab:8443"')], ...],
+        DISTINCT,
+    ] = ()
+    """Origins of further web pages that may connect to the Foxglove server and the 3-D view: those of this machine and
+    of Foxglove may. Their host may stand for this machine, as behind a proxy."""
     ros2_commands: bool = False
     """Accept start, stop, target force, speed and trajectories of a free arm from ROS 2, within the scene's limits."""
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from canprobe.cell.npz import unpack_npz
 from canprobe.cell.scene.hardware import MM
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.stl_files import stl_damage
@@ -182,10 +183,9 @@ def _grid(path: Path) -> tuple[Floats, float | None]:
     try:
         if kind in (".csv", ".txt"):
             return _of_text(content.decode("utf-8-sig")), None
-        read = np.load(BytesIO(content))
-        if isinstance(read, np.lib.npyio.NpzFile):
-            return _of_archive({name: read[name] for name in read.files})
-        return np.asarray(read, dtype=np.float64), None
+        if content.startswith(b"PK"):
+            return _of_archive(unpack_npz(BytesIO(content), mapped=False))
+        return np.asarray(np.load(BytesIO(content)), dtype=np.float64), None
     except UnicodeDecodeError as error:
         why = f"byte {error.start} is {error.object[error.start]:#04x}, which is no text"
         raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_RETRY_HINT}") from error

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -15,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.emulated.truth_columns import TruthColumns
+from canprobe.cell.npz import read_npz
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.child_process import ChildProcess
-from canprobe.errors import BusError, NodeError
+from canprobe.errors import BusError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE
@@ -143,12 +143,8 @@ class EmulatorChild(ChildProcess):
                     self._process.wait(patience_s)
                     break
         truth = TruthColumns()
-        if self._truth.exists():
-            with (
-                contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile),  # cut off by a full disk
-                np.load(self._truth, allow_pickle=False) as data,
-            ):
-                truth.update({name: np.asarray(data[name]) for name in data.files})
+        with contextlib.suppress(UsageError):  # none was written, or it was cut off by a full disk
+            truth.update(read_npz(self._truth))
         words = self.last_words()
         self.unwritten = words if words.startswith(str(self._truth)) else None
         self.remove()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import socket
 import time
@@ -14,6 +15,7 @@ from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
 from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.port import Reports
 from canprobe.fieldbus.bus.real.mmsg import Row
+from canprobe.fieldbus.bus.real.python_can import PythonCanPort
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageAssembler, ImageFormat
@@ -254,6 +256,48 @@ def test_a_step_tears_no_image_of_an_array_that_runs_on_its_own_time(ms: float, 
         assert assembler.torn == 0 and [max(one.counts) for one in images] == list(range(20))
         if abs(ms) >= 1:
             assert [one.t_ns for one in images] == [10 * MS + 4 * MS * n for n in range(20)]
+
+
+@pytest.mark.parametrize("ms", [-3_600_000, -300, 300, 3_600_000])
+def test_a_clock_that_is_set_to_and_fro_between_two_looks_misplaces_no_frame(ms: float, opened: Open) -> None:
+    """Nothing of the two steps is left but the stamps of the frames between them; the frames keep their order."""
+    machine = Machine()
+    port, said = opened(machine)
+    before_ns = 0
+    for number in range(40):
+        came = []
+        for can_id in (0x181, 0x182, 0x183, 0x184):
+            machine.pass_ns(500_000)
+            if number == 20 and can_id in (0x182, 0x184):
+                machine.set_wall(ms if can_id == 0x182 else -ms)
+            came.append((can_id, machine.arrive(can_id)))
+        machine.pass_ns(500_000)
+        read = port.drain()
+        assert [can_id for can_id, _, _ in read] == [can_id for can_id, _ in came]
+        assert all(before_ns <= read_ns <= machine.monotonic.now_ns() for _, _, read_ns in read)
+        if number != 20:
+            assert [read_ns for _, _, read_ns in read] == [came_ns for _, came_ns in came]
+        before_ns = machine.monotonic.now_ns()
+    assert port.counters.clock_steps == 1
+    assert said == ["can7: the wall clock was set to and fro; frames keep their time, further times are only counted"]
+
+
+def test_a_wait_of_python_can_goes_by_the_monotonic_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wall clock is set back by an hour at each look at it: no wait on a silent bus becomes longer."""
+    clock, waits, wall = VirtualClock(), [], itertools.count(0.0, -3600.0)
+    port = PythonCanPort("virtual", "set back", 1_000_000, clock)
+
+    def silent(timeout: float | None) -> tuple[None, bool]:
+        waits.append(timeout)
+        clock.move_ns(clock.now_ns() + round(1e9 * (timeout or 0.0)))
+        return None, False
+
+    monkeypatch.setattr(port._bus, "_recv_internal", silent)
+    monkeypatch.setattr("can.bus.time", lambda: next(wall))
+    assert port.drain() == []
+    port.wait(20 * MS)
+    assert waits == [0.0, 0.02]
+    port.close()
 
 
 def test_a_clock_that_nobody_sets_costs_two_readings_a_millisecond_and_no_step(opened: Open) -> None:

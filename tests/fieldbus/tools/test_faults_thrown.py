@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import os
+import resource
+import socket
 import threading
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -249,18 +255,121 @@ def test_faults_over_the_control_channel(line):
 
 
 def test_another_user_throws_no_faults(line, monkeypatch):
-    """Root may reach the process, which refuses; others do not see one of their own."""
+    """Root may reach the process, which hangs up; others do not see one of their own."""
     monkeypatch.setattr("canprobe.fieldbus.tools.faults.control._user", lambda _: 4711)
     said = []
 
     def client():
-        with pytest.raises((UsageError, InterfaceError)) as refused:
+        with pytest.raises(InterfaceError, match="no process of this user serves nodes there"):
             request_faults("vcan8", ["node 5: mute"])
-        said.append(str(refused.value))
+        said.append(True)
 
     with ControlServer("vcan8", line.nodes) as server:
         thread = threading.Thread(target=client)
         thread.start()
         while thread.is_alive():
             server.poll(line.clock.now_ns())
-    assert any(words in said[0] for words in ("only the user who serves the nodes", "no process of this user"))
+    assert said and line.nodes.faults == []
+
+
+@pytest.fixture
+def server(line):
+    with ControlServer("vcan9", line.nodes) as server:
+        yield server
+
+
+@pytest.fixture
+def connect():
+    """Connects to the server of this process on vcan9."""
+    with ExitStack() as stack:
+
+        def connected():
+            end = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK))
+            end.connect(f"\0canprobe-inject-vcan9-{os.getpid()}")
+            return end
+
+        yield connected
+
+
+MUTE = json.dumps({"faults": ["node 5: mute"], "clear": False}).encode()
+
+
+def descriptors():
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_foreign_connections_are_closed_in_the_look_that_accepts_them(line, server, connect, monkeypatch):
+    """In one look, also where each has sent a request, and one of the right user behind them is answered."""
+    users = iter([4711] * 40)
+    monkeypatch.setattr("canprobe.fieldbus.tools.faults.control._user", lambda _: next(users, os.getuid()))
+    foreign, mine = [connect() for _ in range(40)], connect()
+    for end in (*foreign[::2], mine):
+        end.send(MUTE)
+    before = descriptors()
+    server.poll(line.clock.now_ns())
+    assert descriptors() == before
+    for end in foreign[1::2]:
+        assert end.recv(100) == b""
+    for end in foreign[::2]:  # hung up on with a request unread
+        with pytest.raises(ConnectionResetError):
+            end.recv(100)
+    assert json.loads(mine.recv(1000))["nodes"] == [5]
+    assert len(line.nodes.faults) == 1
+
+
+def test_eight_connections_at_most_and_idle_ones_end_after_a_second(line, server, connect):
+    before = descriptors()
+    idle = [connect() for _ in range(12)]
+    last = connect()
+    last.send(MUTE)
+    server.poll(0)
+    assert descriptors() == before + 13 + 8
+    server.poll(S - 1)
+    assert descriptors() == before + 13 + 8 and line.nodes.faults == []
+    server.poll(S)
+    assert [end.recv(100) for end in idle[:8]] == [b""] * 8
+    server.poll(S + 1)
+    assert json.loads(last.recv(1000))["nodes"] == [5]
+    assert descriptors() == before + 13 + 4
+    server.poll(2 * S + 1)
+    assert descriptors() == before + 13
+
+
+def test_a_process_without_free_descriptors_goes_on_serving(line, server, connect):
+    mine = connect()
+    mine.send(MUTE)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with ExitStack() as held:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors() + 8, hard))
+        try:
+            while True:
+                try:
+                    held.enter_context(socket.socket())
+                except OSError:
+                    break
+            server.poll(0)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert line.nodes.faults == []
+    server.poll(1)
+    assert json.loads(mine.recv(1000))["nodes"] == [5]
+
+
+@pytest.mark.parametrize(
+    "request_text", ["[" * 60_000, '{"faults": 3, "clear": false}', "{}", "\0", json.dumps({"faults": [7], "clear": 0})]
+)
+def test_a_request_that_is_none_ends_nothing(line, server, connect, request_text):
+    mine = connect()
+    mine.send(request_text.encode())
+    server.poll(0)
+    assert json.loads(mine.recv(1000)) == {"error": "the request is none: canprobe has another version there"}
+
+
+def test_an_answer_that_is_too_long_ends_nothing(line, server, connect):
+    """Four thousand faults fit into a request, their words into no datagram of this system's size."""
+    mine = connect()
+    mine.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+    mine.send(json.dumps({"faults": ["node 5:mute"] * 4000, "clear": False}).encode())
+    server.poll(0)
+    assert len(line.nodes.faults) == 4000
+    server.poll(1)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
+import shutil
 import subprocess
 import sys
 from collections import deque
@@ -236,6 +238,92 @@ def test_a_writer_that_leaves_or_dies_commands_nothing(free):
             leaves.kill()
             dies.kill()
     assert list(filter(None, got)) == ["start", "stop", "stop"]
+
+
+KEPT_NODE = """
+import json, os, socket, sys
+from canprobe.lab.bridge import ros2_dds as ros2
+
+node = ros2.Ros2Node(77, sys.argv[1] == "loopback", ros2.Encoder())
+open_sockets = []
+for descriptor in map(int, os.listdir("/proc/self/fd")):
+    try:
+        one = socket.socket(fileno=descriptor)
+    except OSError:
+        continue
+    device = one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16).rstrip(bytes(1)).decode()
+    open_sockets.append((*one.getsockname(), device))
+    one.detach()
+print(json.dumps(open_sockets), flush=True)
+sys.stdin.read()
+"""
+"""A participant in its own process, which prints address, port and device of each of its sockets, and waits."""
+
+
+def test_no_socket_of_a_domain_on_loopback_receives_from_elsewhere():
+    with subprocess.Popen(
+        [sys.executable, "-c", KEPT_NODE, "loopback"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        sockets = json.loads(process.stdout.readline())
+        process.stdin.close()
+    assert len(sockets) >= 2
+    assert all(address.startswith("127.") or device == "lo" for address, _, device in sockets), sockets
+
+
+SEND = """
+import socket, sys
+for port in map(int, sys.argv[1:]):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.settimeout(0.2)
+        one.connect(("10.77.0.1", port))
+        one.send(b"RTPS")
+        try:
+            one.recv(10)
+        except ConnectionRefusedError:
+            print("refused")
+        except TimeoutError:
+            print("taken")
+"""
+"""Sends a datagram to each port of the first host, and prints whether a socket there took it."""
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("ip") is None, reason="needs root, unshare, nsenter and ip")
+@pytest.mark.parametrize(("kept", "answer"), [("loopback", "refused"), ("network", "taken")])
+def test_another_host_reaches_the_domain_only_where_it_is_asked_for(kept, answer, monkeypatch):
+    """Two network namespaces with a wire between them are two hosts."""
+    monkeypatch.setenv(
+        "CYCLONEDDS_URI", '<General><Interfaces><NetworkInterface address="10.77.0.1"/></Interfaces></General>'
+    )
+
+    def on(host, *words):
+        return ["nsenter", "-t", str(host.pid), "-n", *words]
+
+    hosts = [subprocess.Popen(["unshare", "-n", "cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in "12"]
+    try:
+        for host in hosts:
+            host.stdin.write(b"x")
+            host.stdin.flush()
+            assert host.stdout.read(1) == b"x"  # it is in its namespace
+        lines = [(hosts[0], f"link add wire type veth peer name wire netns {hosts[1].pid}")]
+        for number, host in enumerate(hosts, start=1):
+            lines += [(host, f"addr add 10.77.0.{number}/24 dev wire"), (host, "link set wire up")]
+            lines += [(host, "link set lo up")]
+        for host, line in lines:
+            subprocess.run(on(host, "ip", *line.split()), check=True)
+        words = on(hosts[0], sys.executable, "-c", KEPT_NODE, kept)
+        with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as node:
+            ports = [str(port) for _, port, _ in json.loads(node.stdout.readline())]
+            sender = on(hosts[1], sys.executable, "-c", SEND, *ports)
+            answers = subprocess.run(sender, check=True, capture_output=True, text=True).stdout.split()
+            node.stdin.close()
+    finally:
+        for host in hosts:
+            host.kill()
+            host.communicate()
+    if kept == "loopback":
+        assert answers == [answer] * len(ports)
+    else:  # the one that sends is bound to the address of the wire, or nobody listens on it
+        assert answers.count(answer) >= 2
 
 
 @pytest.mark.parametrize(

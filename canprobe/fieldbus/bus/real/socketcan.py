@@ -2,7 +2,8 @@
 
 Time stamps are those of the kernel at reception (CLOCK_REALTIME), converted to CLOCK_MONOTONIC by the difference of the
 two clocks. The difference is measured again after each sending (`StampClock`), so that a wall clock that is set is
-noticed and counted.
+noticed and counted. Whatever the wall clock says, a frame is never older than the look before the last one, nor of the
+future: deadlines and ages are derived from times that the monotonic clock has confirmed.
 29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
 than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
 
@@ -21,6 +22,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Collection, Sequence
+from itertools import accumulate
 from operator import itemgetter
 
 from canprobe.errors import InterfaceError
@@ -78,6 +80,8 @@ class StampClock:
 
     Attributes:
         offset_ns: realtime clock minus monotonic clock.
+        since_ns, now_ns: monotonic clock at the last comparison but two, and at the last one. Frames that were read for
+            the last one came in between: the look before it took all that had come until the comparison before that.
     """
 
     def __init__(
@@ -85,6 +89,7 @@ class StampClock:
     ) -> None:
         self._realtime_ns, self._monotonic_ns = realtime_ns, monotonic_ns
         self._compared_ns = 0
+        self.since_ns = self._before_ns = self.now_ns = monotonic_ns()
         self.offset_ns, _ = self._measure()
 
     def doubt(self) -> None:
@@ -102,7 +107,8 @@ class StampClock:
         if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARISON_PERIOD_NS:
             return 0
         self._compared_ns = self._realtime_ns()
-        if abs(self._compared_ns - self._monotonic_ns() - self.offset_ns) <= _CLOCK_READING_ERROR_NS:
+        self.since_ns, self._before_ns, self.now_ns = self._before_ns, self.now_ns, self._monotonic_ns()
+        if abs(self._compared_ns - self.now_ns - self.offset_ns) <= _CLOCK_READING_ERROR_NS:
             return 0
         offset_ns, doubt_ns = self._measure()  # this process may only have waited between the two readings
         step_ns = offset_ns - self.offset_ns
@@ -110,6 +116,11 @@ class StampClock:
             return 0
         self.offset_ns = offset_ns
         return step_ns
+
+    def allows(self, stamp_ns: int) -> bool:
+        """Whether a frame that was read now can have come at this stamp."""
+        t_ns = stamp_ns - self.offset_ns
+        return self.since_ns - _CLOCK_READING_ERROR_NS <= t_ns <= self.now_ns + _COMPARISON_PERIOD_NS
 
     def _measure(self) -> tuple[int, int]:
         """The difference of the clocks and its uncertainty, ns, from the quickest of three readings."""
@@ -220,12 +231,16 @@ class SocketCanPort:
             self._count_drops(0, rows)
         if patient:
             self._count_drops(1, patient)
-            rows = patient + rows
-        if not rows:
+        if not rows and not patient:
             return []
-        stamps = [row[2] for row in rows]
-        if step_ns := self._stamps.follow(min(stamps), max(stamps)):
-            rows = self._stamped_anew(rows, step_ns)
+        stamps = [row[2] for row in (patient + rows if patient else rows)]
+        oldest_ns, newest_ns = min(stamps), max(stamps)
+        step_ns = self._stamps.follow(oldest_ns, newest_ns)
+        if step_ns or not (self._stamps.allows(oldest_ns) and self._stamps.allows(newest_ns)):
+            self._note_step(step_ns)
+            rows, patient = self._stamped_anew(rows, step_ns), self._stamped_anew(patient or [], step_ns)
+        if patient:
+            rows = patient + rows
         if self._patient_frames is not None:
             rows = sorted(rows, key=itemgetter(2))  # by stamp
         offset_ns = self._stamps.offset_ns
@@ -360,22 +375,27 @@ class SocketCanPort:
         self._dropped[which] += dropped
         self.counters.overruns += dropped
 
-    def _stamped_anew(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
-        """Stamp frames anew after the wall clock was set; some came before that, some after it, all of them until now.
-
-        A stamp may mean two times. The later one that is not in the future is taken: it is right, or late by less than
-        the step, and no frame gets older than it is.
-        """
+    def _note_step(self, step_ns: int) -> None:
         self.counters.clock_steps += 1
         if self.counters.clock_steps == 1:
-            way = "back" if step_ns < 0 else "forward"
-            what = f"the wall clock was set {way} by {abs(step_ns) * 1e-6:.1f} ms"
+            way = f"{'back' if step_ns < 0 else 'forward'} by {abs(step_ns) * 1e-6:.1f} ms" if step_ns else "to and fro"
+            what = f"the wall clock was set {way}"
             self._reports.say(f"{self.channel}: {what}; frames keep their time, further times are only counted")
-        now_ns = self.clock.now_ns() + self._stamps.offset_ns
-        return [
-            (can_id, data, max((t for t in (t_ns, t_ns + step_ns) if t <= now_ns), default=now_ns), drops)
-            for can_id, data, t_ns, drops in rows
-        ]
+
+    def _stamped_anew(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
+        """Stamp the frames of a socket anew after the wall clock was set; some came before that, some after it.
+
+        A stamp may mean two times. The later one that is possible is taken: it is right, or late by less than the step.
+        Where none is possible, as after two steps, the frame came now. No frame gets older than it is, and their order
+        stays.
+        """
+        stamps = self._stamps
+        now_ns = self.clock.now_ns() + stamps.offset_ns
+        since_ns = stamps.since_ns - _CLOCK_READING_ERROR_NS + stamps.offset_ns
+        times = (
+            max((t for t in (row[2], row[2] + step_ns) if since_ns <= t <= now_ns), default=now_ns) for row in rows
+        )
+        return [(row[0], row[1], t_ns, row[3]) for row, t_ns in zip(rows, accumulate(times, max), strict=True)]
 
     def _note_errors(self, rows: Sequence[Row], offset_ns: int) -> None:
         for can_id, data, t_ns, _ in rows:

@@ -3,12 +3,12 @@
 A process that serves nodes listens on an abstract Unix socket (Linux, unix(7)), one for each channel of CAN: it has no
 file, and ends with its process. A request is one JSON message, the answer another. The server never waits: it looks at
 the socket once in each pass of its loop, so that a request costs the nodes less than their work for one frame. Only the
-user who serves the nodes, and root, may throw faults: both ends ask the kernel who is on the line.
+user who serves the nodes, and root, may throw faults: both ends ask the kernel who is on the line. Everybody on the
+machine can connect, so a foreign connection is closed as soon as it is accepted, and the others are few and short.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
@@ -22,7 +22,11 @@ from canprobe.errors import CanprobeError, InterfaceError, UsageError
 from canprobe.fieldbus.tools.faults.injection import FaultyNodes
 
 _MAX_BYTES = 1 << 16
-_PATIENCE_S = 5.0
+_MAX_LINES, _MAX_IDLE_NS = 8, 1_000_000_000
+"""Largest number of open connections, and time for which one may be open without a request."""
+_MAX_WAITING = 64
+"""Largest number of connections that wait to be accepted: one look takes them all, so that a flood delays nobody."""
+_PATIENCE_S = 5
 """Time that a request waits for the answer; a server that stands still for longer is not there."""
 _CREDENTIALS = struct.Struct("3i")
 _SOCKETS = Path("/proc/net/unix")
@@ -61,10 +65,10 @@ class ControlServer:
 
     def __init__(self, channel: str, nodes: FaultyNodes) -> None:
         self._nodes = nodes
-        self._lines: list[socket.socket] = []
+        self._lines: dict[socket.socket, int] = {}
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         self._socket.bind(f"\0{_name(channel)}{os.getpid()}")
-        self._socket.listen(4)
+        self._socket.listen(_MAX_WAITING)
 
     def __enter__(self) -> ControlServer:
         return self
@@ -79,25 +83,31 @@ class ControlServer:
         Args:
             now_ns: present time on the clock of the bus, from which the times of faults count.
         """
-        try:
-            line, _ = self._socket.accept()
-        except BlockingIOError:
-            if not self._lines:
-                return
-        else:
-            line.setblocking(False)
-            self._lines.append(line)
-        for line in self._lines[:]:
-            with contextlib.suppress(BlockingIOError):
-                with contextlib.suppress(ConnectionError):
-                    if message := line.recv(_MAX_BYTES):
-                        line.send(json.dumps(self._answer(line, message, now_ns)).encode())
-                self._lines.remove(line)
+        for _ in range(_MAX_WAITING):
+            if len(self._lines) == _MAX_LINES:
+                break
+            try:
+                line, _ = self._socket.accept()
+            except OSError:  # nobody is there, or this process has no descriptor left: it may have one later
+                break
+            if _user(line) in (os.getuid(), 0):
+                line.setblocking(False)
+                self._lines[line] = now_ns
+            else:
                 line.close()
+        for line, since_ns in [*self._lines.items()]:
+            try:
+                if message := line.recv(_MAX_BYTES):
+                    line.send(json.dumps(self._answer(message, now_ns)).encode())
+            except BlockingIOError:
+                if now_ns - since_ns < _MAX_IDLE_NS:
+                    continue
+            except OSError:  # it has hung up, or takes no answer of that size
+                pass
+            del self._lines[line]
+            line.close()
 
-    def _answer(self, line: socket.socket, message: bytes, now_ns: int) -> dict[str, Any]:
-        if _user(line) not in (os.getuid(), 0):
-            return {"error": "only the user who serves the nodes may throw faults"}
+    def _answer(self, message: bytes, now_ns: int) -> dict[str, Any]:
         try:
             request = json.loads(message)
             texts, clear = request["faults"], request["clear"]
@@ -106,7 +116,7 @@ class ControlServer:
             nodes = [node.node_id for node in self._nodes.nodes]
         except CanprobeError as error:
             return {"error": str(error)}
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return {"error": "the request is none: canprobe has another version there"}
         return {"thrown": thrown, "ended": ended, "nodes": nodes}
 
@@ -148,7 +158,8 @@ def request_faults(channel: str, faults: Sequence[str], *, clear: bool = False) 
 def _ask(name: str, faults: Sequence[str], clear: bool) -> dict[str, Any] | None:
     """The answer of one process; None where it has ended, or is that of another user."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as line:
-        line.settimeout(_PATIENCE_S)
+        for limit in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):  # Python's own time-out waits for no place in a queue
+            line.setsockopt(socket.SOL_SOCKET, limit, struct.pack("@ll", _PATIENCE_S, 0))
         try:
             line.connect(f"\0{name}")
             if os.getuid() and _user(line) != os.getuid():
@@ -157,7 +168,7 @@ def _ask(name: str, faults: Sequence[str], clear: bool) -> dict[str, Any] | None
             answer: dict[str, Any] = json.loads(line.recv(_MAX_BYTES) or b"{}")
         except ConnectionError:
             return None
-        except TimeoutError as error:
+        except BlockingIOError as error:
             raise InterfaceError(f"{name}: the process that serves the nodes does not answer") from error
     if "error" in answer:
         raise UsageError(answer["error"])
