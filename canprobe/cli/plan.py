@@ -98,6 +98,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.planning.report import plan_text
     from canprobe.cell.planning.report_json import plan_dict, refused_dict
     from canprobe.cell.scene.resolve import resolve
+    from canprobe.cell.session.joint_record import warned
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured compares a log with the plan and writes no --export or --figure")
@@ -106,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     scene = loaded(args)
     try:
         setup = resolve(scene)
-        plan = make_plan(opened(setup) if args.auto else setup)
+        plan = warned(make_plan(opened(setup) if args.auto else setup))
         rehearsed = _rehearse(plan) if args.rehearse else None
     except PlanError as error:
         if args.json:
