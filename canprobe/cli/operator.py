@@ -80,7 +80,7 @@ class TerminalOperator:
         self._text = rest
         word = line.decode(errors="replace").strip().lower()
         if self._for_way and (way := _WAY.fullmatch(word.replace("°", "deg"))) is not None:
-            return SeenWay(float(way[1].replace(",", ".")), way[2])
+            return SeenWay(float(way[1].replace(",", ".")), way[2], way[1][0] in "+-")
         if (answer := _WORDS.get(word)) is None:
             say(f"[{_CHOICES[self._for_way]}]")
         return answer

@@ -72,8 +72,9 @@ def _keep(record: JointRecord, findings: Sequence[JointFinding], serials: Mappin
             record.put(finding, serials)
     except ResultsError as error:
         say(f"warning: {error}")
-    seen = ", ".join(str(finding.joint + 1) for finding in findings if finding.seen and finding.fault is None)
-    say(f"recorded in {record.path}: joints {seen}" if seen else "no joint is recorded: nobody has seen a larger way")
+    seen = [str(finding.joint + 1) for finding in findings if finding.seen and finding.fault is None]
+    which = f"joint{'s' * (len(seen) > 1)} {', '.join(seen)}"
+    say(f"recorded in {record.path}: {which}" if seen else "no joint is recorded: nobody has seen a larger way")
 
 
 def _zero_pose(model: ArmModel, start: Floats) -> str:

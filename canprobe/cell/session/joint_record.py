@@ -1,8 +1,8 @@
 """The commissioning record of a cell: which joints were seen to move as its file says, when, and what showed it.
 
-It is kept beside the record of the zeros, a line a drive, and only for real drives. `canprobe up --check-joints` writes
-it. `plan`, `run` and `up` read it and warn where a joint was not checked, or where the cell file or the drive has
-changed since. Nothing refuses to move for want of it.
+It is kept beside the record of the zeros, an entry a drive, and only for real drives. `canprobe up --check-joints`
+writes it. `plan`, `run` and `up` read it and warn where a joint was not checked, or where the cell file or the drive
+has changed since. Nothing refuses to move for want of it.
 """
 
 from __future__ import annotations
@@ -10,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.folder import record_file
-from canprobe.cell.tasks.joint_finding import JointFinding
 from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.bringup import BringUp
+    from canprobe.cell.tasks.joint_finding import JointFinding
 
 WHAT_CHANGED = {
     "joint": "node id",

@@ -162,8 +162,10 @@ class JointCheck(Controller):
         self, finding: JointFinding, start: Floats, way: Floats
     ) -> Generator[Command, Measurement, JointFinding]:
         """Ask whether the joint moved the right way."""
-        verb, positive = VERBS[finding.unit][0], self._positive(finding.joint)
-        seen = f"did joint {finding.joint + 1} {verb} by about {finding.asked:+.1f} {finding.unit}, {positive}?"
+        verb = VERBS[finding.unit][0]
+        positive = "along" if self._model.joints[finding.joint].prismatic else "by the right hand round"
+        told = f"{finding.asked:+.1f} {finding.unit}, positive {positive} its axis"
+        seen = f"did joint {finding.joint + 1} {verb} by about {told}?"
         answer = yield from self._asked(seen, start + way)
         if answer is Answer.NO and finding.fault is None:
             fault = f"the operator did not see it {verb} that way: polarity, gear or another joint's drive"
@@ -181,10 +183,8 @@ class JointCheck(Controller):
         by_flange = not its.prismatic and flange_mm >= 1e3 * MIN_FLANGE_WAY_M
         number = "mm" if its.prismatic else "degrees"
         question = (
-            f"by how many {number} did joint {finding.joint + 1} {VERBS[unit][0]}, {self._positive(finding.joint)}"
-            f" (Enter for {finding.asked:+.1f})?"
-            + " Or how far did its flange move, straight, such as 35 mm?"
-            * by_flange
+            f"by how many {number} did joint {finding.joint + 1} {VERBS[unit][0]} (Enter for {finding.asked:+.1f})"
+            f"{', or how far did its flange go, straight, such as 35 mm' * by_flange}?"
         )
         while finding.fault is None:
             answer = yield from self._asked(question, start + way, for_way=True)
@@ -195,20 +195,19 @@ class JointCheck(Controller):
             if not isinstance(answer, SeenWay):
                 answer = SeenWay(finding.asked, unit)
             if answer.unit in (None, unit):
-                seen, due = answer.number, finding.asked
+                due = finding.asked
+                seen = answer.number if answer.signed else math.copysign(answer.number, due)
+                words = f"{seen:+g} {unit}"
             elif answer.unit == "mm" and by_flange:
-                seen, due = answer.number, flange_mm
+                due, seen = flange_mm, abs(answer.number)
+                words = f"{seen:g} mm of the flange, where {due:.0f} mm are due"
             else:
                 continue
-            of = "" if due == finding.asked else f" of the flange, where {due:.0f} mm are due"
-            if (fault := find_seen_fault(seen, due, unit)) is None and short and not of:
+            if (fault := find_seen_fault(seen, due, unit)) is None and short and due == finding.asked:
                 left = its.text(angle)
                 return replace(finding, unseen=f"there is room for {left} only: turn it away from its stop, or measure")
-            return replace(finding, seen=f"{seen:+g} {answer.unit or unit}{of}", fault=fault)
+            return replace(finding, seen=words, fault=fault)
         return finding
-
-    def _positive(self, joint: int) -> str:
-        return f"positive {'along' if self._model.joints[joint].prismatic else 'by the right hand round'} its axis"
 
     def _room(self, joint: int, start: Floats) -> float:
         """Signed room of a joint, rad: forwards where it has twice `SEEN_ANGLE`, should a gear be half, or else where

@@ -34,10 +34,12 @@ class SeenWay:
         number: its length; that of a joint is negative in negative direction.
         unit: unit that came with the number, deg or mm; None without one. Millimetres of a joint that turns are those
             of the flange, straight from where it was.
+        signed: the number came with a sign; else it goes the way that was asked for.
     """
 
     number: float
     unit: str | None = None
+    signed: bool = True
 
 
 class Operator(Protocol):

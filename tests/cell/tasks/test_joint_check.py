@@ -174,8 +174,8 @@ def test_nothing_moves_before_the_operator_says_so(plan):
         "joint 2 at 65.00 deg: turn it by +1.00 deg?",
         "did joint 2 turn by about +1.0 deg, positive by the right hand round its axis?",
         "joint 2 at 65.00 deg: turn it by +10.00 deg?",
-        "by how many degrees did joint 2 turn, positive by the right hand round its axis (Enter for +10.0)? Or how far"
-        " did its flange move, straight, such as 35 mm?",
+        "by how many degrees did joint 2 turn (Enter for +10.0), or how far did its flange go, straight, such as"
+        " 35 mm?",
     ]
     assert targets[-1] == pytest.approx(START) and np.all(targets[:, 4:] == START[4:])
     assert np.degrees(targets - START).max(axis=0) == pytest.approx([0, 10, 1, 1, 0, 0])
@@ -208,7 +208,12 @@ def test_the_terminal_is_never_waited_for(capsys):
     assert ask(b"perhaps\n", b" Y \n") == [Answer.YES]
     assert ask(b"q\n") == [Answer.QUIT]
     assert ask(b"9.5\n", b"\n") == [Answer.YES], "no number was asked for"
-    numbers = {b"9.5": (9.5, None), b"-10 deg": (-10, "deg"), "+8,5°".encode(): (8.5, "deg"), b"35mm": (35, "mm")}
+    numbers = {
+        b"9.5": (9.5, None, False),
+        b"-10 deg": (-10, "deg", True),
+        "+8,5°".encode(): (8.5, "deg", True),
+        b"35mm": (35, "mm", False),
+    }
     for typed, way in numbers.items():
         assert ask(typed + b"\n", for_way=True) == [SeenWay(*way)], typed
     assert ask(b"10 cm\n", b"n\n", for_way=True) == [Answer.NO]
@@ -238,7 +243,7 @@ def test_a_way_of_the_flange_is_as_good_as_an_angle(plan):
         check = JointCheck(plan, Scripted(Answer.NO, *[Answer.YES] * 3, SeenWay(round(said), "mm"), Answer.QUIT))
         run(check)
         finding = check.findings[1]
-        assert finding.seen == f"{round(said):+g} mm of the flange, where {chord:.0f} mm are due"
+        assert finding.seen == f"{round(said)} mm of the flange, where {chord:.0f} mm are due"
         assert (finding.fault is None) == right
     operator = Scripted(*[Answer.NO] * 5, *[Answer.YES] * 3, SeenWay(35, "mm"), SeenWay(-9, "deg"))
     check = JointCheck(plan, operator)
@@ -265,3 +270,11 @@ def test_below_ten_degrees_only_a_measured_way_tells_gears_apart(plan, guard, an
             ": as expected; gear and counts are not known, there is room for 6.0 deg only: turn it away from its stop,"
             " or measure"
         )
+
+
+@pytest.mark.parametrize(("signed", "right"), [(False, True), (True, False)])
+def test_a_number_without_a_sign_goes_the_way_that_was_asked_for(plan, signed, right):
+    check = JointCheck(plan, Scripted(*[Answer.YES] * 3, SeenWay(9.0, None, signed), Answer.QUIT))
+    run(check)
+    (finding,) = check.findings
+    assert finding.asked == pytest.approx(-10.0) and (finding.fault is None) == right
