@@ -11,7 +11,7 @@ it meanwhile is no part of the motion.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +36,8 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 Script = Generator[Command, Measurement, Measurement]
+Judged = Generator[Command, Measurement, JointFinding]
+Look = Callable[[JointFinding, Floats, Floats], Judged]
 MOVE_ANGLE, MOVE_SPEED = math.radians(1.0), math.radians(2.0)
 """Angle by which a revolute joint is moved first, and its highest speed, per s; a prismatic joint moves by
 `ArmModel.radian` times that: 3.5 mm."""
@@ -121,17 +123,20 @@ class JointCheck(Controller):
         if abs(room) < MOVE_ANGLE:
             why = "either way it would leave its limits or the workspace"
             return JointFinding(joint, its.shown(start[joint]), skipped=why, unit=its.unit)
-        first = yield from self._motion(joint, start, math.copysign(MOVE_ANGLE, room))
+        first = yield from self._motion(joint, start, math.copysign(MOVE_ANGLE, room), MOVE_SPEED, self._look_small)
         if first is None or first.skipped or first.fault or self._operator is None:
             return first
         if self._quits:
             return replace(first, unseen="the operator ended before he saw a larger way")
-        second = yield from self._motion(joint, start, min(max(room, -SEEN_ANGLE), SEEN_ANGLE))
+        angle = min(max(room, -SEEN_ANGLE), SEEN_ANGLE)
+        second = yield from self._motion(joint, start, angle, SEEN_SPEED, self._look_large)
         if second is None or second.skipped is not None:
             return replace(first, unseen="no larger way was seen, as the operator wished")
         return second
 
-    def _motion(self, joint: int, start: Floats, angle: float) -> Generator[Command, Measurement, JointFinding | None]:
+    def _motion(
+        self, joint: int, start: Floats, angle: float, speed: float, look: Look
+    ) -> Generator[Command, Measurement, JointFinding | None]:
         """Ask, move, look, ask, move back; None where the operator has enough before it has moved."""
         its, units_per_q = self._model.joints[joint], self._model.units_per_q
         stood, unit = its.shown(start[joint]), its.unit
@@ -141,8 +146,7 @@ class JointCheck(Controller):
         question = f"joint {joint + 1} at {its.text(start[joint], '.2f')}: {VERBS[unit][0]} it by {told:+.2f} {unit}?"
         if (yield from self._asked(question, start)) is not Answer.YES:
             return None if self._quits else JointFinding(joint, stood, skipped="as the operator wished", unit=unit)
-        small = abs(angle) <= MOVE_ANGLE
-        speed = min(MOVE_SPEED if small else SEEN_SPEED, float(self._highest[joint]))
+        speed = min(speed, float(self._highest[joint]))
         before = yield from self._hold(start)
         measured = yield from self._move(joint, start, angle, speed)
         assert before.q is not None and measured.q is not None
@@ -153,14 +157,11 @@ class JointCheck(Controller):
         if self._pressed is not None:
             return replace(finding, fault=self._pressed)
         fault = find_fault(joint, units_per_q @ way, moved, rest_counts(self._model), unit)
-        look = self._look_small if small else self._look_large
         finding = yield from look(replace(finding, fault=fault), start, way)
         yield from self._move(joint, start + way, -angle, speed, watched=False)
         return finding
 
-    def _look_small(
-        self, finding: JointFinding, start: Floats, way: Floats
-    ) -> Generator[Command, Measurement, JointFinding]:
+    def _look_small(self, finding: JointFinding, start: Floats, way: Floats) -> Judged:
         """Ask whether the joint moved the right way."""
         verb = VERBS[finding.unit][0]
         positive = "along" if self._model.joints[finding.joint].prismatic else "by the right hand round"
@@ -172,9 +173,7 @@ class JointCheck(Controller):
             return replace(finding, fault=fault)
         return finding
 
-    def _look_large(
-        self, finding: JointFinding, start: Floats, way: Floats
-    ) -> Generator[Command, Measurement, JointFinding]:
+    def _look_large(self, finding: JointFinding, start: Floats, way: Floats) -> Judged:
         """Ask for the way in numbers, until one of them can be judged."""
         its, unit, angle = self._model.joints[finding.joint], finding.unit, abs(way[finding.joint])
         chain = self._model.chain

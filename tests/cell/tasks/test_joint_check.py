@@ -272,6 +272,16 @@ def test_below_ten_degrees_only_a_measured_way_tells_gears_apart(plan, guard, an
         )
 
 
+def test_with_room_for_the_small_way_alone_the_way_is_asked_for_all_the_same(plan, guard):
+    check = JointCheck(plan, Scripted(*[Answer.YES] * 3, SeenWay(-1.0), Answer.QUIT))
+    check._guard.low, check._guard.high = guard.low.copy(), guard.high.copy()
+    check._guard.high[0] = START[0] + math.radians(0.3)
+    check._guard.low[0] = START[0] - math.radians(1.7)
+    run(check)
+    (finding,) = check.findings
+    assert finding.asked == pytest.approx(-1.0) and finding.unseen.startswith("there is room for 1.0 deg only")
+
+
 @pytest.mark.parametrize(("signed", "right"), [(False, True), (True, False)])
 def test_a_number_without_a_sign_goes_the_way_that_was_asked_for(plan, signed, right):
     check = JointCheck(plan, Scripted(*[Answer.YES] * 3, SeenWay(9.0, None, signed), Answer.QUIT))
