@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from canprobe.cell.master.array import PatchReader, make_patch_reader
-from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample
 from canprobe.cell.master.position_track import rest_counts
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.model import Plan
@@ -75,6 +75,7 @@ class JointCheck(Controller):
         self.start: Floats | None = None
         self._quits = False
         self._force: float | None = None
+        self._sample: TactileSample | None = None
         self._pressed: str | None = None
         self._script: Generator[Command, Measurement, None] = self._all_joints()
         next(self._script)
@@ -151,9 +152,9 @@ class JointCheck(Controller):
         measured = yield from self._move(joint, start, angle, speed)
         assert before.q is not None and measured.q is not None
         moved = units_per_q @ (measured.q - before.q)
-        finding = JointFinding(
-            joint, stood, told, its.shown(float(moved[joint] / units_per_q[joint, joint])), unit=unit, force=self._force
-        )
+        shown = its.shown(float(moved[joint] / units_per_q[joint, joint]))
+        force = self._force if self.array_alive else None
+        finding = JointFinding(joint, stood, told, shown, unit=unit, force=force)
         if self._pressed is not None:
             return replace(finding, fault=self._pressed)
         fault = find_fault(joint, units_per_q @ way, moved, rest_counts(self._model), unit)
@@ -255,9 +256,12 @@ class JointCheck(Controller):
 
     def _presses(self, joint: int, measurement: Measurement) -> bool:
         """Whether something presses on the array while a joint moves."""
-        if self._reader is None or measurement.tactile is None:
+        before, sample = self._sample, measurement.tactile
+        if self._reader is None or sample is None:
             return False
-        force = self._reader.read(measurement.tactile).force
+        self._sample = sample
+        self.array_alive = self.array_alive or (before is not None and sample.differs_from(before))
+        force = self._reader.read(sample).force
         self._force = max(force, self._force or 0.0)
         if force > TOUCH_FORCE:
             self._pressed = (

@@ -70,7 +70,7 @@ class JointFinding:
         skipped: why it was not moved; None where it was.
         seen: the way that the operator saw, in words; None where nobody saw enough to judge gear and counts.
         unseen: why the operator did not; None where he did, or nobody was asked.
-        force: highest force that the array showed meanwhile, N; None without an array.
+        force: highest force that the array showed meanwhile, N; None without an array that was seen alive.
     """
 
     joint: int

@@ -420,6 +420,14 @@ def test_what_presses_on_the_array_stops_the_joint_and_is_named(cell):
     assert_disabled(cell.session)
 
 
+@pytest.mark.parametrize(("noise", "seen"), [(True, True), (False, False)])
+def test_an_array_of_which_no_image_changes_is_no_witness(cell, noise, seen):
+    quiet = canprobe.load_scene("cylinder", {"bus.timed": False, "plant.noise": noise})
+    cell.operator = Watcher(0, {5})
+    (finding,) = [one for one in canprobe.api.check_joints(quiet, operator=cell.operator) if one.skipped is None]
+    assert finding.seen is not None and (finding.force is not None) == seen
+
+
 def test_a_scene_without_an_arm_is_refused():
     with pytest.raises(UsageError, match=r"scene listen has no \[arm\]"):
         canprobe.api.check_joints(canprobe.load_scene("listen"))
