@@ -108,3 +108,15 @@ def test_a_key_is_a_line_of_its_letter(monkeypatch):
     found.append(any([key.pressed() for _ in range(45)]))
     os.close(reader)
     assert found == [False, False, True, False]
+
+
+@pytest.mark.parametrize(("stands_deg", "elsewhere"), [(65.0, False), (66.0, False), (66.1, True), (-65.0, True)])
+def test_an_arm_is_compared_with_where_it_stood_and_not_with_its_zero(stands_deg, elsewhere):
+    """As far as the tolerance goes, and no further; the mirrored posture is elsewhere."""
+    joints = canprobe.plan("free").setup.arm.model.joints
+    place = LastPlace(joints, np.radians([90.0, 65.0, 15.0, 0.0, 100.0, 0.0]), np.full(6, np.radians(1.0) + 1e-12))
+    found = place.difference(np.radians([90.0, stands_deg, 15.0, 0.0, 100.0, 0.0]))
+    if elsewhere:
+        assert found.startswith(f"joint 2 reports {stands_deg:.2f} deg, and reported 65.00 deg before the loss")
+    else:
+        assert found is None
