@@ -120,3 +120,14 @@ def test_an_arm_is_compared_with_where_it_stood_and_not_with_its_zero(stands_deg
         assert found.startswith(f"joint 2 reports {stands_deg:.2f} deg, and reported 65.00 deg before the loss")
     else:
         assert found is None
+
+
+def test_a_hold_lasts_for_as_long_as_nobody_asks():
+    """The first cycle of a hold takes no word for motion; none of those after it begins motion without one."""
+    mine, asked = Mine(), []
+    held = HeldTask(mine, None, lambda: bool(asked))
+    for cycle in range(50):
+        assert held.step(Measurement(cycle, cycle * 2_500_000)) == Command() and held.held
+    assert (mine.steps, mine.went_on) == (0, 0)
+    asked.append(True)
+    assert held.step(Measurement(50, 50 * 2_500_000)).q_target is not None and not held.held
