@@ -131,3 +131,10 @@ def test_a_hold_lasts_for_as_long_as_nobody_asks():
     assert (mine.steps, mine.went_on) == (0, 0)
     asked.append(True)
     assert held.step(Measurement(50, 50 * 2_500_000)).q_target is not None and not held.held
+
+
+def test_a_controller_that_does_not_let_go_leaves_that_to_the_cell_after_the_hold_too():
+    held = HeldTask(Mine(), None, lambda: True)
+    for cycle in range(2):
+        held.step(Measurement(cycle, cycle * 2_500_000))
+    assert not held.held and not held.lets_go
