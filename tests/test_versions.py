@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.master import homing
+from canprobe.cell.master import node_record
 from canprobe.cell.planning import report_json
 from canprobe.cell.recorded import reestimate
 from canprobe.cell.results import run_files, surface_file
@@ -46,7 +46,8 @@ def test_the_page_has_the_schemas_of_the_code():
         "plan (`plan --json`)": str(report_json.SCHEMA),
         "report of an examination (`*.json`)": str(json_file.SCHEMA),
         "snapshot of a device (`*.snapshot.json`)": str(journal.SCHEMA),
-        "zeros of a cell (`zeros-CELL.json`)": str(homing.SCHEMA),
+        "zeros of a cell (`zeros-CELL.json`)": str(node_record.SCHEMA),
+        "commissioning record of a cell (`joints-CELL.json`)": str(node_record.SCHEMA),
         "stored parameters of an emulated node (`node*.json`)": str(stored_file.SCHEMA),
     }
 
@@ -83,13 +84,13 @@ def newer_node(folder):
 
 def newer_zeros(folder):
     path = folder / "zeros-x.json"
-    homing.ZeroRecord(path).put(1, {"zero": 3})
-    assert homing.ZeroRecord(path).entry(1) == {"zero": 3}
+    node_record.NodeRecord(path, "").put(1, {"zero": 3})
+    assert node_record.NodeRecord(path, "").entry(1) == {"zero": 3}
     path.write_text('{"nodes": {"1": {"zero": 4}}}')
-    assert homing.ZeroRecord(path).entry(1) == {"zero": 4}, "as 0.1 wrote it"
-    homing.ZeroRecord(path).put(1, {"zero": 3})
+    assert node_record.NodeRecord(path, "").entry(1) == {"zero": 4}, "as 0.1 wrote it"
+    node_record.NodeRecord(path, "").put(1, {"zero": 3})
     raise_schema(path)
-    homing.ZeroRecord(path)
+    node_record.NodeRecord(path, "")
 
 
 def newer_snapshot(folder):

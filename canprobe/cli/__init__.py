@@ -15,17 +15,17 @@ import errno
 import importlib
 import io
 import os
-import re
-import shlex
 import sys
 import traceback
 from collections.abc import Sequence
+from functools import partial
 
 import canprobe
 from canprobe.cell.session.terminal import StepReport
 from canprobe.cli.completion import complete
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.parser import Parser
+from canprobe.cli.target import with_scene
 from canprobe.errors import EXTRA_OF, CanprobeError, did_you_mean, install_line
 from canprobe.fieldbus.bus.real.interrupts import Terminated
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
@@ -99,6 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     try:
         args = parser_of(arguments).parse_args(arguments)
         args.report, report.verbosity = report, getattr(args, "verbosity", 0)
+        report.words = partial(with_scene, args=args)
         with termination_interrupts():
             status = int(args.run(args))
         sys.stdout.flush()
@@ -107,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
         return leaving.code if isinstance(leaving.code, int) else 0
     except CanprobeError as error:
         text = "\n".join([str(error), *getattr(error, "__notes__", ())])
-        return _complain(report, _with_scene(text, args), error.exit_status)
+        return _complain(report, text, error.exit_status)
     except BrokenPipeError:
         _forget_output()
         return 141
@@ -167,14 +168,6 @@ def parser_of(arguments: Sequence[str]) -> Parser:
         one.set_defaults(run=command.run)
         command.add_arguments(one)
     return parser
-
-
-def _with_scene(text: str, args: argparse.Namespace) -> str:
-    """A message whose line to type has the scene as it was given: the command line knows its path, a cell its name."""
-    if getattr(args, "scene", None) is None:
-        return text
-    cell = f" --cell {shlex.quote(args.cell)}" if getattr(args, "cell", None) else ""
-    return re.sub(r"(?<=type: canprobe up ).+?(?= --home)", lambda _: shlex.quote(str(args.scene)) + cell, text)
 
 
 def _complain(report: StepReport, text: str, status: int) -> int:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import sys
 
-from canprobe.cell.tasks.joint_finding import Answer
+from canprobe.cell.tasks.joint_finding import Answer, SeenWay
 from canprobe.cli.progress import say
 
-_CHOICES = "Enter or y: yes, n: no, q: end"
+_CHOICES = {False: "Enter or y: yes, n: no, q: end", True: "a number, Enter or y: just so, n: otherwise, q: end"}
+"""The choices of a question, by whether it asks for a way."""
+_WAY = re.compile(r"([+-]?\d+(?:[.,]\d*)?) ?(deg|mm)?")
 _WORDS = {"": Answer.YES, "y": Answer.YES, "yes": Answer.YES, "n": Answer.NO, "no": Answer.NO, "q": Answer.QUIT}
 _LOOK_EVERY = 20
 """Cycles between two looks at the terminal: each costs a system call."""
@@ -54,15 +57,16 @@ class TerminalOperator:
         self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
         self._text = b""
         self._left = 0
+        self._for_way = False
 
-    def ask(self, question: str) -> None:
+    def ask(self, question: str, *, for_way: bool = False) -> None:
         """Ask a question; lines typed before it are ignored."""
         self._read()
         self._text = b""
-        self._left = 0
-        say(f"{question} [{_CHOICES}]")
+        self._left, self._for_way = 0, for_way
+        say(f"{question} [{_CHOICES[for_way]}]")
 
-    def answer(self) -> Answer | None:
+    def answer(self) -> Answer | SeenWay | None:
         """The answer in the next whole line; after an unknown word it asks again."""
         self._left -= 1
         if self._left > 0:
@@ -74,9 +78,11 @@ class TerminalOperator:
         if not newline:
             return None
         self._text = rest
-        answer = _WORDS.get(line.decode(errors="replace").strip().lower())
-        if answer is None:
-            say(f"[{_CHOICES}]")
+        word = line.decode(errors="replace").strip().lower()
+        if self._for_way and (way := _WAY.fullmatch(word.replace("°", "deg"))) is not None:
+            return SeenWay(float(way[1].replace(",", ".")), way[2], way[1][0] in "+-")
+        if (answer := _WORDS.get(word)) is None:
+            say(f"[{_CHOICES[self._for_way]}]")
         return answer
 
     def _read(self) -> bool:

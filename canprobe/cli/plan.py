@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from canprobe.cli.common_arguments import add_options, add_scene
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Parser
 from canprobe.cli.progress import say
-from canprobe.cli.target import loaded
+from canprobe.cli.target import loaded, with_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.planning.report import plan_text
     from canprobe.cell.planning.report_json import plan_dict, refused_dict
     from canprobe.cell.scene.resolve import resolve
+    from canprobe.cell.session.joint_record import warned
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured compares a log with the plan and writes no --export or --figure")
@@ -106,7 +108,8 @@ def run(args: argparse.Namespace) -> int:
     scene = loaded(args)
     try:
         setup = resolve(scene)
-        plan = make_plan(opened(setup) if args.auto else setup)
+        plan = warned(make_plan(opened(setup) if args.auto else setup))
+        plan = replace(plan, warnings=tuple(with_scene(one, args) for one in plan.warnings))
         rehearsed = _rehearse(plan) if args.rehearse else None
     except PlanError as error:
         if args.json:

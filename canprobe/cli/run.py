@@ -17,7 +17,7 @@ from typing import Any
 from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.output import print_json, print_lines, print_summary
 from canprobe.cli.parser import Parser
-from canprobe.cli.target import scene_of
+from canprobe.cli.target import scene_of, with_scene
 from canprobe.errors import CanprobeError
 
 HELP = "run a scene and write the results"
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     def print_early(summary: Mapping[str, Any]) -> None:
         if not args.json:
             with contextlib.suppress(OSError):  # what follows is printed there too, and then it is reported
-                print_summary(summary_text({**summary, "bridges": None}, None))
+                print_summary(with_scene(summary_text({**summary, "bridges": None}, None), args))
                 sys.stdout.flush()
 
     try:

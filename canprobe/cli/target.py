@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -59,6 +61,15 @@ def loaded(args: argparse.Namespace, more: Mapping[str, Any] | None = None) -> S
     if getattr(args, "realtime", False):
         overrides["cycle.realtime"] = True
     return load_scene(args.scene, overrides)
+
+
+def with_scene(text: str, args: argparse.Namespace) -> str:
+    """A message whose line to type has the scene as it was given: the command line knows its path, a cell its name."""
+    if getattr(args, "scene", None) is None:
+        return text
+    cell = f" --cell {shlex.quote(args.cell)}" if getattr(args, "cell", None) else ""
+    steps = r"(?<=type: canprobe up ).+?(?= --(?:home|check-joints))"
+    return re.sub(steps, lambda _: shlex.quote(str(args.scene)) + cell, text)
 
 
 def target_of(args: argparse.Namespace, scene: Scene) -> Target:

@@ -31,8 +31,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--check-joints",
         action="store_true",
-        help="move one joint after the other by 1 deg (3.5 mm for a sliding joint) and back, compare the encoders, and"
-        " end; asks before each motion",
+        help="move one joint after the other by 1 deg and by 10 deg (3.5 and 35 mm for a sliding joint) and back,"
+        " compare the encoders and what you see, record it, and end; asks before each motion",
     )
     parser.add_argument(
         "--home",
@@ -45,7 +45,9 @@ def add_arguments(parser: Parser) -> None:
         help="come back after a node was switched off or reset, or the interface was down: stop, wait, bring up again"
         " and hold; `r` and Enter let requested motion go on",
     )
-    parser.add_argument("--yes", action="store_true", help="with --check-joints or --home: do not ask")
+    parser.add_argument(
+        "--yes", action="store_true", help="with --check-joints or --home: do not ask; by 10 deg nothing moves then"
+    )
     add_verbosity(parser)
 
 

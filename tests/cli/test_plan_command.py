@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
@@ -50,3 +51,22 @@ def test_an_array_that_shows_no_force_is_refused_with_its_key(tmp_path, capsys):
     )
     assert main(["plan", "listen", "--set", f"sensor.array={tmp_path / 'mat.toml'}"]) == 2
     assert "sensor.pitch_mm = 30: on the sphere of probe.radius_mm = 40" in capsys.readouterr().err
+
+
+def test_joints_of_real_drives_that_nobody_has_checked_are_a_warning_with_the_line_to_type(
+    tmp_path, capsys, monkeypatch
+):
+    """The line has the scene as it was typed, and a bus that real drives can be on."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    scene = tmp_path / "my first.toml"
+    scene.write_text(
+        '[scene]\nname = "mine"\n[arm]\nemulated = false\n[bus]\nchannel = "can1"\n[task]\nkind = "free"\n'
+    )
+    line = f"type: canprobe up '{scene}' --check-joints --bus socketcan --channel can1"
+    assert main(["plan", str(scene)]) == 0
+    assert re.search(rf"^warning: whether the arm moves .* joints 1, .* {line}$", capsys.readouterr().out, re.M)
+    assert main(["plan", str(scene), "--json"]) == 0
+    (warning,) = json.loads(capsys.readouterr().out)["warnings"]
+    assert warning.endswith(line)
+    assert main(["plan", "free"]) == 0
+    assert "whether the arm moves" not in capsys.readouterr().out

@@ -15,11 +15,11 @@ A `cell.Cell` is made of a plan and a port; nothing is sent before it is entered
    pre-operational and closes the bus.
 
 `position_track` is the position of a motor as its TPDOs report it, `tactile_frame` the frame that controllers see;
-`observers` see every cycle after its work. `log` keeps rows, with positions as `joint_columns`. `homing`
-finds the zeros of drives without an absolute encoder. `monitor` reads a bus without sending and `monitor_text` writes
-it as lines. `scan` lists nodes; `commission` gives node ids by LSS: `id_assignment` decides which, `lss_session` sends.
-`as_found` leaves nodes as a check found
-them. `raw_array_start` starts an array that is no node; `options` is what the caller of a run sets.
+`observers` see every cycle after its work. `log` keeps rows, with positions as `joint_columns`. `homing` finds the
+zeros of drives without an absolute encoder, and `node_record` keeps them. `monitor` reads a bus without sending and
+`monitor_text` writes it as lines. `scan` lists nodes; `commission` gives node ids by LSS: `id_assignment` decides
+which, `lss_session` sends. `as_found` leaves nodes as a check found them. `raw_array_start` starts an array that is no
+node; `options` is what the caller of a run sets.
 The room knows `Setup`, `Plan`, `Clock` and `Port`; it never sees the emulator.
 Start reading at `cell`, then `conditions`.
 """

@@ -15,7 +15,8 @@ Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,6 +50,7 @@ HEARTBEAT_CONSUMER = 0x1016
 PDO_PARAMETERS = range(0x1400, 0x1C00)
 MODE_DISPLAY = 0x6061
 REVISION_SUBINDEX = 3
+IDENTITY, SERIAL_SUBINDEX = 0x1018, 4
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 RELEASE_S = 0.1
 """Longest time to an answer of a node that is released."""
@@ -263,7 +265,7 @@ class BringUp:
     def _identify(self, report: NodeReport) -> Dialogue:
         setup = report.setup
         for subindex, expected in setup.identity.items():
-            got = yield from read_entry(setup, 0x1018, subindex)
+            got = yield from read_entry(setup, IDENTITY, subindex)
             newer = got > expected and got >> 16 == expected >> 16  # CiA 301, 1018h:03: of the same major revision
             if subindex == REVISION_SUBINDEX and newer:
                 report.remarks.append(
@@ -391,6 +393,17 @@ class BringUp:
                     " it may not have this mode, or need another setting for it",
                     setup,
                 )
+
+    def serial_numbers(self, node_ids: Collection[int]) -> dict[int, int]:
+        """1018h:04 of nodes, once they are up; without those that have or answer none."""
+        found: dict[int, int] = {}
+
+        def ask(setup: NodeSetup) -> Dialogue:
+            with contextlib.suppress(NodeError):
+                found[setup.node_id] = yield from read_entry(setup, IDENTITY, SERIAL_SUBINDEX)
+
+        self._talk({s.node_id: ask(s) for s in self._setups if s.node_id in node_ids}, self._settings.sdo_s)
+        return found
 
     # the way out
 

@@ -15,9 +15,7 @@ Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah; statusword
 from __future__ import annotations
 
 import contextlib
-import json
 import math
-import shlex
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,14 +23,14 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.master.bringup import MODE_DISPLAY, read_entry, write_entry
+from canprobe.cell.master.bringup import IDENTITY, MODE_DISPLAY, read_entry, write_entry
+from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE, NodeSetup, Write
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.scene.setup import HomingParameters
-from canprobe.errors import CanprobeError, NodeError, UsageError, check_schema
-from canprobe.fieldbus.bus.files import write_text
+from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
 from canprobe.fieldbus.eds.description import Description
@@ -58,7 +56,7 @@ from canprobe.mechanics.types import Floats
 POLL_S = 0.01
 TOLERANCE_RAD = math.radians(1.0)
 """Largest difference of a position from the record, and at home from the home offset, rad; of a slide in proportion."""
-CONTROLWORD, STATUSWORD, POSITION, IDENTITY = 0x6040, 0x6041, 0x6064, 0x1018
+CONTROLWORD, STATUSWORD, POSITION = 0x6040, 0x6041, 0x6064
 TARGET, PROFILE_SPEED = 0x607A, 0x6081
 _ENABLE = 0x0F
 _OFF = frozenset(DriveState) - POWERED_STATES
@@ -71,54 +69,8 @@ _MOVES = {
 """Direction in which a drive counts, and what it looks for, of the common methods."""
 
 
-SCHEMA = 1
-"""Version of the record of zeros."""
-
-
 class UnhomedError(NodeError):
     """A drive has to be homed before it may be enabled."""
-
-
-class ZeroRecord:
-    """The record of the zeros of a cell's drives, by node id, in a file.
-
-    Args:
-        path: path of a JSON file; None: nothing is kept.
-
-    Raises:
-        UsageError: the file is of a newer canprobe. One that cannot be read counts as none: the drives are homed again.
-    """
-
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
-        self._nodes: dict[str, dict[str, Any]] = {}
-        if path is not None and path.is_file():
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                content = json.loads(path.read_text(encoding="utf-8"))
-                nodes = dict(content["nodes"])
-                check_schema(path, content.get("schema", 1), SCHEMA, "remove it, and home the drives again")
-                self._nodes = nodes
-
-    def entry(self, node_id: int) -> dict[str, Any]:
-        """The entry of a node; empty where nothing is known."""
-        found = self._nodes.get(str(node_id))
-        return found if isinstance(found, dict) else {}
-
-    def put(self, node_id: int, entry: dict[str, Any] | None) -> None:
-        """Write the entry of a node; None removes it.
-
-        Raises:
-            CanprobeError: the file cannot be written.
-        """
-        self._nodes.pop(str(node_id), None)
-        if entry is not None:
-            self._nodes[str(node_id)] = entry
-        if self._path is not None:
-            try:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise UsageError(f"{self._path.parent}: {error.strerror}") from error
-            write_text(self._path, json.dumps({"schema": SCHEMA, "nodes": self._nodes}, indent=1) + "\n")
 
 
 class Homing:
@@ -150,13 +102,13 @@ class Homing:
         say: Callable[[str], None],
     ) -> None:
         assert plan.setup.arm is not None
-        self._arm, self._times, self._bus = plan.setup.arm, plan.setup.bring_up, plan.setup.bus
-        self._scene = shlex.quote(plan.setup.name)
+        self._arm, self._times = plan.setup.arm, plan.setup.bring_up
+        self._command_line = plan.setup.up_line("--home")
         self._model, self._drives = self._arm.model, self._arm.drives
         by_id = {setup.node_id: setup for setup in setups}
         self._setups = [by_id[drive.node_id] for drive in self._drives]
         self._network, self._watch, self._supervise = network, watch, supervise
-        self._record, self._say = ZeroRecord(record), say
+        self._record, self._say = NodeRecord(record, "home the drives again"), say
         guard = JointGuard(plan)
         self._low, self._high = (
             guard.low + TOLERANCE_RAD * self._model.radian,
@@ -204,7 +156,7 @@ class Homing:
             raise UnhomedError(
                 self._drives[lacking[0]].node_id,
                 f"({self._setups[lacking[0]].name}) is not homed, or was switched off or moved since{too}; type:"
-                f" canprobe up {self._scene} --home --bus {self._bus.interface} --channel {self._bus.channel}",
+                f" {self._command_line}",
             )
 
     def keep(self) -> None:

@@ -32,6 +32,7 @@ from canprobe.cell.results.summary import (
 )
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
+from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
@@ -67,7 +68,7 @@ class OpenCell:
     """
 
     def __init__(self, plan: Plan, options: RunOptions, *, task: Controller | None = None) -> None:
-        self.plan = plan
+        self.plan = plan = warned(plan)
         folder = None if options.out is None or options.rows_kept is not None else options.out / ROWS_FOLDER
         self.session = Session(plan, replace(options, rows_folder=folder))
         self._out, self._say, self._early_summary = options.out, options.say, options.early_summary

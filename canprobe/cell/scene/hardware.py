@@ -78,6 +78,11 @@ class BusSettings:
         """There is no bus."""
         return self.interface == DIRECT
 
+    @property
+    def virtual(self) -> bool:
+        """Time is virtual, and no node is real."""
+        return self.interface in ("lockstep", DIRECT)
+
 
 @dataclass(frozen=True, slots=True)
 class BringUpSettings:

@@ -12,6 +12,7 @@ scene whose values are SI already (`[bus]`, `[bring_up]`, `[bridge]`) are taken 
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -509,6 +510,11 @@ class Setup:
     def emulates(self) -> bool:
         """Whether any part of the cell is emulated."""
         return bool(self.emulated_node_ids) or (self.array is not None and self.array.emulated)
+
+    def up_line(self, option: str) -> str:
+        """The command line of a step of `up` on the cell's bus; on SocketCAN where the scene names none."""
+        interface = "socketcan" if self.bus.virtual else self.bus.interface
+        return f"canprobe up {shlex.quote(self.name)} {option} --bus {interface} --channel {self.bus.channel}"
 
     def changed(self, part: Literal["bus", "arm", "array"], **values: Any) -> Setup:
         """A setup with other values of one part, in the task too."""

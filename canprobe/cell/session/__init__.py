@@ -10,7 +10,7 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     buses           ports, buses in virtual time, routes between several buses, counters of their frames
     links           check of the interfaces' settings before anything is sent
     link_faults     faults in the setting of one interface
-    folder          the folder of a run before its first frame
+    folder          the folder of a run before its first frame, and the files of what a cell keeps
     direct          a cell without a bus
     rehearsal       the scene of a short run in lockstep, before a real one
     bus_record      record of its buses
@@ -23,6 +23,7 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     check           a verdict on link and machine before motion
     first_second    the same verdict on the first second of a run
     check_joints, home   the joints of a cell, one after the other: which is which, and their zeros
+    joint_record    what a check of the joints has shown, for later runs
     looking         a bus without a cell: scan, node ids, monitor
     emulation       emulated nodes for other masters
     array_calibration    touches of known objects, visit by visit, and the fit

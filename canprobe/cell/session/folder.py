@@ -1,4 +1,4 @@
-"""The folder of a run before its first frame, and the file of a cell's zeros."""
+"""The folder of a run before its first frame, and the files of what a cell keeps from one run to the next."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.rows import ROWS_FOLDER
+from canprobe.cell.scene.setup import Arm
 from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
 
 STEPS = "steps.log"
@@ -46,9 +47,14 @@ def write_scene(plan: Plan, folder: Path) -> None:
 
 
 def zeros_file(plan: Plan) -> Path | None:
-    """File of the zeros of a cell's real drives, in the user's state folder; None where no drive is homed."""
+    """File of the zeros of a cell's real drives; None where no drive is homed."""
     arm = plan.setup.arm
     if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
         return None
+    return record_file("zeros", arm)
+
+
+def record_file(kind: str, arm: Arm) -> Path:
+    """File of a record of an arm's drives, in the user's state folder."""
     folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    return Path(folder).expanduser() / "canprobe" / f"zeros-{arm.model.name}.json"
+    return Path(folder).expanduser() / "canprobe" / f"{kind}-{arm.model.name}.json"

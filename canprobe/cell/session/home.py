@@ -10,7 +10,7 @@ from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import ROWS_OF_UP
-from canprobe.cell.tasks.joint_finding import Answer
+from canprobe.cell.tasks.joint_finding import Answer, SeenWay
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -37,14 +37,13 @@ def home(scene: Scene, *, operator: Operator | None = None, say: Say = quiet) ->
         homing = session.cell.homing
         assert homing is not None
         for axis in homing.order:
-            answer = Answer.YES
+            answer: Answer | SeenWay | None = Answer.YES
             if operator is None:
                 say(homing.question(axis).removesuffix("?"))
             else:
                 operator.ask(homing.question(axis))
-                while (given := operator.answer()) is None:
+                while (answer := operator.answer()) is None:
                     homing.keep_alive()
-                answer = given
             if answer is Answer.QUIT:
                 return
             say(homing.home(axis) if answer is Answer.YES else f"joint {axis + 1} is left as it is")

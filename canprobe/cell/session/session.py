@@ -34,6 +34,7 @@ from canprobe.cell.session.buses import channel_routes, lockstep_bus, open_ports
 from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.first_second import FirstSecond
 from canprobe.cell.session.folder import STEPS, prepare_folder, zeros_file
+from canprobe.cell.session.joint_record import exchanged
 from canprobe.cell.session.link_faults import expected_of
 from canprobe.cell.session.links import check_links, need_controllers
 from canprobe.cell.session.recovery import VIRTUAL_WAIT_S, Recovery
@@ -168,6 +169,9 @@ class Session:
             else:
                 self._stack.enter_context(self._cell)
             self._observe_frames(port)
+            if not self.options.to_check and (other := exchanged(self.plan, self.cell.bring_up)) is not None:
+                self._say(f"warning: {other}")
+                self._note(other)
         except BaseException as error:
             self._close()
             need_controllers(self.scene.bus.interface, self._ports, error)

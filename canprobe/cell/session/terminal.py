@@ -41,10 +41,14 @@ class StepReport:
     Args:
         verbosity: level of detail: -1 only warnings, 0 the steps of long commands, 1 every step.
         stream: stream to write to; stderr by default.
+
+    Attributes:
+        words: gives the words of each line that is written.
     """
 
     def __init__(self, verbosity: int = 0, stream: TextIO | None = None) -> None:
         self.verbosity = verbosity
+        self.words: Callable[[str], str] = str
         self._stream = sys.stderr if stream is None else stream
         self._bar = ""
 
@@ -107,5 +111,6 @@ class StepReport:
 
     def _write(self, line: str) -> None:
         """A line above the bar, if there is one."""
+        line = self.words(line)
         self._stream.write(f"\r\x1b[K{line}\n{self._bar}" if self._bar else f"{line}\n")
         self._stream.flush()

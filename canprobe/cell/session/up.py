@@ -11,6 +11,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
+from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.session.target import need_real_bus
 from canprobe.cell.tasks.from_plan import make_task
@@ -43,7 +44,7 @@ def up(
         BusError, SafetyStop: as in :func:`canprobe.run`.
     """
     need_real_bus(scene, "up")
-    plan = make_plan(resolve(with_bridges(scene, bridge)))
+    plan = warned(make_plan(resolve(with_bridges(scene, bridge))))
     with Bridges(plan, None, virtual=False, say=say) as bridges:
         session = Session(plan, RunOptions(None, say, bridges.observers, ROWS_OF_UP, recover=recover))
         with reporting_notes(session, say) as report_news:

@@ -1,4 +1,4 @@
-"""The result of a joint's first motion, and the operator who watches it."""
+"""The result of a joint's first motions, and the operator who watches them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from canprobe.mechanics.types import Floats
 
 TRAVEL_TOLERANCE_SHARE, TRAVEL_TOLERANCE_RESTS = 0.05, 0.5
 """Tolerance of an encoder's way: this share of the commanded way, but at least this part of `rest_counts`."""
+SEEN_TOLERANCE_SHARE = 0.25
+"""Tolerance of a way that an operator saw, as a share of it: an eye is right within that, and half and twice as far are
+outside."""
 
 
 class Answer(Enum):
@@ -23,13 +26,29 @@ class Answer(Enum):
     QUIT = "quit"
 
 
+@dataclass(frozen=True, slots=True)
+class SeenWay:
+    """The way of a motion, as an operator saw or measured it.
+
+    Attributes:
+        number: its length; that of a joint is negative in negative direction.
+        unit: unit that came with the number, deg or mm; None without one. Millimetres of a joint that turns are those
+            of the flange, straight from where it was.
+        signed: the number came with a sign; else it goes the way that was asked for.
+    """
+
+    number: float
+    unit: str | None = None
+    signed: bool = True
+
+
 class Operator(Protocol):
     """A person who watches the arm. The cell goes on meanwhile: `answer` never waits."""
 
-    def ask(self, question: str) -> None:
-        """Put a question."""
+    def ask(self, question: str, *, for_way: bool = False) -> None:
+        """Put a question; one for a way may be answered by a number, and yes stands for the way in the question."""
 
-    def answer(self) -> Answer | None:
+    def answer(self) -> Answer | SeenWay | None:
         """The answer to it; None until it is given."""
 
 
@@ -49,6 +68,9 @@ class JointFinding:
         unit: deg or mm.
         fault: fault that was found; None without one.
         skipped: why it was not moved; None where it was.
+        seen: the way that the operator saw, in words; None where nobody saw enough to judge gear and counts.
+        unseen: why the operator did not; None where he did, or nobody was asked.
+        force: highest force that the array showed meanwhile, N; None without an array that was seen alive.
     """
 
     joint: int
@@ -58,13 +80,39 @@ class JointFinding:
     fault: str | None = None
     skipped: str | None = None
     unit: str = "deg"
+    seen: str | None = None
+    unseen: str | None = None
+    force: float | None = None
 
     def __str__(self) -> str:
         where = f"joint {self.joint + 1} at {self.start:.2f} {self.unit}: "
         if self.skipped is not None:
             return where + f"not moved, {self.skipped}"
         way = f"asked {self.asked:+.2f} {self.unit}, {VERBS[self.unit][1]} {self.moved:+.2f} {self.unit}"
-        return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
+        seen = f", seen {self.seen}" if self.seen is not None else ""
+        unseen = f"; gear and counts are not known, {self.unseen}" if self.unseen is not None else ""
+        return where + way + seen + (f": {self.fault}" if self.fault is not None else f": as expected{unseen}")
+
+
+def find_seen_fault(seen: float, due: float, unit: str) -> str | None:
+    """The fault in the way that an operator saw; None where it is the one that is due, within the tolerance.
+
+    Args:
+        seen, due: both ways, in one unit.
+        unit: unit of the joint, deg or mm.
+    """
+    share = seen / due
+    if abs(share - 1.0) <= SEEN_TOLERANCE_SHARE:
+        return None
+    if share < 0.0:
+        return f"it {VERBS[unit][1]} the wrong way, as the operator saw it: sign, or polarity (607Eh)"
+    return (
+        f"it {VERBS[unit][1]} {share:.2f} times as far, as the operator saw it: gear, counts_per_{_OF_COUNTS[unit]}, or"
+        " another joint's drive; no encoder shows that"
+    )
+
+
+_OF_COUNTS = {"deg": "turn", "mm": "m"}
 
 
 def find_fault(joint: int, asked: Floats, moved: Floats, rest: Sequence[float], unit: str = "deg") -> str | None:

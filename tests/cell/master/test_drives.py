@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from puma_arm import MODELS
 
+import canprobe
 from canprobe.cell.master.array import TactileReceiver
 from canprobe.cell.master.drives import DriveAxis, DriveGroup
 from canprobe.cell.master.position_track import MIN_REST_COUNTS, REST_NS, PositionTrack, rest_counts
@@ -545,3 +546,28 @@ def test_a_frame_with_a_lost_pdo_is_never_handed_out(lost):
     sample = receiver.take(3, 4, times(3))
     assert sample is not None and sample.frame.header.frame_counter == 2
     assert receiver.assembler.torn + receiver.assembler.orphans > 0
+
+
+# The borders of what a motor can have reached.
+
+
+def test_at_a_sync_before_the_last_report_a_motor_is_where_it_was_reported():
+    """Nothing is carried back: the report is the better word for it."""
+    track = moving(10)
+    assert [track.position(cycle, cycle * PERIOD) for cycle in (17, 18, 19)] == [190.0] * 3
+    assert PositionTrack(BASE).position(5, 5 * PERIOD) == 0.0, "nor is anything carried on before the first report"
+
+
+def test_a_report_at_the_border_of_rest_is_rest():
+    track = PositionTrack(BASE)
+    for k, counts in enumerate((0, BASE, -BASE, 0)):
+        track.take(counts, k, k * PERIOD, guarded=False)
+        assert track.rested_ns == k * PERIOD
+    track.take(BASE + 1, 4, 4 * PERIOD, guarded=False)
+    assert track.rested_ns == 0
+
+
+def test_a_slide_rests_within_a_fifth_of_a_millimetre():
+    model = canprobe.plan("gantry").setup.arm.model
+    assert rest_counts(model) == pytest.approx(np.maximum(2e-4 * np.abs(np.diag(model.units_per_q)), MIN_REST_COUNTS))
+    assert max(rest_counts(model)) > MIN_REST_COUNTS

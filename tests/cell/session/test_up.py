@@ -1,25 +1,32 @@
 """`up --check-joints` on the whole cell in lockstep, with drives that were set up wrongly."""
 
+import json
 import re
 import struct
 from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 import pytest
+from scenes import change
 
 import canprobe
 import canprobe.api
+from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.controller import Command
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.session import check_joints as joint_report
+from canprobe.cell.session.joint_record import JointRecord, warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import reporting_notes
-from canprobe.cell.tasks.joint_finding import Answer
+from canprobe.cell.tasks.joint_finding import Answer, JointFinding, SeenWay
 from canprobe.cli import main
 from canprobe.errors import NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
-from canprobe.fieldbus.protocol.frames import EMCY_BASE
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, SYNC_ID
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units
 
 REPORTED = "by its encoders the arm stands at"
 
@@ -42,23 +49,33 @@ class Obeying:
 
 
 class Watcher:
-    """An operator who sees the true arm: whether the joint in question turned by what it was told."""
+    """An operator who sees the true arm, in degrees or mm, with an eye that misjudges a way by up to a tenth.
 
-    def __init__(self):
-        self.session, self._before, self._question = None, None, ""
+    At a degree he sees which joint moves and in which direction, and no gear. `only` are the joints that he lets move.
+    """
 
-    def ask(self, question):
-        self._question = question
+    def __init__(self, seed=0, only=None):
+        self.session, self.asked = None, []
+        self._before, self._question, self._only, self._rng = None, "", only, np.random.default_rng(seed)
+
+    def ask(self, question, *, for_way=False):
+        self._question, self._for_way = question, for_way
+        self.asked.append(question)
 
     def answer(self):
-        q = self.session.world.plant.truth()["q"]
+        plant = self.session.world.plant
+        prismatic = plant.config.model.chain.prismatic
+        q = np.where(prismatic, 1e3, 180 / np.pi) * plant.truth()["q"]
+        joint = int(re.search(r"joint (\d)", self._question)[1]) - 1
         if self._question.startswith("joint"):
             self._before = q
-            return Answer.YES
-        joint = int(self._question.split()[2]) - 1
+            return Answer.YES if self._only is None or joint in self._only else Answer.NO
+        way = q - self._before
+        others = np.delete(np.abs(way), joint).max()
+        if self._for_way:
+            return SeenWay(round(way[joint] * self._rng.uniform(0.9, 1.1)))
         told = float(self._question.split("about ")[1].split()[0])
-        turned = np.degrees(q - self._before)
-        return Answer.YES if abs(turned[joint] - told) < 0.1 else Answer.NO
+        return Answer.YES if way[joint] / told > 0.2 and others < 0.2 * abs(told) else Answer.NO
 
 
 @pytest.fixture
@@ -66,10 +83,12 @@ def cell(monkeypatch):
     """Lets the session of a check join its nodes through a function; `cell.session` is that session afterwards."""
 
     class Opened:
-        session, joins, operator = None, staticmethod(lambda participant: participant), None
+        session, joins, operator, world = None, staticmethod(lambda participant: participant), None, None
 
     def make(*args, **more):
         Opened.session = Session(*args, **more)
+        if Opened.world is not None:
+            vars(Opened.session)["world"] = Opened.world
         participants = Opened.session.world.participants
         participants[:] = map(Opened.joins, participants)
         if Opened.operator is not None:
@@ -77,6 +96,7 @@ def cell(monkeypatch):
         return Opened.session
 
     monkeypatch.setattr(joint_report, "Session", make)
+    monkeypatch.setattr(Session, "_need_emulated", lambda *_: None)  # real drives, as far as the cell can see
     return Opened
 
 
@@ -90,23 +110,44 @@ def flip(node):
     return node
 
 
-def scene():
-    free = canprobe.load_scene("free")
-    return replace(free, cycle=replace(free.cycle, rate_hz=50.0), bus=replace(free.bus, timed=False))
+def scene(cell="puma260", *, seed=0, real=False):
+    free = canprobe.load_scene("free", {"cell": cell, "scene.seed": seed, "cycle.rate_hz": 25.0, "bus.timed": False})
+    return change(free, arm={"emulated": not real})
+
+
+def true_world(scene, change_units=lambda units: units, swapped=()):
+    """An arm whose motors are another one's: their units by joint, or two drives that have each other's node ids.
+
+    Where the arm stands its drives show what the cell file has there, as after zeros that were read at the marks.
+    """
+    plan = canprobe.plan(scene)
+    arm, model = plan.setup.arm, plan.setup.arm.model
+    order = list(range(model.n))
+    if swapped:
+        i, j = swapped
+        order[i], order[j] = j, i
+    drives = tuple(arm.drives[i] for i in order)
+    units = change_units(np.array(model.units_per_q))
+    zeros = joints_to_units(model, arm.q_start)[order] - units @ arm.q_start
+    truth = replace(plan.setup.truth, model=ArmModel(model.chain, model.joints, units, zeros))
+    setup = replace(plan.setup, arm=replace(arm, drives=drives), truth=truth)
+    return make_world(replace(plan, setup=setup), plan.node_ids)
+
+
+def scaled(joint, factor, *, gear_only=True):
+    """The units of an arm of which one gear, or all that one drive counts, is another."""
+
+    def change_units(units):
+        columns = joint if gear_only else slice(None)
+        units[joint, columns] *= factor
+        return units
+
+    return change_units
 
 
 def assert_disabled(session):
     words = [node.dictionary.number(0x6041) for node in session.world.nodes]
     assert not POWERED_STATES.intersection(map(state_of, words))
-
-
-def test_a_sound_arm_is_found_so_and_its_pose_is_told(cell):
-    cell.operator, said = Watcher(), []
-    findings = canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
-    assert [(f.joint, f.fault, f.skipped) for f in findings] == [(joint, None, None) for joint in range(6)]
-    assert [f.moved for f in findings] == pytest.approx([1.0] * 6, abs=0.03)
-    assert said[-1].startswith(f"{REPORTED} 90.00, 65.00, 15.00, 0.00, 100.00, 0.")
-    assert_disabled(cell.session)
 
 
 def test_a_drive_that_obeys_the_wrong_way_round_is_named(cell):
@@ -149,8 +190,242 @@ def test_an_interrupt_between_two_joints_disables_and_reports_what_was_done(cell
     cell.operator, said = Interrupting(), []
     with pytest.raises(KeyboardInterrupt):
         canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
-    assert said[-2].startswith("joint 1 at 90.00 deg: asked +1.00 deg, turned +1.0")
+    assert re.match(r"joint 1 at 90.00 deg: asked -10.00 deg, turned -10.0\d deg, seen -\d+ deg: as expected", said[-2])
     assert_disabled(cell.session)
+
+
+@pytest.mark.parametrize(
+    ("factor", "gear_only", "fault"),
+    [
+        (0.5, True, r"it turned [12].\d+ times as far, as the operator saw it: gear, counts_per_turn"),
+        (2.0, True, r"it turned 0.[3-6]\d* times as far, as the operator saw it: gear, counts_per_turn"),
+        (2.0, False, r"it turned 0.[3-6]\d* times as far, as the operator saw it: gear, counts_per_turn"),
+        (-1.0, False, "the operator did not see it turn that way: polarity, gear or another joint's drive"),
+        (1000.0, True, "the operator did not see it turn that way: polarity, gear or another joint's drive"),
+    ],
+    ids=["gear half", "gear twice", "counts twice", "sign", "does not move"],
+)
+@pytest.mark.parametrize("seed", range(5))
+def test_what_no_encoder_shows_is_found_by_who_watches(cell, factor, gear_only, fault, seed):
+    """Of a joint by chance. A joint with another gear drags those of the wrist along, as its drive counts for them."""
+    joint = int(np.random.default_rng((seed, round(100 * abs(factor)))).integers(6))
+    cell.operator, cell.world = (
+        Watcher(seed, {joint}),
+        true_world(scene(seed=seed), scaled(joint, factor, gear_only=gear_only)),
+    )
+    with pytest.raises(
+        NodeError, match=rf"^node {joint + 1}: \(joint {joint + 1}\) ({fault}|the operator did not see it)"
+    ):
+        canprobe.api.check_joints(scene(seed=seed), operator=cell.operator)
+    assert_disabled(cell.session)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_swapped_drives_are_seen(cell, seed):
+    pair = sorted(int(joint) for joint in np.random.default_rng(seed).choice(6, 2, replace=False))
+    cell.operator, cell.world = Watcher(seed, pair), true_world(scene(seed=seed), swapped=pair)
+    with pytest.raises(NodeError, match=r"the operator did not see it turn.*; node .*the operator did not see it turn"):
+        canprobe.api.check_joints(scene(seed=seed), operator=cell.operator)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_right_arm_is_found_so_by_every_eye(cell, seed):
+    cell.operator, cell.world, said = Watcher(seed), true_world(scene(seed=seed)), []
+    findings = canprobe.api.check_joints(scene(seed=seed), operator=cell.operator, say=said.append)
+    assert [(f.fault, f.unseen, f.seen is None) for f in findings] == [(None, None, False)] * 6
+    assert [f.moved for f in findings] == pytest.approx([-10.0, *[10.0] * 5], abs=0.03)
+    assert said[-1].startswith(f"{REPORTED} 90.00, 65.00, 15.00, 0.00, 100.00, 0.")
+    assert_disabled(cell.session)
+
+
+@pytest.mark.parametrize(("name", "joint"), [("seven-axis", 3), ("gantry", 2), ("puma260", 4)])
+def test_each_kind_of_arm_is_checked_in_its_unit(cell, name, joint):
+    """Seven axes, slides in mm, and the wrist whose motors drag each other along."""
+    right = scene(name)
+    cell.operator, cell.world = Watcher(1, {joint, 0}), true_world(right)
+    findings = canprobe.api.check_joints(right, operator=cell.operator)
+    assert [f.joint for f in findings if f.seen is not None] == [0, joint]
+    way = 34.9 if name == "gantry" else 10.0
+    assert [abs(f.asked) for f in findings if f.seen is not None] == pytest.approx([way] * 2, abs=0.01)
+    for factor, share in ((0.5, r"[12]\.\d+"), (2.0, r"0\.\d+")):
+        cell.operator, cell.world = Watcher(1, {joint}), true_world(right, scaled(joint, factor))
+        with pytest.raises(
+            NodeError, match=rf"^node \d+: \(joint {joint + 1}\) it \w+ {share} times as far, as the operator"
+        ):
+            canprobe.api.check_joints(right, operator=cell.operator)
+
+
+# The record of real drives, which `plan`, `run` and `up` read.
+
+
+@pytest.fixture
+def state(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path / "canprobe" / "joints-puma260.json"
+
+
+def warning(scene):
+    plan = canprobe.plan(scene)
+    told = set(warned(plan).warnings) - set(plan.warnings)
+    assert len(told) <= 1
+    return told.pop() if told else None
+
+
+def check_real(cell, scene, *, only=None, world=None, said=()):
+    cell.operator, cell.world = Watcher(0, only), world or true_world(scene)
+    return canprobe.api.check_joints(scene, operator=cell.operator, say=said.append if said != () else lambda _: None)
+
+
+def test_a_check_of_real_drives_is_recorded_and_the_warning_ends(cell, state):
+    real, said = scene(real=True), ["from here"]
+    line = "before the first contact type: canprobe up free --check-joints --bus socketcan --channel can0"
+    unknown = "whether the arm moves as its file says is not known: "
+    assert warning(real) == f"{unknown}joints 1, 2, 3, 4, 5, 6 were not checked; {line}"
+    check_real(cell, real, only={0, 2}, said=said)
+    assert said[-1] == f"recorded in {state}: joints 1, 3"
+    assert warning(real) == f"{unknown}joints 2, 4, 5, 6 were not checked; {line}"
+    check_real(cell, real, only={1, 3, 4, 5})
+    assert warning(real) is None
+    entry = json.loads(state.read_text())["nodes"]["3"]
+    assert re.fullmatch(r"\+(9|10|11) deg", entry.pop("seen")) and datetime.fromisoformat(entry.pop("date")).tzinfo
+    assert entry == {
+        "joint": "joint_3",
+        "identity": [0xCA5E, 0x260],
+        "serial": 3,
+        "units": canprobe.plan(real).setup.arm.model.units_per_q[2].tolist(),
+        "zero": [canprobe.plan(real).setup.arm.model.zero_units[2], None],
+        "asked": "+10.00 deg",
+        "array_n": None,
+    }
+
+
+def test_an_emulated_cell_is_neither_warned_nor_recorded(cell, state):
+    assert warning(scene()) is None
+    said = []
+    cell.operator = Watcher(0, {0})
+    canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
+    assert not state.exists() and not any("record" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    ("joint", "keys", "told"),
+    [
+        (2, {"gear": 30.0}, "joint 3 was checked with another counts, gear, sign or coupling"),
+        (1, {"sign": -1}, "joint 2 was checked with another counts, gear, sign or coupling"),
+        (4, {"zero_counts": 17}, "joint 5 was checked with another zero"),
+        (0, {"serial_number": 4711}, r"joint 1 was checked with another drive \(1018h:04\)"),
+        (3, {"node_id": 17}, "joint 4 was not checked"),
+        (5, {"swing_deg": 3.0}, None),
+    ],
+)
+def test_an_edit_of_the_cell_makes_its_joint_stale(state, checked, joint, keys, told):
+    real = scene(real=True)
+    state.parent.mkdir(parents=True)
+    state.write_text(checked)
+    name = list(real.joints)[joint]
+    edited = replace(real, joints={**real.joints, name: replace(real.joints[name], **keys)})
+    if told is None:
+        assert warning(edited) is None
+    else:
+        assert re.search(rf": {told}; before the first contact type", warning(edited))
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory):
+    """A record of all joints of the cell."""
+    plan, folder = canprobe.plan(scene(real=True)), tmp_path_factory.mktemp("state")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(folder))
+        record = JointRecord(plan)
+        for joint in range(6):
+            record.put(JointFinding(joint, 0.0, 10.0, 10.0, seen="+10 deg"), {i: i for i in plan.node_ids})
+        return record.path.read_text()
+
+
+def test_an_exchanged_drive_is_noticed_once_the_nodes_are_up(cell, state, checked):
+    real, said = scene(real=True), []
+    state.parent.mkdir(parents=True)
+    state.write_text(checked.replace('"serial": 5', '"serial": 55'))
+    assert warning(real) is None, "no cell file says which it has"
+    session = Session(canprobe.plan(real), RunOptions(say=said.append))
+    vars(session)["world"] = true_world(real)
+    with session:
+        pass
+    (line,) = [line for line in said if line.startswith("warning: whether")]
+    assert "joint 5 was checked with another drive (1018h:04); before the first contact type" in line
+    assert line.removeprefix("warning: ") in session.cell.faults
+
+
+def test_a_joint_that_is_found_wrong_is_forgotten(cell, state, checked):
+    real = scene(real=True)
+    state.parent.mkdir(parents=True)
+    state.write_text(checked)
+    with pytest.raises(NodeError, match="times as far, as the operator saw it"):
+        check_real(cell, real, only={1, 2}, world=true_world(real, scaled(2, 0.5)))
+    assert ": joint 3 was not checked; before" in warning(real)
+
+
+def test_without_an_operator_nothing_is_recorded(cell, state):
+    real, said = scene(real=True), []
+    cell.world = true_world(real)
+    findings = canprobe.api.check_joints(real, say=said.append)
+    assert {f.asked for f in findings} == {-1.0, 1.0}
+    assert said[-1] == "no joint is recorded: nobody has seen a larger way" and not state.exists()
+
+
+@pytest.mark.parametrize("content", ["", "{", '{"schema": 1, "nodes": []}', '{"schema": 1, "nodes": {"1": 7}}'])
+def test_a_record_that_cannot_be_read_counts_as_none(state, content):
+    state.parent.mkdir(parents=True)
+    state.write_text(content)
+    assert ": joints 1, 2, 3, 4, 5, 6 were not checked;" in warning(scene(real=True))
+
+
+def test_a_record_of_a_newer_canprobe_is_said_and_refuses_no_run(cell, state, checked):
+    state.parent.mkdir(parents=True)
+    state.write_text(checked.replace('"schema": 1', '"schema": 2'))
+    assert "the file is of a newer canprobe" in warning(scene(real=True))
+    with pytest.raises(UsageError, match="remove it, and check the joints again"):
+        check_real(cell, scene(real=True))
+
+
+def test_a_record_that_cannot_be_written_is_a_warning(cell, state):
+    state.parent.parent.joinpath("canprobe").write_text("a file where the folder should be")
+    said = ["from here"]
+    check_real(cell, scene(real=True), only={0}, said=said)
+    assert any(line.startswith(f"warning: {state.parent}: cannot be written") for line in said)
+
+
+# The array is the second witness where the scene has one.
+
+
+def test_what_presses_on_the_array_stops_the_joint_and_is_named(cell):
+    """Joint 2 lowers the probe onto the cylinder 6 mm below it."""
+    touching = change(canprobe.load_scene("cylinder"), bus={"timed": False})
+    forces, said = [], []
+
+    class Noting(Obeying):
+        """A drive beside which the true force is noted at each SYNC."""
+
+        def receive(self, can_id, data, t_ns):
+            if can_id == SYNC_ID:
+                forces.append(cell.session.world.plant.truth()["force"])
+            return self._node.receive(can_id, data, t_ns)
+
+    cell.operator, cell.joins = Watcher(0, {1}), on_node(1, lambda node: Noting(node, 1.0))
+    pressed = r"the array showed 0\.\d+ N while joint 2 moved alone, and it went back"
+    with pytest.raises(SafetyStop, match=f"^{pressed}: move the arm away"):
+        canprobe.api.check_joints(touching, operator=cell.operator, say=said.append)
+    assert any(re.match(f"joint 2 at .*: {pressed}", line) for line in said)
+    assert 0.15 < max(forces) < 2.0 and forces[-1] == 0.0
+    assert_disabled(cell.session)
+
+
+@pytest.mark.parametrize(("noise", "seen"), [(True, True), (False, False)])
+def test_an_array_of_which_no_image_changes_is_no_witness(cell, noise, seen):
+    quiet = canprobe.load_scene("cylinder", {"bus.timed": False, "plant.noise": noise})
+    cell.operator = Watcher(0, {5})
+    (finding,) = [one for one in canprobe.api.check_joints(quiet, operator=cell.operator) if one.skipped is None]
+    assert finding.seen is not None and (finding.force is not None) == seen
 
 
 def test_a_scene_without_an_arm_is_refused():

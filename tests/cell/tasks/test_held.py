@@ -108,3 +108,33 @@ def test_a_key_is_a_line_of_its_letter(monkeypatch):
     found.append(any([key.pressed() for _ in range(45)]))
     os.close(reader)
     assert found == [False, False, True, False]
+
+
+@pytest.mark.parametrize(("stands_deg", "elsewhere"), [(65.0, False), (66.0, False), (66.1, True), (-65.0, True)])
+def test_an_arm_is_compared_with_where_it_stood_and_not_with_its_zero(stands_deg, elsewhere):
+    """As far as the tolerance goes, and no further; the mirrored posture is elsewhere."""
+    joints = canprobe.plan("free").setup.arm.model.joints
+    place = LastPlace(joints, np.radians([90.0, 65.0, 15.0, 0.0, 100.0, 0.0]), np.full(6, np.radians(1.0) + 1e-12))
+    found = place.difference(np.radians([90.0, stands_deg, 15.0, 0.0, 100.0, 0.0]))
+    if elsewhere:
+        assert found.startswith(f"joint 2 reports {stands_deg:.2f} deg, and reported 65.00 deg before the loss")
+    else:
+        assert found is None
+
+
+def test_a_hold_lasts_for_as_long_as_nobody_asks():
+    """The first cycle of a hold takes no word for motion; none of those after it begins motion without one."""
+    mine, asked = Mine(), []
+    held = HeldTask(mine, None, lambda: bool(asked))
+    for cycle in range(50):
+        assert held.step(Measurement(cycle, cycle * 2_500_000)) == Command() and held.held
+    assert (mine.steps, mine.went_on) == (0, 0)
+    asked.append(True)
+    assert held.step(Measurement(50, 50 * 2_500_000)).q_target is not None and not held.held
+
+
+def test_a_controller_that_does_not_let_go_leaves_that_to_the_cell_after_the_hold_too():
+    held = HeldTask(Mine(), None, lambda: True)
+    for cycle in range(2):
+        held.step(Measurement(cycle, cycle * 2_500_000))
+    assert not held.held and not held.lets_go
