@@ -139,6 +139,7 @@ class EmulatedBus(ABC):
         """Write to the log what was recorded so far."""
         self._act(0, self._writer.flush)
 
+    @abstractmethod
     def _wake(self) -> None:
         """Let nodes do at once what has become due."""
 
@@ -339,6 +340,9 @@ class ServedBus(EmulatedBus):
         except TimeoutError:
             why = self._failures[0] if self._failures else None
             raise InterfaceError(f"{self.channel}: the emulated nodes are not served any more") from why
+
+    def _wake(self) -> None:
+        pass  # the thread of the nodes looks at their deadlines after each request
 
     def _start(self, node_ids: Sequence[int], loop: Callable[[Callable[[], bool]], None]) -> None:
         """Start a thread with a loop that asks after each wait whether to end; then it does what is requested."""
