@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     import canopen
 
     from canprobe.cell.results.lockstep_cell import LockstepCell
-    from canprobe.fieldbus.tools.emulated_bus import EmulatedBus
-    from canprobe.fieldbus.tools.faults import FaultyNode
+    from canprobe.fieldbus.tools.emulated_bus import EmulatedBus, EmulatedNode
     from canprobe.fieldbus.tools.faults.planned import PlannedFaults
     from canprobe.fieldbus.tools.judged_bus import JudgedBus
 
@@ -184,17 +183,18 @@ def emulated_bus(request: pytest.FixtureRequest, canprobe_bus: str) -> Iterator[
 @pytest.fixture
 def emulated_nodes(
     request: pytest.FixtureRequest, canprobe_bus: str, canprobe_eds: str, faults: PlannedFaults
-) -> Callable[..., list[FaultyNode]]:
+) -> Callable[..., list[EmulatedNode]]:
     """Puts emulated nodes on the bus of the test: ``emulated_nodes("drive.eds", "io.eds", first_id=3)``.
 
-    A path is looked for beside the test first. Without a name `canprobe_eds` is taken.
+    A path is looked for beside the test first. Without a name `canprobe_eds` is taken. Of a node that it returns
+    ``node[0x6401, 1] = 1234`` sets a value, as the device itself does, and ``node.emcy(0x5000)`` reports an error.
     """
     if canprobe_bus not in EMULATED_INTERFACES:
         why = f"emulated nodes would answer beside the devices of {canprobe_bus}"
         pytest.fail(f"{why}: mark the test hardware, or take --canprobe-bus vcan", pytrace=False)
     emulated_bus: EmulatedBus = request.getfixturevalue("emulated_bus")
 
-    def add(*eds: str | Path, first_id: int | None = None) -> list[FaultyNode]:
+    def add(*eds: str | Path, first_id: int | None = None) -> list[EmulatedNode]:
         from canprobe.errors import UsageError
 
         if not (files := eds or ((canprobe_eds,) if canprobe_eds else ())):
@@ -218,9 +218,10 @@ def canopen_network(emulated_bus: EmulatedBus) -> canopen.Network:
 @pytest.fixture
 def faults(request: pytest.FixtureRequest, canprobe_seed: int) -> Iterator[PlannedFaults]:
     """Throws faults at the emulated nodes of the test; those of markers are thrown when the nodes are powered on."""
+    from canprobe.cell.emulated.array_faults import CELL_FAULTS
     from canprobe.fieldbus.tools.faults.planned import PlannedFaults
 
-    thrown = PlannedFaults(canprobe_seed)
+    thrown = PlannedFaults(canprobe_seed, CELL_FAULTS)
     _record_of(request).faults = thrown
     for marker in reversed(list(request.node.iter_markers("fault"))):
         thrown.inject(*marker.args, **marker.kwargs)

@@ -18,6 +18,7 @@ The stages, each in its module:
     findings      what is wrong in a file, and where
     reading       all of it: the whole file, mended where the standard allows
     description   what a dictionary states of its device, typed
+    foreign_files what a file is that is no EDS file
     packaged      the files of this package, and `load_eds` for any file
 
 Start reading at `packaged.load_eds`, then `reading`.

@@ -16,6 +16,12 @@ from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.values import FOREIGN_TYPE_NUMBERS, KNOWN_TYPES, TYPE_NUMBERS, name_of
 
 _OBJECT_DOMAIN = 2
+_OTHER_TYPES = {
+    range(0x20, 0x24): "is a record of CiA 301, not the type of one value",
+    range(0x40, 0x60): "is a type of the manufacturer, which this file does not define",
+    range(0x60, 0x260): "is a type of a device profile, which this file does not define",
+}
+"""Data types beyond `KNOWN_TYPES`. Source: CiA 301, "Object dictionary data types"."""
 
 
 def data_type_of(source: Source, section: Section, index: int, subindex: int, composite: bool) -> int | None:
@@ -65,5 +71,6 @@ def _foreign(source: Source, section: Section, data_type: int) -> int:
     base = source.number(definition, "DefaultValue") if definition is not None else 0
     if base in KNOWN_TYPES:
         return base
-    source.warn(section, "DataType", f"{data_type:#06x} is not a type of CiA 301; the object is served as octets")
+    what = next((what for numbers, what in _OTHER_TYPES.items() if data_type in numbers), "is not a type of CiA 301")
+    source.warn(section, "DataType", f"{data_type:#06x} {what}; the object is served as octets")
     return int(datatypes.DOMAIN)

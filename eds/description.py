@@ -11,7 +11,15 @@ from dataclasses import dataclass, replace
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable, datatypes
 
-from canprobe.fieldbus.eds.values import OCTET_TYPES, SIGNED_BITS, TEXT_TYPES, UNSIGNED_BITS, Value
+from canprobe.fieldbus.eds.values import (
+    OCTET_TYPES,
+    SIGNED_BITS,
+    TEXT_TYPES,
+    TIME_BITS,
+    TIME_TYPES,
+    UNSIGNED_BITS,
+    Value,
+)
 
 LAST_DUMMY = 0x0007
 """Last index of a data type; DummyUsage lists those that an RPDO may map to fill room."""
@@ -26,7 +34,7 @@ class DescribedEntry:
         index, subindex: place of the entry; an index up to `LAST_DUMMY` is a dummy type.
         name: name, ParameterName.
         data_type: data type of CiA 301, such as 7 for UNSIGNED32.
-        bits: length of a value; 0 for texts, octets and domains, which have no fixed one.
+        bits: length of a value, 8 for a BOOLEAN; 0 for texts, octets and domains, which have no fixed one.
         signed: whether it is an integer in two's complement.
         access: access, AccessType: ro, wo, rw, rwr, rww or const.
         mappable: whether a PDO may map it, PDOMapping.
@@ -78,6 +86,15 @@ class DescribedEntry:
         """Whether an RPDO may map it: it can be written and mapped, or is a dummy."""
         return self.index <= LAST_DUMMY or (self.mappable and self.access in {"wo", "rw", "rww"})
 
+    @property
+    def pdo_bits(self) -> int:
+        """Length in a PDO: that of a value over SDO, but one bit of a BOOLEAN."""
+        return 1 if self.data_type == datatypes.BOOLEAN else self.bits
+
+    def fits_pdo(self, bits: int) -> bool:
+        """Whether a PDO may carry it in so many bits; some devices map a BOOLEAN as a byte."""
+        return bits > 0 and bits in (self.bits, self.pdo_bits)
+
     def allows(self, value: float) -> bool:
         """Whether a number lies within LowLimit and HighLimit, and within the range of an integer type."""
         low, high = self.low, self.high
@@ -102,18 +119,18 @@ class Description:
         """Entry at a place; None where the object or the sub-index is missing."""
         found = variable_at(self.od, index, subindex)
         if found is not None:
-            return _entry(found)
+            return described_entry(found)
         array = self.od.indices.get(index)
         if not isinstance(array, ODArray) or not 0 < subindex <= _array_length(array):
             return None
-        first = _entry(array.subindices[1])  # the first member is described and stands for all
+        first = described_entry(array.subindices[1])  # the first member is described and stands for all
         return replace(first, subindex=subindex, name=f"{first.name}_{subindex:x}")
 
     def entries(self) -> Iterator[DescribedEntry]:
         """All entries that are described, with the dummy types."""
         for found in self.od.indices.values():
             for variable in (found,) if isinstance(found, ODVariable) else found.subindices.values():
-                yield _entry(variable)
+                yield described_entry(variable)
 
     @property
     def dummies(self) -> frozenset[int]:
@@ -169,14 +186,21 @@ def _array_length(array: ODArray) -> int:
     return min(count, 254) if isinstance(count, int) else 0
 
 
-def _entry(variable: ODVariable) -> DescribedEntry:
+def _bits(variable: ODVariable, data_type: int) -> int:
+    if data_type in TEXT_TYPES | OCTET_TYPES:
+        return 0
+    return TIME_BITS if data_type in TIME_TYPES else len(variable)
+
+
+def described_entry(variable: ODVariable) -> DescribedEntry:
+    """What a variable of a dictionary states."""
     data_type = variable.data_type or int(datatypes.DOMAIN)
     return DescribedEntry(
         index=variable.index,
         subindex=variable.subindex,
         name=variable.name,
         data_type=data_type,
-        bits=0 if data_type in TEXT_TYPES | OCTET_TYPES else len(variable),
+        bits=_bits(variable, data_type),
         signed=data_type in SIGNED_BITS,
         access=variable.access_type,
         mappable=variable.pdo_mappable,

@@ -10,6 +10,7 @@ mapping".
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,9 +18,10 @@ from pathlib import Path
 from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
 
 from canprobe.errors import EdsError
-from canprobe.fieldbus.eds.description import variable_at
+from canprobe.fieldbus.eds.description import described_entry, variable_at
 from canprobe.fieldbus.eds.device_info import commissioned_node, read_information
 from canprobe.fieldbus.eds.findings import EdsFinding, EdsFindings
+from canprobe.fieldbus.eds.foreign_files import HEAD_BYTES, file_kind
 from canprobe.fieldbus.eds.numbers import parse_sum
 from canprobe.fieldbus.eds.object_lists import check_lists
 from canprobe.fieldbus.eds.sections import Section, decode, split_sections
@@ -44,6 +46,7 @@ _PREDEFINED_COB_IDS = (
     *((0x1800 + n, 1, 0x180 + 0x100 * n) for n in range(4)),
 )
 """Index, sub-index and COB-ID without the node-ID, of the pre-defined connection set."""
+_FURTHER_PDOS = frozenset((*range(0x1404, 0x1600), *range(0x1804, 0x1A00)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +106,10 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
     except OSError as error:
         raise EdsError(f"{path}: {error.strerror}") from error
     faults, od = EdsFindings(), ObjectDictionary()  # type: ignore[no-untyped-call]
+    if (kind := file_kind(data[:HEAD_BYTES])) is not None:
+        way = f"; {kind.into_eds.format(path=shlex.quote(str(path)))}" if kind.into_eds else ""
+        faults.fault(0, "", "", f"{kind.name}, not an EDS file{way}")
+        data = b""
     sections = split_sections(decode(data, faults), faults)
     source = Source(sections, commissioned_node(sections) or 1 if node_id is None else node_id, faults)
     read_information(source, od)
@@ -230,6 +237,12 @@ class _Repair:
             variable = variable_at(self._od, index, subindex)
             if variable is None:
                 continue
+            if variable.default is None and variable.value is None:
+                self._warn(
+                    (index, subindex), f"missing; {base:#x} + $NODEID taken, that of the pre-defined connection set"
+                )
+                variable.default, variable.relative = base + node_id, True
+                continue
             written, key = _text(variable)
             default, cob_id = variable.default, _present(variable)
             forgotten = isinstance(default, int) and not variable.relative and default & ~INVALID_FLAG == base
@@ -240,6 +253,12 @@ class _Repair:
                 cob_id += node_id - made_for
                 self._warn((index, subindex), f"{written} is of node {made_for}; {cob_id:#x} taken", key)
                 setattr(variable, "value" if key == "ParameterValue" else "default", cob_id)
+        others = {index for index in self._od if index in _FURTHER_PDOS}
+        for place, cob_id, what in (
+            ((0x1005, 0), 0x80, "that of SYNC"),
+            *(((index, 1), INVALID_FLAG, "the PDO is off until somebody names one") for index in sorted(others)),
+        ):
+            self._fill(place, cob_id, f"missing; {cob_id:#x} taken, {what}")
 
     def _check_mapping(self, index: int, serving: bool) -> None:
         """Check the default mapping of a PDO."""
@@ -250,8 +269,9 @@ class _Repair:
             target = variable_at(self._od, word >> 16, word >> 8 & 0xFF)
             if target is None:
                 self._warn((index, subindex), f"maps {name}, which is not described; the PDO is served empty")
-            elif len(target) != length:
-                text = f"maps {length} bits of {name}, which has {len(target)}; the PDO is served empty"
+            elif not (entry := described_entry(target)).fits_pdo(length):
+                has = str(entry.bits) if entry.bits else "no fixed length"
+                text = f"maps {length} bits of {name}, which has {has}; the PDO is served empty"
                 self._warn((index, subindex), text)
             elif not target.pdo_mappable and target.index > 7:
                 self._warn((target.index, target.subindex), f"is mapped in {index:04X}h, so 1", "PDOMapping")

@@ -32,7 +32,8 @@ FOREIGN_TYPE_NUMBERS = {
     **{"FLOAT": 0x08, "DOUBLE": 0x11, "STRING": 0x09},
 }
 """Data types by their names in other standards. Source: IEC 61131-3, "Elementary data types"; C's <stdint.h>."""
-_TIME_BYTES = 6
+TIME_BITS = 48
+"""Length of TIME_OF_DAY and TIME_DIFFERENCE."""
 
 
 def name_of(data_type: int) -> str:
@@ -62,7 +63,7 @@ def convert(text: str, data_type: int, node_id: int, remark: Remark) -> Value:
         return int(parse_flag(text, remark))
     number, _ = parse_sum(text, node_id, remark)
     if data_type in TIME_TYPES:
-        return number.to_bytes(_TIME_BYTES, "little")
+        return number.to_bytes(TIME_BITS // 8, "little")
     return _fitted(number, text, data_type, remark)
 
 

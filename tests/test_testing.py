@@ -154,6 +154,60 @@ def test_the_same_test_on_each_bus_with_nodes_that_are_added_one_by_one(
     ] == []
 
 
+@pytest.mark.parametrize("canprobe_bus", ["lockstep", "virtual", pytest.param("vcan", marks=pytest.mark.vcan)])
+def test_the_log_has_each_frame_while_the_test_runs(emulated_nodes, emulated_bus, canopen_network):
+    emulated_nodes("puma260_joint", first_id=4)
+    node = canopen_network.add_node(4, str(eds_path("puma260_joint")))
+    assert node.sdo[0x1000].raw == 0x20192
+    canopen_network.pass_time(0.2)
+    assert "604#4000100000000000\n" in emulated_bus.log.read_text()
+    frames = emulated_bus.frames()
+    assert [(can_id, data) for can_id, data, _ in frames[:2]] == [(0x704, b"\0"), (0x604, b"\x40\0\x10\0\0\0\0\0")]
+    assert all(t_ns >= 0 for *_, t_ns in frames)
+
+
+@pytest.mark.parametrize("canprobe_bus", ["lockstep", "virtual", pytest.param("vcan", marks=pytest.mark.vcan)])
+def test_values_and_errors_of_a_device_are_set_by_the_test(emulated_nodes, emulated_bus, canopen_network):
+    drive, array = emulated_nodes("puma260_joint", "tactile_array")
+    node = canopen_network.add_node(2, str(eds_path("tactile_array")))
+    node.nmt.state = "OPERATIONAL"
+    errors = []
+    node.emcy.add_callback(lambda error: errors.append(error.code))
+    array[0x2100, 1] = 9
+    assert node.sdo[0x2100][1].raw == array[0x2100, 1] == 9
+    array.emcy(0x5000, b"\1\2")
+    array.emcy(0x5000)
+    assert node.sdo[0x1001].raw & 1 and node.sdo[0x1003][1].raw & 0xFFFF == 0x5000
+    array.emcy(0)
+    drive.emcy(0x4310)
+    canopen_network.pass_time(0.05)
+    assert errors == [0x5000, 0]
+    assert node.sdo[0x1001].raw == 0
+    sent = [(can_id, data) for can_id, data, _ in emulated_bus.frames() if 0x80 < can_id < 0x100]
+    assert sent == [(0x82, b"\x00\x50\x01\x01\x02\0\0\0"), (0x82, bytes(8)), (0x81, b"\x10\x43\x09\0\0\0\0\0")]
+    with pytest.raises(UsageError, match=r"node 2: its EDS has no 6041h:00"):
+        array[0x6041] = 1
+    with pytest.raises(UsageError, match=r"node 1: 6041h:00: expected a number of 16 bits, unsigned, got -1"):
+        drive[0x6041] = -1
+
+
+def test_a_value_that_a_test_sets_is_an_event(emulated_nodes, emulated_bus, canopen_network, faults):
+    (drive,) = emulated_nodes("puma260_joint")
+    node = canopen_network.add_node(1, str(eds_path("puma260_joint")))
+    for subindex, value in ((1, 0x80000281), (2, 255)):
+        node.sdo[0x1801][subindex].raw = value
+    node.sdo[0x1A01][0].raw = 0
+    node.sdo[0x1A01][1].raw = 0x603F0010
+    node.sdo[0x1A01][0].raw = 1
+    node.sdo[0x1801][1].raw = 0x281
+    node.nmt.state = "OPERATIONAL"
+    drive[0x603F] = 0x7300
+    assert emulated_bus.frames()[-1][:2] == (0x281, b"\x00\x73")
+    faults.inject("mute", node=1)
+    drive[0x603F] = 0x7500
+    assert emulated_bus.frames()[-1][1] != b"\x00\x75", "a mute node says nothing of it"
+
+
 def test_what_canopen_waits_for_passes_virtual_time(emulated_nodes, canopen_network, faults):
     emulated_nodes("puma260_joint")
     node = canopen_network.add_node(1, load_eds("puma260_joint", 1))
@@ -247,6 +301,22 @@ def test_no_nodes(): pass
     )
     out.fnmatch_lines(["*never thrown, as no such node was powered on: node 3: mute*"])
     out.fnmatch_lines(["*the marker fault needs the fixture emulated_nodes*"])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("node 1: mote", "*unknown kind 'mote'*"),
+        ("node 1: delay mss=2", "*unknown parameter 'mss'*"),
+        ("node 1: mute on enabeld", "*unknown event 'enabeld'*"),
+        ("node 16: stuck-imag", "*unknown kind 'stuck-imag'; did you mean stuck-image*"),
+    ],
+)
+def test_an_unknown_fault_is_unknown_before_its_node_is_there(run_inside, text, told):
+    text = f'@pytest.mark.fault("{text}")\ndef test_no_nodes(faults): pass'
+    out = run_inside(text, outcomes={"errors": 1})
+    out.fnmatch_lines([told])
+    out.no_fnmatch_line("*never thrown*")
 
 
 def test_real_devices_and_emulated_ones_do_not_meet(run_inside):

@@ -33,6 +33,7 @@ from canprobe.cli.reports import (
 )
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.port import nothing
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.port import Port
@@ -97,6 +98,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--restore", metavar="FILE", type=Path, help="put back a snapshot, and end")
     parser.add_argument("--log", metavar="FILE", type=Path, help="record all frames as a candump log")
+    parser.add_argument("--full", action="store_true", help="print all points below the verdict")
     parser.add_argument("--list", action="store_true", help="list the points, and end")
     add_report_options(parser)
     add_verbosity(parser)
@@ -138,19 +140,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> Report:
-    """Run the examination, with its progress on stderr or its rows on stdout."""
-    from canprobe.fieldbus.tools.reports import row_text
-
-    bar = args.report.bar(".0f points") if args.json else None
-
-    def show(row: object, number: int, total: int) -> None:
-        if bar is not None:
-            bar(number, total)
-        elif not args.json:
-            print(row_text(row), flush=True)  # type: ignore[arg-type]
-
+    """Run the examination, with its progress on stderr."""
+    bar = args.report.bar(".0f points") or nothing
     examination.report.facts.update(_bench_facts(args))
-    report = examination.run(points, show)
+    report = examination.run(points, lambda _row, number, total: bar(number, total))
     report.log = None if args.log is None else str(args.log)
     if "warning" in report.facts:
         args.report.say(f"warning: {report.facts['warning']}")
@@ -158,14 +151,29 @@ def _examine(args: argparse.Namespace, examination: Examination, points: Sequenc
 
 
 def _finish(args: argparse.Namespace, report: Report, baseline: Report | None) -> int:
-    from canprobe.fieldbus.tools.reports import closing_text, report_document
+    from canprobe.fieldbus.tools.reports import closing_text, report_document, row_text, verdict_text
 
+    if baseline is not None and args.points:
+        asked = {(row.group, row.name) for row in report.rows}
+        baseline.rows = [row for row in baseline.rows if (row.group, row.name) in asked]
     change = write_report(args, report, baseline)
     if args.json:
         print_json(report_document(report))
+        return report.exit_status
+    print(verdict_text(report, change))
+    if args.full:
+        print("", *map(row_text, report.rows), closing_text(report), sep="\n")
     else:
-        print(closing_text(report, change))
+        print(f"all points: type it again with --full, or --html FILE for the frames{_again(report)}")
     return report.exit_status
+
+
+def _again(report: Report) -> str:
+    """How to examine again what failed."""
+    from canprobe.fieldbus.tools.reports import Verdict
+
+    groups = dict.fromkeys(row.group for row in report.rows if row.verdict is Verdict.FAIL)
+    return f"; after a change --points {','.join(groups)}" if groups else ""
 
 
 def _points(args: argparse.Namespace) -> tuple[Point, ...]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,7 +125,7 @@ def _judge_record(args: argparse.Namespace) -> int:
         if getattr(args, option):
             name = "COMMAND" if option == "command" else f"--{option}"
             raise UsageError(f"judge: {name} belongs to served nodes, not to --record")
-    from canprobe.fieldbus.tools.judge import judge_frames, read_record
+    from canprobe.fieldbus.tools.judge import judge_frames, nodes_of, read_record
 
     named = [name for _, name in args.channel or ()]
     if len(named) > 1:
@@ -134,12 +134,21 @@ def _judge_record(args: argparse.Namespace) -> int:
     nodes = _descriptions(args, named[0] if named else None)
     judge = judge_frames(frames, nodes, bitrate=args.bitrate or 1_000_000, without=args.without)
     if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
-        ids = ", ".join(map(str, nodes))
-        raise UsageError(f"judge: {args.record} has no frame of node {ids} or to it: which nodes does the log have?")
+        raise UsageError(_no_such_node(args, nodes, nodes_of(read_record(args.record, named[0] if named else None))))
     facts = {**_facts(args), "frames": str(judge.frame_count)}
     report = judge.report(f"the master in {args.record}", facts, log=str(args.record))
     _print(args, report)
     return report.exit_status
+
+
+def _no_such_node(args: argparse.Namespace, asked: Iterable[int], found: Sequence[int]) -> str:
+    """The message where a log has no frame of the nodes that are judged: which it has, and what to type."""
+    ids = ", ".join(map(str, asked))
+    head = f"judge: {args.record} has no frame of node {ids} or to it"
+    if not found:
+        return f"{head}, and no heartbeat, EMCY or SDO answer of any other: is it a log of a CANopen bus?"
+    way = f"type --node-id {found[0]}" if args.eds else "name a scene or a cell with them, or --eds FILE --node-id N"
+    return f"{head}; nodes that it shows: {', '.join(map(str, found))}; {way}"
 
 
 def _judge_served(args: argparse.Namespace) -> int:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import pytest
 
 from canprobe.cli import main
+from canprobe.fieldbus.tools.conform import POINTS
 
 ARGS = ["conform", "--node", "5", "--eds", "puma260_joint", "--bus", "lockstep"]
 
@@ -25,8 +28,36 @@ def test_all_reports_of_one_examination(tmp_path, capsys):
     baseline = tmp_path / "before.json"
     baseline.write_text(json.dumps(document), encoding="utf-8")
     assert main([*ARGS, "--points", "nmt", "--baseline", str(baseline)]) == 0
-    out = capsys.readouterr().out
-    assert "pass   nmt       1 boot-up" in out and "baseline: gone:" in out
+    assert "baseline: as in the baseline" in capsys.readouterr().out, "points that were not asked for are not gone"
+
+
+def test_the_verdict_comes_first_and_the_points_with_full(capsys):
+    assert main(ARGS) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 6
+    assert re.fullmatch(r"canprobe PUMA 260 joint, node 5 on lockstep: passes, \d+ points", lines[0])
+    assert lines[2] == "more points with: --write (8), --motion (6)"
+    assert "--full" in lines[-1] and "--html FILE" in lines[-1]
+    assert main([*ARGS, "--full", "--points", "nmt,28"]) == 0
+    full = capsys.readouterr().out
+    assert re.match(r"canprobe PUMA 260 joint, node 5 on lockstep: passes, \d+ points\n", full)
+    assert "pass   nmt       1 boot-up" in full and "in all" in full
+    assert "1010h" not in full and "tactile" not in full, "left out, and not asked for"
+
+
+def test_what_fails_comes_with_what_to_type(capsys, monkeypatch):
+    def deviates(bench):
+        bench.deviates("the TPDO is short")
+
+    point = next(point for point in POINTS if point.title == "83 heard lengths")
+    monkeypatch.setattr("canprobe.cli.conform._points", lambda args: [replace(point, run=deviates)])
+    assert main(ARGS) == 1
+    assert capsys.readouterr().out.splitlines() == [
+        "canprobe PUMA 260 joint, node 5 on lockstep: 1 of 1 point FAIL",
+        "1 FAIL",
+        "FAIL   pdo 83 heard lengths: the TPDO is short [CiA 301, PDO mapping]",
+        "all points: type it again with --full, or --html FILE for the frames; after a change --points pdo",
+    ]
 
 
 def test_the_list_and_chosen_points(capsys):

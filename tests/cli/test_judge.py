@@ -54,10 +54,29 @@ def test_a_log_of_a_good_master_and_what_became_better(tmp_path, capsys):
     assert "01 target at enable" in capsys.readouterr().out
 
 
-def test_a_log_of_other_nodes(tmp_path, capsys):
-    log = log_of(Master(), tmp_path / "good.log")
-    assert main(["judge", "--eds", "puma260_joint", "--node-id", "9", "--record", log]) == 2
-    assert "has no frame of node 9 or to it" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("nodes", "told"),
+    [
+        (
+            (*NODE[:2], "--node-id", "9"),
+            "no frame of node 9 or to it; nodes that it shows: 1, 2, 127; type --node-id 1",
+        ),
+        (("listen",), "nodes that it shows: 1, 2, 127; name a scene or a cell with them, or --eds FILE --node-id N"),
+    ],
+)
+def test_a_log_of_other_nodes_says_which_it_has(nodes, told, tmp_path, capsys):
+    class TwoNodes(Master):
+        nodes = (1, 2)
+
+    log = log_of(TwoNodes(), tmp_path / "good.log")
+    assert main(["judge", *nodes, "--record", log]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_log_without_nodes(tmp_path, capsys):
+    (tmp_path / "x.log").write_text("(1.000000) can0 123#00\n")
+    assert main(["judge", *NODE, "--record", str(tmp_path / "x.log")]) == 2
+    assert "is it a log of a CANopen bus?" in capsys.readouterr().err
 
 
 def test_the_log_of_a_run_has_nothing_to_blame(tmp_path, capsys):

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-TYPES = {"I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7, "STR": 9}
-SIZES = {"I8": 8, "I16": 16, "I32": 32, "U8": 8, "U16": 16, "U32": 32}
+TYPES = {"BOOL": 1, "I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7, "STR": 9}
+SIZES = {"BOOL": 8, "I8": 8, "I16": 16, "I32": 32, "U8": 8, "U16": 16, "U32": 32}
 Place = tuple[int, int]
 
 

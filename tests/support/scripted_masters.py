@@ -605,6 +605,26 @@ class NamelessAbort(Master):
         self.put(0x601, b"\x80\0\0\0" + struct.pack("<I", 0x05040000))
 
 
+class AbortsNothing(Master):
+    """An abort long after the transfer is over."""
+
+    numbers, named = (30,), b"\x18\x10\x01"
+
+    def configure(self, drive):
+        super().configure(drive)
+        self.read(1, 0x1018, 1, 4)
+        self.wait(300)
+        self.put(0x601, b"\x80" + self.named + struct.pack("<I", 0x05040000))
+
+
+class AbortsNamelessAtOnce(AbortsNothing):
+    def wait(self, ms):
+        if ms != 300:
+            super().wait(ms)
+
+    named = b"\0\0\0"
+
+
 class AsksTwice(Master):
     numbers = (31,)
 
@@ -790,7 +810,56 @@ class MutePassedOver(Master):
         drive = self.drives[2]
         drive.beats = drive.reports = False
         for _ in range(150):
-            self.cycle(targets={1: self.drives[1].target + 100})
+            self.cycle({2: 2}, {1: self.drives[1].target + 100})
+
+
+class DrivesMuteAxis(Master):
+    """The only axis says nothing any more, and its target goes on."""
+
+    numbers = (19,)
+
+    def move(self):
+        self.go(20)
+        self.drives[1].beats = self.drives[1].reports = False
+        self.go(150)
+
+    def stop(self):
+        self.hold(20, 2)
+
+
+class DrivesMuteAxisWithoutHeartbeat(DrivesMuteAxis):
+    def configure(self, drive):
+        super().configure(drive)
+        self.write(drive.node_id, 0x1017, 0, 0, 2)
+        drive.beats = False
+
+
+class DrivesMuteSpeed(DrivesMuteAxis):
+    """In CSV a target that stays is a motion; it comes by an RPDO beside the controlword's."""
+
+    mode, way = 9, 0
+
+    def configure(self, drive):
+        super().configure(drive)
+        self.write(1, 0x1401, 1, 0x80000301, 4)
+        self.write(1, 0x1401, 2, 1, 1)
+        self.write(1, 0x1601, 0, 0, 1)
+        self.write(1, 0x1601, 1, 0x60FF0020, 4)
+        self.write(1, 0x1601, 0, 1, 1)
+        self.write(1, 0x1401, 1, 0x301, 4)
+
+    def send(self, drive, word, target):
+        self.put(0x301, struct.pack("<i", 500 if word == 15 and drive.state == ENABLED else 0))
+        super().send(drive, word, drive.position)
+
+
+class KeepsMuteAxisEnabled(DrivesMuteAxis):
+    """The target stays, and the controlword goes on to enable the axis that nobody sees."""
+
+    def move(self):
+        self.go(20)
+        self.drives[1].beats = self.drives[1].reports = False
+        self.hold(160)
 
 
 class CutsPower(Master):
@@ -941,6 +1010,15 @@ class RemapsRightly(Careful):
         self.put(0x201, struct.pack("<iH", target, word))
         drive.obey(word)
         drive.target = target
+
+
+class AbortsAnswered(Careful):
+    """An abort that crosses the answer on the bus."""
+
+    def configure(self, drive):
+        super().configure(drive)
+        self.read(1, 0x1018, 1, 4)
+        self.put(0x601, b"\x80\x18\x10\x01" + struct.pack("<I", 0x05040000))
 
 
 class SkipsNow(Careful):

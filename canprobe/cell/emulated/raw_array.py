@@ -44,10 +44,9 @@ class RawArray(Participant):
         self.running = not wire.start
         self._due_ns: int | None = None
         self._span = wire.full_scale - wire.unloaded
-        spread = OFFSET_SHARE * self._span if wire.tare_images else 0.0
+        spread = OFFSET_SHARE * abs(self._span) if wire.tare_images else 0.0
         offsets = np.random.default_rng(seed).uniform(-spread, spread, array.pad.shape) if spread else 0.0
         self._unloaded = np.rint(wire.unloaded + np.zeros(array.pad.shape) + offsets)
-        self._largest = (1 << wire.image.bits) - 1
         self._waiting: list[tuple[int, list[Frame]]] = []
 
     @property
@@ -101,7 +100,7 @@ class RawArray(Participant):
         counts[:] = self._unloaded[:, :, None]
         counts[:, :, self._wire.normal] = np.rint(self._unloaded + self._span * loads)
         self._waiting.append(
-            (t_ns + self._latency_ns, image.encode(np.clip(counts, 0, self._largest).reshape(-1).tolist()))
+            (t_ns + self._latency_ns, image.encode(np.clip(counts, *image.range).reshape(-1).tolist()))
         )
 
     def _ready(self, t_ns: int) -> list[Frame]:

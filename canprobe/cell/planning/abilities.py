@@ -72,7 +72,7 @@ class Abilities:
         entry = self.description.entry(index, subindex)
         if entry is None or not (entry.in_tpdo if direction == "tpdo" else entry.in_rpdo):
             return None
-        return PdoEntry(index, subindex, entry.bits, entry.signed, entry.name)
+        return PdoEntry(index, subindex, entry.pdo_bits, entry.signed, entry.name)
 
     def dummy(self, data_type: int, bits: int) -> PdoEntry | None:
         """A dummy entry, None where DummyUsage does not allow it."""

@@ -60,7 +60,7 @@ def support_of(setup: Setup) -> Support | None:
     if array.pad.is_flat:
         lacks = "the array is flat"
     elif not array.pad.is_grid:
-        lacks = "the taxels are no grid"
+        lacks = "the taxels are no square grid"
     elif taxels < CURVATURE_TAXELS:
         lacks = f"fewer than {CURVATURE_TAXELS} taxels under the patch"
     return Support(taxels, taxels >= CENTROID_TAXELS, lacks)
@@ -80,6 +80,8 @@ def array_text(array: Array) -> str:
     taxels = f"{pad.rows}×{pad.columns} taxels"
     where = "flat" if pad.mount_radius_m is None else f"on a sphere of radius {1e3 * pad.mount_radius_m:g} mm"
     spread = f"{1e3 * pad.pitch_m:g} mm apart" if pad.is_grid else "at given places"
+    if pad.cell_m is not None:
+        spread = " × ".join(f"{1e3 * side:g}" for side in pad.cell_m) + " mm apart"
     return f"{array.name}: {taxels} {spread}, {where}"
 
 
@@ -90,13 +92,16 @@ def array_problems(setup: Setup) -> Iterator[str]:
         return
     if not array.pad.is_flat and array.pad.pitch_m > COARSE_SHARE * array.pad.radius_m:
         yield from _unreadable(array)
+    if not array.pad.is_grid and array.raw is None and array.mode != "image":
+        yield (
+            f'sensor.mode = "{array.mode}": the array {array.name} is no square grid, and has neither a window nor'
+            ' features; set sensor.mode = "image"'
+        )
     what = 'task.kind = "scan"' if setup.scan is not None else 'task.kind = "calibrate"'
     if setup.scan is not None or isinstance(task, Calibrate):
         needs = "its contact must be able to move over the sphere of a probe; press or listen with it"
         if array.pad.is_flat:
             yield f'{what}: the array {array.name} is flat (sensor.mount = "flat"): {needs}'
-        elif not array.pad.is_grid:
-            yield f"{what}: the array {array.name} is a list of taxels (sensor.positions_mm), no grid: {needs}"
         elif not support.centroid:
             covers = f"the patch covers {support.taxels:.1f} taxels"
             why = f"fewer than {CENTROID_TAXELS} show no place; raise task.force_n, or take a finer array"

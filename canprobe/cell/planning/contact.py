@@ -157,7 +157,7 @@ def edge_margin(task: Touch, kappa: Sequence[float] = (0.0, 0.0)) -> float:
         kappa: (2,) principal curvatures of the object there, 1/m.
     """
     array = task.array
-    if array.pad.is_flat or not array.pad.is_grid:
+    if array.pad.is_flat:
         return 0.0
     half_axis = pressed(task.force, task.probe, array, kappa).half_axis
     if array.mode == "features":
@@ -175,7 +175,7 @@ def edge_problem(task: Touch, joints: Floats, normals: Floats, kappas: Floats) -
         kappas: (m, 2) principal curvatures there, 1/m.
     """
     pad, probe, chain = task.array.pad, task.probe, task.arm.model.chain
-    if pad.is_flat or not pad.is_grid:
+    if pad.is_flat:
         return None
     axes = np.array([(forward(chain, q) @ probe.T_flange_probe)[:3, :3] for q in joints])
     x, y, z = -np.einsum("mij,mi->jm", axes, normals)  # from the probe's centre to the contact
@@ -183,13 +183,13 @@ def edge_problem(task: Touch, joints: Floats, normals: Floats, kappas: Floats) -
     angle = np.arctan2(sine, z)
     uv = np.abs(np.stack((x, y), axis=1)) * (probe.radius * angle / np.maximum(sine, 1e-300))[:, None]
     margins = np.array([edge_margin(task, kappa) for kappa in kappas.tolist()])
-    beyond = uv + margins[:, None] - 0.5 * pad.pitch_m * np.array((pad.columns, pad.rows))
+    beyond = uv + margins[:, None] - pad.half_sides_m
     worst = int(np.argmax(beyond.max(axis=1)))
     if beyond[worst].max() <= 0.0:
         return None
     axis = int(np.argmax(beyond[worst]))
     count, needs = (pad.columns, pad.rows)[axis], f"the patch at {task.force:g} N needs {1e3 * margins[worst]:.1f} mm"
-    half = 0.5 * pad.pitch_m * count
+    half = pad.half_sides_m[axis]
     if margins[worst] > half:
         return (
             f"sensor.{('columns', 'rows')[axis]} = {count}: the array is {2e3 * half:g} mm wide, and {needs} on each "

@@ -176,7 +176,7 @@ class PressureField:
 
 
 class ListField:
-    """A `PressureField` of taxels at given places: each is a separate square, without blur.
+    """A `PressureField` of taxels at given places: each is a separate rectangle, without blur.
 
     Args:
         radius_m: probe radius.
@@ -187,8 +187,8 @@ class ListField:
     def __init__(self, radius_m: float, pad: Pad, *, samples: int = 3) -> None:
         self.radius = radius_m
         self.shape = pad.shape
-        inside = ((np.arange(samples) + 0.5) / samples - 0.5) * pad.pitch_m
-        du, dv = np.meshgrid(inside, inside)
+        inside = (np.arange(samples) + 0.5) / samples - 0.5
+        du, dv = np.meshgrid(*(side * inside for side in pad.cell_m or (pad.pitch_m, pad.pitch_m)))
         u, v = (pad.uv[:, axis, None] + d.reshape(-1) for axis, d in ((0, du), (1, dv)))
         self._samples = _sample_rows(u, v, radius_m).reshape(5, -1)
         self._each = samples**2

@@ -115,8 +115,11 @@ class SensorSettings:
     """Rows of taxels."""
     columns: Annotated[int, Range(1, 64)] = 16
     """Columns of taxels."""
-    pitch_mm: Annotated[float, Range(0.1, 100)] = 1.5875
-    """Distance of neighbouring taxels. Its square is the area that one taxel stands for."""
+    pitch_mm: (
+        Annotated[float, Range(0.1, 100)] | tuple[Annotated[float, Range(0.1, 100)], Annotated[float, Range(0.1, 100)]]
+    ) = 1.5875
+    """Distance of neighbouring taxels, whose square is the area that one taxel stands for; or two distances, of the
+    columns and of the rows, and the area is their product."""
     positions_mm: tuple[Vec3, ...] | None = None
     """Position of each taxel on the array, row by row; z points out of it. Left out: a grid of `pitch_mm`."""
     normals: tuple[Vec3, ...] | None = None
@@ -171,9 +174,11 @@ class WireSettings:
     """Number of the value that is the normal pressure, from 1."""
     order: Annotated[Literal["rows", "columns"], RAW_ONLY] = "rows"
     """Taxels come row by row, or column by column."""
-    unloaded_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW_ONLY] = 0
+    signed: Annotated[bool, RAW_ONLY] = False
+    """Values are in two's complement, as those of magnetometers."""
+    unloaded_counts: Annotated[int, Range(-0x80000000, 0xFFFFFFFF), RAW_ONLY] = 0
     """Value of a taxel without load."""
-    full_scale_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW_ONLY] = 255
+    full_scale_counts: Annotated[int, Range(-0x80000000, 0xFFFFFFFF), RAW_ONLY] = 255
     """Value of a taxel at `sensor.full_scale_kpa`: below `unloaded_counts` where values fall with pressure."""
     tare_images: Annotated[int, Range(0, 10_000), RAW_ONLY] = 0
     """Images at the beginning of which the mean is the unloaded value of each taxel. 0: `unloaded_counts` is."""

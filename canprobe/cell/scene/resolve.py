@@ -176,15 +176,27 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
     positions, normals = (
         np.array(one) if one is not None else None for one in (settings.positions_mm, settings.normals)
     )
-    pad = Pad(
-        rows=settings.rows,
-        columns=settings.columns,
-        pitch_m=settings.pitch_mm * MM,
-        full_scale_pa=settings.full_scale_kpa * 1e3,
-        mount_radius_m=None if settings.mount == "flat" else radius,
-        positions=positions * MM if positions is not None else None,
-        normals=normals / np.linalg.norm(normals, axis=1, keepdims=True) if normals is not None else None,
-    )
+    pitch = settings.pitch_mm
+    full_scale, mount = settings.full_scale_kpa * 1e3, None if settings.mount == "flat" else radius
+    if positions is None or isinstance(pitch, tuple):
+        sides = pitch if isinstance(pitch, tuple) else (pitch, pitch)
+        pad = Pad.of_grid(
+            settings.rows,
+            settings.columns,
+            (sides[0] * MM, sides[1] * MM),
+            full_scale_pa=full_scale,
+            mount_radius_m=mount,
+        )
+    else:
+        pad = Pad(
+            settings.rows,
+            settings.columns,
+            pitch * MM,
+            full_scale,
+            mount,
+            positions=positions * MM,
+            normals=normals / np.linalg.norm(normals, axis=1, keepdims=True) if normals is not None else None,
+        )
     return Array(
         node_id=settings.node_id,
         channel=settings.channel or scene.bus.channel,

@@ -188,7 +188,7 @@ def _sensor_rate(cycle: float, sensor: float) -> _Complaint:
 
 
 @_across("sensor.rows", "sensor.columns", "sensor.pitch_mm", "sensor.positions_mm?", "sensor.normals?")
-def _taxel_positions(rows: int, columns: int, pitch: float, positions: object, normals: object) -> _Complaint:
+def _taxel_positions(rows: int, columns: int, pitch: object, positions: object, normals: object) -> _Complaint:
     if positions is None and normals is not None:
         yield "sensor.normals", "only with sensor.positions_mm"
     for key, points in (("positions_mm", positions), ("normals", normals)):
@@ -197,7 +197,9 @@ def _taxel_positions(rows: int, columns: int, pitch: float, positions: object, n
             yield f"sensor.{key}", f"{expects}, got {len(points)}"
     if isinstance(normals, tuple) and not all(any(normal) for normal in normals):
         yield "sensor.normals", "expected directions, got one that is all zero"
-    if isinstance(positions, tuple) and len(positions) == rows * columns > 1:
+    if isinstance(positions, tuple) and isinstance(pitch, tuple):
+        yield "sensor.pitch_mm", f"expected one distance with sensor.positions_mm, got {list(pitch)}"
+    elif isinstance(positions, tuple) and isinstance(pitch, float) and len(positions) == rows * columns > 1:
         yield from _taxels_apart(positions, pitch)
     if isinstance(normals, tuple) and sum(normal[2] for normal in normals) < 0.0:
         yield (
@@ -224,7 +226,7 @@ def _taxels_apart(positions: Sequence[Vec3], pitch: float) -> _Complaint:
 
 TINY_SHARE = 0.1
 """Width of an array over its pitch below which the places of its taxels are in another unit."""
-_WIRE = ("ids", "frames", "byte_order", "axes", "normal_axis", "unloaded_counts", "full_scale_counts", "poll")
+_WIRE = ("ids", "frames", "byte_order", "axes", "normal_axis", "signed", "unloaded_counts", "full_scale_counts", "poll")
 
 
 @_across("wire", "sensor.rows", "sensor.columns", "sensor.mode", "sensor.window", *(f"wire.{key}" for key in _WIRE))
@@ -265,15 +267,19 @@ def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Comp
             'not with wire.sampling = "sync": nothing is sampled before the cycle; give unloaded_counts',
         )
     try:
-        bits = image_format(wire, rows, columns).bits
+        image = image_format(wire, rows, columns)
     except ProtocolError as error:
         yield "wire.frames", str(error)
         return
-    if (counts := wire.full_scale_counts) >= 1 << bits:
-        yield (
-            "wire.full_scale_counts",
-            f"expected at most {(1 << bits) - 1} in {bits} bits of wire.frames, got {counts}",
-        )
+    low, high = image.range
+    for key, counts in (("unloaded_counts", wire.unloaded_counts), ("full_scale_counts", wire.full_scale_counts)):
+        if not low <= counts <= high:
+            kind = "signed" if wire.signed else "unsigned"
+            way = "; set wire.signed = true for two's complement" if counts < 0 and not wire.signed else ""
+            yield (
+                f"wire.{key}",
+                f"expected {low} to {high} in {image.bits} {kind} bits of wire.frames, got {counts}{way}",
+            )
 
 
 def image_format(wire: WireSettings, rows: int, columns: int) -> ImageFormat:
@@ -286,7 +292,7 @@ def image_format(wire: WireSettings, rows: int, columns: int) -> ImageFormat:
     for text in wire.ids:
         first, _, last = text.replace("h", "").partition("-")
         ids += range(int(first, 16), int(last or first, 16) + 1)
-    frames = tuple(FramePattern.parse(text, wire.byte_order) for text in wire.frames)
+    frames = tuple(FramePattern.parse(text, wire.byte_order, signed=wire.signed) for text in wire.frames)
     return ImageFormat(tuple(ids), frames, rows, columns, wire.axes, wire.order == "columns")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import re
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
@@ -21,6 +22,7 @@ from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.port import Port, TimedFrame, nothing
 from canprobe.fieldbus.bus.tapped import TappedPort
+from canprobe.fieldbus.eds.foreign_files import HEAD_BYTES, file_kind
 from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
@@ -227,8 +229,11 @@ class CandumpReader:
         """
         try:
             file = self._opened()
-            encoding = _ENCODINGS.get(file.peek(2)[:2], "ascii")
-            with TextIOWrapper(file, encoding, errors="replace") as lines:
+            head = file.peek(HEAD_BYTES)[:HEAD_BYTES]
+            with TextIOWrapper(file, _ENCODINGS.get(head[:2], "ascii"), errors="replace") as lines:
+                if (kind := file_kind(head)) is not None:
+                    way = f"; {kind.into_log.format(path=shlex.quote(str(self._path)))}" if kind.into_log else ""
+                    raise UsageError(f"{self._path}: {kind.name}, not a candump log{way}")
                 for self.number, line in enumerate(lines, 1):
                     text = line.rstrip("\r\n")
                     match = _LINE_PATTERN.fullmatch(text)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from canopen.objectdictionary import ObjectDictionary, datatypes
 
 from canprobe.fieldbus.eds.description import LAST_DUMMY, DescribedEntry, Description
-from canprobe.fieldbus.eds.values import REAL_FORMS, SIGNED_BITS, UNSIGNED_BITS
+from canprobe.fieldbus.eds.values import REAL_FORMS
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 
 Value = int | float | bytes
@@ -30,7 +30,8 @@ class Entry:
     Attributes:
         key: index << 8 | subindex.
         name: name in the EDS.
-        bits: length of a value of fixed size; 0 for strings and domains.
+        bits: length of a value of fixed size over SDO; 0 for strings and domains.
+        boolean: whether it is a BOOLEAN, which is one bit in a PDO.
         signed: whether an integer is signed.
         real: struct format of a REAL32 or REAL64; empty for other types.
         readable, writable: whether SDO may read and write it.
@@ -42,6 +43,7 @@ class Entry:
     key: int
     name: str
     bits: int
+    boolean: bool
     signed: bool
     real: str
     readable: bool
@@ -92,12 +94,12 @@ def read_entries(od: ObjectDictionary) -> Iterator[Entry]:
 
 def _entry(described: DescribedEntry) -> Entry:
     data_type = described.data_type
-    number = data_type in SIGNED_BITS or data_type in UNSIGNED_BITS or data_type in REAL_FORMS
-    bits = 8 if data_type == datatypes.BOOLEAN else described.bits if number else 0
+    bits = 8 if data_type == datatypes.BOOLEAN else described.bits
     return Entry(
         key=key_of(described.index, described.subindex),
         name=described.name,
         bits=bits,
+        boolean=data_type == datatypes.BOOLEAN,
         signed=described.signed,
         real=REAL_FORMS[data_type][0] if data_type in REAL_FORMS else "",
         readable=described.readable,
@@ -117,4 +119,4 @@ def _default(described: DescribedEntry, bits: int) -> Value:
     if isinstance(value, str):
         unicode = described.data_type == datatypes.UNICODE_STRING
         return value.encode("utf-16-le") if unicode else value.encode("latin-1", "replace")
-    return value
+    return int.from_bytes(value, "little") if bits and isinstance(value, bytes) else value

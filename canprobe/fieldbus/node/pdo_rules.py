@@ -95,6 +95,9 @@ class PdoRules:
         """
         target = self.dictionary.entries.get(word >> 8)
         mappable = target is not None and (fixed or (target.in_tpdo if self.transmits else target.in_rpdo))
-        if target is None or not mappable or target.real or not target.bits or target.bits != word & 0xFF:
+        length = word & 0xFF
+        if target is None or not mappable or target.real or not target.bits:
+            raise SdoAbort(Abort.NOT_MAPPABLE)
+        if length != target.bits and not (length == 1 and target.boolean):
             raise SdoAbort(Abort.NOT_MAPPABLE)
         return PdoEntry.from_word(word, target.signed, target.name)

@@ -180,6 +180,12 @@ class SlaveNode(Participant):
         self._run(t_ns)
         return self._taken()
 
+    def act(self, t_ns: int, act: Callable[[SlaveNode], object]) -> list[Frame]:
+        """Let the device do something by itself at `t_ns`, such as to report an error; return the frames."""
+        self._run(t_ns)
+        act(self)
+        return self._taken()
+
     def _run(self, t_ns: int) -> None:
         self.core.now_ns = t_ns
         self.application.advance(t_ns)

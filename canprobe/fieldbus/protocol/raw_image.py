@@ -33,15 +33,17 @@ class FramePattern:
         length: fewest bytes of the frame; what follows them is not read.
         mask, tag: bits that name the frame, and their values, in these bytes as one big-endian number.
         values: shifts of the nibbles of each value in that number, the most significant nibble first.
+        signed: whether values are in two's complement.
     """
 
     length: int
     mask: int
     tag: int
     values: tuple[tuple[int, ...], ...]
+    signed: bool = False
 
     @classmethod
-    def parse(cls, text: str, byte_order: str = "big") -> FramePattern:
+    def parse(cls, text: str, byte_order: str = "big", *, signed: bool = False) -> FramePattern:
         """Read a pattern from its text, as the module describes it.
 
         Raises:
@@ -68,7 +70,7 @@ class FramePattern:
             if byte_order == "little":
                 ordered = sorted(ordered, key=lambda place: (-(place // 2), place % 2))
             values.append(tuple(4 * (2 * length - 1 - place) for place in ordered))
-        return cls(length, mask, tag, tuple(values))
+        return cls(length, mask, tag, tuple(values), signed)
 
     def resembles(self, other: FramePattern) -> bool:
         """Whether there are bytes that match both frames."""
@@ -84,7 +86,8 @@ class FramePattern:
             value = 0
             for shift in shifts:
                 value = value << 4 | number >> shift & 0xF
-            values.append(value)
+            sign = 1 << 4 * len(shifts) - 1 if self.signed else 0
+            values.append((value ^ sign) - sign)
         return values
 
     def pack(self, values: Sequence[int]) -> bytes:
@@ -95,14 +98,21 @@ class FramePattern:
         """
         number = self.tag
         for value, shifts in zip(values, self.values, strict=True):
-            if not 0 <= value < 1 << 4 * len(shifts):
-                raise ProtocolError(f"value {value} has more than {4 * len(shifts)} bits")
+            low, high = value_range(4 * len(shifts), signed=self.signed)
+            if not low <= value <= high:
+                raise ProtocolError(f"value {value} does not fit {4 * len(shifts)} bits, {low} to {high}")
             for place, shift in enumerate(reversed(shifts)):
                 number |= (value >> 4 * place & 0xF) << shift
         return number.to_bytes(self.length, "big")
 
     def _number(self, data: bytes) -> int:
         return int.from_bytes(data[: self.length], "big")
+
+
+def value_range(bits: int, *, signed: bool) -> tuple[int, int]:
+    """Least and greatest value of so many bits."""
+    low = -(1 << bits - 1) if signed else 0
+    return low, low + (1 << bits) - 1
 
 
 @dataclass(frozen=True)
@@ -157,6 +167,11 @@ class ImageFormat:
     def bits(self) -> int:
         """Number of bits of the narrowest value."""
         return min(4 * len(shifts) for frame in self.frames for shifts in frame.values)
+
+    @property
+    def range(self) -> tuple[int, int]:
+        """Least and greatest count that every value can have."""
+        return value_range(self.bits, signed=any(frame.signed for frame in self.frames))
 
     @cached_property
     def _places(self) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ serves the nodes and another one writes the log; the master under test may live 
 from __future__ import annotations
 
 import re
+import struct
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -22,16 +23,19 @@ from typing import Self, TypeVar
 import canopen
 
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.candump import CandumpWriter
+from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
 from canprobe.fieldbus.bus.canopen_network import PortNetwork
 from canprobe.fieldbus.bus.clock import Clock, MonotonicClock, VirtualClock
-from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.drive.from_eds import make_eds_node
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.node.abort import SdoAbort
+from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.serve import serve
+from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
 
 T = TypeVar("T")
@@ -51,7 +55,7 @@ class EmulatedBus(ABC):
     Attributes:
         faulty: the emulated nodes.
         descriptions: what the EDS files say, by node id.
-        log: path of the candump log, whose time is 0 when the bus opens.
+        log: path of the candump log, whose time is 0 when the bus opens. It has each frame as soon as it was carried.
     """
 
     def __init__(self, channel: str, clock: Clock, log: Path) -> None:
@@ -62,7 +66,7 @@ class EmulatedBus(ABC):
         self._stack = ExitStack()
         self._writer = self._stack.enter_context(CandumpWriter(log, channel, self.start_ns))
 
-    def add_nodes(self, files: Sequence[tuple[str | Path, int]]) -> list[FaultyNode]:
+    def add_nodes(self, files: Sequence[tuple[str | Path, int]]) -> list[EmulatedNode]:
         """Power on a node from each EDS file.
 
         Args:
@@ -72,7 +76,7 @@ class EmulatedBus(ABC):
             EdsError: a file cannot be served.
             UsageError: a node id is taken.
         """
-        nodes = [FaultyNode(make_eds_node(load_eds(name, node_id), node_id)) for name, node_id in files]
+        nodes = [EmulatedNode(make_eds_node(load_eds(name, node_id), node_id), self) for name, node_id in files]
         self.power_on(nodes)
         self.descriptions |= {node_id: Description(load_eds(name, node_id)) for name, node_id in files}
         return nodes
@@ -104,6 +108,25 @@ class EmulatedBus(ABC):
             if node.node_id == fault.node_id:
                 self._act(node.node_id, partial(node.remove, fault))
 
+    def act(self, node: FaultyNode, do: Callable[[SlaveNode], T]) -> T:
+        """Let a device do something by itself, now; return what `do` returns. Its frames are sent."""
+        done: Future[T] = Future()
+
+        def act(slave: SlaveNode) -> None:
+            try:
+                done.set_result(do(slave))
+            except Exception as error:
+                done.set_exception(error)
+
+        self._act(node.node_id, partial(node.act, act))
+        self._wake()
+        return done.result(_PATIENCE_S)
+
+    def frames(self) -> list[TimedFrame]:
+        """The frames of the bus until now: identifier, data, and time since the bus opened, ns."""
+        self.flush()
+        return [(can_id, data, t_ns) for t_ns, _, can_id, data in read_candump(self.log)]
+
     @abstractmethod
     def network(self) -> canopen.Network:
         """A connected network of canopen-python with a method `pass_time(seconds)`."""
@@ -115,6 +138,10 @@ class EmulatedBus(ABC):
     def flush(self) -> None:
         """Write to the log what was recorded so far."""
         self._act(0, self._writer.flush)
+
+    @abstractmethod
+    def _wake(self) -> None:
+        """Let nodes do at once what has become due."""
 
     @abstractmethod
     def _attach(self, nodes: Sequence[FaultyNode]) -> None: ...
@@ -130,13 +157,76 @@ class EmulatedBus(ABC):
         self._stack.close()
 
 
+class EmulatedNode(FaultyNode):
+    """A node of the bus of a test, whose values a test reads and sets as the device itself does.
+
+        io[0x6401, 1] = 1234      # an analog input; a TPDO of an event goes out
+        io.emcy(0x5000)           # a fault of the hardware; io.emcy(0) ends it
+
+    A drive computes its position, velocity and statusword itself: what a test sets there lasts for an instant.
+
+    Args:
+        node: the node.
+        bus: the bus.
+    """
+
+    def __init__(self, node: SlaveNode, bus: EmulatedBus) -> None:
+        super().__init__(node)
+        self._bus = bus
+
+    def __getitem__(self, place: int | tuple[int, int]) -> Value:
+        """The value of an entry: `node[0x6041]`, `node[0x6401, 1]`. Raises UsageError where the EDS has none."""
+        index, subindex = self._known(place)
+        return self._bus.act(
+            self, lambda node: node.dictionary.find(index, subindex).from_bytes(node.dictionary.read(index, subindex))
+        )
+
+    def __setitem__(self, place: int | tuple[int, int], value: Value) -> None:
+        """Set the value of an entry. Raises UsageError where the EDS has none, or its type does not hold the value."""
+        index, subindex = self._known(place)
+        entry = self.node.dictionary.find(index, subindex)
+        try:
+            entry.from_bytes(entry.to_bytes(value))
+        except (SdoAbort, OverflowError, TypeError, ValueError, struct.error) as error:
+            kind = "bytes" if not entry.bits else f"a number of {entry.bits} bits, {'' if entry.signed else 'un'}signed"
+            raise UsageError(f"{self.name}: {index:04X}h:{subindex:02X}: expected {kind}, got {value!r}") from error
+
+        def put(node: SlaveNode) -> None:
+            node.dictionary.put(index, subindex, value)
+            node.pdos.event(index, subindex)
+
+        self._bus.act(self, put)
+
+    def emcy(self, code: int, data: bytes = b"") -> None:
+        """Report an error by EMCY, 1001h and 1003h, once until it ends; with code 0 end all errors.
+
+        Args:
+            code: emergency error code.
+            data: bytes of the manufacturer, up to five.
+        """
+
+        def report(node: SlaveNode) -> None:
+            if code:
+                node.emcy.report(code, data)
+            for one in () if code else node.emcy.active:
+                node.emcy.clear(one)
+
+        self._bus.act(self, report)
+
+    def _known(self, place: int | tuple[int, int]) -> tuple[int, int]:
+        index, subindex = (place, 0) if isinstance(place, int) else place
+        if key_of(index, subindex) not in self.node.dictionary:
+            raise UsageError(f"{self.name}: its EDS has no {index:04X}h:{subindex:02X}")
+        return index, subindex
+
+
 class VirtualTimeBus(EmulatedBus):
     """A bus in virtual time: nodes answer at once, and time passes in `pass_time` and in the waits of ports."""
 
     def __init__(self, log: Path) -> None:
         self._bus = LockstepBus(VirtualClock(), "can0")
         super().__init__(self._bus.channel, self._bus.clock, log)
-        self._bus.recorder = self._writer.write
+        self._bus.recorder = self._record
 
     def network(self) -> canopen.Network:
         """A network without a thread: see `PortNetwork`."""
@@ -156,6 +246,14 @@ class VirtualTimeBus(EmulatedBus):
     def _act(self, node_id: int, act: Callable[[], T]) -> T:
         self._bus.settle()
         return act()
+
+    def _wake(self) -> None:
+        self._bus.next_deadline_ns()  # the bus looks at the deadlines anew
+        self._bus.settle()
+
+    def _record(self, can_id: int, data: bytes, t_ns: int) -> None:
+        self._writer.write(can_id, data, t_ns)
+        self._writer.flush()
 
 
 class RealTimeNetwork(canopen.Network):
@@ -222,6 +320,7 @@ class ServedBus(EmulatedBus):
         while not ended():
             for frame in port.wait_and_drain(self.clock.now_ns() + _LOOK_NS):
                 self._writer.write(*frame)
+            self._writer.flush()
 
     def _act(self, node_id: int, act: Callable[[], T]) -> T:
         """Let the thread of the node do it, which looks for requests after each wait."""
@@ -241,6 +340,9 @@ class ServedBus(EmulatedBus):
         except TimeoutError:
             why = self._failures[0] if self._failures else None
             raise InterfaceError(f"{self.channel}: the emulated nodes are not served any more") from why
+
+    def _wake(self) -> None:
+        pass  # the thread of the nodes looks at their deadlines after each request
 
     def _start(self, node_ids: Sequence[int], loop: Callable[[Callable[[], bool]], None]) -> None:
         """Start a thread with a loop that asks after each wait whether to end; then it does what is requested."""

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
@@ -19,6 +21,7 @@ COUNTS_MAX = 255
 """Counts of an image at full scale; 0 is no pressure. What a device counts instead its wire converts."""
 THRESHOLD_COUNTS = 5
 """Least count of an image that is not taken as 0."""
+_RIM_DIRECTIONS = 32
 FLAT_RADIUS_M = 10.0
 """Radius of the sphere that a flat pad is taken for where a radius is needed: 8 µm deep over one inch."""
 
@@ -32,12 +35,14 @@ class Pad:
 
     Attributes:
         rows, columns: shape of the images.
-        pitch_m: distance of neighbours, m; its square is the area that one taxel stands for.
+        pitch_m: distance of neighbours, m; its square is the area that one taxel stands for. Of a grid with two
+            distances it is the root of their product.
         full_scale_pa: pressure at `COUNTS_MAX` counts, Pa.
         mount_radius_m: radius of the sphere that the array is wrapped on, m; None for a flat array.
         positions: (rows · columns, 3) places of listed taxels, m; None for a grid of the pitch.
         normals: (rows · columns, 3) outward unit normals of listed taxels; None: a grid has those of its sphere, a list
             has z.
+        cell_m: sides along u and v of the area that a listed taxel stands for, m; None: a square of the pitch.
     """
 
     rows: int = 16
@@ -47,6 +52,17 @@ class Pad:
     mount_radius_m: float | None = 0.040
     positions: Floats | None = None
     normals: Floats | None = None
+    cell_m: tuple[float, float] | None = None
+
+    @classmethod
+    def of_grid(cls, rows: int, columns: int, pitches_m: tuple[float, float], **more: Any) -> Pad:
+        """The pad of a grid with distances of its columns and of its rows; where they differ, a list of taxels."""
+        u_pitch, v_pitch = pitches_m
+        if u_pitch == v_pitch:
+            return cls(rows, columns, u_pitch, **more)
+        v, u = np.meshgrid(v_pitch * _centred(rows), u_pitch * _centred(columns), indexing="ij")
+        places = np.stack((u, v, np.zeros_like(u)), axis=-1).reshape(-1, 3)
+        return cls(rows, columns, math.sqrt(u_pitch * v_pitch), positions=places, cell_m=pitches_m, **more)
 
     def __post_init__(self) -> None:
         for name in ("pitch_m", "full_scale_pa", "radius_m"):
@@ -82,7 +98,7 @@ class Pad:
 
     @property
     def is_grid(self) -> bool:
-        """Whether the taxels are a grid of rows, columns and pitch; a scan needs a grid."""
+        """Whether the taxels are a grid of rows, columns and one pitch, whose patches show the curvature."""
         return self.positions is None
 
     @property
@@ -95,7 +111,22 @@ class Pad:
         """Distance from the middle to the nearest edge, m."""
         if self.positions is None:
             return 0.5 * min(self.shape) * self.pitch_m
-        return float(np.abs(self.uv).max(axis=0).min()) + 0.5 * self.pitch_m
+        return float(self.half_sides_m.min())
+
+    @property
+    def half_sides_m(self) -> Floats:
+        """(2,) distances along u and v from the middle to the edges, m."""
+        if self.positions is None:
+            return 0.5 * self.pitch_m * np.array((self.columns, self.rows), dtype=np.float64)
+        half: Floats = np.abs(self.uv).max(axis=0) + 0.5 * np.array(self.cell_m or (self.pitch_m, self.pitch_m))
+        return half
+
+    @cached_property
+    def rim(self) -> NDArray[np.intp]:
+        """Numbers of the listed taxels at the edge: none lies more than half a pitch beyond them in some direction."""
+        angles = np.arange(_RIM_DIRECTIONS) * (2.0 * math.pi / _RIM_DIRECTIONS)
+        along = self.uv @ np.stack((np.cos(angles), np.sin(angles)))
+        return np.flatnonzero((along >= along.max(axis=0) - 0.5 * self.pitch_m).any(axis=1))
 
     @cached_property
     def uv(self) -> Floats:
@@ -110,10 +141,15 @@ class Pad:
         """(rows · columns,) area that each taxel stands for, m².
 
         A taxel of a grid on a sphere has `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R. A listed taxel has the part of its
-        area across z, so that pressure times area is the force along z.
+        area across z, so that pressure times area is the force along z; on a sphere without normals that of a grid.
         """
         if self.positions is not None:
-            tilt = 1.0 if self.normals is None else np.asarray(self.normals, dtype=np.float64)[:, 2]
+            if self.normals is not None:
+                tilt = np.asarray(self.normals, dtype=np.float64)[:, 2]
+            elif self.is_flat:
+                tilt = np.ones(self.taxels)
+            else:
+                tilt = np.sinc(np.hypot(*self.uv.T) / self.radius_m / math.pi)
             return _read_only(np.full(self.taxels, self.pitch_m**2) * tilt)
         angle = np.hypot(*self.uv.T) / self.radius_m
         return _read_only(self.pitch_m**2 * np.sinc(angle / math.pi))

@@ -224,9 +224,69 @@ def test_an_array_may_come_on_its_own_sphere(tmp_path):
     assert (setup.array.pad.mount_radius_m, setup.probe.radius) == (0.02, 0.02)
 
 
+HEXAGONAL = [
+    [round((column - 7.5) * 1.55 + (0.4 if row % 2 else -0.4), 3), round((row - 7.5) * 1.6, 3), 0]
+    for row in range(16)
+    for column in range(16)
+]
+SCANNING = {
+    "two pitches": 'rows = 14\ncolumns = 16\npitch_mm = [1.4, 1.9]\nmode = "image"\nrate_hz = 100\nchannel = "can1"',
+    "places": f'pitch_mm = 1.575\npositions_mm = {HEXAGONAL}\nmode = "image"\nrate_hz = 100\nchannel = "can1"',
+    "signed, falling, tared": f"""pitch_mm = 1.575
+positions_mm = {HEXAGONAL}
+mode = "image"
+rate_hz = 80
+channel = "can1"
+[wire]
+kind = "frames"
+ids = ["300h-33Fh"]
+frames = ["aaaa bbbb cccc dddd"]
+byte_order = "little"
+signed = true
+unloaded_counts = -120
+full_scale_counts = -30000
+tare_images = 20""",
+}
+
+
+@pytest.mark.parametrize("array", SCANNING)
+def test_an_array_that_is_no_square_grid_scans(array, tmp_path):
+    scene = touch(SCANNING[array])
+    bus = "lockstep" if "wire" in SCANNING[array] else "direct"
+    result = canprobe.run(scene, bus=bus, duration_s=1.5, out=tmp_path / "run")
+    summary = result.summary
+    assert summary["completed"] and summary["contact"]["contact_fraction"] == 1.0
+    assert abs(summary["contact"]["force_true_bias_n"]) < 0.06, "3 % of 2 N: the model is that of separate taxels"
+    assert summary["shape"]["kappa_est_per_m"][0] == pytest.approx(1 / 0.036, rel=0.1), "by the motion alone"
+
+
+def test_a_scan_that_would_leave_a_list_is_refused():
+    small = [[x, y, 0] for y in range(-2, 3) for x in range(-2, 3)]
+    sensor = f'rows = 5\ncolumns = 5\npitch_mm = 1\npositions_mm = {small}\nmode = "image"\nrate_hz = 100'
+    with pytest.raises(PlanError, match=r"would run off the array: .* of the array, which reaches 2\.5 mm"):
+        plan_of(touch(sensor + '\nchannel = "can1"'))
+
+
+@pytest.mark.parametrize("mode", ["window", "features"])
+def test_a_list_has_neither_window_nor_features(mode):
+    sensor = SCANNING["places"].replace('mode = "image"', f'mode = "{mode}"')
+    with pytest.raises(PlanError, match=rf'sensor\.mode = "{mode}": .* set sensor\.mode = "image"'):
+        plan_of(touch(sensor, "press"))
+
+
 @pytest.mark.parametrize(
     ("sensor", "problem"),
     [
+        ("pitch_mm = [1, 2, 3]", "sensor.pitch_mm: expected"),
+        (
+            "rows = 1\ncolumns = 1\npitch_mm = [1, 2]\npositions_mm = [[0, 0, 0]]",
+            "expected one distance with sensor.positions_mm",
+        ),
+        ('array = "uskin4x4"\n[wire]\nunloaded_counts = -5', "set wire.signed = true for two's complement"),
+        (
+            'array = "uskin4x4"\n[wire]\nsigned = true\nfull_scale_counts = 40000',
+            "expected -32768 to 32767 in 16 signed bits",
+        ),
         ('array = "inch61"', "did you mean inch16?"),
         ("rows = 20", 'sensor.rows: expected at most 16 with wire.kind = "canopen"'),
         ("rows = 6\ncolumns = 6", "sensor.window: expected at most the 6 taxels"),

@@ -74,6 +74,24 @@ def test_a_cell_of_one_make_moves(tmp_path, make):
     assert_first_targets_are_positions(plan, frames)
 
 
+def test_a_fixed_mapping_with_booleans_is_read_bit_by_bit(tmp_path):
+    """BOOLEANs of one bit between statusword and position: all behind them lies across the bytes."""
+    make = MAKES["fixed_mapping"]()
+    objects = dict(make.objects)
+    objects |= {(0x2010, n): Entry(f"Switch {n}", "BOOL", "ro", n % 2, mappable=True) for n in range(1, 4)}
+    objects[0x2010, 0] = Entry("Highest sub-index supported", "U8", "ro", 3)
+    without(objects, 0x1802, 0x1A02)
+    switches = [word(0x2010, n, 1) for n in (1, 2, 3)]
+    objects |= pdo("tpdo", 3, (word(0x6041, 0, 16), *switches, word(0x6064, 0, 32)), fixed=True)
+    plan = canprobe.plan(scene_of(replace(make, name="switches", objects=objects), tmp_path))
+    _, way, frames = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+    (feedback,) = plan.pdos_of(1, "tpdo")
+    assert feedback.layout.length == 7
+    data = [data for can_id, data in frames if can_id == feedback.cob_id][-1]
+    assert feedback.layout.unpack(data)[1:4] == (1, 0, 1)
+
+
 def assert_first_targets_are_positions(plan, frames):
     """Of each drive: its first RPDO has the position of its first TPDO, whatever 607Ah holds as delivered."""
     for node in plan.nodes:

@@ -138,7 +138,7 @@ def test_counts_that_do_not_fit_the_field_are_refused():
     wire = '[wire]\nkind = "frames"\nids = ["480h"]\nframes = ["aa bb cc dd"]\nsampling = "free"\nunloaded_counts = 1\n'
     text = '[scene]\nname = "mine"\n[task]\nkind = "press"\n[object]\nkind = "plane"\n'
     text += '[sensor]\nrows = 2\ncolumns = 2\nmode = "image"\n'
-    with pytest.raises(SceneError, match=r"wire\.full_scale_counts: expected at most 255 in 8 bits .* got 256"):
+    with pytest.raises(SceneError, match=r"wire\.full_scale_counts: expected 0 to 255 in 8 unsigned bits .* got 256"):
         parse_scene(f"{text}{wire}full_scale_counts = 256\n")
 
 

@@ -1,7 +1,12 @@
 """candump logs: written and read back, against lines that candump itself writes."""
 
 import contextlib
+import gzip
+import lzma
 import os
+import re
+import struct
+import subprocess
 import threading
 from pathlib import Path
 
@@ -102,6 +107,41 @@ def test_a_log_that_another_system_wrote_again_is_read(tmp_path: Path, encoding:
     log = tmp_path / "bus.log"
     log.write_text("".join(f"{line}\r\n" for line, _ in LINES), encoding=encoding)
     assert list(read_candump(log)) == [frame for _, frame in LINES]
+
+
+PCAP = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 227)
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "told"),
+    [
+        ("a b.pcap", PCAP, "a capture of tcpdump or Wireshark (pcap), not a candump log; type: tshark -r '"),
+        ("x.pcap", struct.pack(">I", 0xA1B23C4D), "a capture of tcpdump or Wireshark (pcap), not a candump log"),
+        ("x.pcapng", b"\n\r\r\n\x1c\0\0\0", "a capture of Wireshark (pcapng), not a candump log; type: tshark -r"),
+        (
+            "x.log.gz",
+            gzip.compress(b"(1.000000) can0 123#00\n"),
+            "compressed by gzip, not a candump log; type: zcat < ",
+        ),
+        ("x.log.xz", lzma.compress(b"(1.000000) can0 123#00\n"), "compressed by xz, not a candump log; type: xzcat < "),
+        ("x.blf", b"LOGG" + bytes(140), "a log of Vector's tools (BLF), not a candump log; type: can_logconvert"),
+        ("x.xdd", b"<?xml version='1.0'?>\n", "XML, as XDD and XDC files are, not a candump log"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_as_what_it_is(tmp_path: Path, name: str, head: bytes, told: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(head)
+    with pytest.raises(UsageError, match=re.escape(f"{path}: {told}")):
+        list(read_candump(path))
+
+
+def test_the_way_out_of_a_compressed_log_works_as_it_is_typed(tmp_path: Path) -> None:
+    path = tmp_path / "my log.gz"
+    path.write_bytes(gzip.compress(b"(1.000000) can0 123#00\n"))
+    with pytest.raises(UsageError) as raised:
+        list(read_candump(path))
+    subprocess.run(str(raised.value).rpartition("type: ")[2], shell=True, check=True, cwd=tmp_path)
+    assert list(read_candump(tmp_path / "bus.log")) == [(1_000_000_000, "can0", 0x123, b"\0")]
 
 
 @pytest.mark.parametrize(

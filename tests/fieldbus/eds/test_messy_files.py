@@ -1,5 +1,6 @@
 """Files as vendors ship them. Each file says itself what is wrong with the line below: `; expect: warning TEXT`."""
 
+import gzip
 import io
 import random
 import re
@@ -94,6 +95,13 @@ VALUES = {
     "orphans.eds": {(0x2000, 0): 2, (0x2000, 2): 5, (0x2002, 1): 6, (0x2003, 0): 3},
     "stray_lines.eds": {(0x2000, 0): 1},
     "mappings.eds": {(0x1A02, 2): 0x20000008},
+    "pdo_entries.eds": {
+        (0x1005, 0): 0x80,
+        (0x1014, 0): 0x85,
+        (0x1800, 1): 0x185,
+        (0x1804, 1): 0x80000000,
+        (0x2003, 0): 0x010203040506.to_bytes(6, "little"),
+    },
     "dummies.eds": {(0x1600, 1): 0x00040020},
     "no_statusword.eds": {(0x6040, 0): 0},
     "untold_drive.eds": {(0x1000, 0): 0x20192, (0x1018, 1): 0xFB, (0x1018, 2): 0x62100000, (0x1018, 3): None},
@@ -293,6 +301,55 @@ def test_every_value_is_served_over_sdo(path):
             assert not any(answer), "without a value in the file: zeros"
     assert read >= 3
     assert upload(node, 0x5FFF, 0) == 0x06020000
+
+
+def test_booleans_are_bits_in_a_pdo_and_a_time_has_48():
+    """Left is 1, right 0, the level 1234h behind them; TPDO2 and TPDO4, which do not fit, are empty."""
+    node = make_eds_node(check_eds(FOLDER / "pdo_entries.eds", NODE_ID).usable(), NODE_ID)
+    node.start(0)
+    sent = dict(node.receive(0, bytes((1, NODE_ID)), 0))
+    assert sent[0x185] == (1 | 0x1234 << 2).to_bytes(3, "little")
+    assert sent[0x385] == 0x010203040506.to_bytes(6, "little")
+    assert not {0x285, 0x485} & sent.keys()
+    assert upload(node, 0x2000, 0) == b"\1" and upload(node, 0x2001, 0) == b"\0"
+    sent = dict(node.receive(0x605, bytes.fromhex("2f01200001000000"), 0))
+    assert sent[0x185] == (3 | 0x1234 << 2).to_bytes(3, "little"), "an event of one bit"
+
+
+def test_a_boolean_may_be_mapped_as_a_bit_or_as_a_byte_and_as_nothing_else():
+    node = make_eds_node(check_eds(FOLDER / "pdo_entries.eds", NODE_ID).usable(), NODE_ID)
+    node.start(0)
+
+    def write(text):
+        ((_, answer),) = node.receive(0x605, bytes.fromhex(text), 0)
+        return answer[0] == 0x60
+
+    assert write("2300180185010080") and write("2f001a0000000000")
+    assert [bits for bits in range(1, 33) if write(f"23001a01{bits:02x}000020")] == [1, 8]
+
+
+@pytest.mark.parametrize(
+    ("head", "told"),
+    [
+        (
+            b"<?xml version='1.0'?><ISO15745ProfileContainer/>",
+            "XML, as XDD and XDC files are, not an EDS file; export it",
+        ),
+        (b"\xef\xbb\xbf\r\n  <ISO15745ProfileContainer>", "XML, as XDD and XDC files are, not an EDS file; export it"),
+        ("<?xml version='1.0'?>".encode("utf-16"), "XML, as XDD and XDC files are, not an EDS file; export it"),
+        (gzip.compress(b"[FileInfo]"), "compressed by gzip, not an EDS file; type: zcat < "),
+        (b"PK\3\4....", "compressed by zip, not an EDS file; type: unzip -p "),
+        (b"\xd4\xc3\xb2\xa1\2\0\4\0", "a capture of tcpdump or Wireshark (pcap), not an EDS file"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_as_what_it_is(head, told, tmp_path):
+    path = tmp_path / "some device.eds"
+    path.write_bytes(head)
+    with pytest.raises(EdsError, match=re.escape(told)) as raised:
+        load_eds(path, NODE_ID)
+    assert len(str(raised.value).splitlines()) == 1
+    if "type:" in told:
+        assert f"'{path}' > device.eds" in str(raised.value)
 
 
 def test_the_vendors_drive_moves_an_axis_of_its_own():

@@ -118,10 +118,32 @@ def test_no_bytes_make_it_fail(name, frames):
         (lambda: ImageFormat((1,), (FramePattern.parse("B1 tt"), FramePattern.parse(".. tt")), 1, 2), "own tag"),
         (lambda: ImageFormat((1,), (FramePattern.parse("tt uu"),), 1, 3), "carry 2 values"),
         (lambda: FramePattern.parse("t").pack([16]), "two characters"),
-        (lambda: FramePattern.parse(".t").pack([16]), "more than 4 bits"),
+        (lambda: FramePattern.parse(".t").pack([16]), "does not fit 4 bits, 0 to 15"),
         (lambda: FORMATS["uskin4x4"].encode([0] * 16), "expected 48 counts, got 16"),
     ],
 )
 def test_what_contradicts_itself_is_refused(build, words):
     with pytest.raises(ProtocolError, match=words):
         build()
+
+
+@pytest.mark.parametrize(
+    ("text", "order", "data", "values"),
+    [
+        ("xxxx yyyy", "big", "ff88 0078", [-120, 120]),
+        ("xxxx yyyy", "little", "88ff ff7f", [-120, 32767]),
+        ("xxxx yyyy", "big", "8000 7fff", [-32768, 32767]),
+        ("aa bb", "big", "80 7f", [-128, 127]),
+        ("aab bb", "big", "800 7ff", [-2048, 2047]),
+        ("xxxxxx ..", "little", "ffffff 00", [-1]),
+    ],
+)
+def test_signed_values_are_in_twos_complement(text, order, data, values):
+    pattern = FramePattern.parse(text.replace("aab bb", "aa ab bb"), order, signed=True)
+    raw = bytes.fromhex(data.replace(" ", ""))
+    assert pattern.unpack(raw) == values
+    assert pattern.unpack(pattern.pack(values)) == values
+    width = 4 * len(pattern.values[0])
+    for beyond in (1 << width - 1, -(1 << width - 1) - 1):
+        with pytest.raises(ProtocolError, match=f"does not fit {width} bits"):
+            pattern.pack([beyond, *values[1:]])

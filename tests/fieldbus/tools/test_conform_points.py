@@ -31,7 +31,7 @@ from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.timed import TimedBus
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.quirks import Quirks
-from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.node.slave_node import Application, SlaveNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, NmtState
 from canprobe.fieldbus.tools.conform import POINTS, ExaminationSettings, WriteList
@@ -236,6 +236,7 @@ DEFECTS = {
             [(TPDO, "00" * 8)] if (i, text) == (0x80, "") and state(d) == NmtState.PRE_OPERATIONAL else None
         )
     ),
+    "nmt 7 operational": nmt(0x01, lambda d: [(EMCY, "2032010000000000")]),
     "nmt 7 transitions": nmt(0x01, lambda d: [] if state(d) == NmtState.STOPPED else None),
     "heartbeat 8 producer": hears(one_more_beat),
     "heartbeat 9 guarding": rewrites(HEARTBEAT, "", lambda text: f"{int(text, 16) & 0x7F:02x}"),
@@ -259,6 +260,7 @@ DEFECTS = {
     "pdo 38 dummies": answers("2300160108000500", "8000160141000406"),
     "pdo 38 dummies in a TPDO": accepts("23001a0120000700"),
     "pdo 83 mapped entries": answers("40011a01", "43011a012000ff20"),
+    "pdo 83 heard lengths": rewrites(TPDO + 0x100, "", lambda text: text[:-2]),
     "pdo 84 mapped anew": answers("2f001a0002", "80001a0041000406"),
     "pdo 85 what the EDS lets map": answers("23001a0120000520", "80001a0141000406", when=lambda d: not valid(d)),
     "pdo 30 type 1": rewrites(TPDO, "", lambda text: text + "00" if len(text) < 16 else text[:-2]),
@@ -334,8 +336,8 @@ DRIVE_DEFECTS = {
     "drive402 54 handshake of profile position": status(lambda d, word: word & ~(1 << 12), mode=1),
     "drive402 55 homing": status(lambda d, word: word | 1 << 13 if word & 0x6F == 0x27 else word, mode=6),
 }
-ALSO = {"emcy 43 identifier": {"sync 40 wrong length"}}
-"""EMCY under another identifier is missed by a point that waits for it."""
+ALSO = {"emcy 43 identifier": {"sync 40 wrong length"}, "pdo 30 type 1": {"pdo 83 heard lengths"}}
+"""EMCY under another identifier is missed by a point that waits for it; a TPDO that is too short is heard by both."""
 INFORMATION = {"objects 81 defaults"}
 """It notes what differs, and never fails."""
 WITHOUT_MOTION = {"drive402 48 statusword", "drive402 53 supported modes"}
@@ -391,6 +393,104 @@ def test_a_defect_is_found_by_its_point_alone(title, whole_eds):
     device = whole(whole_eds, DEFECTS[title])
     found = failed(device.run(replace(PERMITTED, ask=device.switch)))
     assert found.keys() == {title} | ALSO.get(title, set()), found
+
+
+class Undervoltage(Application):
+    """An error that stays: the device reports it after each boot-up; 1001h and 1003h have it."""
+
+    def attach(self, node):
+        self.node = node
+
+    def entered(self, t_ns):
+        if self.node.state is NmtState.PRE_OPERATIONAL:
+            self.node.emcy.report(0x3220)
+
+
+def kept_out_by(error):
+    return {
+        "an EMCY with the start": nmt(0x01, lambda d: [(EMCY, error)]),
+        "left again at once": nmt(0x01, lambda d: [*d.take(0, "0105"), (EMCY, error), *d.take(0, "8005")]),
+        "no EMCY at all": nmt(0x01, lambda d: []),
+    }
+
+
+@pytest.mark.parametrize("way", kept_out_by(""))
+def test_what_keeps_the_device_out_of_operational_is_reported_once(way, whole_eds):
+    report = whole(whole_eds, kept_out_by("2032050000000000")[way]).run()
+    found = failed(report)
+    assert found.keys() == {"nmt 7 operational"}, found
+    cause = "1001h is 00h, and no EMCY came" if way == "no EMCY at all" else "EMCY 3220h (DC link under-voltage)"
+    assert cause in found["nmt 7 operational"] and "NMT start leads to state 7Fh" in found["nmt 7 operational"]
+    assert cause in report.facts["warning"]
+    others = [row for row in report.rows if row.detail.startswith("it needs operational")]
+    assert len(others) > 15 and all(row.verdict is Verdict.NOT_APPLICABLE for row in others)
+
+
+def test_an_error_that_stands_before_the_first_point_fails_no_point(whole_eds):
+    od = load_eds(whole_eds, NODE_ID)
+    for points in (POINTS, [point for point in POINTS if point.group == "nmt"]):
+        report = Examined(SlaveNode(od, NODE_ID, Undervoltage(), od_of=partial(load_eds, whole_eds)), od).run(
+            points=points
+        )
+        assert failed(report) == {}
+        assert report.facts["error before the first point"] == "EMCY 3220h (DC link under-voltage)"
+
+
+@pytest.mark.parametrize("after_ms", [0.4, 4.0])
+def test_an_answer_that_was_under_way_at_the_reset_is_none_of_the_initialisation(after_ms, whole_eds):
+    def late(device, can_id, text):
+        if can_id == REQUEST and state(device) == 0 and not device.count:
+            device.count = 1
+            device.later(after_ms, ANSWER, "4300100012000000")
+
+    assert failed(whole(whole_eds, hears(late)).run(points=[p for p in POINTS if p.number == 4])) == {}
+
+
+def test_an_answer_in_the_initialisation_is_told_with_both_times(whole_eds):
+    device = whole(whole_eds, DEFECTS["nmt 4 initialisation"])
+    (detail,) = failed(device.run(points=[p for p in POINTS if p.number == 4])).values()
+    assert detail == "an SDO request is answered 20.0 ms after the reset command and 80.0 ms before the boot-up"
+
+
+def watches_from_the_last_sync(device, can_id, text):
+    """It watches SYNC from the last one on, however long ago, once 1006h is set; and tells the error once."""
+    if can_id == 0x80:
+        device.synced_ns = device.t_ns
+    period_ns = device.number(0x1006) * 1000
+    began_ns = getattr(device, "synced_ns", None)
+    if period_ns and began_ns is not None and device.t_ns - began_ns > 1.5 * period_ns and can_id == 0:
+        return [*device.take(can_id, text), (EMCY, "0081110000000000")]
+    return None
+
+
+@pytest.mark.parametrize("before", [(), (30,), (30, 40, 101)])
+def test_the_verdict_on_lost_sync_does_not_depend_on_the_points_before(before, whole_eds):
+    points = [point for point in POINTS if point.number in before and point.group != "sync"]
+    points += [point for point in POINTS if point.number == 41 or (point.number in before and point.group == "sync")]
+    report = whole(whole_eds, hears(watches_from_the_last_sync)).run(points=points)
+    assert failed(report) == {}
+    (row,) = (row for row in report.rows if row.name == "41 lost SYNC")
+    assert row.verdict is Verdict.PASS
+
+
+@pytest.mark.parametrize(
+    ("can_id", "prefix", "change", "told"),
+    [
+        (0x285, "", lambda text: text[:-2], "TPDO 285h (1801h) has 3 bytes, its mapping 4"),
+        (0x285, "", lambda text: text + "00", "TPDO 285h (1801h) has 5 bytes, its mapping 4"),
+        (0x185, "", lambda text: text[:-2], "TPDO 185h (1800h) has 7 bytes, its mapping 8"),
+    ],
+)
+def test_every_tpdo_that_is_heard_is_compared_with_its_mapping(can_id, prefix, change, told, whole_eds):
+    points = [point for point in POINTS if point.title == "83 heard lengths"]
+    device = whole(whole_eds, rewrites(can_id, prefix, change))
+    assert failed(device.run(points=points)) == {"pdo 83 heard lengths": told}
+
+
+def test_left_out_is_what_was_asked_for(whole_eds):
+    chosen = whole(whole_eds).run(points=[point for point in POINTS if point.number == 28])
+    assert chosen.left_out == []
+    assert any("1010h" in what for what, _ in whole(whole_eds).run().left_out)
 
 
 @pytest.mark.parametrize("title", DRIVE_DEFECTS)

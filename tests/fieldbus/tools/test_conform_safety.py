@@ -6,6 +6,7 @@ import json
 import random
 
 import pytest
+from defects import rewrites
 from examined import NODE_ID, eds_device, failed
 
 from canprobe.errors import NodeError, UsageError
@@ -217,6 +218,14 @@ def test_beside_others_it_leaves_out_what_could_disturb_them(frame, never):
     assert any("alone" in why for _, why in report.left_out)
     assert {row.verdict for row in report.rows if row.group == "lss"} == {Verdict.NOT_APPLICABLE}
     assert ("warning" in report.facts) is (frame[0] in (0x000, 0x609))  # who commands may also watch its heartbeat
+
+
+def test_tpdos_that_others_ask_for_are_compared_without_a_command():
+    """Another master has started the device, and sends SYNC: its TPDOs were heard before the first point."""
+    short = rewrites(0x185, "", lambda text: text[:-2])
+    device = eds_device(others=[Talker(0x000, b"\x01\x05"), Talker(0x80, b"")], wrap=short)
+    assert failed(device.run()) == {"pdo 83 heard lengths": "TPDO 185h (1800h) has 7 bytes, its mapping 8"}
+    assert not {0x000, 0x080} & {can_id for can_id, _ in device.port.sent}
 
 
 def test_it_does_not_begin_beside_another_client_of_the_device():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
-from scripted_masters import Careful, Master, all_masters
+from scripted_masters import Careful, DrivesMuteAxis, Master, MutePassedOver, all_masters
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
@@ -42,6 +42,12 @@ def test_a_bad_master_raises_its_rule_alone(master):
 
 def test_every_rule_has_a_bad_master():
     assert {number for master in BAD for number in master.numbers} == {rule.number for rule in RULES}
+
+
+@pytest.mark.parametrize(("master", "number", "judged_times"), [(DrivesMuteAxis, 46, 0), (MutePassedOver, 46, 1)])
+def test_a_mute_axis_that_is_alone_has_no_others_to_stop(master, number, judged_times):
+    (rule,) = (rule for rule in judged(master()).rules if rule.number == number)
+    assert rule.looked == judged_times
 
 
 @pytest.mark.parametrize("seed", range(3))

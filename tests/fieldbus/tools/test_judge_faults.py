@@ -112,7 +112,7 @@ def test_a_careful_master_answers_in_time_and_nothing_is_found():
     [
         ("mute", {20}),
         ("deaf", {20}),
-        ("mute at 2 s for 2 s", {46}),
+        ("mute at 2 s for 2 s", {19, 46}),
         ("heartbeat-off at 2 s for 2 s", {19}),
         ("reboot at 2 s", {21}),
         ("nmt command=2 at 2 s for 1 s", {42}),

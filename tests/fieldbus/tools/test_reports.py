@@ -20,6 +20,7 @@ from canprobe.fieldbus.tools.reports import (
     read_json,
     report_document,
     row_text,
+    verdict_text,
     write_html,
     write_json,
     write_junit,
@@ -171,7 +172,7 @@ def test_a_device_may_have_sent_any_text(tmp_path_factory, rows, text):
     write_html(report, place / "report.html")
     Page(place / "report.html")
     append_step_summary(report, {"GITHUB_STEP_SUMMARY": str(place / "summary.md")})
-    shown = "\n".join([closing_text(report), *map(row_text, rows)])
+    shown = "\n".join([verdict_text(report), closing_text(report), *map(row_text, rows)])
     assert not [char for char in shown if not char.isprintable() and char not in "\n\t"]
 
 
@@ -192,6 +193,46 @@ def test_the_text_of_a_row_and_the_closing_table():
         "by hand: switch the supply off and on",
         "log: conform.log",
     ]
+
+
+def test_the_verdict_comes_in_some_lines():
+    report = example()
+    assert verdict_text(report, compare(report, report)).splitlines() == [
+        "drive.eds at node 1: 1 of 3 points FAIL",
+        "2 pass, 1 FAIL, 1 n/a, 1 ERROR",
+        "FAIL   sdo 11 below min: the write of a value below the least one was accepted [CiA 301 7.2.4.3]",
+        "ERROR  pdo 30 type 1: the bus was off",
+        "baseline: as in the baseline",
+        "log: conform.log",
+    ]
+    report = Report("conform", "a device", rows=[ReportRow("sdo", f"{n}", Verdict.FAIL, detail="x") for n in range(9)])
+    assert verdict_text(report).splitlines()[-1] == "       and 6 more"
+    ended = [ReportRow("sdo", f"{n}", Verdict.ERROR, detail="not examined: the power is on") for n in range(5)]
+    assert verdict_text(Report("conform", "a device", rows=ended)).splitlines() == [
+        "a device: not examined to the end",
+        "5 ERROR",
+        "ERROR  sdo 0 (and 4 more): not examined: the power is on",
+    ]
+    some = [("--eds FILE names it", "1"), ("--motion permits it", "2"), ("--motion permits it", "3")]
+    rows = [ReportRow("sdo", name, Verdict.NOT_APPLICABLE, detail=text) for text, name in some]
+    rows.append(ReportRow("sdo", "4", Verdict.PASS))
+    assert verdict_text(Report("conform", "a device", rows=rows)).splitlines() == [
+        "a device: passes, 1 point",
+        "1 pass, 3 n/a",
+        "more points with: --eds (1), --motion (2)",
+    ]
+
+
+def test_a_page_without_a_failure_has_no_alarm(tmp_path):
+    write_html(Report("conform", "x", rows=[ReportRow("sdo", "1", Verdict.PASS)]), tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert '<span class="none">0 fail</span>' in text and '<span class="none">0 error</span>' in text
+    assert 'class="fail"' not in text and '<span class="pass">1 pass</span>' in text
+    write_html(example(), tmp_path / "report.html")
+    page = Page(tmp_path / "report.html")
+    (at,) = (n for n, text in enumerate(page.texts) if text.startswith(" sdo 11 below min: the write of a value"))
+    assert page.texts[at - 1] == "FAIL" and at < page.texts.index("Device and bench")
+    assert '<span class="fail">1 fail</span>' in (tmp_path / "report.html").read_text()
 
 
 def test_the_exit_status_is_the_worst_that_was_found():

@@ -7,6 +7,7 @@ import pytest
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 
 
 def test_a_wrapped_grid_covers_the_cap_of_its_sphere() -> None:
@@ -33,3 +34,45 @@ def test_a_list_of_taxels_keeps_its_places_and_tilts() -> None:
     assert pad.areas[1] / pad.areas[0] == pytest.approx(math.cos(0.3))
     with pytest.raises(UsageError, match="expected 3 points of 3 coordinates"):
         Pad(1, 3, 6.5e-3, positions=places)
+
+
+def test_a_grid_with_two_distances_is_a_list_of_rectangles() -> None:
+    pad = Pad.of_grid(3, 5, (2e-3, 4.5e-3), mount_radius_m=None)
+    assert not pad.is_grid and pad.uv[1] - pad.uv[0] == pytest.approx([2e-3, 0.0])
+    assert pad.uv[5] - pad.uv[0] == pytest.approx([0.0, 4.5e-3])
+    assert pad.areas == pytest.approx(np.full(15, 9e-6)) and pad.half_sides_m == pytest.approx([5e-3, 6.75e-3])
+    assert pad.reach_m == pytest.approx(5e-3)
+    square = Pad.of_grid(3, 5, (2e-3, 2e-3))
+    assert square.is_grid and square.half_sides_m == pytest.approx([5e-3, 3e-3])
+
+
+def test_a_list_on_a_sphere_covers_it_as_a_grid_does() -> None:
+    grid = Pad(mount_radius_m=0.03)
+    places = np.c_[grid.uv, np.zeros(grid.taxels)]
+    assert Pad(mount_radius_m=0.03, positions=places).areas == pytest.approx(grid.areas)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, math.pi / 4])
+def test_the_rim_of_a_list_is_its_outermost_taxels(turn: float) -> None:
+    """A square of 8 × 8, turned: its outer ring or, where a corner points along a direction, a part of it; no other."""
+    grid = Pad(8, 8, 2e-3)
+    c, s = math.cos(turn), math.sin(turn)
+    places = np.c_[grid.uv @ np.array(((c, s), (-s, c))), np.zeros(64)]
+    rim = set(Pad(8, 8, 2e-3, positions=places).rim.tolist())
+    ring = {8 * row + column for row in range(8) for column in range(8) if {row, column} & {0, 7}}
+    assert rim <= ring and {0, 7, 56, 63} <= rim
+    if not turn:
+        assert rim == ring
+
+
+@pytest.mark.parametrize(("mount_m", "leaves"), [(0.04, True), (None, False)])
+def test_a_contact_at_the_rim_of_a_list_leaves_it(mount_m: float | None, leaves: bool) -> None:
+    """On a sphere the contact may roll off; a flat list has nowhere to roll to, and its few taxels are all rim."""
+    grid = Pad(8, 8, 2e-3)
+    pad = Pad(8, 8, 2e-3, mount_radius_m=mount_m, positions=np.c_[grid.uv, np.zeros(64)])
+    calibration = PatchCalibration(pad)
+    image = np.zeros((8, 8), np.uint8)
+    image[3:5, 3:5] = 100
+    assert not compute_patch(image, calibration).off_pad
+    image[3:5, 6:8] = 200
+    assert compute_patch(image, calibration).off_pad is leaves

@@ -42,6 +42,8 @@ class Bench(SdoClient):
         first_answer: answer to the first read of 1000h, by which is seen that the device serves.
         by_hand: function that asks a person to do something, and returns whether it was done.
         asked: codes of EMCY messages that the point provoked; others fail it.
+        standing: codes of errors that the device had before the first point; no point fails for them.
+        kept_out: why the device cannot be brought to operational; empty: it can.
     """
 
     def __init__(
@@ -58,6 +60,8 @@ class Bench(SdoClient):
         self.device, self.bitrate, self.fd = device, bitrate, fd
         self.notes = []
         self.asked: set[int] = set()
+        self.standing: set[int] = set()
+        self.kept_out = ""
         self.distributions: dict[str, tuple[float, ...]] = {}
         self.first_answer = b""
         self.by_hand: Callable[[str], bool] = lambda _: False
@@ -110,7 +114,9 @@ class Bench(SdoClient):
         raise Deviation(text)
 
     def nmt(self, command: int) -> int:
-        """Send an NMT command to the device; return when."""
+        """Send an NMT command to the device; return when. Raises PointNotApplicable where it cannot be followed."""
+        if command == NmtCommand.START and self.kept_out:
+            raise PointNotApplicable(f"it needs operational: {self.kept_out}")
         self._changed_ns = self.send(NMT_ID, bytes((command, self.node_id)))
         return self._changed_ns
 
@@ -197,7 +203,7 @@ class Bench(SdoClient):
 
     def unasked(self) -> list[Emcy]:
         """EMCY messages that report an error nobody asked for; all are taken."""
-        found = [emcy for emcy in self.errors() if emcy.code not in self.asked]
+        found = [emcy for emcy in self.errors() if emcy.code not in self.asked | self.standing]
         self.emergencies.clear()
         return found
 

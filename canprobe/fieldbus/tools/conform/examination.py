@@ -1,6 +1,7 @@
 """An examination: every point in its turn, what it wrote put back after it, its verdict in the report.
 
-    hear the bus → read the device → snapshot → for each point: 6041h, run, put back, 6041h, EMCY → put all of it back
+    hear the bus → read the device → snapshot → look whether it reaches operational
+    → for each point: 6041h, run, put back, 6041h, EMCY → put all of it back
 
 It goes on after a point that fails. It ends where the power stage is on without permission, where the device no longer
 answers, and where the bus is gone; whatever ends it, an exception and Ctrl-C too, what was written is put back first.
@@ -8,6 +9,7 @@ answers, and where the bus is gone; whatever ends it, an exception and Ctrl-C to
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +19,8 @@ from canprobe.fieldbus.bus.port import ControllerState, Port, nothing
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, describe_state, known_state
-from canprobe.fieldbus.protocol.emcy import describe
-from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, describe
+from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import CONTROLWORD, RPDOS, ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
@@ -40,6 +42,7 @@ from canprobe.fieldbus.tools.conform.surroundings import hear
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
 _BACK_ON_BUS_S = 5.0
+_STATE_READS = 10
 _WAY_OUT = "type: canprobe conform --restore {path} --node {node_id}"
 
 
@@ -132,7 +135,7 @@ class Examination:
                 self._leave()
             except BenchFailure as error:
                 self.report.rows.append(ReportRow("bench", "put back", Verdict.ERROR, detail=str(error)))
-        self.report.left_out += LEFT_OUT
+        self.report.left_out += LEFT_OUT if set(points) >= set(POINTS) else ()
         self.report.distributions.update(self.bench.distributions)
         return self.report
 
@@ -187,6 +190,44 @@ class Examination:
             self._ended = f"not examined: {error}"
         else:
             self._put_back()
+            self._look_for_standing_errors()
+
+    def _look_for_standing_errors(self) -> None:
+        """Find the errors that the device has already, and whether they keep it out of operational.
+
+        An error that stays would otherwise fail every point that needs operational, and each for another reason.
+        """
+        if self.bench.permits.surroundings.lacks("nmt"):
+            return
+        with contextlib.suppress(CanprobeError):  # a device that fails here fails the points that are about it
+            self._start_once()
+        with contextlib.suppress(CanprobeError):
+            self._put_back()
+
+    def _start_once(self) -> None:
+        bench = self.bench
+        state: int | None = None
+        with contextlib.suppress(Deviation, PointNotApplicable):
+            bench.watch_state()
+            bench.nmt(NmtCommand.START)
+            bench.pass_time(bench.times.silence_s)
+            for _ in range(_STATE_READS):  # on a slow bus a heartbeat from before may have waited in a queue
+                if (state := bench.state()) == NmtState.OPERATIONAL:
+                    break
+        found = {emcy.code for emcy in bench.errors()}
+        ended = len(bench.emergencies) > len(bench.errors())
+        bench.emergencies.clear()
+        register = bench.number(0x1001)
+        if register and (newest := bench.device.number(0x1003, 1) & 0xFFFF):
+            found.add(newest)
+        errors = ", ".join(f"EMCY {code:04X}h ({describe(code)})" for code in sorted(found))
+        if register and not ended:  # it stays; one that comes and goes is none that stands
+            bench.standing = found
+            self.report.facts["error before the first point"] = errors or f"1001h is {register:02X}h"
+        if state in (NmtState.PRE_OPERATIONAL, NmtState.STOPPED):
+            cause = errors or f"1001h is {register:02X}h, and no EMCY came"
+            bench.kept_out = f"NMT start leads to state {state:02X}h; {cause}"
+            self.report.facts["warning"] = bench.kept_out
 
     def _examine(self, point: Point) -> ReportRow:
         """One point: run it, put back what it wrote, look for what it left behind."""
@@ -259,7 +300,8 @@ class Examination:
         """See that the device answers and that its power stage is off."""
         bench = self.bench
         self._await_bus()
-        bench.asked.clear()
+        # a device that watches SYNC and gets none may say so between any two points
+        bench.asked = {SYNC_LOST_CODE} if bench.device.number(0x1006) else set()
         bench.forget()
         bench.emergencies.clear()
         try:
@@ -324,6 +366,7 @@ class Examination:
         bench, surroundings = self.bench, self.bench.permits.surroundings
         if self._ended and not self.journal.touched:
             return
+        bench.kept_out = ""
         try:
             self._check_power()
             self._put_back()

@@ -6,8 +6,8 @@ for some time; only where nobody but the device was heard is every other node id
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.presence import answering_nodes
@@ -36,6 +36,7 @@ class Surroundings:
         master: what showed that there is another master; empty: nothing did.
         strangers: identifiers of frames that belong to no service of a known node.
         states: NMT states by node id, as heartbeats reported them.
+        lengths: identifiers and lengths of the frames that may be PDOs of the device.
         seconds: time of listening, s.
     """
 
@@ -45,6 +46,7 @@ class Surroundings:
     strangers: frozenset[int] = frozenset()
     states: tuple[tuple[int, int], ...] = ()
     seconds: float = 0.0
+    lengths: frozenset[tuple[int, int]] = frozenset()
 
     @property
     def alone(self) -> bool:
@@ -54,6 +56,10 @@ class Surroundings:
     def state_of(self, node_id: int) -> int | None:
         """NMT state that a node reported; None where it sent no heartbeat."""
         return dict(self.states).get(node_id)
+
+    def lengths_of(self, can_id: int) -> set[int]:
+        """Lengths of the frames that were heard with an identifier."""
+        return {length for one, length in self.lengths if one == can_id}
 
     def lacks(self, need: str) -> str:
         """Why a need of a point is not met here; empty where it is met."""
@@ -86,10 +92,10 @@ def hear(port: Port, node_id: int, seconds: float) -> Surroundings:
     if not found.alone:
         return found
     others = answering_nodes(PumpedNetwork(port), (n for n in range(1, 128) if n != node_id), 0.05)
-    return Surroundings(frozenset(others), states=found.states, seconds=seconds)
+    return replace(found, others=frozenset(others))
 
 
-def surroundings_of(frames: Iterable[TimedFrame], node_id: int, seconds: float) -> Surroundings:
+def surroundings_of(frames: Collection[TimedFrame], node_id: int, seconds: float) -> Surroundings:
     """What frames show of others than one node."""
     others: set[int] = set()
     strangers: set[int] = set()
@@ -115,5 +121,11 @@ def surroundings_of(frames: Iterable[TimedFrame], node_id: int, seconds: float) 
         else:
             master = "LSS"
     return Surroundings(
-        frozenset(others - {node_id}), sync, master, frozenset(strangers), tuple(sorted(states.items())), seconds
+        frozenset(others - {node_id}),
+        sync,
+        master,
+        frozenset(strangers),
+        tuple(sorted(states.items())),
+        seconds,
+        frozenset((can_id, len(data)) for can_id, data, _ in frames if 0x180 <= can_id < SDO_TX_BASE),
     )

@@ -6,7 +6,7 @@ fault the node behaves as itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from heapq import heappop, heappush
 
 from canprobe.fieldbus.node.slave_node import SlaveNode
@@ -43,6 +43,7 @@ class FaultyNode(WrappedNode):
         self._count = 0
         self._swapped: list[Frame] = []
         self._said: list[Frame] = []
+        self._acts: list[Callable[[SlaveNode], object]] = []
         self._busy = False
         self._before: frozenset[str] = frozenset()
         for fault in faults:
@@ -63,6 +64,11 @@ class FaultyNode(WrappedNode):
             if effect.fault is fault:
                 effect.end_ns = min(effect.end_ns, self.now_ns)
 
+    def act(self, act: Callable[[SlaveNode], object]) -> None:
+        """Let the device do something by itself when the bus asks it next; its frames go through the faults."""
+        self._acts.append(act)
+        self._busy = True
+
     @property
     def faults(self) -> list[Fault]:
         """Faults that hold, and those that are to come."""
@@ -82,6 +88,7 @@ class FaultyNode(WrappedNode):
         due = [self._later[0][0]] if self._later else []
         due += [fault.start_ns for fault in self._pending if not fault.event]
         due += [effect.end_ns for effect in self._effects]
+        due += [self.now_ns] if self._acts else []
         due += [effect.due_ns for effect in self._effects if effect.due_ns is not None]
         if own is not None:
             due.append(max([own, *(effect.end_ns for effect in self._effects if effect.dark)]))
@@ -123,9 +130,12 @@ class FaultyNode(WrappedNode):
         own = self.node.next_deadline_ns
         if own is not None and own <= t_ns and not self._is_dark():
             answers += self.node.advance(t_ns)
+        acts, self._acts = self._acts, []
+        for act in acts:
+            answers += self.node.act(t_ns, act)
         made = [f for e in self._effects if e.due_ns is not None and e.due_ns <= t_ns for f in e.advance(t_ns)]
         out = [*ready, *self._finished(answers, made, t_ns)]
-        self._busy = bool(self._pending or self._effects or self._later or self._swapped)
+        self._busy = bool(self._pending or self._effects or self._later or self._swapped or self._acts)
         return out
 
     def later(self, frame: Frame, t_ns: int, *, incoming: bool) -> None:

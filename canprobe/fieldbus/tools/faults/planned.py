@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.tools.faults.fault import Fault
+from canprobe.fieldbus.tools.faults.fault import Fault, FaultKind
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
-from canprobe.fieldbus.tools.faults.text import FORM
+from canprobe.fieldbus.tools.faults.text import FORM, parse_fault
 
 
 class PlannedFaults:
@@ -16,14 +16,15 @@ class PlannedFaults:
 
     Args:
         seed: seed of their random choices, where a fault names none.
+        kinds: kinds that a fault may have whose node is not powered on yet.
 
     Attributes:
         waiting: texts of faults whose node is not powered on yet.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, kinds: Mapping[str, FaultKind]) -> None:
         self.waiting: list[str] = []
-        self._seed = seed
+        self._seed, self._kinds = seed, kinds
         self._throw: dict[int, tuple[Callable[[str], Fault], Callable[[Fault], None]]] = {}
         self._thrown: list[tuple[Fault, str]] = []
         self._nodes: list[FaultyNode] = []
@@ -49,7 +50,7 @@ class PlannedFaults:
             values: parameters of the kind, and ``share``, ``count``, ``seed``, ``direction``.
 
         Raises:
-            UsageError: the fault is wrong; where it waits, that is found when it is thrown.
+            UsageError: the fault is wrong; whether its node is the device that it needs is found when it is thrown.
         """
         if ":" not in fault:
             words = [f"node {node}: {fault}", *(f"{name}={value}" for name, value in values.items())]
@@ -65,6 +66,7 @@ class PlannedFaults:
         if (node_id := int(match[1])) in self._throw:
             self._thrown.append((self._throw[node_id][0](fault), fault))
         else:
+            parse_fault(fault, self._kinds)
             self.waiting.append(fault)
 
     def clear(self) -> None:

@@ -26,7 +26,7 @@ Start reading at `bus_state`, then `rule`, then `enable`.
 from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, start_position, write_log
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.judging import Judge, judge_frames
-from canprobe.fieldbus.tools.judge.record import read_record
+from canprobe.fieldbus.tools.judge.record import nodes_of, read_record
 from canprobe.fieldbus.tools.judge.rules import RULES
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "MasterBench",
     "first_answers",
     "judge_frames",
+    "nodes_of",
     "read_record",
     "start_position",
     "write_log",

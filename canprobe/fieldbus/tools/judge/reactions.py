@@ -20,7 +20,7 @@ from canprobe.fieldbus.tools.judge.events import (
     TargetSeen,
 )
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity
-from canprobe.fieldbus.tools.judge.seen_node import SeenNode
+from canprobe.fieldbus.tools.judge.seen_node import STATUSWORD, SeenNode
 from canprobe.fieldbus.tools.judge.targets import Onward
 
 _COMMUNICATION = (0x81, 0x82)
@@ -159,55 +159,84 @@ class BootUpIgnored(Rule):
 
 
 class LossIgnored(Rule):
-    """A node falls silent, and axes go on."""
+    """A node falls silent, and the master drives it on; or only its heartbeat is lost, and axes go on."""
 
     number, name, group, severity = 19, "heartbeat lost, no reaction", "reactions", Severity.UNSAFE
     source = "canopen#543; CiA 301, 1016h"
-    expected = "within the consumer time (1016h, or three times 1017h) and two cycles after the last heartbeat, a stop"
+    expected = (
+        "within the consumer time (1016h, or three times 1017h) and two cycles after the last heartbeat, a stop; a lost"
+        " axis is not kept enabled"
+    )
     hint = "consume the heartbeat of each node, and stop all axes when it is missing"
-    hears = (SyncSeen, HeartbeatSeen, TargetSeen, StatusSeen)
+    hears = (SyncSeen, HeartbeatSeen, TargetSeen, ControlSeen, StatusSeen)
     answers = True
-    silent = False
 
     def begin(self) -> None:
         """Remember nothing yet."""
         self._lost: dict[int, BusFrame] = {}
         self._onward: dict[int, Onward] = {}
         self._beat: dict[int, BusFrame] = {}
-        self._report: dict[int, int] = {}
+        self._report: dict[int, BusFrame] = {}
+        self._still_ns: dict[int, int] = {}
         self._blamed: set[int] = set()
 
     def see(self, event: BusEvent) -> None:
-        """Find nodes whose heartbeat is overdue, and follow the targets from then on."""
+        """Find nodes whose sign of life is overdue, and follow the targets from then on."""
         if isinstance(event, HeartbeatSeen):
-            node_id = event.node.node_id
-            self._beat[node_id] = event.frame
-            if self._lost.pop(node_id, None) is not None:
-                self._onward.clear()
-                self._blamed.clear()
+            self._beat[event.node.node_id] = event.frame
+            self._find(event.node)
         elif isinstance(event, StatusSeen):
-            self._report[event.node.node_id] = event.frame.t_ns
-        elif isinstance(event, SyncSeen):
+            if event.frame.can_id in event.node.tpdos:
+                self._report[event.node.node_id] = event.frame
+                if not self._beats(event.node):
+                    self._find(event.node)
+        elif isinstance(event, SyncSeen) or (isinstance(event, TargetSeen) and not self.bus.syncs_ns):
             for node in self.bus.nodes.values():
                 self._look(node)
-        elif isinstance(event, TargetSeen) and event.node.enabled and self._lost:
+        if isinstance(event, TargetSeen | ControlSeen) and event.node.enabled and self._lost:
             self._follow(event)
 
+    def _find(self, node: SeenNode) -> None:
+        """A lost node is back."""
+        if self._lost.pop(node.node_id, None) is not None:
+            self._onward.clear()
+            self._still_ns.clear()
+            self._blamed.clear()
+
     def _look(self, node: SeenNode) -> None:
-        last = self._beat.get(node.node_id)
-        limit_ns = self._limit_ns(node)
-        if last is None or not limit_ns or not node.operational or node.node_id in self._lost:
+        last = (self._beat if self._beats(node) else self._report).get(node.node_id)
+        if last is None or node.node_id in self._lost or not node.operational:
             return
-        if self.bus.now_ns - last.t_ns > limit_ns and self._is_silent(node) is self.silent:
+        limit_ns = self._limit_ns(node)
+        if limit_ns and self.bus.now_ns - last.t_ns > limit_ns:
             self._lost[node.node_id] = last
-            self.looked += 1
+            self.looked += self._concerned(node)
+
+    def _concerned(self, lost: SeenNode) -> bool:
+        """Whether there is an axis whose targets the rule follows when this node is lost."""
+        return lost.is_drive or not self._is_silent(lost)
+
+    def _follows(self, node: SeenNode, lost: SeenNode) -> bool:
+        """Whether the rule follows the targets of a node while another, or itself, is lost."""
+        return node is lost or not self._is_silent(lost)
 
     def _is_silent(self, node: SeenNode) -> bool:
-        """Whether the TPDOs of a node are missing, too."""
-        shown_ns = self._report.get(node.node_id)
-        return shown_ns is None or self.bus.now_ns - shown_ns > max(50_000_000, 10 * self.bus.period_ns)
+        """Whether nothing else of a node comes, either."""
+        return self.bus.now_ns - node.heard_ns > self._silence_ns()
+
+    def _silence_ns(self) -> int:
+        return max(50_000_000, 10 * self.bus.period_ns)
+
+    def _beats(self, node: SeenNode) -> bool:
+        """Whether heartbeats show that a node lives; else its synchronous statuswords do, which come with each SYNC."""
+        return len(node.heartbeats_ns) >= 3 or not any(
+            pdo.layout.transmission_type == 1 and pdo.maps(STATUSWORD) for pdo in node.tpdos.values()
+        )
 
     def _limit_ns(self, node: SeenNode) -> int:
+        """Age of the last sign of life at which a node is lost; 0 where it is not known."""
+        if not self._beats(node):
+            return self._silence_ns() + 2 * self.bus.period_ns
         times = list(node.heartbeats_ns)
         if len(times) < 3:
             return 0
@@ -216,19 +245,29 @@ class LossIgnored(Rule):
         consumed_ms = max(word & 0xFFFF for word in consumers)
         return max(3 * usual_ns, consumed_ms * 1_000_000) + 2 * self.bus.period_ns
 
-    def _follow(self, event: TargetSeen) -> None:
-        node_id = event.node.node_id
-        if node_id in self._blamed or (self.silent and node_id in self._lost):
+    def _follow(self, event: TargetSeen | ControlSeen) -> None:
+        node, node_id, nodes = event.node, event.node.node_id, self.bus.nodes
+        lost_id = next((one for one in self._lost if self._follows(node, nodes[one])), None)
+        if lost_id is None or node_id in self._blamed:
             return
-        (lost_id, last), *_ = self._lost.items()
-        since_ns = last.t_ns + self._limit_ns(self.bus.nodes[lost_id])
-        onward = self._onward.setdefault(node_id, Onward(event.node, since_ns, self.bus.period_ns, last))
-        if onward.goes_on(event):
-            what = (
-                f"the last {'sign' if self.silent else 'heartbeat'} of node {lost_id} is"
-                f" {(event.frame.t_ns - last.t_ns) * 1e-6:.0f} ms old, and the targets of node {node_id} go on"
-            )
-            self.blame(what, last, event.frame, node_id=lost_id)
+        last = self._lost[lost_id]
+        since_ns = last.t_ns + self._limit_ns(nodes[lost_id])
+        if isinstance(event, TargetSeen):
+            onward = self._onward.setdefault(node_id, Onward(node, since_ns, self.bus.period_ns, last))
+            found = onward.goes_on(event)
+            if event.value != event.before:
+                self._still_ns[node_id] = event.frame.t_ns
+            what = f"the targets of node {node_id} go on"
+        else:  # an axis that nobody sees is not held by a target that stays: its power has to go
+            enables_on = command_of(event.word, event.before or 0) is DriveCommand.ENABLE_OPERATION
+            waited_ns = event.frame.t_ns - max(since_ns, self._still_ns.get(node_id, 0))
+            found = node_id == lost_id and enables_on and waited_ns > _SECOND_NS
+            what = f"6040h = {event.word:04X}h still enables it"
+        if found:
+            sign = "sign" if self._is_silent(nodes[lost_id]) else "heartbeat"
+            age_ms = (event.frame.t_ns - last.t_ns) * 1e-6
+            self.blame(f"the last {sign} of node {lost_id} is {age_ms:.0f} ms old, and {what}", last, event.frame,
+                       node_id=lost_id)  # fmt: skip
             self._blamed.add(node_id)
 
 
@@ -239,7 +278,12 @@ class MuteIgnored(LossIgnored):
     source = "openarm_can"
     expected = "when one axis falls silent the others stop, too"
     hint = "watch the TPDOs and heartbeats of each axis, and stop all"
-    silent = True
+
+    def _concerned(self, lost: SeenNode) -> bool:
+        return self._is_silent(lost) and any(node.is_drive and node is not lost for node in self.bus.nodes.values())
+
+    def _follows(self, node: SeenNode, lost: SeenNode) -> bool:
+        return node.node_id not in self._lost and self._is_silent(lost)
 
 
 class MissingFromStart(Rule):

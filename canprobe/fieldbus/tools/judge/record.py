@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from heapq import heappop, heappush
 from pathlib import Path
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.port import ERR_FLAG
-from canprobe.fieldbus.protocol.frames import EFF_FLAG
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, EMCY_BASE, HEARTBEAT_BASE, SDO_TX_BASE
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 
+_SENT_BY_NODES = (EMCY_BASE, SDO_TX_BASE, HEARTBEAT_BASE)
 _OUT_OF_ORDER = 1000
 """Lines by which a frame may stand too late in a log."""
 
@@ -35,6 +36,12 @@ def read_record(path: Path, channel: str | None = None) -> Iterator[BusFrame]:
             yield heappop(waiting)[2]
     while waiting:
         yield heappop(waiting)[2]
+
+
+def nodes_of(frames: Iterable[BusFrame]) -> tuple[int, ...]:
+    """Ids of the nodes that frames show: those that send a heartbeat, a boot-up, an EMCY or an SDO answer."""
+    ids = {frame.can_id & 0x7F for frame in frames if frame.can_id & ~0x7F in _SENT_BY_NODES}
+    return tuple(sorted(ids - {0}))
 
 
 def _frames(path: Path, channel: str | None) -> Iterator[BusFrame]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, place_text
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place, place_text
 from canprobe.fieldbus.tools.judge.enable import enables
 from canprobe.fieldbus.tools.judge.events import AbortSeen, AnswerSeen, BusEvent, ControlSeen, RequestSeen
-from canprobe.fieldbus.tools.judge.rule import Rule, Severity
+from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity
 
 _TIMED_OUT = 0x05040000
 _SHORT_NS = 50_000_000
@@ -111,19 +111,36 @@ class AbortWithoutObject(Rule):
 
     number, name, group, severity = 30, "abort without index", "sdo", Severity.MINOR
     source = "canopen#409, #516"
-    expected = "an abort has index and sub-index of the transfer"
-    hint = "fill in bytes 1 to 3 of the abort"
-    hears = (AbortSeen,)
+    expected = "an abort has index and sub-index of the transfer, which is open"
+    hint = "fill in bytes 1 to 3 of the abort, and send none for a transfer that is over"
+    hears = (AbortSeen, AnswerSeen)
+
+    def begin(self) -> None:
+        """Remember nothing yet."""
+        self._over: dict[int, tuple[Place, BusFrame]] = {}
 
     def see(self, event: BusEvent) -> None:
-        """Compare the object in a client's abort with that of the transfer."""
-        assert isinstance(event, AbortSeen)
-        if not event.by_client or event.place is None:
+        """Compare the object in a client's abort with that of the transfer; an abort may cross the last answer."""
+        assert isinstance(event, AbortSeen | AnswerSeen)
+        node_id, over = event.node.node_id, self._over.get(event.node.node_id)
+        if event.place is not None:
+            self._over[node_id] = event.place, event.frame
+        if (
+            isinstance(event, AnswerSeen)
+            or not event.by_client
+            or (event.place is None and not over and not event.node.booted)
+        ):
             return
         self.looked += 1
-        if event.named != event.place:
-            what = f"the abort of the transfer of {place_text(event.place)} names {place_text(event.named)}"
-            self.blame(what, event.request, event.frame, node_id=event.node.node_id)
+        named = place_text(event.named)
+        if event.place is not None and event.named != event.place:
+            what = f"the abort of the transfer of {place_text(event.place)} names {named}"
+            self.blame(what, event.request, event.frame, node_id=node_id)
+        elif event.place is None and (
+            over is None or over[0] != event.named or event.frame.t_ns - over[1].t_ns > QUEUED_NS
+        ):
+            what = f"an abort that names {named}, and no transfer is open"
+            self.blame(what, over[1] if over else None, event.frame, node_id=node_id)
 
 
 class TwoRequests(Rule):

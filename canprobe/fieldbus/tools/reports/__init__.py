@@ -27,7 +27,7 @@ from canprobe.fieldbus.tools.reports.json_file import read_json, report_document
 from canprobe.fieldbus.tools.reports.junit import write_junit
 from canprobe.fieldbus.tools.reports.page import write_html
 from canprobe.fieldbus.tools.reports.report import Report, ReportRow, Verdict
-from canprobe.fieldbus.tools.reports.text import append_step_summary, closing_text, row_text
+from canprobe.fieldbus.tools.reports.text import append_step_summary, closing_text, row_text, verdict_text
 
 __all__ = [
     "Report",
@@ -40,6 +40,7 @@ __all__ = [
     "read_json",
     "report_document",
     "row_text",
+    "verdict_text",
     "write_html",
     "write_json",
     "write_junit",

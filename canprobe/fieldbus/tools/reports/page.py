@@ -28,6 +28,8 @@ table.facts th { width: 9.5rem; white-space: normal }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums }
 .pass { color: var(--pass) } .fail { color: var(--fail) } .na { color: var(--na) } .error { color: var(--error) }
 .counts span { font-size: 1.1rem; font-weight: 600; margin-right: 1.5rem }
+.counts span.none { color: var(--na); font-weight: 400 }
+.counts ~ p { margin: .2rem 0 }
 details { border-bottom: 1px solid var(--line); padding: .25rem 0 } summary { cursor: pointer }
 summary b { display: inline-block; min-width: 9.5rem } summary small { opacity: .75 }
 details table { margin: .3rem 0 .6rem 1.1rem; width: calc(100% - 1.1rem) } details tr { border: 0 }
@@ -35,6 +37,8 @@ pre { margin: 0; white-space: pre-wrap; overflow-wrap: anywhere; font-size: 13px
 footer { margin-top: 2rem; opacity: .75 } svg { display: block } svg rect { fill: var(--na) }
 @media print { body { max-width: none } details { break-inside: avoid } }
 """
+_WORST_ROWS = 10
+"""Rows of each verdict that the page begins with."""
 _BARS = 40
 """Number of bars of a distribution."""
 
@@ -52,7 +56,7 @@ def write_html(report: Report, path: Path, change: ReportChange | None = None) -
     """
     title = _text(f"canprobe {report.tool}: {report.title}")
     counts = "".join(
-        f'<span class="{_CLASSES[verdict]}">{number} {_text(verdict.lower())}</span>'
+        f'<span class="{_CLASSES[verdict] if number else "none"}">{number} {_text(verdict.lower())}</span>'
         for verdict, number in report.counts().items()
     )
     facts = [(name, _text(value)) for name, value in report.facts.items()]
@@ -60,6 +64,7 @@ def write_html(report: Report, path: Path, change: ReportChange | None = None) -
     changes = [] if change is None else ["<h2>Since the baseline</h2>", _list(change.lines())]
     body = [
         f'<h1>{title}</h1><p class="counts">{counts}</p>',
+        *_worst(report),
         *(["<h2>Device and bench</h2>", _facts(facts)] if facts else []),
         *changes,
         *(line for group, rows in report.groups().items() for line in _group(group, rows)),
@@ -76,6 +81,14 @@ def write_html(report: Report, path: Path, change: ReportChange | None = None) -
         f"<title>{title}</title><style>{_STYLE}</style></head><body>"
     )
     write_text(path, "\n".join([head, *body, "</body></html>\n"]))
+
+
+def _worst(report: Report) -> Iterable[str]:
+    """What failed, before everything else."""
+    for verdict in (Verdict.FAIL, Verdict.ERROR):
+        for row in [row for row in report.rows if row.verdict is verdict][:_WORST_ROWS]:
+            mark = f'<b class="{_CLASSES[verdict]}">{_text(verdict)}</b>'
+            yield f"<p>{mark} {_text(row.group)} {_text(row.name)}: {_text(row.detail)}</p>"
 
 
 def _group(group: str, rows: Sequence[ReportRow]) -> Iterable[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,9 @@ from canprobe.fieldbus.tools.reports.report import Report, ReportRow, Verdict, p
 
 MARKS = {Verdict.PASS: "pass", Verdict.FAIL: "FAIL", Verdict.NOT_APPLICABLE: "n/a", Verdict.ERROR: "ERROR"}
 """Mark of a row on a terminal."""
+_WORST_ROWS = 3
+"""Rows that the verdict shows."""
+_OPTION = re.compile(r"--[a-z]+")
 _MAX_SUMMARY_ROWS = 200
 """Rows of a step summary; GitHub refuses summaries of more than 1 MiB."""
 
@@ -21,7 +25,40 @@ def row_text(row: ReportRow) -> str:
     """One row for a terminal: mark and name, and a line of detail where it did not pass."""
     head = f"{MARKS[row.verdict]:5}  {row.group:9} {row.name}"
     detail = f"{row.detail} [{row.clause}]" if row.clause and row.verdict is not Verdict.NOT_APPLICABLE else row.detail
-    lines = [head] if row.verdict is Verdict.PASS or not row.detail else [head, f"       {' '.join(detail.split())}"]
+    lines = [head] if row.verdict is Verdict.PASS or not row.detail else [head, f"       {_line(detail)}"]
+    return printable("\n".join(lines))
+
+
+def verdict_text(report: Report, change: ReportChange | None = None) -> str:
+    """The verdict in some lines: whether it passes, the counts, the worst rows, and which options examine more."""
+    counts, bad = report.counts(), [row for row in report.rows if row.verdict in (Verdict.FAIL, Verdict.ERROR)]
+    examined = counts[Verdict.PASS] + counts[Verdict.FAIL]
+    points = f"{examined} point{'s' if examined != 1 else ''}"
+    if counts[Verdict.FAIL]:
+        head = f"{report.title}: {counts[Verdict.FAIL]} of {points} FAIL"
+    elif counts[Verdict.ERROR]:
+        head = f"{report.title}: not examined to the end"
+    else:
+        head = f"{report.title}: passes, {points}"
+    lines = [head, ", ".join(f"{number} {MARKS[verdict]}" for verdict, number in counts.items() if number)]
+    causes: dict[str, list[ReportRow]] = {}
+    for row in sorted(bad, key=lambda row: row.verdict is not Verdict.FAIL):
+        causes.setdefault(row.detail if row.verdict is Verdict.ERROR else f"{row.group} {row.name}", []).append(row)
+    for rows in [*causes.values()][:_WORST_ROWS]:
+        more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
+        clause = f" [{rows[0].clause}]" if rows[0].clause else ""
+        lines.append(
+            f"{MARKS[rows[0].verdict]:5}  {rows[0].group} {rows[0].name}{more}: {_line(rows[0].detail)}{clause}"
+        )
+    if len(causes) > _WORST_ROWS:
+        lines.append(f"       and {len(causes) - _WORST_ROWS} more")
+    options = Counter(
+        option for row in report.rows if row.verdict is Verdict.NOT_APPLICABLE for option in _OPTION.findall(row.detail)
+    )
+    if options:
+        lines.append(f"more points with: {', '.join(f'{option} ({number})' for option, number in options.items())}")
+    lines += [f"baseline: {line}" for line in change.lines()] if change is not None else []
+    lines += [f"log: {report.log}"] if report.log is not None else []
     return printable("\n".join(lines))
 
 
@@ -73,6 +110,11 @@ def append_step_summary(report: Report, environ: Mapping[str, str], change: Repo
         file.write("\n".join(lines) + "\n\n")
 
 
+def _line(text: str) -> str:
+    """The text on one line."""
+    return " ".join(text.split())
+
+
 def _cell(text: str) -> str:
     """The text in one cell of a table in Markdown."""
-    return html.escape(printable(" ".join(text.split())), quote=False).replace("|", "\\|")
+    return html.escape(printable(_line(text)), quote=False).replace("|", "\\|")

@@ -199,7 +199,10 @@ def compute_patch(
     active = counts.translate(None, _ALL_COUNTS[: max(calibration.threshold_counts, 1)])
     if not active:
         return _nothing(0.0)._replace(dead=dead)
-    edges = _edges(counts, pad.shape, window) if pad.is_grid else (0, 0)
+    if pad.is_grid:
+        edges = _edges(counts, pad.shape, window)
+    else:  # a flat list has no contact that may leave it
+        edges = (0 if pad.is_flat else int(taxels.reshape(-1)[pad.rim].max()), 0)
     n_active, peak = len(active), max(active)
     pascals = calibration.pascals
     peak_pa, at_pad, at_window = [pascals.item(count) for count in (peak, *edges)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
 from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -27,7 +28,6 @@ from canprobe.fieldbus.tools.conform.point import conformance_point
 from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
 
 TRANSMISSION = "CiA 301, PDO transmission types"
-_NO_RTR = 1 << 30
 _EVENT_MS, _INHIBIT_MS, _WATCHED_MS = 50, 100, 200
 _WINDOW_US = 100_000
 _SHARE = 0.1
@@ -121,7 +121,7 @@ def type_255(bench: Bench) -> None:
 def remote_request(bench: Bench) -> None:
     """A remote request for a TPDO whose bit 30 permits it."""
     pdo = changeable_pdo(bench, TPDOS)
-    if bench.device.number(pdo, 1) & _NO_RTR:
+    if bench.device.number(pdo, 1) & NO_RTR_FLAG:
         raise PointNotApplicable("bit 30 of the COB-ID permits no remote request")
     switch_off(bench, pdo)
     set_parameters(bench, pdo, 253)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from canprobe.fieldbus.node.core import NO_RTR_FLAG
+from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -15,6 +19,7 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
     switch_on,
 )
 from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
 from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_write
 
 MAPPING = "CiA 301, PDO mapping"
@@ -24,6 +29,11 @@ _RESERVED_TYPES = {"RPDO": (0xF1, 0xF8, 0xFD), "TPDO": (0xF1, 0xF6, 0xFB)}
 _RESTRICTED = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x601, 0x6E0, 0x701, 0x77F, 0x7FF)
 _LONG_ENTRIES = 9
 _CHANGED_BIT = 0x08
+_CYCLIC = 240
+"""Highest transmission type that goes by SYNC."""
+_SYNC_PACE_S = 0.005
+_LONGEST_EVENT_MS = 2000
+"""Longest event time (18xxh:05) that is waited for."""
 
 
 def _valid(bench: Bench, area: range, *, mapping: bool = False) -> int:
@@ -234,6 +244,49 @@ def mapped_entries(bench: Bench) -> None:
                     bench.deviates(f"{pdo:04X}h maps {refused}")
                 if len(value) * 8 != bits and len(value) != 4 and bits >= 8:
                     bench.deviates(f"{pdo:04X}h maps {bits} bits of {index:04X}h, which has {len(value)} bytes")
+
+
+@conformance_point(83, "pdo", "heard lengths", MAPPING, "every TPDO that comes is as long as its mapping")
+def heard_lengths(bench: Bench) -> None:
+    """Every TPDO that was heard before, and that comes in operational by SYNC, request, event timer or by itself."""
+    pdos = {cob_id: pdo for pdo in bench.device.pdos(TPDOS) if (cob_id := bench.device.cob_id(pdo)) is not None}
+    surroundings = bench.permits.surroundings
+    heard = {cob_id: surroundings.lengths_of(cob_id) for cob_id in pdos}
+    for cob_id in pdos:
+        bench.taken(cob_id)
+    if not surroundings.lacks("nmt"):
+        bench.nmt(NmtCommand.START)
+        bench.pass_time(0.01)
+        _ask_for_tpdos(bench, pdos)
+    longest_ms = min(max([bench.device.number(pdo, 5) for pdo in pdos.values()], default=0), _LONGEST_EVENT_MS)
+    bench.pass_time(1.5e-3 * longest_ms + bench.times.silence_s)
+    wrong = []
+    for cob_id, pdo in pdos.items():
+        heard[cob_id] |= {len(frame.data) for frame in bench.taken(cob_id)}
+        mapped = -(-sum(word & 0xFF for word in bench.device.mapping(pdo)) // 8)
+        if mapped and (others := sorted(heard[cob_id] - {mapped})):
+            got = " and ".join(map(str, others))
+            wrong.append(f"TPDO {cob_id:03X}h ({pdo:04X}h) has {got} bytes, its mapping {mapped}")
+    if wrong:
+        bench.deviates("; ".join(wrong))
+    if not any(heard.values()):
+        raise PointNotApplicable("no TPDO is heard")
+    if silent := [f"{cob_id:03X}h" for cob_id, lengths in heard.items() if not lengths]:
+        bench.notes.append(f"not heard: TPDO {', '.join(silent)}")
+
+
+def _ask_for_tpdos(bench: Bench, pdos: Mapping[int, int]) -> None:
+    """Send as many SYNCs as the slowest cyclic type of the device needs, and remote requests where they are allowed."""
+    overflow = bench.device.number(0x1019)
+    kinds = [kind for pdo in pdos.values() if (kind := bench.device.number(pdo, 2)) <= _CYCLIC]
+    starts = [bench.device.number(pdo, 6) for pdo in pdos.values()]
+    if kinds and not bench.permits.surroundings.lacks("sync"):
+        for number in range(max(kinds) + max(starts) + 1):
+            bench.sync(number % overflow + 1 if overflow else None)
+            bench.pass_time(_SYNC_PACE_S)
+    for cob_id, pdo in pdos.items():
+        if not bench.device.number(pdo, 1) & NO_RTR_FLAG:
+            request_pdo(bench, cob_id)
 
 
 @conformance_point(

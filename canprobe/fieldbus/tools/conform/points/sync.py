@@ -56,12 +56,17 @@ def wrong_length(bench: Bench) -> None:
     41, "sync", "lost SYNC", "CiA 301, 1006h", "in time no EMCY; 8100h after the period, if at all", needs="nmt sync"
 )
 def lost_sync(bench: Bench) -> None:
-    """1006h is 100 ms: SYNCs in time, then none."""
+    """1006h is 100 ms: SYNCs in time, then none. A device may watch from a SYNC on that came long before."""
     bench.need((0x1006, 0))
     plain_sync(bench)
     bench.put(0x1006, 0, _PERIOD_US)
     bench.nmt(NmtCommand.START)
-    last_ns = 0
+    bench.pass_time(0.01)
+    for _ in range(2):
+        last_ns = bench.sync()
+        bench.pass_time(bench.times.slack_s)
+    bench.asked.add(SYNC_LOST_CODE)
+    bench.emergencies.clear()
     for _ in range(5):
         last_ns = bench.sync()
         bench.pass_time(_PERIOD_US * 1e-6)
