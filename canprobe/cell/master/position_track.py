@@ -114,7 +114,7 @@ class PositionTrack:
 
     def position(self, cycle: int, t_ns: int) -> float:
         """Position of the motor at a SYNC: as reported, or carried on by its rate for a bounded time."""
-        if cycle <= self.cycle or self.cycle < 0:
+        if cycle <= self.cycle:
             return float(self.counts)
         return self.counts + self._carried(t_ns - self._t_ns)
 
