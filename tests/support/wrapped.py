@@ -29,6 +29,10 @@ class Wrapped(Task):
     def lets_go(self) -> bool:
         return self.task.lets_go
 
+    @property
+    def trail(self):
+        return self.task.trail
+
     def retreat(self, reason: str) -> None:
         self.task.retreat(reason)
 

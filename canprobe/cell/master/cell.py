@@ -26,6 +26,7 @@ from canprobe.cell.master.controller import (
 )
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
+from canprobe.cell.master.held_arm import HeldArm
 from canprobe.cell.master.homing import Homing
 from canprobe.cell.master.joint_columns import joint_columns
 from canprobe.cell.master.lift_off import LiftOff
@@ -62,11 +63,6 @@ OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille",
 """Columns of the cell in the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
-
-
-def _hold(_: Measurement) -> Command:
-    """Hold the targets of the drives."""
-    return Command()
 
 
 class Cell:
@@ -160,6 +156,7 @@ class Cell:
         besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
         self.homing = Homing(plan, setups, self._network, self.watch, **besides) if homed else None
         self._holding = False
+        self._held = HeldArm()
         self._running = False
         self._retreats_for: CanprobeError | None = None
         self._controller = Controller()
@@ -291,7 +288,7 @@ class Cell:
         runs = as_controller(controller)
         with self._one_at_a_time(), self._naming_another_master():
             self._controller, self._retreats_for, self._remarks_noted = runs, None, 0
-            self.stopped_by = None
+            self.stopped_by, self._held = None, HeldArm()
             runs.array_alive = self.supervisor.array_alive
             if runs.reader is not None:
                 self._note_silent_taxels()
@@ -375,10 +372,10 @@ class Cell:
         assert self.cycle is not None
         measurement = self._begin_cycle()
         held = self._supervise(measurement)
-        step = _hold if held else self._controller.step
+        step = self._held.freeze if held else self._controller.step
         command = self._or_lift_off(self._ask, step, measurement, interrupts)
-        command, finding = self.supervisor.guard_target(command)
-        if finding is not None:
+        command, finding = self.supervisor.guard_target(command if held else self._held.thaw(command, measurement))
+        if finding is not None and not held:
             self._react(finding)
         self.cycle.end(command)
         self._or_lift_off(self._controller.update)
@@ -563,7 +560,7 @@ class Cell:
         supervisor = self.supervisor
         if self.drives is None or self.tactile is None or not supervisor.pressing() or supervisor.must_stop():
             return
-        lift = LiftOff(self._plan, self.drives, self.watch, error)
+        lift = LiftOff(self._plan, self.drives, self.watch, error, self._controller.trail)
         t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
         if not lift.possible:
             self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)

@@ -188,6 +188,21 @@ def _not_heard(seen: Seen, cycles: int, word: str) -> NodeError | None:
     return NodeError(seen.drives.axes[i].node_id, f"{word}no usable TPDO for {ages[i]} cycles")
 
 
+@_checked("following", "joint that does not follow its targets", Reaction.LIFT, _cycles(2))
+def _following(seen: Seen) -> NodeError | None:
+    drives = seen.drives
+    if drives is None or not (beyond := drives.beyond_lag()):
+        return None
+    i = max(beyond, key=beyond.__getitem__)
+    lag_ms = seen.limits.lag_ns * 1e-6
+    lag = f"a lag of {lag_ms:.3g} ms (servo.drive_lag_ms)" if lag_ms else "its lag"
+    return NodeError(
+        drives.axes[i].node_id,
+        f"(joint {i + 1}) does not follow its targets: its motion is {drives.joint_text(i, beyond[i])} beside what"
+        f" {lag} explains; see to its brake and its power stage, or state the lag of the drive",
+    )
+
+
 @_counted("torn_frame", "tactile frame torn, corrupt or mixed", _frame)
 def _torn_frame(seen: Seen) -> int:
     return seen.tactile.unusable if seen.tactile is not None else 0

@@ -13,6 +13,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
+    from canprobe.cell.master.trail import TakenWay
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
     from canprobe.mechanics.touch.patch.image import Patch
 
@@ -203,6 +204,11 @@ class Controller:
         Args:
             measurement: the state of the cell, whose time has gone on meanwhile.
         """
+
+    @property
+    def trail(self) -> TakenWay | None:
+        """The way by which the probe has come, where a lift-off may go back on it; None: it goes along the pole."""
+        return None
 
     @property
     def restarts(self) -> int:

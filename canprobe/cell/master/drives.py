@@ -12,9 +12,11 @@ from operator import itemgetter
 
 import numpy as np
 
+from canprobe.cell.master.following import Following
 from canprobe.cell.master.position_track import PERIOD_NS, REST_NS, PositionTrack, rest_counts
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import TARGETS, Place
+from canprobe.cell.planning.units import lag_s
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.cia402 import (
     ENABLE_INTERPOLATION_BIT,
@@ -34,6 +36,8 @@ SYNCHRONOUS_MAX = 240
 COMMAND_REPEAT_NS = 100_000_000
 _FEEDBACK: tuple[Place, ...] = ((0x6041, 0), (0x6064, 0), (0x6077, 0))
 _TARGETS = frozenset(TARGETS.values())
+UNSTATED_LAG_S = 0.05
+"""Longest usual lag of a drive without a feed-forward, s, where neither scene nor emulation states one."""
 CONTROLWORD, TARGET, CONSTANT = range(3)
 """Kinds of values in a command."""
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
@@ -150,6 +154,7 @@ class DriveGroup:
         model: the arm, for drive units ↔ joint positions.
         repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
         period_ns: period of the cycle.
+        lag_s: lag of the drives behind a ramp.
 
     Attributes:
         torque_permille: torque of each drive, NaN for one whose TPDO has no torque; empty where none has.
@@ -160,7 +165,12 @@ class DriveGroup:
     """
 
     def __init__(
-        self, axes: tuple[DriveAxis, ...], model: ArmModel, repeat_cycles: int = 40, period_ns: int = PERIOD_NS
+        self,
+        axes: tuple[DriveAxis, ...],
+        model: ArmModel,
+        repeat_cycles: int = 40,
+        period_ns: int = PERIOD_NS,
+        lag_s: float = 0.0,
     ) -> None:
         self.axes = axes
         self.goal = DriveState.OPERATION_ENABLED
@@ -178,6 +188,7 @@ class DriveGroup:
         self._model = model
         self._sources = {one.layout.cob_id: (k, one) for k, one in enumerate(sources)}
         self._tracks = tuple([PositionTrack(base, period_ns) for base in rest_counts(model)])
+        self._following = Following(model, lag_s, period_ns)
         self._period_ns = period_ns
         self._deadline_ns = self._aimed_ns = 0
         self._heard = [-1] * len(sources)
@@ -342,6 +353,23 @@ class DriveGroup:
     def forget_targets(self) -> None:
         """Let the target of each drive be its reported position again, as before the first one was set."""
         self._targets = self._aimed = None
+        self._following.forget()
+
+    def beyond_lag(self) -> dict[int, float]:
+        """Drives, by number from 0, that follow their targets less than their lag explains, and how much less, counts.
+
+        Only those count that were heard in this cycle, and are enabled and not stopped.
+        """
+        found = {}
+        for i, track in enumerate(self._tracks):
+            heard = track.cycle == self._cycle and self.statuswords[i] & _STATE_BITS == _ENABLED
+            if heard and (beyond := self._following.beyond(i, track.counts, self._sync_ns)):
+                found[i] = beyond
+        return {i: beyond for i, beyond in found.items() if self.axes[i].node_id not in self.stopped}
+
+    def joint_text(self, axis: int, counts: float) -> str:
+        """A motion of a drive, counts, as one of its joint, for people."""
+        return self._model.joints[axis].text(abs(counts / float(self._model.units_per_q[axis, axis])), ".2f")
 
     def aim(self, targets: Sequence[int]) -> None:
         """Note the `targets` (counts) of this cycle: they bound the motion that the drives may report next."""
@@ -351,6 +379,8 @@ class DriveGroup:
         for track, target, last in zip(self._tracks, targets, before, strict=True):
             track.aim(abs(target - last), periods)
         self._aimed, self._aimed_ns = tuple(targets), self._deadline_ns
+        now = [track.counts if track.cycle == self._cycle else None for track in self._tracks]
+        self._following.aim(self._aimed, now, self._sync_ns)
 
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle, as `commands`, packed."""
@@ -426,7 +456,8 @@ def make_drives(plan: Plan) -> DriveGroup | None:
     if arm is None:
         return None
     period_ns = plan.sync.period_ns
-    return DriveGroup(drive_axes(plan), arm.model, max(1, COMMAND_REPEAT_NS // period_ns), period_ns)
+    repeat_cycles = max(1, COMMAND_REPEAT_NS // period_ns)
+    return DriveGroup(drive_axes(plan), arm.model, repeat_cycles, period_ns, lag_s(plan.setup) or UNSTATED_LAG_S)
 
 
 def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:

@@ -1,4 +1,7 @@
-"""Taking the probe off the object without its task: with the drives that still obey, a short way back along the pole.
+"""Taking the probe off the object without its task: with the drives that still obey, a short way back.
+
+Where all of them obey and the way that the probe has come is known to be free, it goes back on that (`trail`).
+Otherwise the way is computed: along the pole.
 
 A lost drive stands still, by its own quick stop or because it gets no targets, and its position is known. The others
 carry the tool's point away from the object on a straight line, its orientation left open. A drive that reports a
@@ -13,6 +16,7 @@ from numpy.typing import NDArray
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.supervisor import Supervisor
+from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, Retrace, TakenWay, way_gone
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import NodeError
@@ -21,13 +25,6 @@ from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.robot.remaining_drives import lifting_step
 from canprobe.mechanics.types import Floats
-
-LIFT_WAY = 6e-3
-"""Length of the way back, m: as far as a touch retreats, and further than the softest pad is pressed in."""
-LIFT_SPEED = 20e-3
-"""Mean speed of the way back, m/s; it begins with twice as much, which then falls to zero."""
-ARRIVAL_S = 0.02
-"""Time for the drives to make up their lag at the end."""
 
 
 class WayBack:
@@ -58,21 +55,16 @@ class WayBack:
         T, J = forward_jacobian(self._model.chain, measured, self._flange_probe)
         if self._away is None or self._targets is None:
             self._away, self._targets = -T[:3, 2], joints_to_units(self._model, measured)
-        before, self._t = self._gone(self._t), self._t + self._period_s
-        if self._t > LIFT_WAY / LIFT_SPEED + ARRIVAL_S:
+        before, self._t = way_gone(self._t), self._t + self._period_s
+        if self._t > WAY_BACK / WAY_BACK_SPEED + ARRIVAL_S:
             return None
-        move = self._away * (self._gone(self._t) - before)
+        move = self._away * (way_gone(self._t) - before)
         if move.any():
             units = lifting_step(self._model, J[:3], move, self._free)
             if units is None:
                 return None
             self._targets = self._targets + units
         return units_to_joints(self._model, self._targets)
-
-    @staticmethod
-    def _gone(t: float) -> float:
-        """Way after ``t`` seconds, m."""
-        return LIFT_WAY * (1.0 - max(1.0 - t * LIFT_SPEED / LIFT_WAY, 0.0) ** 2)
 
 
 class LiftOff:
@@ -83,21 +75,22 @@ class LiftOff:
         drives: drives of the arm; those that do not obey are stopped from now on.
         watch: what the nodes report of themselves.
         error: why the cell is stopped; the node that it names does not obey.
+        trail: the way that the probe has come, where it is free; None: it goes back along its pole.
     """
 
-    def __init__(self, plan: Plan, drives: DriveGroup, watch: NodeWatch, error: BaseException) -> None:
+    def __init__(
+        self, plan: Plan, drives: DriveGroup, watch: NodeWatch, error: BaseException, trail: TakenWay | None = None
+    ) -> None:
         assert plan.setup.arm is not None
+        model, self._period_s = plan.setup.arm.model, plan.sync.period_ns * 1e-9
         self._drives = drives
         heard = zip(drives.axes, drives.ages(), drives.enabled_ones(), strict=True)
         self._free = np.array([age == 0 and on and _obeys(watch, axis.node_id, error) for axis, age, on in heard])
-        self._way = WayBack(
-            plan.setup.arm.model,
-            plan.setup.probe.T_flange_probe,
-            plan.sync.period_ns * 1e-9,
-            self._free,
-        )
-        self._force_known_from: int | None = None
-        self._highest = 0.0
+        self._way = WayBack(model, plan.setup.probe.T_flange_probe, self._period_s, self._free)
+        self._trail = trail if self._free.all() else None  # with a drive at rest the others do not go where they were
+        self._step_max: Floats = model.qd_max * plan.setup.limits.speed_share * self._period_s
+        self._retrace: Retrace | None = None
+        self._begun = False
 
     @property
     def possible(self) -> bool:
@@ -110,25 +103,28 @@ class LiftOff:
         self._drives.stopped = frozenset(axis.node_id for axis, free in axes if not free)
 
     def command(self, supervisor: Supervisor) -> Command | None:
-        """The command of this cycle; None at the end, and where the force grows on the way back."""
-        measurement, force = supervisor.seen.measurement, supervisor.felt()
+        """The command of this cycle; None at the end, and where a witness shows that the force grows."""
+        measurement = supervisor.seen.measurement
         if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
             return None
-        q = self._way.step(measurement.q)
+        if not self._begun:
+            self._begun = True
+            supervisor.begin_way_back()
+            self._retrace = self._trail.back(measurement.q, self._step_max) if self._trail is not None else None
+        retrace = self._retrace
+        q = self._way.step(measurement.q) if retrace is None else retrace.step(self._period_s)
         if q is None:
             return None
         command, finding = supervisor.guard_target(Command(q))
-        if self._force_known_from is None:
-            self._force_known_from = measurement.cycle + supervisor.seen.limits.cycles_to_feel
-        if measurement.cycle < self._force_known_from:  # what is felt is from before the way back
-            self._highest = max(self._highest, force)
-        return None if finding is not None or supervisor.must_stop() or force > self._highest else command
+        grows = supervisor.witness_grows(measurement)
+        return None if finding is not None or supervisor.must_stop() or grows else command
 
     def _still_obeyed(self) -> bool:
-        """A TPDO may be missing now and then; a drive that has left operation does not come back."""
+        """A TPDO may be missing now and then; a drive that has left operation or stands does not come back."""
         enabled = np.array(self._drives.enabled_ones())
         late = np.array(self._drives.ages()) >= 3
-        return not bool((self._free & (~enabled | late)).any())
+        beyond = self._drives.beyond_lag()
+        return not bool((self._free & (~enabled | late)).any()) and not any(self._free[i] for i in beyond)
 
 
 def _obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:

@@ -18,6 +18,8 @@ from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.image_witness import ImageWitness
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
+from canprobe.cell.planning.units import lag_s
 from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
@@ -53,6 +55,7 @@ class Limits:
         tactile_timeout: cycles without a tactile sample.
         regain: distance towards the object on which a scan searches for a lost contact, m; 0: it does not.
         tares: the array is tared in bring-up, so that nothing may press on it then.
+        lag_ns: lag of the drives behind a ramp; 0: unknown.
     """
 
     safety: SafetyLimits
@@ -62,11 +65,17 @@ class Limits:
     tactile_timeout: int = 12
     regain: float = 0.0
     tares: bool = False
+    lag_ns: int = 0
 
     @property
     def cycles_to_feel(self) -> int:
         """Cycles from a motion to the cycle that has taken in a tactile sample of it."""
         return 2 * self.tactile_cycles + 2
+
+    @property
+    def cycles_to_turn(self) -> int:
+        """Cycles from a command to the cycle that has taken in a tactile sample of the motion that it has turned."""
+        return self.cycles_to_feel + CYCLES_TO_EFFECT - (-2 * self.lag_ns // self.period_ns)
 
 
 def limits_of(plan: Plan) -> Limits:
@@ -82,6 +91,7 @@ def limits_of(plan: Plan) -> Limits:
         tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
         regain=scan.regain if scan is not None else 0.0,
         tares=setup.touch is not None,
+        lag_ns=round(lag_s(setup) * 1e9),
     )
 
 

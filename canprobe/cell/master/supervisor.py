@@ -14,6 +14,7 @@ from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touc
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.push_witness import PushWitness
 from canprobe.cell.master.supervision import Finding, Reaction, Seen, TouchState
+from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.robot.chain import forward
@@ -223,6 +224,7 @@ class Supervisor:
         self._push = push
         self._sample: TactileSample | None = None
         self._press = PressDetector()
+        self._growing = GrowingForce(seen.limits.cycles_to_turn)
         self._look_ns = 0
         self._untouched = seen.limits.tares
         self._late: deque[tuple[int, int]] = deque()  # while one of them is late, the last second's cycles
@@ -315,6 +317,14 @@ class Supervisor:
         if self._sample is None or self._patch_from is None:
             return False
         return not math.isfinite(self._patch_from(self._sample).sigma.total)
+
+    def begin_way_back(self) -> None:
+        """Begin to watch a way back of the probe."""
+        self._growing = GrowingForce(self.seen.limits.cycles_to_turn)
+
+    def witness_grows(self, measurement: Measurement) -> bool:
+        """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
+        return self._growing.grows(measurement.cycle, math.inf if self.shows_a_part else self.felt())
 
     def pressing(self) -> float:
         """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""

@@ -156,7 +156,8 @@ class OpenCell:
             The result of the whole block, the same from every call; it is complete when the block is left.
 
         Raises:
-            UsageError: when it is no controller, or its step returned no command.
+            UsageError: when it is no controller, its step returned no command, or the cell was stopped for safety and
+                `resume` was not called.
             BusError: when the interface or a node failed.
             SafetyStop: when the cell was stopped for safety, or the controller gave a `stop_reason`.
         """
@@ -167,13 +168,15 @@ class OpenCell:
         return self._result
 
     def resume(self) -> None:
-        """Ask for motion in a cell that was opened with ``recover=True`` and has come back from a loss.
+        """A person's word that the arm may move again.
 
+        After a `SafetyStop`, and after any other stop by the supervision, `run` is refused before this was called. In a
+        cell that was opened with ``recover=True`` it asks for motion after a loss, from which such a cell comes back.
         A controller that is held goes on in the next cycle. May be called from any thread, an observer, or `progress`.
         Where no controller is held, as after one that the loss has ended, the cell is brought up again for the next.
 
         Raises:
-            UsageError: the cell was not opened with ``recover=True``, or is closed.
+            UsageError: nothing was stopped, and the cell was not opened with ``recover=True``; or the cell is closed.
             BusError, SafetyStop: the cell cannot be brought up again.
         """
         self.session.resume()

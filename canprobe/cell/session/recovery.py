@@ -94,6 +94,11 @@ class Recovery:
         self._released: set[int] = set()
         self._asked = self._running = False
 
+    @property
+    def lost(self) -> bool:
+        """Whether the cell has ended by a loss that it may come back from."""
+        return self._lost is not None
+
     def run(
         self, controller: Controller | Callable[[Measurement], Command], progress: Callable[[Measurement], None]
     ) -> None:

@@ -42,7 +42,7 @@ from canprobe.cell.session.rehearsal import shortened
 from canprobe.cell.session.step_log import StepLog
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.errors import CanprobeError, ResultsError, UsageError
+from canprobe.errors import CanprobeError, ResultsError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import RecordingPort
 from canprobe.fieldbus.bus.clock import Clock, MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.fieldbus.bus.files import writing
@@ -103,6 +103,7 @@ class Session:
         self._direct: Callable[..., Cycle] | None = None
         self._recovery: Recovery | None = None
         self._child: EmulatorChild | None = None
+        self._stopped_for: CanprobeError | None = None
         self.around: Callable[[Port], Port] = lambda port: port
 
     @cached_property
@@ -188,9 +189,18 @@ class Session:
         controller: Controller | Callable[[Measurement], Command],
         progress: Callable[[Measurement], None] = lambda _: None,
     ) -> None:
-        """Run a controller until it is done; see :meth:`canprobe.cell.master.cell.Cell.run`."""
+        """Run a controller until it is done; see :meth:`canprobe.cell.master.cell.Cell.run`.
+
+        After a stop by the supervision nothing moves again before `resume`, unless it was a loss that a cell which
+        recovers may come back from.
+        """
         if self._left:
             raise UsageError("the cell is closed: open another one with `with canprobe.open_cell(scene) as cell:`")
+        if self._stopped_for is not None:
+            raise UsageError(
+                f"the cell was stopped for safety: {self._stopped_for}; nothing moves again by itself: look at the arm,"
+                " then call resume() before the next run"
+            )
         first_second = None if self.virtual else FirstSecond(self.cell, self.plan, self._say)
 
         def after_cycle(measurement: Measurement) -> None:
@@ -199,19 +209,30 @@ class Session:
             progress(measurement)
 
         after = progress if first_second is None else after_cycle
-        if self._recovery is not None:
-            self._recovery.run(controller, after)
-        else:
-            self.cell.run(controller, after)
+        try:
+            if self._recovery is not None:
+                self._recovery.run(controller, after)
+            else:
+                self.cell.run(controller, after)
+        except CanprobeError as error:
+            passing = self._recovery is not None and self._recovery.lost
+            if isinstance(error, SafetyStop) or (self.cell.stopped_by is not None and not passing):
+                self._stopped_for = error
+            raise
 
     def resume(self) -> None:
-        """Ask for motion after a loss; see `canprobe.cell.session.recovery`.
+        """Allow the next run after a stop for safety, or ask for motion after a loss; see `cell.session.recovery`.
 
         Raises:
-            UsageError: the cell was not opened with ``recover``, or is closed.
+            UsageError: nothing was stopped, and the cell was not opened with ``recover``; or the cell is closed.
         """
+        if self._stopped_for is not None and not self._left:
+            self._stopped_for = None
+            return
         if self._recovery is None or self._left:
-            raise UsageError("resume: the cell is closed, or was not opened with recover=True")
+            raise UsageError(
+                "resume: nothing was stopped for safety, and the cell is closed, or was not opened with recover=True"
+            )
         self._recovery.resume()
 
     def _make_cell(self, port: Port, before: Cell | None = None) -> Cell:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.trail import TakenWay
 from canprobe.mechanics.robot.model import Joint
 from canprobe.mechanics.types import Floats
 
@@ -93,6 +94,11 @@ class HeldTask(Controller):
     def lets_go(self) -> bool:  # type: ignore[override]
         """Whether the controller lets go by itself; in the hold the cell does."""
         return not self.held and self._controller.lets_go
+
+    @property
+    def trail(self) -> TakenWay | None:
+        """The way by which the controller's probe has come; after a hold it is not known."""
+        return None if self.held else self._controller.trail
 
     def retreat(self, reason: str) -> None:
         """Let the controller let go."""

@@ -38,6 +38,7 @@ class ProbeMotion:
     Attributes:
         limit: message of a joint or workspace limit that is reached; None without one.
         slowed: cycles in which a joint could not keep up.
+        step_max: largest step of each joint in a period (n,), rad or m.
     """
 
     def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Floats) -> None:
@@ -45,7 +46,8 @@ class ProbeMotion:
         self._model = model = arm.model
         self._steps = PoseSteps(model, probe.T_flange_probe, self.q, _solve)
         self._workspace, self._radius = safety.workspace, probe.radius
-        self._step_max: list[float] = (model.qd_max * safety.speed_share * period_s).tolist()
+        self.step_max: Floats = model.qd_max * safety.speed_share * period_s
+        self._step_max: list[float] = self.step_max.tolist()
         self._period_s = period_s
         margin = safety.joint_margin
         self._low, self._high = model.q_min + margin, model.q_max - margin

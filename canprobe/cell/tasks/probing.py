@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from canprobe.cell.master.array import PatchReader, force_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.supervision import Finding, TouchState, limits_of
+from canprobe.cell.master.trail import GrowingForce, Retrace, TakenWay
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.planning.witnesses import reports_torque
@@ -41,6 +43,10 @@ class Phase(IntEnum):
     RETREAT = 4
     DONE = 5
     REGAIN = 6
+
+
+COMING = (Phase.MOVE, Phase.APPROACH, Phase.SETTLE)
+"""Phases in which the probe comes from free space: the way that it has taken leads off what it touches."""
 
 
 class ProbingTask(Task):
@@ -76,6 +82,10 @@ class ProbingTask(Task):
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
         self._motion: ProbeMotion | None = None
         self._line: LineMotion | ArcMotion | None = None
+        self._way_here: TakenWay | None = None
+        self._retrace: Retrace | None = None
+        self._growing: GrowingForce | None = None
+        self._measured: Floats | None = None
         self._cycle = 0
         self._t = 0.0
         self._floor = 0.0
@@ -103,6 +113,11 @@ class ProbingTask(Task):
         watched = self.depth.watched / contacts if contacts else None
         return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed, depth_watched=watched)
 
+    @property
+    def trail(self) -> TakenWay | None:
+        """The way by which the probe has come, until it moves over the object."""
+        return self._way_here if self.phase in COMING else None
+
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
         self._cycle = measurement.cycle
@@ -111,7 +126,11 @@ class ProbingTask(Task):
             setup = self._setup
             assert measurement.q is not None and setup.arm is not None
             self._motion = ProbeMotion(setup.arm, setup.probe, setup.limits, self._period_s, measurement.q)
+            self._way_here = TakenWay(setup.arm.model, setup.probe.T_flange_probe)
             self._begin(self._motion.pose)
+        self._measured = measurement.q
+        if self._way_here is not None and self.phase in COMING:
+            self._way_here.add(measurement.q, measurement.q_age)
         patch = self.sensing.step(measurement)
         if patch is not None and measurement.tactile is not None:
             self._witness(measurement.tactile, patch, self._feel(measurement.tactile, patch))
@@ -163,11 +182,17 @@ class ProbingTask(Task):
             self.array_blind = str(finding.error)
 
     def _command(self, pose: ProbePose) -> Command:
-        """One step of the probe to a pose, as the cell takes it; a joint's limit on the way makes the task let go."""
+        """One step of the probe to a pose, as the cell takes it; a joint's limit on the way makes the task let go.
+
+        On its trail the probe goes back by joints that were measured, whatever the pose is.
+        """
         assert self._motion is not None
-        target = self._motion.step(pose)
-        if self._motion.limit is not None:
-            self.retreat(self._motion.limit)
+        if self._retrace is not None:
+            target = self._retrace.q
+        else:
+            target = self._motion.step(pose)
+            if self._motion.limit is not None:
+                self.retreat(self._motion.limit)
         self._columns["phase"] = float(self.phase)
         done = self.phase is Phase.DONE
         return Command(
@@ -197,6 +222,8 @@ class ProbingTask(Task):
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
         self._t = 0.0
+        if phase is Phase.MOVE and self._way_here is not None:
+            self._way_here.forget()
 
     def _move(self) -> ProbePose:
         assert self._line is not None
@@ -233,18 +260,38 @@ class ProbingTask(Task):
         raise NotImplementedError
 
     def _draw_back(self, way: Floats) -> None:
-        """Begin the retreat by a way (3,), m, off the object."""
+        """Begin the retreat: back on the way that the probe has come, or where it has moved over the object, by a way.
+
+        Args:
+            way: (3,) m, off the object.
+        """
         assert self._motion is not None
+        if self._way_here is not None and self._measured is not None and self.phase in COMING:
+            self._retrace = self._way_here.back(self._measured, self._motion.step_max)
         pose = self._motion.pose
         self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED_M_S, at_once=True)
+        self._growing = None
         self._enter(Phase.RETREAT)
 
     def _retreat(self) -> ProbePose:
         assert self._line is not None
+        if self._witness_grows():
+            grows = f"the force grows on the way back, to {self._touch.force:.2f} N: the probe was stopped there"
+            self.reason = grows if self.reason is None else f"{self.reason}; {grows}"
+            self._enter(Phase.DONE)
+            return self._stay()
         pose = self._line.at(self._t)
-        if self._t >= self._line.duration + self._lead_s:
+        over = self._t >= self._line.duration + self._lead_s
+        if over if self._retrace is None else self._retrace.step(self._dt) is None:
             self._off()
         return pose
+
+    def _witness_grows(self) -> bool:
+        """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
+        if self._growing is None:
+            self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
+        bound = math.isinf(self._touch.force_sigma)  # an array that leaves saturation may measure more than before
+        return self._growing.grows(self._cycle, math.inf if bound else self._touch.force)
 
     def _off(self) -> None:
         """The probe is off the object."""

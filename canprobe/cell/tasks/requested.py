@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.trail import TakenWay
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.task import MotionTime
@@ -156,6 +157,11 @@ class RequestedTask(Controller):
     def lets_go(self) -> bool:  # type: ignore[override]
         """Whether the task lets go by itself."""
         return self._task is not None and self._task.lets_go
+
+    @property
+    def trail(self) -> TakenWay | None:
+        """The way by which the task's probe has come."""
+        return None if self._task is None else self._task.trail
 
     def retreat(self, reason: str) -> None:
         """Let the task let go."""

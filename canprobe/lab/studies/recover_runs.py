@@ -14,6 +14,7 @@ from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
+from canprobe.cell.master.trail import TakenWay
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.scene.load import load_scene
@@ -112,6 +113,11 @@ class Work(Controller):
     def lets_go(self) -> bool:  # type: ignore[override]
         """Whether the task lets go."""
         return self._task.lets_go
+
+    @property
+    def trail(self) -> TakenWay | None:
+        """The way by which the task's probe has come."""
+        return self._task.trail
 
     def retreat(self, reason: str) -> None:
         """Let the task let go."""

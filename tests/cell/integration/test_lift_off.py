@@ -13,7 +13,7 @@ from injected import HOLD_CYCLE, Injected, altered, send
 
 import canprobe
 from canprobe.cell.master.controller import Command
-from canprobe.cell.master.lift_off import LIFT_WAY
+from canprobe.cell.master.trail import WAY_BACK
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
@@ -62,7 +62,7 @@ def test_the_probe_is_taken_off(what):
     assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
     assert run.session.truth["force_n"][-1] == 0.0
     back, aside = lifted(run)
-    assert 0.95 * LIFT_WAY < back < 1.2 * LIFT_WAY and aside < 0.05 * LIFT_WAY, (
+    assert 0.95 * WAY_BACK < back < 1.2 * WAY_BACK and aside < 0.05 * WAY_BACK, (
         "without a sensor the task begins to retreat by itself"
     )
     assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
@@ -85,7 +85,7 @@ def test_two_lost_drives_leave_four():
 def pressed_on(run, told):
     run.assert_drives_off()
     assert run.session.truth["force_n"][-1] == pytest.approx(2.0, abs=0.3)
-    assert abs(lifted(run)[0]) < 0.1 * LIFT_WAY
+    assert abs(lifted(run)[0]) < 0.1 * WAY_BACK
     assert any(told in fault for fault in (str(run.error), *run.session.cell.faults))
 
 
@@ -189,7 +189,7 @@ def test_a_lift_off_does_not_go_on_when_something_else_comes(second, cycles):
     run = Twice(second)
     assert type(run.error) is KeyboardInterrupt
     assert 20 <= run.lifting <= 20 + cycles
-    assert 0.2 * LIFT_WAY < lifted(run)[0] < 0.5 * LIFT_WAY, "as far as it was, and what is left of the motion"
+    assert 0.2 * WAY_BACK < lifted(run)[0] < 0.5 * WAY_BACK, "as far as it was, and what is left of the motion"
     if second is master_heard:
         assert "another master is on the bus: SYNC from another master" in run.session.cell.faults
 
@@ -298,7 +298,7 @@ def test_whoever_ends_the_run_the_probe_is_taken_off(what):
     assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
     assert run.session.truth["force_n"][-1] == 0.0
     back, aside = lifted(run)
-    assert 0.95 * LIFT_WAY < back < 1.05 * LIFT_WAY and aside < 0.05 * LIFT_WAY
+    assert 0.95 * WAY_BACK < back < 1.05 * WAY_BACK and aside < 0.05 * WAY_BACK
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
@@ -348,18 +348,18 @@ def test_a_second_interrupt_stops_at_once():
     assert isinstance(run.error, KeyboardInterrupt)
     run.assert_drives_off()
     back, _ = lifted(run)
-    assert 0.2 * LIFT_WAY < back < 0.5 * LIFT_WAY, "20 of 128 cycles, the fast ones"
+    assert 0.2 * WAY_BACK < back < 0.5 * WAY_BACK, "20 of 128 cycles, the fast ones"
 
 
 def test_a_way_back_on_which_the_force_grows_ends():
     def misfeel(run):
-        force = count(2.0, 0.01)
+        force = count(2.0, 0.02)
         run.session.cell.supervisor.felt = lambda: next(force)
         run.inject("node 4: mute")
 
     run = Injected("press", HOLD_CYCLE, misfeel)
     run.assert_drives_off()
-    assert 0.0 < lifted(run)[0] < 0.5 * LIFT_WAY
+    assert 0.0 < lifted(run)[0] < 0.5 * WAY_BACK
 
 
 def test_an_own_controller_that_cannot_retreat_is_taken_off_at_the_force_limit():

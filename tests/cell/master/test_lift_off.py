@@ -11,8 +11,9 @@ from puma_arm import ELBOW_FORM
 
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement
-from canprobe.cell.master.lift_off import ARRIVAL_S, LIFT_SPEED, LIFT_WAY, LiftOff, WayBack
+from canprobe.cell.master.lift_off import LiftOff, WayBack
 from canprobe.cell.master.supervision import limits_of
+from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, TakenWay
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.errors import NodeError, SafetyStop
 from canprobe.fieldbus.protocol.emcy import Emcy
@@ -36,12 +37,12 @@ def test_the_way_is_straight_back_and_fast_at_first(still):
     T = [forward(MODEL.chain, q) @ T_FLANGE_PROBE for q in joints]
     ways = np.array([one[:3, 3] - T[0][:3, 3] for one in T])
     back = -ways @ T[0][:3, 2]
-    assert np.linalg.norm(ways + np.outer(back, T[0][:3, 2]), axis=1).max() < 0.01 * LIFT_WAY
-    assert back[-1] == pytest.approx(LIFT_WAY, rel=0.01)
-    assert len(joints) - 1 == pytest.approx((LIFT_WAY / LIFT_SPEED + ARRIVAL_S) / PERIOD_S, abs=1.5)
+    assert np.linalg.norm(ways + np.outer(back, T[0][:3, 2]), axis=1).max() < 0.01 * WAY_BACK
+    assert back[-1] == pytest.approx(WAY_BACK, rel=0.01)
+    assert len(joints) - 1 == pytest.approx((WAY_BACK / WAY_BACK_SPEED + ARRIVAL_S) / PERIOD_S, abs=1.5)
     speed = np.diff(back) / PERIOD_S
-    assert speed[0] == pytest.approx(2 * LIFT_SPEED, rel=0.02) and np.diff(speed).max() < 1e-4
-    moving = round(LIFT_WAY / LIFT_SPEED / PERIOD_S)
+    assert speed[0] == pytest.approx(2 * WAY_BACK_SPEED, rel=0.02) and np.diff(speed).max() < 1e-4
+    moving = round(WAY_BACK / WAY_BACK_SPEED / PERIOD_S)
     assert np.abs(speed[moving:]).max() < 1e-9 < speed[moving - 1]
     moved = np.abs(joints_to_units(MODEL, joints[-1]) - joints_to_units(MODEL, ELBOW_FORM)) > 1e-6
     assert moved.any() and not moved[~free].any()
@@ -60,13 +61,16 @@ class Drives:
     stopped = frozenset()
 
     def __init__(self):
-        self.age, self.on = [0] * 6, [True] * 6
+        self.age, self.on, self.beyond = [0] * 6, [True] * 6, {}
 
     def ages(self):
         return tuple(self.age)
 
     def enabled_ones(self):
         return tuple(self.on)
+
+    def beyond_lag(self):
+        return self.beyond
 
 
 def a_watch():
@@ -131,10 +135,13 @@ class Cell:
 
     def __init__(self):
         self.seen = SimpleNamespace(measurement=Measurement(1000, 0, q=ELBOW_FORM), limits=limits_of(PLAN))
-        self.force, self.stops, self.finding = 2.0, False, None
+        self.grows, self.begun, self.stops, self.finding = False, False, False, None
 
-    def felt(self):
-        return self.force
+    def begin_way_back(self):
+        self.begun = True
+
+    def witness_grows(self, measurement):
+        return self.grows
 
     def must_stop(self):
         return self.stops
@@ -162,8 +169,8 @@ ENDS = {
     "a condition that forbids motion": (lambda d, c: setattr(c, "stops", True), True),
     "a joint at its stop": (lambda d, c: setattr(c, "finding", object()), True),
     "no positions": (lambda d, c: setattr(c.seen, "measurement", replace(c.seen.measurement, q=None)), True),
-    "the force as before": (lambda d, c: setattr(c, "force", 2.0), False),
-    "a force that grows": (lambda d, c: setattr(c, "force", 2.001), True),
+    "a witness that shows a growing force": (lambda d, c: setattr(c, "grows", True), True),
+    "a joint that stands": (lambda d, c: d.beyond.update({4: 3.0}), True),
 }
 
 
@@ -183,15 +190,40 @@ def test_a_drive_that_was_lost_before_does_not_end_it():
     assert going.command(cell) is not None
 
 
-def test_what_was_pressed_before_the_motion_is_felt_for_a_while_and_is_no_growth():
+def test_a_drive_that_stood_before_does_not_end_it():
     drives, cell = Drives(), Cell()
-    going, first = lift(drives), cell.seen.measurement.cycle
-    for k in range(12):
-        cell.force = 2.0 + 0.1 * k
-        cell.seen.measurement = replace(cell.seen.measurement, cycle=first + k)
-        if going.command(cell) is None:
-            break
-    assert k == cell.seen.limits.cycles_to_feel
+    drives.beyond = {2: 3.0}
+    assert lift(drives, error=NodeError(3, "does not follow")).command(cell) is not None and cell.begun
+    assert lift(drives).command(cell) is None
+
+
+def trail_of(joints):
+    trail = TakenWay(MODEL, T_FLANGE_PROBE)
+    for q in joints:
+        trail.add(q, (0,) * 6)
+    return trail
+
+
+def come(steps=400):
+    """Joints of a way that is not straight, 0.02 mm or so a step."""
+    u = np.linspace(0.0, 1.0, steps)[:, None]
+    return ELBOW_FORM + u * np.array([0.05, -0.03, 0.02, 0.01, -0.02, 0.03]) + 0.02 * np.sin(6.0 * u)
+
+
+def test_where_the_way_is_known_it_goes_back_on_it_and_with_a_drive_at_rest_along_the_pole():
+    joints = come()
+    for still, follows in ((None, True), (2, False)):
+        drives, cell = Drives(), Cell()
+        if still is not None:
+            drives.on[still] = False
+        cell.seen.measurement = replace(cell.seen.measurement, q=joints[-1])
+        going = LiftOff(PLAN, drives, a_watch(), SafetyStop("lost"), trail_of(joints))
+        targets = []
+        while (command := going.command(cell)) is not None:
+            targets.append(command.q_target)
+            cell.seen.measurement = replace(cell.seen.measurement, q=command.q_target)
+        off = max(np.abs(joints - q).max(axis=1).min() for q in targets)
+        assert len(targets) > 100 and bool(off < 5e-4) is follows, off
 
 
 def test_the_command_is_the_guarded_one():

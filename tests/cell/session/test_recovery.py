@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +14,8 @@ from canprobe.cell.master.homing import UnhomedError
 from canprobe.cell.session import recovery
 from canprobe.cell.session.recovery import STEADY_NS, TRIES, Recovery, may_pass
 from canprobe.errors import InterfaceError, NodeError, SafetyStop
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
 LOST, STOP, DOWN = NodeError(3, "lost"), SafetyStop("stop"), InterfaceError("can0: down")
 PERIOD_NS = 2_500_000
@@ -191,3 +194,30 @@ def test_motion_that_is_asked_for_while_nothing_is_lost_brings_nothing_up(monkey
     bench = Bench(monkeypatch, [{}])
     bench.recovery.resume()
     assert bench.told() == [[], []] and not bench.said
+
+
+def test_motion_that_is_asked_for_during_a_recovery_brings_nothing_up_a_second_time(monkeypatch):
+    """From another thread, while the cell is lost and waits for its nodes."""
+    bench, looks = Bench(monkeypatch, [{}, {}]), []
+
+    def look(port, must_boot):
+        looks.append(must_boot)
+        if len(looks) == 1:
+            bench.recovery.resume()
+
+    monkeypatch.setattr(bench, "look", look, raising=False)
+    bench.run()
+    assert bench.told()[1:] == [UP, []] and len(looks) == 1
+
+
+def test_a_drive_that_does_not_answer_is_asked_as_long_and_as_often_as_the_cell_says():
+    """Whether it kept its power is not known then: it counts as one that did not."""
+    scene = canprobe.load_scene("free")
+    name = list(scene.joints)[2]
+    joint = replace(scene.joints[name], zero="homing", homing_method=37, home_deg=0.0)
+    scene = replace(scene, joints={**scene.joints, name: joint})
+    plan = canprobe.plan(replace(scene, bring_up=replace(scene.bring_up, sdo_s=0.04, retries=3)))
+    clock = VirtualClock()
+    port = LockstepBus(clock, plan.buses[0].channel).port()
+    assert recovery._Wait(plan, foreign=False).without_power(port, set()) == {3}
+    assert clock.now_ns() * 1e-9 == pytest.approx(4 * 0.04, rel=0.1)

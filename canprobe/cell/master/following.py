@@ -1,0 +1,90 @@
+"""Whether motors follow their targets: a stuck brake, a power stage that is off, a drive that goes too slowly.
+
+A drive that lags moves as its targets did a little earlier: in a while it goes as far as they went in a while of the
+same length, begun up to four stated lags before. So its motion lies between the least and the largest of those
+motions, whatever its lag is, up to one and a half times the stated one. Why not a model of second order: its bounds
+would be as narrow, but a drive that lags less or more than stated would be taken for one that does not follow. Why
+motions and not positions: a drive without an integral part stands beside its target by what its load takes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.robot.motors import units_per_motor
+
+LAGS = 4.0
+"""Stated lags before which a drive may have begun a motion: with 1.5 times the lag it has then followed to 97 %."""
+WHILES_S = (0.005, 0.02, 0.08, 0.32)
+"""Whiles in which the motions are compared, s: a fast joint that stands shows in the first, a slow one in the last."""
+MARGIN_RAD = 0.5e-3
+"""Angle of a joint by which a motion may differ: rounding of target and position, noise of the encoder, friction."""
+MIN_MARGIN_COUNTS = 3
+"""Least margin in counts."""
+
+
+class Following:
+    """Targets and positions of the motors in the last while.
+
+    Args:
+        model: the arm, for the units of its drives.
+        lag_s: lag of the drives behind a ramp.
+        period_ns: period of the cycle.
+    """
+
+    def __init__(self, model: ArmModel, lag_s: float, period_ns: int) -> None:
+        margins = np.abs(units_per_motor(model)) * model.radian * MARGIN_RAD
+        self._margins: list[float] = np.maximum(margins, MIN_MARGIN_COUNTS).tolist()
+        self._period_ns = period_ns
+        self._whiles = sorted({max(1, round(s * 1e9 / period_ns)) for s in WHILES_S})
+        self._delays = range(1, CYCLES_TO_EFFECT + 1 + int(-(-LAGS * lag_s * 1e9 // period_ns)))
+        self._usual = 1 + len(self._delays) // 2
+        size = self._whiles[-1] + len(self._delays) + 1
+        self._cycles: deque[tuple[int, Sequence[int], Sequence[int | None]]] = deque(maxlen=size)
+
+    def forget(self) -> None:
+        """Forget all cycles, as before the first one."""
+        self._cycles.clear()
+
+    def aim(self, targets: Sequence[int], counts: Sequence[int | None], t_ns: int) -> None:
+        """Take a cycle: time of its SYNC, positions at it (None: not reported), and the targets that follow it."""
+        if self._cycles:
+            before_ns, last, _ = self._cycles[-1]
+            for _ in range(min(round((t_ns - before_ns) / self._period_ns) - 1, len(self._delays))):
+                self._cycles.append((before_ns, last, (None,) * len(last)))  # no target came: the drives came to rest
+        self._cycles.append((t_ns, targets, counts))
+
+    def beyond(self, motor: int, counts: int, t_ns: int) -> float:
+        """Counts by which a motor's motion until now is less or more than its targets explain; 0 where it follows.
+
+        Args:
+            motor: number of the motor, from 0.
+            counts: its position at the SYNC of this cycle.
+            t_ns: time of that SYNC.
+        """
+        cycles, margin, most = self._cycles, self._margins[motor], 0.0
+        last = len(cycles) - 1
+        for span in self._whiles:
+            if span > last:
+                break
+            begin_ns, _, before = cycles[-span]
+            if (was := before[motor]) is None:
+                continue
+            moved = counts - was
+            end, start = last + 1 - self._usual, last + 1 - self._usual - span
+            asked = cycles[max(end, 0)][1][motor] - cycles[max(start, 0)][1][motor]
+            if abs(moved - asked) <= margin:
+                continue
+            ends = [cycles[max(last + 1 - delay, 0)][1][motor] for delay in self._delays]
+            starts = [cycles[max(last + 1 - delay - span, 0)][1][motor] for delay in self._delays]
+            asks = [end - start for end, start in zip(ends, starts, strict=True)]
+            uneven = abs(t_ns - begin_ns - span * self._period_ns) / self._period_ns
+            allowed = margin + uneven * max([abs(b - a) for a, b in pairwise((*starts, *ends))])
+            most = max(most, moved - max(asks) - allowed, min(asks) - allowed - moved)
+        return most

@@ -1,0 +1,39 @@
+"""An arm that is held and goes on: joint targets during a hold, and after it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from canprobe.cell.master.controller import Command, Measurement
+from canprobe.mechanics.types import Floats
+
+THAW_NS = 50_000_000
+"""Time in which the targets go on from where the arm was held to where its controller is."""
+
+
+class HeldArm:
+    """Holds an arm where it is: its last targets lie ahead of it, and the drives that are heard would go on to them."""
+
+    def __init__(self) -> None:
+        self._frozen: Floats | None = None
+        self._behind: Floats | None = None
+        self._thawed_ns = 0
+
+    def freeze(self, measurement: Measurement) -> Command:
+        """The command of a cycle of the hold: where the arm was in the first one."""
+        if self._frozen is None:
+            self._frozen = measurement.q
+        return Command(self._frozen)
+
+    def thaw(self, command: Command, measurement: Measurement) -> Command:
+        """The controller's command; after a hold it makes up little by little for the way from there."""
+        if command.q_target is None or (self._frozen is None and self._behind is None):
+            return command
+        if self._frozen is not None:
+            self._behind, self._frozen = self._frozen - command.q_target, None
+            self._thawed_ns = measurement.t_ns
+        left = 1.0 - (measurement.t_ns - self._thawed_ns) / THAW_NS
+        if left <= 0.0 or self._behind is None:
+            self._behind = None
+            return command
+        return replace(command, q_target=command.q_target + left * self._behind)

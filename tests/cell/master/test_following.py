@@ -1,0 +1,147 @@
+"""Whether a motor follows its targets: drives of any lag do, one that stands or goes at another speed does not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.master.following import MIN_MARGIN_COUNTS, Following
+
+MODEL = canprobe.plan("press").setup.arm.model
+PERIOD_NS, LAG_S = 2_500_000, 6.8e-3
+COUNTS_PER_RAD = abs(float(MODEL.units_per_q[0, 0]))
+
+
+class Motor:
+    """Reaches each target two cycles later, behind the lag of a loop of second order."""
+
+    def __init__(self, lag_s, period_s=PERIOD_NS * 1e-9):
+        self.x = self.v = 0.0
+        self.w = 2.0 / lag_s if lag_s else math.inf
+        self.period_s, self.share, self.stands = period_s, 1.0, False
+        self.reference = [0.0] * 3
+
+    def step(self, target):
+        self.reference = [*self.reference[1:], target]
+        begin, end = self.reference[0], self.reference[1]
+        if self.stands:
+            return round(self.x)
+        if math.isinf(self.w):
+            self.x = end
+            return round(self.x)
+        n = 50
+        for k in range(n):
+            r = begin + (end - begin) * (k + 1) / n
+            self.v += (self.w**2 * (self.share * r - self.x) - 2.0 * self.w * self.v) * self.period_s / n
+            self.x += self.v * self.period_s / n
+        return round(self.x)
+
+
+def found(motor, targets, *, at=10**9, what=lambda motor: None, late=None, period_ns=PERIOD_NS):
+    """Cycles from `at` to the first cycle in which the motor does not follow; None where it always does."""
+    following, t_ns = Following(MODEL, LAG_S, period_ns), 0
+    counts = 0
+    for k, target in enumerate(targets):
+        t_ns += period_ns + (late(k) if late else 0)
+        if k == at:
+            what(motor)
+        if following.beyond(0, counts, t_ns) > 0.0:
+            return k - at
+        following.aim([round(target)] * 6, [counts] * 6, t_ns)
+        counts = motor.step(round(target))
+    return None
+
+
+def motions(period_s=PERIOD_NS * 1e-9):
+    t = np.arange(0.0, 1.5, period_s)
+    ramp = np.clip(t - 0.2, 0.0, 1.0)
+    return {
+        "a ramp": 0.6 * COUNTS_PER_RAD * ramp,
+        "to and fro": 0.05 * COUNTS_PER_RAD * (1.0 - np.cos(2.0 * math.pi * 3.0 * t)),
+        "a slow ramp": 0.003 * COUNTS_PER_RAD * ramp,
+        "at once to its speed and back": 0.2 * COUNTS_PER_RAD * (0.25 - np.abs(np.mod(t, 0.5) - 0.25)),
+    }
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 2e-3, LAG_S, 2.0 * LAG_S])
+@pytest.mark.parametrize("what", motions())
+def test_a_drive_with_any_lag_up_to_twice_the_stated_one_follows(what, lag_s):
+    assert found(Motor(lag_s), motions()[what]) is None
+
+
+@pytest.mark.parametrize("rate_hz", [200, 1000])
+def test_the_while_is_a_time_at_every_rate(rate_hz):
+    period_s = 1.0 / rate_hz
+    for targets in motions(period_s).values():
+        assert found(Motor(LAG_S, period_s), targets, period_ns=round(period_s * 1e9)) is None
+    ramp, at = motions(period_s)["a ramp"], round(0.6 * rate_hz)
+    stand = lambda motor: setattr(motor, "stands", True)  # noqa: E731
+    assert found(Motor(LAG_S, period_s), ramp, at=at, what=stand, period_ns=round(period_s * 1e9)) <= 0.015 * rate_hz
+
+
+@pytest.mark.parametrize(("speed", "within_s"), [(0.6, 0.01), (0.1, 0.02), (0.01, 0.09), (0.002, 0.33)])
+@pytest.mark.parametrize("lag_s", [0.0, LAG_S])
+def test_a_motor_that_stands_is_found_before_it_is_far_behind(speed, within_s, lag_s):
+    t = np.arange(0.0, 1.5, PERIOD_NS * 1e-9)
+    targets = speed * COUNTS_PER_RAD * np.clip(t - 0.2, 0.0, None)
+    stand = lambda motor: setattr(motor, "stands", True)  # noqa: E731
+    cycles = found(Motor(lag_s), targets, at=300, what=stand)
+    assert 0 <= cycles * PERIOD_NS * 1e-9 <= within_s
+
+
+def test_a_motor_at_half_of_its_speed_is_found():
+    half = Motor(LAG_S)
+    half.share = 0.5
+    assert found(half, motions()["a ramp"], at=80) * PERIOD_NS * 1e-9 < 0.04
+
+
+def test_a_drive_that_stands_beside_its_target_by_its_load_follows():
+    class Loaded(Motor):
+        def step(self, target):
+            return super().step(target) - 40
+
+    following = Following(MODEL, LAG_S, PERIOD_NS)
+    motor, counts = Loaded(LAG_S), -40
+    for k, target in enumerate(motions()["a ramp"]):
+        assert following.beyond(0, counts, k * PERIOD_NS) == 0.0
+        following.aim([round(target)] * 6, [counts] * 6, k * PERIOD_NS)
+        counts = motor.step(round(target))
+
+
+@pytest.mark.parametrize("stall_ns", [PERIOD_NS // 3, 2 * PERIOD_NS, 60_000_000])
+def test_after_a_stall_of_the_master_the_drives_begin_from_rest(stall_ns):
+    """Meanwhile they came to rest at their last targets."""
+    following, t_ns, counts, motor = Following(MODEL, LAG_S, PERIOD_NS), 0, 0, Motor(LAG_S)
+    for k, target in enumerate(motions()["a ramp"]):
+        late = stall_ns if k == 300 else 0
+        t_ns += PERIOD_NS + late
+        for _ in range(round(late / PERIOD_NS)):
+            counts = motor.step(motor.reference[-1])
+        assert following.beyond(0, counts, t_ns) == 0.0, k
+        # the targets go on by their step, from where they were
+        following.aim([round(target)] * 6, [counts] * 6, t_ns)
+        counts = motor.step(round(target))
+
+
+def test_what_is_not_known_is_not_compared():
+    following = Following(MODEL, LAG_S, PERIOD_NS)
+    assert following.beyond(0, 10**6, 0) == 0.0
+    for k in range(400):
+        following.aim([100 * k] * 6, [None] * 6, k * PERIOD_NS)
+    assert following.beyond(0, 0, 400 * PERIOD_NS) == 0.0
+    following.aim([40_000] * 6, [0] * 6, 400 * PERIOD_NS)
+    following.forget()
+    assert following.beyond(0, 0, 401 * PERIOD_NS) == 0.0
+
+
+def test_rounding_and_noise_of_some_counts_are_no_motion():
+    rng = np.random.default_rng(4)
+    following = Following(MODEL, LAG_S, PERIOD_NS)
+    for k in range(400):
+        counts = int(rng.integers(-1, 2))
+        assert following.beyond(0, counts, k * PERIOD_NS) == 0.0
+        following.aim([0] * 6, [counts] * 6, k * PERIOD_NS)
+    assert following.beyond(0, MIN_MARGIN_COUNTS + 3, 400 * PERIOD_NS) > 0.0
