@@ -192,7 +192,8 @@ def draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
             start += shares
         left.set(xlabel="share of the runs with this fault", xlim=(0, 1))
         for place, some in enumerate(found.values()):
-            right.plot([max(one["force_share"], 0.01) for one in some], [place] * len(some), ".", color=BLUE, ms=3)
+            heights = [max(one["force_share"], 0.01) for one in some]
+            right.plot(heights, [place] * len(some), ".", color=BLUE, ms=3, label="" if place else "a run")
         for share, style, label in ((USUAL_SHARE, "--", "99 % below"), (FORCE_SHARE, "-", "all below")):
             right.axvline(share, color=ORANGE, linestyle=style, label=f"{share:g} × the limit: {label}")
         log_scale(right, "x")
