@@ -28,7 +28,7 @@ from canprobe.lab.studies.sweep import Sweep
 NUMBERS_A_CELL = 17
 """Runs in a row, of one task and plant, so that a process does not plan for a single one."""
 JOINTS = 6
-QUICK_KINDS = ("stuck-image", "replayed-image", "gain-lost", "brake-stuck", "encoder-jump", "mute")
+QUICK_KINDS = ("stuck-image", "replayed-image", "gain-lost", "brake-stuck", "encoder-jump")
 _QUICK_PLACES = (("press", "approach"), ("weave", "contact"))
 QUICK_FILES = (WrongFile("true gear × ½", 3, "ideal"),)
 COLOURS = {
