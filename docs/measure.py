@@ -40,7 +40,7 @@ IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
 LONG = ("faults", "soak", "growth", "held", "canopen_node")
-FORMS = {"soak": "realtime --soak", "recover_vcan": "recover --vcan"}
+FORMS = {"soak": "realtime --soak", "recover_vcan": "recover --vcan", "faults_vcan": "faults --vcan"}
 """Studies of another form, as they are typed."""
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
@@ -80,6 +80,21 @@ TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] =
             "force off its target": "{force_percent:.1f} %",
             "in contact": "{contact:.1%}",
             "stopped": "{stopped}",
+        },
+    ),
+    "faults": (
+        lambda rows: sorted(rows, key=lambda row: -row["force_max_n"]),
+        {
+            "fault": "{fault}",
+            "runs": "{runs}",
+            "highest true force": "{force_max_n:.1f} N",
+            "in": "{worst}",
+            "noticed after (median, longest)": "{noticed_ms:.0f}, {noticed_max_ms:.0f} ms",
+            "not noticed": "{unnoticed}",
+            "completed": "{completed}",
+            "left pressing, with up to": "{pressing}, {left_n:.1f} N",
+            "cause named": "{named:.0f}%",
+            "failures": "{failures}",
         },
     ),
     "shapes": (

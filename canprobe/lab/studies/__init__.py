@@ -19,7 +19,7 @@ counts the scans that notice a calibration of another array.
 Plant and loop: `workprec`, with `workprec_cell` (`workprec_cell_choice`, `workprec_cell_figure`) on `no_bus`;
 `stability` with `stability_runs`, `stability_extremes` and `linear_loop`.
 Exploration: `explore`, on the shapes of `shapes`.
-Robustness: `faults` with `fault_cases`, `fault_runs`, `fault_scenes`, `fault_scores`, `witnessed_run`; `faults_vcan`.
+Robustness: `faults` with `fault_cases`, `fault_runs`, `witnessed_run`; `faults_vcan`.
 Link: `link` with `link_setups` and `link_rates`; `recover` with `recover_cases`, `recover_runs` and `recover_vcan`.
 Real time: `realtime` with `realtime_cases`, `cycle_times` and `plain_canopen`; `realtime_soak`.
 """

@@ -1,124 +1,135 @@
-"""One run of study `faults` in lockstep: drawn from a seed, carried out under a witness, and scored."""
+"""One run of study `faults` in lockstep, under a witness of the true force, and its score.
+
+The score looks at the emulated nodes and the plant, not at what the master believes. A run fails where the true force
+exceeds `FORCE_SHARE` of the limit (`limits.force_max_n`), where it is reported as completed although the fault
+mattered, where anything moves or has power after the stop, where it does not end, where its log or summary is
+incomplete, or where it raises anything but an error of canprobe.
+
+A fault mattered where the true force was above the limit, or above the measured one by more than `LIE_SHARE` of the
+limit for `LIE_S`. It is noticed with the first condition of the supervision behind its beginning, with the reason for
+which the task ends, or with the error that ends the run.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 import tempfile
 import traceback
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import numpy as np
 
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.master.supervision import limits_of
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.summary import summarise
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError
-from canprobe.lab.studies.fault_cases import FILES_EVERY, KINDS, NEED_TIME, PHASES, FaultCase, Windows, draw_fault
-from canprobe.lab.studies.fault_scenes import SCENARIOS, scenario_plan, seeded_plan
-from canprobe.lab.studies.fault_scores import Peak, peak_of, score_force, score_log, score_rest, score_summary
-from canprobe.lab.studies.witnessed_run import Witness, run_to_end
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.fieldbus.tools.faults import Fault
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS
+from canprobe.lab.studies.fault_cases import (
+    CONTACT_SHARE,
+    LIFT_OFF_NS,
+    FaultCase,
+    Windows,
+    WrongFile,
+    seeded_plan,
+    task_plan,
+)
+from canprobe.lab.studies.witnessed_run import Witness, longest_above, run_to_end
 
+FORCE_SHARE, USUAL_SHARE = 1.5, 1.2
+"""Shares of the force limit: never above the first, in 99 % of the runs not above the second."""
+LIE_SHARE, LIE_S = 0.4, 0.1
+PRESSED_N = 0.05
+"""Force above which the probe is left pressing, N."""
 AFTER_S = 0.3
-"""Time after the end of the run, and of its last fault, in which nothing may move."""
+"""Time after the end of the run in which nothing may move."""
 SETTLED_S = 0.1
 """Time after which everything must be at rest."""
+AT_REST_RAD = 2e-4
 LOOK_NS = 5_000_000
 BRING_UP_NS = 100_000_000
 """Time before the first SYNC for reset, configuration and start; before that the master only listens."""
-STOP_NS = 20_000_000
-"""Time after the end in which faults may begin too: an untimed bus stops all nodes at one instant."""
+FILES_EVERY = 8
+"""One run in so many writes its log, and is scored on that."""
+_OF_THE_ARRAY = re.compile(r"\b(array|image|tactile|taxels?|sensor)\b", re.IGNORECASE)
 
 
 @cache
-def phase_windows(scenario: str, timed: bool) -> Windows:
-    """Start and end of each phase of a scenario in a run without faults, ns."""
-    run = _LockstepRun(FaultCase(0, scenario, "", (), timed, files=False))
+def phase_windows(task: str, plant: str) -> Windows:
+    """Time in which a fault of each phase of a task begins, ns, from a run without faults."""
+    run = FaultRun(task_plan(task, plant))
     cycle, begun = run.session.cell.cycle, run.begun
     assert cycle is not None
-    first, task = cycle.t_first_ns, begun.get(Phase.SETTLE, begun[Phase.SCAN])
-    marks: dict[str, int | None] = {
-        "bring-up": first - BRING_UP_NS,
-        "approach": first if task - first > 2 * run.plan.sync.period_ns else None,
-        "scan": task,
-        "retreat": begun.get(Phase.RETREAT),
-        "stop": begun[Phase.DONE],
-    }
-    there = [(name, t_ns) for name in PHASES if (t_ns := marks[name]) is not None]
-    ends = [t_ns for _, t_ns in there[1:]] + [run.end_ns + STOP_NS]
-    return {name: (t_ns, end_ns) for (name, t_ns), end_ns in zip(there, ends, strict=True)}
-
-
-@cache
-def peak(scenario: str) -> Peak | None:
-    """Depths to which the probe of a scenario can sink in until the cell reacts; None where nothing presses."""
-    return peak_of(_LockstepRun(FaultCase(0, scenario, "", (), timed=False, files=False)).session)
-
-
-def draw_case(seed: int) -> FaultCase:
-    """The case of a seed."""
-    rng = Random(f"fault campaign {seed}")
-    (scenario,) = rng.choices(tuple(SCENARIOS), [scenario.share for scenario in SCENARIOS.values()])
-    number = rng.choice((1, 1, 1, 1, 1, 1, 2, 2, 3))
-    known = tuple(phase_windows(scenario, True))
-    phases = [rng.choice(known) for _ in range(number)]
-    kinds = [rng.choice(KINDS) for _ in range(number)]
-    # an untimed bus configures all nodes at one instant: no fault could begin within it
-    timed = "bring-up" in phases or any(kind.name in NEED_TIME for kind in kinds) or rng.random() < 0.1
-    windows = phase_windows(scenario, timed)
-    nodes = scenario_plan(scenario, timed).node_ids
-    drawn = zip(kinds, phases, strict=True)
-    faults = tuple(draw_fault(rng, kind, nodes, windows[phase]) for kind, phase in drawn)
-    return FaultCase(seed, scenario, phases[0], faults, timed, seed % FILES_EVERY == 0)
-
-
-def run_seed(seed: int) -> dict[str, Any]:
-    """Draw, carry out and score the case of a seed."""
-    case = draw_case(seed)
+    approach, contact, retreat = (begun[phase] for phase in (Phase.APPROACH, Phase.SETTLE, Phase.RETREAT))
     return {
-        "seed": seed,
-        "scenario": case.scenario,
-        "timed": case.timed,
-        "phase": case.phase,
-        "kinds": sorted({fault.kind.name for fault in case.faults}),
-        "faults": [str(fault) for fault in case.faults],
-        **carry_out(case),
+        "start": (cycle.t_first_ns - BRING_UP_NS, approach),
+        "approach": (approach, contact),
+        "contact": (contact, contact + round(CONTACT_SHARE * (retreat - contact))),
+        "lift-off": (retreat, retreat + LIFT_OFF_NS),
     }
 
 
-def carry_out(case: FaultCase) -> dict[str, Any]:
-    """Run a case to its end and some time beyond it; its outcome, its figures, and every failure in words."""
-    reach = peak(case.scenario)
-    wrong = any(fault.incoming and fault.kind.name == "corrupt" for fault in case.faults)
-    bound = reach.force(len(case.faults), wrong) if reach is not None else None
-    if not case.files:
-        return _LockstepRun(case).result(bound)
+def run_case(case: FaultCase) -> dict[str, Any]:
+    """Carry out and score a case."""
+    plan = seeded_plan(case.task, case.plant, case.number)
+    setup = plan.setup
+    assert setup.arm is not None and setup.array is not None
+    fault = case.fault(setup.arm.node_ids, setup.array.node_id, phase_windows(case.task, case.plant))
+    about = {"number": case.number, "kind": case.kind.name, "fault": str(fault)}
+    about |= {"task": case.task, "phase": case.phase, "plant": case.plant}
+    if case.number % FILES_EVERY:
+        return about | FaultRun(plan, (fault,)).result()
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        return _LockstepRun(case, Path(folder)).result(bound)
+        return about | FaultRun(plan, (fault,), Path(folder)).result()
 
 
-class _LockstepRun:
-    """One case, carried out.
+def run_wrong_file(case: WrongFile) -> dict[str, Any]:
+    """Carry out and score a first touch with a wrong file; a plan that refuses it is an outcome."""
+    about = {"file": case.what, "joint": case.joint, "plant": case.plant}
+    try:
+        plan = case.plan()
+    except CanprobeError as error:
+        return about | {"outcome": "refused by the plan", "reason": str(error), "force_max_n": 0.0, "failures": []}
+    assert plan.setup.array is not None
+    run = FaultRun(plan, case.faults(plan.setup.array.node_id))
+    result = run.result()
+    return about | result | {"reason": result["reason"] or "; ".join(run.task.remarks) or "nothing"}
+
+
+class FaultRun:
+    """One run, carried out.
+
+    Args:
+        plan: plan of the run.
+        faults: its faults.
+        folder: folder of its files; None: it writes none.
 
     Attributes:
         begun: start of each phase of the task, ns.
         end_ns: time at which the session was closed.
     """
 
-    def __init__(self, case: FaultCase, folder: Path | None = None) -> None:
-        self.case = case
-        self.plan = seeded_plan(case.scenario, case.timed, case.seed)
-        self.session = Session(self.plan, RunOptions(folder))
-        self.task = make_task(self.plan)
+    def __init__(self, plan: Plan, faults: Sequence[Fault] = (), folder: Path | None = None) -> None:
+        self.plan, self.faults = plan, faults
+        self.session = Session(plan, RunOptions(folder))
+        self.task = make_task(plan)
         self.begun: dict[Phase, int] = {}
         self.steps = self.stepped_ns = 0
+        self.reason_ns: int | None = None
         world = self.session.world
         self.witness = Witness(world.plant, LOOK_NS)
-        self.faulty = world.make_faulty(case.faults)
+        self.faulty = world.make_faulty(faults)
         # the witness sees what the recorder of the truth would, and more
         world.participants[:] = [self.witness, *self.faulty.nodes]
         self.outcome, self.error = run_to_end(self.session, self.task, self._count)
@@ -133,46 +144,135 @@ class _LockstepRun:
         self.steps += 1
         self.stepped_ns = self.session.lockstep.clock.now_ns()
         self.begun.setdefault(getattr(self.task, "phase", Phase.SCAN), self.stepped_ns)
+        if self.reason_ns is None and getattr(self.task, "reason", None) is not None:
+            self.reason_ns = self.stepped_ns
 
-    def result(self, bound_n: float | None) -> dict[str, Any]:
-        """The score; without a bound (N) the force is not judged."""
-        session, reason, failures = self.session, str(self.error or ""), []
+    def result(self) -> dict[str, Any]:
+        """The score."""
+        session, reason, rows = self.session, str(self.error or ""), self.witness.rows
         assert session.lockstep is not None
         session.lockstep.recorder = None  # the log is closed
-        if self.outcome == "hang":
-            failures.append(f"hang: {reason}")
-        elif self.outcome == "crash":
-            assert self.error is not None
-            place = traceback.extract_tb(self.error.__traceback__)[-1]
-            where = f"{Path(place.filename).name}:{place.lineno}"
-            failures.append(f"crash: {type(self.error).__name__}: {self.error} ({where})")
-        failures += score_log(session, self.steps) + score_summary(session, self.task, reason)
-        moved = 0.0
-        if self.outcome != "hang" and session.scene.arm is not None:
-            moved, found = self._rest()
-            failures += found
-        force_max, above_ns, found = score_force(self.witness.rows, limits_of(self.plan), bound_n)
+        limit = self.plan.setup.limits.force_max
+        highest, left = max((force for _, force in rows), default=0.0), rows[-1][1] if rows else 0.0
+        failures = self._ends(reason) + self._log_problems() + self._summary_problems(reason)
+        if highest > FORCE_SHARE * limit:
+            failures.append(f"true force of {highest:.2f} N, limit {limit:g} N")
+        lie = self._lie_n()
+        if self.outcome == "completed" and (highest > limit or lie > LIE_SHARE * limit):
+            failures.append(
+                f"completed, with a true force of up to {highest:.2f} N, {lie:.2f} N above the measured one"
+            )
+        if self.outcome != "hang":
+            failures += self._rest_problems()
+        noticed_ns = self._noticed_ns()
         return {
             "hits": sum(node.hits for node in self.faulty.nodes),
             "outcome": self.outcome,
             "reason": reason,
-            "force_max_n": force_max,
-            "force_bound_n": bound_n,
-            "above_ms": above_ns * 1e-6,
-            "moved_rad": moved,
+            "named": bool(reason) and self._is_named(reason),
+            "force_max_n": highest,
+            "force_share": highest / limit,
+            "above_ms": longest_above(rows, limit) * 1e-6,
+            "above_measured_n": lie,
+            "left_n": left,
+            "noticed_ms": None if noticed_ns is None else noticed_ns * 1e-6,
             "end_s": self.end_ns * 1e-9,
-            "failures": failures + found,
+            "failures": failures,
         }
 
-    def _rest(self) -> tuple[float, list[str]]:
-        """Let time pass without a master: how far a joint moves (rad) once all must be at rest, and failures."""
-        plant, nodes = self.session.world.plant, self.session.world.nodes
-        over_ns = max(self.end_ns, *(fault.end_ns for fault in self.case.faults), 0)
+    def _begin_ns(self) -> int | None:
+        """Time at which the first fault began; 0 without faults, None where none did."""
+        times = [t_ns for node in self.faulty.nodes for t_ns, what, _ in node.history if what == "begins"]
+        return min(times, default=None) if self.faults else 0
+
+    def _noticed_ns(self) -> int | None:
+        """Time from the beginning of the fault until it was noticed, ns; None where it was not, or never began."""
+        begin_ns = self._begin_ns()
+        if begin_ns is None:
+            return None
+        times = [] if self.reason_ns is None else [self.reason_ns]
+        if self.session.opened and (cycle := self.session.cell.cycle) is not None:
+            period_ns = self.plan.sync.period_ns
+            times += [cycle.t_first_ns + k * period_ns for k in self.session.cell.supervisor.first.values()]
+        if self.error is not None:
+            times.append(self.stepped_ns if self.stepped_ns > begin_ns else self.end_ns)
+        return min((t_ns - begin_ns for t_ns in times if t_ns >= begin_ns), default=None)
+
+    def _is_named(self, reason: str) -> bool:
+        """Whether the reason names a node of the faults, or the array."""
+        arm, array = self.plan.setup.arm, self.plan.setup.array
+        assert arm is not None and array is not None
+        for fault in self.faults:
+            if fault.node_id == array.node_id and _OF_THE_ARRAY.search(reason):
+                return True
+            joint = arm.node_ids.index(fault.node_id) + 1 if fault.node_id in arm.node_ids else 0
+            if re.search(rf"\b(node|nodes) {fault.node_id}\b|\bjoint {joint}\b", reason):
+                return True
+        return False
+
+    def _lie_n(self) -> float:
+        """Force by which the true one was above the measured one in all of the worst `LIE_S`, N."""
+        if not self.session.opened or (cycle := self.session.cell.cycle) is None:
+            return 0.0
+        columns = self.session.cell.log.arrays()
+        if "force_n" not in columns or not self.witness.rows:
+            return 0.0
+        times, forces = np.array(self.witness.rows).T
+        t_ns = cycle.t_first_ns + self.plan.sync.period_ns * np.arange(len(columns["force_n"]))
+        off = np.interp(t_ns, times, forces) - np.nan_to_num(columns["force_n"])
+        length = round(LIE_S * 1e9 / self.plan.sync.period_ns)
+        if len(off) < length:
+            return 0.0
+        return float(np.lib.stride_tricks.sliding_window_view(off, length).min(axis=1).max())
+
+    def _ends(self, reason: str) -> list[str]:
+        """Failures to end as an error of canprobe."""
+        if self.outcome == "hang":
+            return [f"hang: {reason}"]
+        if self.outcome != "crash":
+            return []
+        assert self.error is not None
+        place = traceback.extract_tb(self.error.__traceback__)[-1]
+        return [f"crash: {type(self.error).__name__}: {reason} ({Path(place.filename).name}:{place.lineno})"]
+
+    def _rest_problems(self) -> list[str]:
+        """Motion after the stop, once all must be at rest and no master is there; and drives that are not disabled."""
+        plant = self.session.world.plant
+        ends_ns = [fault.end_ns for fault in self.faults if fault.duration_ns < FOREVER_NS]
         try:
-            self.clock.sleep_until_ns(self.end_ns + int(SETTLED_S * 1e9))
+            self.clock.sleep_until_ns(self.end_ns + round(SETTLED_S * 1e9))
             before = np.array(plant.truth()["q"])
-            self.clock.sleep_until_ns(over_ns + int(AFTER_S * 1e9))
+            self.clock.sleep_until_ns(max(self.end_ns, *ends_ns, 0) + round((SETTLED_S + AFTER_S) * 1e9))
         except CanprobeError as error:
-            return 0.0, [f"crash after the end: {error}"]
-        moved = float(np.abs(plant.truth()["q"] - before).max())
-        return moved, score_rest(moved, nodes)
+            return [f"crash after the end: {error}"]
+        moved_rad = float(np.abs(plant.truth()["q"] - before).max())
+        failures = [f"motion after the stop: {moved_rad:.5f} rad"] if moved_rad > AT_REST_RAD else []
+        for node in self.faulty.nodes:
+            number, frozen = node.node.dictionary.number, any(fault.kind.name == "freeze" for fault in node.holding)
+            if not frozen and (state := state_of(number(0x6041))) in POWERED_STATES:
+                failures.append(f"{node.name} is {state.name} after the stop")
+        return failures
+
+    def _summary_problems(self, reason: str) -> list[str]:
+        """Failures to make and write a summary of the run, whatever happened in it."""
+        if not self.session.started:
+            return []
+        try:
+            json.dumps(summarise(self.session, record_of(self.task), {}, reason or None), allow_nan=False)
+        except Exception as error:  # of any kind: a user would have lost the summary of the run
+            return [f"summary: {type(error).__name__}: {error}"]
+        return []
+
+    def _log_problems(self) -> list[str]:
+        """Missing rows of cycles in the log, and missing frames in `bus.log`, where one is written."""
+        session, failures = self.session, []
+        if session.opened and (rows := len(session.cell.log)) < self.steps:
+            failures.append(f"log: {rows} rows of {self.steps} cycles")
+        if session.out is None:
+            return failures
+        try:
+            lines = sum(1 for _ in read_candump(session.out / "bus.log", whole=True))
+        except CanprobeError as error:
+            return [*failures, f"log: {error}"]
+        frames = sum(counter.frames for counter in session.record.traffic.values())
+        return failures if lines == frames else [*failures, f"log: {lines} lines of {frames} frames"]

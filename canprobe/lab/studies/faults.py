@@ -1,116 +1,238 @@
-"""Study `faults`: ten thousand short touches in lockstep, each with faults drawn from its seed, each scored.
+"""Study `faults`: every kind of fault in each task, phase and plant, and files that are wrong; the true force of each.
 
-A run is a press or a short scan over emulated nodes that drop, delay, double, corrupt and swap frames, become mute or
-deaf, reboot, freeze, babble or send wrong data, at random times in bring-up, approach, scan, retreat and stop. It fails
-where the true force stays above the limit for longer than the reaction may take, where anything moves or has power
-after the stop, where it does not end, where the log is incomplete, or where it raises anything but an error of
-canprobe. `canprobe study faults --seed N` carries out one run again and prints what happens in it.
+A run is a press, a weave, a straight path, an exploration or a calibration over emulated nodes, short but with all its
+phases. One fault of the registry begins in one of them; the rest is drawn from the number of the run (`fault_cases`).
+The true force of the plant is judged, and how the run ends (`fault_runs`). A second table has files that are wrong:
+what arm, tool, layer or array are differs from what their file says, and the cell touches for the first time.
+`canprobe study faults --seed N` carries out one run again and prints what happens in it.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from canprobe.lab.studies.fault_cases import DRAWN_KINDS, PHASES
-from canprobe.lab.studies.fault_runs import draw_case, run_seed
-from canprobe.lab.studies.fault_scenes import COLOURS, FORCE_MAX_N, draw_faults
+import numpy as np
+
+from canprobe.cell.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, legend, log_scale, parts, picture
+from canprobe.lab.studies.fault_cases import CASES, KINDS, REPEATS, TASKS, FaultCase, WrongFile, wrong_files
+from canprobe.lab.studies.fault_runs import FORCE_SHARE, PRESSED_N, USUAL_SHARE, run_case, run_wrong_file
 from canprobe.lab.studies.harness import Column, Row, Say, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
-RUNS, QUICK_RUNS, SEEDS_A_CELL = 10_000, 8, 20
+NUMBERS_A_CELL = 17
+"""Runs in a row, of one task and plant, so that a process does not plan for a single one."""
+JOINTS = 6
+QUICK_KINDS = ("stuck-image", "replayed-image", "gain-lost", "brake-stuck", "encoder-jump")
+_QUICK_PLACES = (("press", "approach"), ("weave", "contact"))
+QUICK_FILES = (WrongFile("true gear × ½", 3, "ideal"),)
+COLOURS = {
+    "completed": (GREEN, ""),
+    "stopped for safety": (AMBER, "//"),
+    "bus or node failure": (BLUE, "\\\\"),
+    "bring-up refused": (GREY, "xx"),
+}
+"""Colour and hatch of each outcome; the others, `hang` and `crash`, are failures."""
 COLUMNS = (
     Column("fault", "fault"),
     Column("runs", "runs", "d"),
-    *(Column(phase, phase, "d") for phase in PHASES),
-    *(Column(outcome, outcome, "d") for outcome in COLOURS),
-    Column("force_max_n", "highest force N", ".2f"),
+    Column("force_max_n", "highest true force N", ".2f"),
+    Column("worst", "in"),
+    *(Column(f"{task}_n", f"{task} N", ".1f") for task in TASKS),
     Column("above_ms", "longest above limit ms", ".0f"),
+    Column("noticed_ms", "detection ms, median", ".0f"),
+    Column("noticed_max_ms", "longest", ".0f"),
+    Column("unnoticed", "not noticed", "d"),
+    *(Column(outcome, outcome, "d") for outcome in COLOURS),
+    Column("pressing", "left pressing", "d"),
+    Column("left_n", "with N", ".1f"),
+    Column("named", "cause named %", ".0f"),
     Column("failures", "failures", "d"),
 )
+FILE_COLUMNS = (
+    Column("file", "wrong file"),
+    Column("joint", "joint", "d"),
+    Column("plant", "plant"),
+    Column("force_max_n", "highest true force N", ".2f"),
+    Column("above_ms", "longest above limit ms", ".0f"),
+    Column("left_n", "left pressing with N", ".1f"),
+    Column("outcome", "outcome"),
+    Column("reason", "what notices it"),
+)
+MOST_FAILURES = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Seeds:
-    """One cell of the sweep: some runs in a row, so that a process does not load everything for a single one."""
+class Numbers:
+    """One cell of the sweep: some runs in a row."""
 
-    first: int
-    count: int
+    numbers: tuple[int, ...]
 
 
-def measure(seeds: Seeds) -> list[dict[str, Any]]:
-    """The runs of some seeds."""
-    return [run_seed(seed) for seed in range(seeds.first, seeds.first + seeds.count)]
+def measure(cell: Numbers) -> list[dict[str, Any]]:
+    """The runs of some numbers."""
+    return [run_case(FaultCase.of(number)) for number in cell.numbers]
+
+
+def quick_numbers() -> list[int]:
+    """Kinds that are hard to notice, in the approach of a press and in the contact of a weave."""
+    first = [FaultCase.of(number) for number in range(CASES)]
+    return [
+        case.number
+        for case in first
+        if case.plant == "ideal" and case.kind.name in QUICK_KINDS and (case.task, case.phase) in _QUICK_PLACES
+    ]
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Carry out the campaign."""
-    total = QUICK_RUNS if quick else RUNS
-    size = min(total, SEEDS_A_CELL)
-    cells = [Seeds(first, min(size, total - first)) for first in range(0, total, size)]
+    numbers = quick_numbers() if quick else range(REPEATS * CASES)
+    cells = [Numbers(tuple(numbers[i : i + NUMBERS_A_CELL])) for i in range(0, len(numbers), NUMBERS_A_CELL)]
     runs = [one for answer in sweep.map(measure, cells) for one in answer]
-    facts = measuring_facts(quick, total)
-    return StudyResult("faults", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_faults, runs))
+    touches = sweep.map(run_wrong_file, QUICK_FILES if quick else wrong_files(JOINTS))
+    facts = measuring_facts(quick, len(numbers))
+    drawn = partial(draw_forces, touches, "file", "plant", "Highest true force of a first touch with a wrong file")
+    files = StudyResult("faults_files", FILE_COLUMNS, touches, file_findings(touches), facts, drawn)
+    return StudyResult("faults", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw, runs), (files,))
 
 
 def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
-    """A row for each kind of fault (a run with two kinds is in both), and one for all."""
-    kinds = [(kind, [r for r in runs if kind in r["kinds"]]) for kind in DRAWN_KINDS]
-    return [_row(name, some) for name, some in [*kinds, ("all", list(runs))]]
+    """A row for each kind of fault that ran, and one for all."""
+    kinds = [(kind.name, [one for one in runs if one["kind"] == kind.name]) for kind in KINDS]
+    return [_row(name, some) for name, some in [*kinds, ("all", list(runs))] if some]
 
 
 def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
-    phases = Counter(one["phase"] for one in runs)
-    pressing = pressing_runs(runs)
     outcomes = Counter(one["outcome"] for one in runs)
+    worst = max(runs, key=lambda one: one["force_max_n"])
+    noticed = [one["noticed_ms"] for one in runs if one["noticed_ms"] is not None]
+    stopped = [one for one in runs if one["reason"]]
+    left = [one["left_n"] for one in runs if one["left_n"] > PRESSED_N]
     return {
         "fault": name,
         "runs": len(runs),
-        **{phase: phases[phase] for phase in PHASES},
+        "force_max_n": worst["force_max_n"],
+        "worst": f"{worst['task']}, {worst['phase']}, {worst['plant']}",
+        **{f"{task}_n": _highest(one for one in runs if one["task"] == task) for task in TASKS},
+        "above_ms": max(one["above_ms"] for one in runs),
+        "noticed_ms": float(np.median(noticed)) if noticed else None,
+        "noticed_max_ms": max(noticed, default=None),
+        "unnoticed": len(runs) - len(noticed),
         **{outcome: outcomes[outcome] for outcome in COLOURS},
-        "force_max_n": max((one["force_max_n"] for one in pressing), default=0.0),
-        "above_ms": max((one["above_ms"] for one in pressing), default=0.0),
+        "pressing": len(left),
+        "left_n": max(left, default=None),
+        "named": 100.0 * sum(one["named"] for one in stopped) / len(stopped) if stopped else None,
         "failures": sum(bool(one["failures"]) for one in runs),
     }
 
 
-def pressing_runs(runs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Runs in which the cell presses and its force is judged: in `listen` somebody else presses."""
-    return [one for one in runs if one["force_bound_n"] is not None]
+def _highest(runs: Iterable[Mapping[str, Any]]) -> float | None:
+    return max((one["force_max_n"] for one in runs), default=None)
 
 
 def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The figures of the campaign, and every failure with the command that runs it again."""
-    failed = [one for one in runs if one["failures"]]
+    """The figures of the campaign, and the failures with the command that runs each again."""
+    failed = sorted((one for one in runs if one["failures"]), key=lambda one: -one["force_max_n"])
+    shares = np.array([one["force_share"] for one in runs])
+    highest, above = (max(one[key] for one in runs) for key in ("force_max_n", "above_ms"))
     hit = sum(one["hits"] > 0 for one in runs)
-    pressing = pressing_runs(runs)
-    above = [one["above_ms"] for one in pressing if one["above_ms"] > 0]
+    kinds = {one["kind"] for one in failed}
     lines = [
-        f"{len(runs)} runs, {hit} of them with at least one frame or node hit; {len(failed)} failed.",
-        f"The cell presses in {len(pressing)} runs: true force above the scene's limit of {FORCE_MAX_N:g} N in"
-        f" {len(above)}, for {max(above, default=0):.0f} ms at most, highest"
-        f" {max((one['force_max_n'] for one in pressing), default=0.0):.2f} N.",
+        f"{len(runs)} runs, {hit} of them with at least one frame or node hit; {len(failed)} failed, of {len(kinds)} of"
+        f" {len({one['kind'] for one in runs})} kinds of fault.",
+        f"True force at most {USUAL_SHARE:g} × the limit in {np.mean(shares <= USUAL_SHARE):.2%} of the runs (99 %"
+        f" wanted), highest {shares.max():.2f} × ({FORCE_SHARE:g} × allowed), {highest:.2f} N.",
+        f"The longest time above the limit is {above:.0f} ms;"
+        f" {sum(one['left_n'] > PRESSED_N for one in runs)} runs left the probe pressing.",
     ]
     lines += [
-        f"seed {one['seed']}: {'; '.join(one['failures'])} (canprobe study faults --seed {one['seed']})"
-        for one in failed[:20]
+        f"{one['number']}: {one['task']}, {one['phase']}, {one['plant']}, {one['fault']}: {'; '.join(one['failures'])}"
+        f" (canprobe study faults --seed {one['number']})"
+        for one in failed[:MOST_FAILURES]
     ]
-    return lines if len(failed) <= 20 else [*lines, f"… and {len(failed) - 20} more failures"]
+    return lines if len(failed) <= MOST_FAILURES else [*lines, f"… and {len(failed) - MOST_FAILURES} more failures"]
+
+
+def file_findings(touches: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The worst first touch with each wrong file."""
+    worst: dict[str, Mapping[str, Any]] = {}
+    for one in touches:
+        if one["force_max_n"] >= worst.get(one["file"], {"force_max_n": 0.0})["force_max_n"]:
+            worst[one["file"]] = one
+    places = {what: f"joint {one['joint']}, " if one["joint"] else "" for what, one in worst.items()}
+    return [
+        f"First touch, {what}: at most {one['force_max_n']:.2f} N ({places[what]}{one['plant']} plant),"
+        f" {one['outcome']}."
+        for what, one in worst.items()
+    ]
+
+
+def draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw how the runs with each kind of fault ended, and the true forces of each."""
+    failed = sum(bool(one["failures"]) for one in runs)
+    title = (
+        f"How {len(runs)} runs with a fault of a node, a link, a drive or the array ended; {failed} failed:\n"
+        "force, motion, power, log or report were not as promised"
+    )
+    of_kind = {kind.name: [one for one in runs if one["kind"] == kind.name] for kind in KINDS}
+    found = {kind: some for kind, some in of_kind.items() if some}
+    with picture(path, title, 1.5 + 0.16 * len(found)) as figure:
+        sides = parts(figure, 1, 2)
+        left, right = (part.subplots() for part in sides)
+        start = np.zeros(len(found))
+        for outcome, (colour, hatch) in COLOURS.items():
+            shares = np.array([np.mean([one["outcome"] == outcome for one in some]) for some in found.values()])
+            if shares.any():
+                left.barh(list(found), shares, left=start, color=colour, hatch=hatch, edgecolor="white", label=outcome)
+            start += shares
+        left.set(xlabel="share of the runs with this fault", xlim=(0, 1))
+        for place, some in enumerate(found.values()):
+            heights = [max(one["force_share"], 0.01) for one in some]
+            right.plot(heights, [place] * len(some), ".", color=BLUE, ms=3, label="" if place else "a run")
+        for share, style, label in ((USUAL_SHARE, "--", "99 % below"), (FORCE_SHARE, "-", "all below")):
+            right.axvline(share, color=ORANGE, linestyle=style, label=f"{share:g} × the limit: {label}")
+        log_scale(right, "x")
+        right.set(xlabel="highest true force of a run, × the limit", yticks=range(len(found)), yticklabels=())
+        for axes in (left, right):
+            axes.set_ylim(len(found) - 0.5, -0.5)
+            axes.grid(visible=False, axis="y")
+        for part in sides:
+            legend(part)
+
+
+def draw_forces(rows: Sequence[Mapping[str, Any]], what: str, by: str, title: str, path: Path) -> None:
+    """Draw the highest true force of each row by its column `what`; the values of the column `by` have marks."""
+    names, sorts = (list(dict.fromkeys(row[key] for row in rows)) for key in (what, by))
+    with picture(path, title, 1.8 + 0.25 * len(names)) as figure:
+        axes = figure.subplots()
+        for sort, colour, mark in zip(sorts, (BLUE, ORANGE), "ox", strict=False):
+            some = [row for row in rows if row[by] == sort]
+            places = [names.index(row[what]) for row in some]
+            axes.plot(
+                [max(row["force_max_n"], 0.01) for row in some], places, mark, color=colour, label=f"{by}: {sort}"
+            )
+        log_scale(axes, "x")
+        axes.set_yticks(range(len(names)), names)
+        axes.set(xlabel="highest true force (N)", ylim=(len(names) - 0.5, -0.5))
+        legend(figure)
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
-    """Carry out the run of one seed again and report what happens in it."""
-    case = draw_case(seed)
-    say(f"seed {seed}: {case.scenario}")
-    for fault in case.faults:
-        say(f"  {fault}")
-    outcome = run_seed(seed)
-    say(f"  {outcome['hits']} hits; {outcome['outcome']} at {outcome['end_s']:.3f} s {outcome['reason']}")
-    say(f"  highest force {outcome['force_max_n']:.2f} N, above the limit for {outcome['above_ms']:.0f} ms")
+    """Carry out one run again and report what happens in it."""
+    case = FaultCase.of(seed)
+    say(f"run {seed}: {case.task}, {case.plant} plant, a fault in its {case.phase}")
+    outcome = run_case(case)
+    say(f"  {outcome['fault']}")
+    noticed = "never" if outcome["noticed_ms"] is None else f"after {outcome['noticed_ms']:.0f} ms"
+    ended = f"{outcome['outcome']} at {outcome['end_s']:.3f} s {outcome['reason']}"
+    say(f"  {outcome['hits']} hits; noticed {noticed}; {ended}")
+    say(f"  highest true force {outcome['force_max_n']:.2f} N, above the limit for {outcome['above_ms']:.0f} ms")
+    say(f"  left with {outcome['left_n']:.2f} N")
     for failure in outcome["failures"]:
         say(f"  FAILURE: {failure}")
     return outcome

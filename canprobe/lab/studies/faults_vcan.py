@@ -3,6 +3,9 @@
 `canprobe vcan -- canprobe study faults --vcan`. A run fails where a drive has power or moves two seconds after the
 fault, where the master does not end, or where it leaves no readable log. The nodes are a separate process, which
 outlives the master: they must stop by themselves. Nodes whose interface goes down end with it.
+
+A second table has the faults of the registry that press hardest, thrown as `canprobe inject` throws them, in a cell as
+it is and in a patient one (`--patient`), and the true force of the plant.
 """
 
 from __future__ import annotations
@@ -14,20 +17,27 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache, partial
 from pathlib import Path
 from random import Random
+from typing import Any
 
 from canopen.sdo.exceptions import SdoCommunicationError
 
+from canprobe.cell.master.controller import Measurement
 from canprobe.cell.planning.make import make_plan
+from canprobe.cell.results.picture import BLUE, ORANGE, legend, picture
 from canprobe.cell.scene.load import dump_scene, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.child_process import with_our_imports
 from canprobe.cell.session.emulator_child import EmulatorChild
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError, InterfaceError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.clock import MonotonicClock
@@ -38,14 +48,29 @@ from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.bus.sdo import hold_dialogues, upload
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
-from canprobe.lab.studies.fault_scenes import draw_ends, scenario_scene
+from canprobe.fieldbus.tools.faults.control import request_faults
+from canprobe.lab.studies.fault_cases import task_scene
+from canprobe.lab.studies.fault_runs import FORCE_SHARE
+from canprobe.lab.studies.faults import draw_forces
 from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
+from canprobe.lab.studies.recover_runs import forces_of
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
 
-RUNS = 40
-SCENARIO, HOLD_S = "press, features", 3.0
+RUNS, QUICK_THROWN = 40, 1
+HOLD_S = 3.0
+SERVED: Mapping[str, Any] = {
+    "bus.interface": "socketcan",
+    "bus.channel": CHANNEL,
+    "cycle.rate_hz": 100.0,
+    "sensor.rate_hz": 100.0,
+    "sensor.mode": "features",
+    "task.duration_s": HOLD_S,
+    "task.clearance_mm": 0.3,
+}
+"""Changes of `press` whose nodes are a separate process, which outlives the master; a slow guest holds 100 Hz."""
 MISSED_SYNCS = 20
 """Missed SYNCs that the drives bear: a guest stands still for tens of milliseconds, which is no fault of the cell."""
 PATIENCE_S = 60.0
@@ -65,6 +90,32 @@ COLUMNS = (
     Column("drives", "drives afterwards"),
     Column("failures", "failures"),
 )
+
+
+THROWN_COLUMNS = (
+    Column("fault", "fault"),
+    Column("task", "task"),
+    Column("phase", "thrown in"),
+    Column("patient", "patient"),
+    Column("force_max_n", "highest true force N", ".2f"),
+    Column("above_ms", "longest above limit ms", ".0f"),
+    Column("left_n", "left pressing with N", ".1f"),
+    Column("reason", "reason"),
+    Column("failures", "failures"),
+)
+THROWN = (
+    ("node 16: stuck-image", "press", Phase.APPROACH),
+    ("node 16: stuck-image", "weave", Phase.SCAN),
+    ("node 16: replayed-image", "weave", Phase.SCAN),
+    ("node 16: gain-lost gain=0.3", "press", Phase.APPROACH),
+    ("node 16: stuck-rows first=4 rows=8", "weave", Phase.SCAN),
+    ("node 3: brake-stuck", "weave", Phase.SCAN),
+    ("node 3: encoder-frozen", "weave", Phase.SCAN),
+    ("node 3: encoder-jump counts=200", "press", Phase.SCAN),
+    ("node 3: zero-shift counts=200", "press", Phase.APPROACH),
+    ("node 2: freeze", "weave", Phase.SCAN),
+)
+"""Faults that press hardest in lockstep, the task, and its phase."""
 
 
 class ProcessFault(Enum):
@@ -111,7 +162,8 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         sweep.say(f"{seed + 1} of {total}: {rows[-1]['fault']}: {rows[-1]['failures'] or 'no failure'}")
     patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
     facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
-    return StudyResult("faults", COLUMNS, rows, findings(rows), facts, partial(draw_ends, rows))
+    thrown = _throw_all(quick)
+    return StudyResult("faults_vcan", COLUMNS, rows, findings(rows), facts, partial(draw_ends, rows), (thrown,))
 
 
 def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
@@ -126,9 +178,59 @@ def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
 @cache
 def served_scene() -> Scene:
     """A press whose nodes are a separate process, which outlives the master."""
-    scene = scenario_scene(SCENARIO, True)
-    on_bus = {"bus.interface": "socketcan", "bus.channel": CHANNEL, "task.duration_s": HOLD_S}
-    return patient(load_scene(scene, on_bus), MISSED_SYNCS)
+    return patient(load_scene("press", SERVED), MISSED_SYNCS)
+
+
+def _throw_all(quick: bool) -> StudyResult:
+    """Throw the faults that press hardest, each in a patient cell and in one as it is."""
+    rows = [
+        throw(text, task, phase, is_patient=is_patient)
+        for text, task, phase in (THROWN[:QUICK_THROWN] if quick else THROWN)
+        for is_patient in ((True,) if quick else (True, False))
+    ]
+    failed = [row for row in rows if row["failures"]]
+    highest = max(row["force_max_n"] for row in rows)
+    told = [f"{len(rows)} faults thrown on {CHANNEL}: highest true force {highest:.2f} N; {len(failed)} failed."]
+    told += [f"{row['fault']}, {row['task']}, patient {row['patient']}: {row['failures']}" for row in failed]
+    drawn = partial(draw_forces, rows, "fault", "patient", f"Highest true force with a fault thrown on {CHANNEL}")
+    return StudyResult("faults_thrown", THROWN_COLUMNS, rows, told, measuring_facts(quick, len(rows)), drawn)
+
+
+def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
+    """Run a task, throw a fault in a phase of it, and score the true force."""
+    scene = load_scene(task_scene(task, "ideal"), {"bus.interface": "socketcan", "bus.channel": CHANNEL})
+    session = Session(make_plan(resolve(patient(scene, MISSED_SYNCS) if is_patient else scene)))
+    work = make_task(session.plan)
+    with ThreadPoolExecutor(1) as others:
+        thrown: list[Future[Any]] = []
+
+        def look(_: Measurement) -> None:
+            if not thrown and getattr(work, "phase", None) is phase:
+                thrown.append(others.submit(request_faults, CHANNEL, [text]))
+
+        outcome, error = run_to_end(session, work, look)
+    reason, limit = str(error or ""), session.plan.setup.limits.force_max
+    rows = [(round(1e9 * t_s), force) for t_s, force in forces_of(session)]
+    highest, left = max((force for _, force in rows), default=0.0), rows[-1][1] if rows else 0.0
+    failures = [] if thrown else ["the fault was not thrown"]
+    failures += [str(one.exception()) for one in thrown if one.exception() is not None]
+    if outcome in ("crash", "hang"):
+        failures.append(f"{outcome}: {reason}")
+    if highest > FORCE_SHARE * limit:
+        failures.append(f"true force of {highest:.2f} N, limit {limit:g} N")
+    if outcome == "completed" and highest > limit:
+        failures.append(f"completed, with a true force of up to {highest:.2f} N")
+    return {
+        "fault": text,
+        "task": task,
+        "phase": phase.name.lower(),
+        "patient": is_patient,
+        "force_max_n": highest,
+        "above_ms": longest_above(rows, limit) * 1e-6,
+        "left_n": left,
+        "reason": reason or outcome,
+        "failures": "; ".join(failures),
+    }
 
 
 def row_of(case: ProcessCase) -> Row:
@@ -149,6 +251,24 @@ def row_of(case: ProcessCase) -> Row:
         "drives": drives,
         "failures": "; ".join(run.failures),
     }
+
+
+def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw the time that the master took to end, by the fault on vcan0."""
+    kinds = list(dict.fromkeys(row["fault"] for row in rows))
+    title = (
+        "How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"
+        "failed: it hung, or nodes moved or were enabled afterwards"
+    )
+    with picture(path, title, 1.8 + 0.25 * len(kinds)) as figure:
+        axes = figure.subplots()
+        for colour, mark, label, failed in ((BLUE, "o", "no failure", False), (ORANGE, "X", "failed", True)):
+            some = [row for row in rows if bool(row["failures"]) == failed]
+            places = [kinds.index(row["fault"]) for row in some]
+            axes.plot([row["ended_s"] for row in some], places, mark, color=colour, label=label)
+        axes.set_yticks(range(len(kinds)), kinds)
+        axes.set(xlabel="from the fault to the end of the master (s)", xlim=(0, None), ylim=(len(kinds) - 0.5, -0.5))
+        legend(figure)
 
 
 class _ServedRun:

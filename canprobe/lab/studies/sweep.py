@@ -193,7 +193,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "link": "whether a check of the link says what the next minute of the cell shows",
         "recover": "whether a cell comes back from power cycles, resets, cuts and unplugged interfaces, drawn by seed",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
-        "faults": "how the cell reacts to thousands of random faults of its nodes and their links",
+        "faults": "the true force with every kind of fault, in each task and phase, and with files that are wrong",
     }
 )
 """Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""

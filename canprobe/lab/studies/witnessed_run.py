@@ -1,16 +1,22 @@
-"""A run of a session to its end, and a witness that records the true force meanwhile."""
+"""A run of a session to its end, a witness that records the true force meanwhile, and what its record shows."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.controller import Controller, Measurement
+from canprobe.cell.master.supervision import Limits
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.session.session import Session
 from canprobe.errors import CanprobeError, SafetyStop
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.lab.studies.fault_scores import LONGEST_S
+
+RELEASE_NS = 100_000_000
+"""Time that the retreat has, from its command, to bring the force below the limit."""
+LONGEST_S = 20.0
+"""Virtual time after which a run hangs: nominal runs take four seconds, every time-out in them less than ten."""
 
 
 class HangError(Exception):
@@ -40,7 +46,9 @@ class Witness(Participant):
         """Look at the plant where it is time."""
         self.next_deadline_ns = t_ns + self._period_ns
         self._plant.advance(t_ns)
-        self.rows.append((t_ns, float(self._plant.truth()["force"])))
+        force = self._plant.truth_row()["force"]
+        assert isinstance(force, float)
+        self.rows.append((t_ns, force))
         if t_ns > LONGEST_S * 1e9:
             raise HangError(f"no end after {LONGEST_S:g} s")
         return ()
@@ -62,3 +70,23 @@ def run_to_end(
     except Exception as error:  # of any kind: it is a failure of ours, and the study continues
         return "crash", error
     return "completed", None
+
+
+def reaction_ns(key: str, limits: Limits) -> int:
+    """Time to the reaction to a condition of the supervision, ns."""
+    within = BY_KEY[key].within
+    assert within is not None
+    return within(limits)
+
+
+def longest_above(rows: Sequence[tuple[int, float]], limit: float) -> int:
+    """Longest time without a break for which the force of (t_ns, force) rows is above the limit, ns."""
+    longest = 0
+    since: int | None = None
+    for t_ns, force in rows:
+        if force <= limit:
+            since = None
+            continue
+        since = t_ns if since is None else since
+        longest = max(longest, t_ns - since)
+    return longest

@@ -1,4 +1,4 @@
-"""Study `faults`: runs follow from their seeds, the score sees what it must, and a few runs are without failure."""
+"""Study `faults`: a run follows from its number, the score sees what it must, and a few runs are without failure."""
 
 import json
 import os
@@ -6,117 +6,91 @@ import os
 import numpy as np
 import pytest
 
-from canprobe.cell.master.supervision import limits_of
+from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.master.supervisor import Supervisor
+from canprobe.cell.planning.motion import parked_posture
 from canprobe.cell.tasks import touch
 from canprobe.cli import main
-from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault
+from canprobe.fieldbus.tools.faults import Fault
 from canprobe.lab.studies import witnessed_run
-from canprobe.lab.studies.fault_cases import DRAWN_KINDS, KINDS, PHASES, FaultCase
-from canprobe.lab.studies.fault_runs import carry_out, draw_case, peak, phase_windows, run_seed
-from canprobe.lab.studies.fault_scenes import FORCE_MAX_N, SCENARIOS, seeded_plan
-from canprobe.lab.studies.fault_scores import Peak, score_force
-from canprobe.lab.studies.faults import findings, table_rows
+from canprobe.lab.studies.fault_cases import (
+    ARM_FILES,
+    CASES,
+    PHASES,
+    PLANTS,
+    TASKS,
+    FaultCase,
+    WrongFile,
+    seeded_plan,
+    wrong_files,
+)
+from canprobe.lab.studies.fault_runs import FaultRun, phase_windows, run_case, run_wrong_file
+from canprobe.lab.studies.faults import QUICK_KINDS, findings, quick_numbers, table_rows
 from canprobe.lab.studies.faults_vcan import HOLD_S, ProcessFault, draw_process_case, score_end
 from canprobe.lab.studies.faults_vcan import findings as findings_on_vcan
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 
-FEATURES = "press, features"
 S = 1_000_000_000
+BEYOND = {"stuck-image", "replayed-image", "gain-lost", "brake-stuck"}
+"""Kinds whose force nothing but the array notices, and the array is wrong."""
 
 
-def test_a_seed_is_the_same_run_again():
-    assert run_seed(5) == run_seed(5)
-    assert draw_case(5).faults != draw_case(6).faults
+def thrown(kind, node, phase, *, for_s=0.25, task="press", number=1, **values):
+    """A run of a task with one fault from the beginning of a phase on."""
+    fault = Fault(CELL_FAULTS[kind], node, phase_windows(task, "ideal")[phase][0], round(for_s * S), values, seed=7)
+    return FaultRun(seeded_plan(task, "ideal", number), (fault,))
 
 
-def test_every_kind_every_phase_and_every_node_is_drawn():
-    cases = [draw_case(seed) for seed in range(400)]
-    faults = [fault for case in cases for fault in case.faults]
-    assert {fault.kind for fault in faults} == set(KINDS)
-    assert {fault.node_id for fault in faults} == {1, 2, 3, 4, 5, 6, 16}
-    assert {case.phase for case in cases} == set(PHASES)
-    assert max(len(case.faults) for case in cases) == 3
-    assert {case.scenario for case in cases} == set(SCENARIOS)
-    assert {case.timed for case in cases} == {case.files for case in cases} == {True, False}
-    for case in cases:
-        windows = phase_windows(case.scenario, case.timed)
-        assert all(windows["bring-up"][0] <= fault.start_ns < windows["stop"][1] for fault in case.faults)
-        assert case.timed or case.phase != "bring-up"
+def test_a_number_is_the_same_run_again():
+    number = next(n for n in range(CASES) if FaultCase.of(n).phase == "contact" and FaultCase.of(n).kind.name == "drop")
+    assert run_case(FaultCase.of(number)) == run_case(FaultCase.of(number))
 
 
-@pytest.mark.parametrize("timed", [False, True])
-@pytest.mark.parametrize(
-    ("scenario", "without"), [("listen", {"approach", "retreat"}), ("free", {"retreat"}), (FEATURES, set())]
-)
-def test_the_phases_of_a_scenario_follow_each_other(scenario, without, timed):
-    windows = phase_windows(scenario, timed)
-    assert list(windows) == [phase for phase in PHASES if phase not in without]
+def test_every_kind_of_the_registry_is_drawn_in_every_task_phase_and_plant_at_a_node_that_can_have_it():
+    windows = {phase: (k * S, (k + 1) * S) for k, phase in enumerate(PHASES)}
+    cases = [FaultCase.of(number) for number in range(3 * CASES)]
+    places = {(case.kind.name, case.task, case.phase, case.plant) for case in cases[:CASES]}
+    assert len(places) == CASES == len(CELL_FAULTS) * len(TASKS) * len(PHASES) * len(PLANTS)
+    faults = [(case, case.fault((1, 2, 3, 4, 5, 6), 16, windows)) for case in cases]
+    assert {fault.node_id for _, fault in faults} == {1, 2, 3, 4, 5, 6, 16}
+    for case, fault in faults:
+        assert windows[case.phase][0] <= fault.start_ns < windows[case.phase][1]
+        assert case.kind.needs == "node" or (case.kind.needs == "array") is (fault.node_id == 16)
+        for name, value in fault.values.items():
+            assert case.kind.parameters[name].low <= value <= case.kind.parameters[name].high
+    assert {fault.duration_ns < 2 * S for _, fault in faults} == {True, False}
+
+
+@pytest.mark.parametrize("task", ["press", "calibrate"])
+def test_the_phases_of_a_task_follow_each_other(task):
+    windows = phase_windows(task, "ideal")
+    assert tuple(windows) == PHASES
     edges = [edge for window in windows.values() for edge in window]
-    assert edges == sorted(edges) and edges[1:-1:2] == edges[2::2]
-    assert all(last > first for first, last in windows.values())
-
-
-def test_the_peak_force_follows_from_what_the_probe_can_reach():
-    reach = peak(FEATURES)
-    assert reach is not None and peak("free") is None and peak("listen") is None
-    # K/h = 1.27e8 N/m3, probe 40 mm on a cylinder of 36 mm: F = pi K/h d^2 / (2 sqrt(ab)), gap a x^2 + b y^2
-    a, b = 0.5 / 0.040, 0.5 / 0.040 + 0.5 / 0.036
-    assert reach.depth_at_1n == pytest.approx((2 * (a * b) ** 0.5 / (np.pi * 1.27e8)) ** 0.5, rel=0.02)
-    # blind at 4 mm/s: six frames of 10 ms until the frame is stale, two cycles more, one of ramp, 6.8 ms of lag
-    assert reach.blind == pytest.approx(4e-3 * (0.080 + 0.010 + 0.0068), abs=4e-3 * 0.0101)
-    # with all drives going on the probe sinks in at the speed of the approach
-    assert reach.torn[0] == pytest.approx(4e-3 * (0.070 + 0.0168), rel=0.05)
-    assert list(reach.torn) == sorted(reach.torn)
-    assert reach.force(3) > reach.force(2) - 1e-12 and reach.force(2) > reach.force(1) > 3.0
-
-
-def test_a_force_is_scored_by_its_height_and_by_its_time():
-    limits = limits_of(seeded_plan(FEATURES, False, 0))
-    bound = Peak(3.0, 1e-3, 1e-3, (0.0, 0.0)).force(1)
-    assert bound == pytest.approx((3.0**0.5 + 1.0) ** 2)
-    rows = [(t * 5_000_000, 3.5 if 10 <= t < 30 else 1.0) for t in range(60)]
-    assert score_force(rows, limits, bound) == (3.5, 95_000_000, [])
-    long = [(t * 5_000_000, 3.5 if 10 <= t < 50 else 1.0) for t in range(60)]
-    assert "for 195 ms" in score_force(long, limits, bound)[2][0]
-    high = [(t * 5_000_000, 8.0 if t == 10 else 1.0) for t in range(60)]
-    assert "8.00 N" in score_force(high, limits, bound)[2][0] and score_force(high, limits, None)[2] == []
+    assert edges == sorted(edges)
+    assert all(last - first > 0.1 * S for first, last in windows.values())
 
 
 def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert main(["study", "faults", "--quick", "--workers", "1", "--out", str(tmp_path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    everything = document["rows"][-1]
-    assert (everything["fault"], everything["runs"], everything["failures"]) == ("all", 8, 0)
-    assert document["findings"][0].startswith("8 runs")
-    assert (tmp_path / "faults.png").is_file()
+    rows = {row["fault"]: row for row in document["rows"]}
+    assert set(rows) == {*QUICK_KINDS, "all"} and rows["all"]["runs"] == len(quick_numbers())
+    assert {name for name, row in rows.items() if row["failures"]} <= BEYOND | {"all"}
+    assert all(row["force_max_n"] <= 1.2 * 5.0 for name, row in rows.items() if name not in BEYOND | {"all"})
+    assert rows["all"]["force_max_n"] == max(rows[name]["force_max_n"] for name in QUICK_KINDS)
+    assert document["findings"][0].startswith(f"{rows['all']['runs']} runs")
+    (files,) = document["more"]
+    assert [row["file"] for row in files["rows"]] == ["true gear × ½"]
+    assert (tmp_path / "faults.png").is_file() and (tmp_path / "faults_files.csv").is_file()
 
 
-def test_one_run_is_told_by_its_seed(capsys):
-    assert main(["study", "faults", "--seed", "3", "--json"]) == 0
+def test_one_run_is_told_by_its_number(capsys):
+    assert main(["study", "faults", "--seed", "0", "--json"]) == 0
     told = capsys.readouterr()
     outcome = json.loads(told.out)
-    assert outcome["seed"] == 3 and all(fault in told.err for fault in outcome["faults"])
+    assert outcome["number"] == 0 and outcome["fault"] in told.err
     assert main(["study", "bound", "--seed", "3"]) == 2
-
-
-@pytest.mark.parametrize("seed", [1321, 4008])
-def test_a_drive_that_was_lost_in_contact_near_the_limit(seed):
-    """These stayed above the limit for 1305 and 335 ms while the cell stopped where it stood."""
-    run = run_seed(seed)
-    assert run["failures"] == [] and run["outcome"] == "bus or node failure"
-    assert run["force_max_n"] < 4.0 and run["above_ms"] < 50.0
-
-
-def test_a_force_that_the_cell_does_not_make_is_not_judged():
-    common = {"hits": 1, "failures": [], "kinds": ["drop"], "phase": "scan", "outcome": "completed"}
-    hand = common | {"force_bound_n": None, "force_max_n": 3.9, "above_ms": 615.0}
-    cell = common | {"force_bound_n": 8.0, "force_max_n": 3.2, "above_ms": 20.0}
-    told = findings([hand, cell])[1]
-    assert told.startswith("The cell presses in 1 runs:") and told.endswith(
-        "3 N in 1, for 20 ms at most, highest 3.20 N."
-    )
-    row = table_rows([hand, cell])[0]
-    assert (row["fault"], row["runs"], row["force_max_n"], row["above_ms"]) == ("drop", 2, 3.2, 20.0)
 
 
 def deaf_to_findings(monkeypatch):
@@ -124,14 +98,29 @@ def deaf_to_findings(monkeypatch):
     monkeypatch.setattr(touch, "touch_finding", lambda _: None)
 
 
-def test_the_score_sees_a_force_above_the_limit(monkeypatch):
+def test_the_score_sees_a_force_above_the_limit_and_when_a_fault_is_noticed(monkeypatch):
     """A sensor that falls mute while the probe comes near, and nobody who cares: the probe is driven on."""
-    mute = Fault(BUS_FAULTS["mute"], 16, int(0.8 * S), 2 * S)
-    supervised = carry_out(FaultCase(0, FEATURES, "approach", (mute,)))
-    assert supervised["failures"] == [] and supervised["outcome"] in ("stopped for safety", "bus or node failure")
+    supervised = thrown("mute", 16, "approach", for_s=5.0).result()
+    assert supervised["failures"] == [] and supervised["named"]
+    assert supervised["outcome"] in ("stopped for safety", "bus or node failure")
+    assert 0.0 < supervised["noticed_ms"] < 50.0 and supervised["left_n"] == 0.0
     deaf_to_findings(monkeypatch)
-    run = carry_out(FaultCase(0, FEATURES, "approach", (mute,)))
-    assert any("force above the limit" in failure for failure in run["failures"])
+    run = thrown("mute", 16, "approach", for_s=5.0).result()
+    assert any(failure.startswith("true force of ") for failure in run["failures"])
+    assert run["force_share"] == run["force_max_n"] / 5.0 > 1.5 and run["above_ms"] > 100.0
+
+
+def test_a_fault_that_mattered_is_not_reported_as_completed():
+    run = FaultRun(seeded_plan("press", "ideal", 0))
+    assert run.result()["failures"] == []
+    highest = max(range(len(run.witness.rows)), key=lambda k: run.witness.rows[k][1])
+    t_ns, force = run.witness.rows[highest]
+    run.witness.rows[highest] = (t_ns, 5.5)
+    assert [failure.partition(",")[0] for failure in run.result()["failures"]] == ["completed"]
+    run.witness.rows[highest] = (t_ns, force)
+    run.witness.rows[:] = [(t_ns, force + 2.5 * (force > 2.0)) for t_ns, force in run.witness.rows]  # 0.6 s of a hold
+    result = run.result()
+    assert 2.3 < result["above_measured_n"] < 2.8 and result["failures"][-1].startswith("completed")
 
 
 def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
@@ -139,13 +128,14 @@ def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
     monkeypatch.setattr("canprobe.cell.master.bringup.BringUp.release", lambda self: None)
     monkeypatch.setattr("canprobe.fieldbus.drive.self_stop.Supervision._lose", lambda self, code, t_ns: None)
     monkeypatch.setattr("canprobe.fieldbus.node.slave_node.SlaveNode._communication_error", lambda self, t_ns: None)
-    run = carry_out(FaultCase(0, FEATURES, "", ()))
+    run = FaultRun(seeded_plan("press", "ideal", 0)).result()
     assert any("OPERATION_ENABLED after the stop" in failure for failure in run["failures"])
 
 
-def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch):
+def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch, tmp_path):
+    plan = seeded_plan("press", "ideal", 0)
     monkeypatch.setattr(witnessed_run, "LONGEST_S", 0.5)
-    assert any(f.startswith("hang") for f in carry_out(FaultCase(0, FEATURES, "", ()))["failures"])
+    assert any(f.startswith("hang") for f in FaultRun(plan).result()["failures"])
     monkeypatch.undo()
 
     def crash(self, measurement):
@@ -153,33 +143,72 @@ def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch):
 
     monkeypatch.setattr(touch.TouchTask, "step", crash)
     monkeypatch.setattr("canprobe.cell.session.bus_record.TrafficMeter.frames", property(lambda self: 1))
-    monkeypatch.setattr("canprobe.lab.studies.fault_scores.summarise", lambda *_: {"force": float("nan")})
-    failures = carry_out(FaultCase(0, FEATURES, "", ()))["failures"]
+    monkeypatch.setattr("canprobe.lab.studies.fault_runs.summarise", lambda *_: {"force": float("nan")})
+    failures = FaultRun(plan, folder=tmp_path).result()["failures"]
     assert any("ZeroDivisionError" in failure for failure in failures)
     assert any(failure.startswith("log:") for failure in failures)
     assert any(failure.startswith("summary: ValueError") for failure in failures)
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=DRAWN_KINDS)
-def test_a_node_that_has_every_fault_in_contact_is_answered(kind):
-    start = phase_windows(FEATURES, True)["scan"][0] + S // 5
-    faults = tuple(Fault(kind, node, start, S // 4, seed=7) for node in (3, 16))
-    run = carry_out(FaultCase(1, FEATURES, "scan", faults))
+@pytest.mark.parametrize(
+    ("kind", "node"),
+    [("drop", 3), ("delay", 2), ("corrupt", 16), ("reboot", 5), ("freeze", 3), ("wrong-data", 3), ("sto", 2)],
+)
+def test_a_node_that_has_a_fault_in_contact_is_answered(kind, node):
+    run = thrown(kind, node, "contact").result()
     assert run["failures"] == [] and run["hits"] > 0
-
-
-def test_a_drive_that_tells_wrong_positions_does_not_let_the_probe_be_driven_in():
-    """Reports wrong by powers of two, some of them believed: carried on as a motion they led to 16.7 N."""
-    wrong = Fault(BUS_FAULTS["wrong-data"], 3, 1_080_816_012, 146_755_255, seed=1530753339)
-    run = carry_out(FaultCase(100_006, FEATURES, "scan", (wrong,), files=False))
-    assert run["hits"] > 10 and run["failures"] == [] and run["force_max_n"] < 10.0
 
 
 def test_a_corrupted_target_is_not_followed():
     """Bit errors behind the CRC of a drive's controller: it refuses the target, and the cell stops."""
-    corrupt = Fault(BUS_FAULTS["corrupt"], 2, phase_windows(FEATURES, False)["scan"][0], S // 2, incoming=True, seed=3)
-    run = carry_out(FaultCase(2, FEATURES, "scan", (corrupt,), files=False))
-    assert run["outcome"] != "completed" and run["failures"] == [] and run["force_max_n"] < FORCE_MAX_N
+    start_ns = phase_windows("press", "ideal")["contact"][0]
+    corrupt = Fault(CELL_FAULTS["corrupt"], 2, start_ns, S // 2, incoming=True, seed=3)
+    run = FaultRun(seeded_plan("press", "ideal", 2), (corrupt,)).result()
+    assert run["outcome"] != "completed" and run["failures"] == [] and run["force_max_n"] < 5.0
+
+
+def test_the_table_names_the_worst_run_of_each_kind():
+    common = {"hits": 1, "failures": [], "kind": "drop", "phase": "contact", "plant": "ideal", "named": True}
+    common |= {"above_ms": 0.0, "left_n": 0.0, "fault": "drop at node 3", "number": 7}
+    mild = common | {"task": "press", "outcome": "completed", "reason": "", "noticed_ms": None}
+    hard = common | {"task": "weave", "outcome": "stopped for safety", "reason": "node 3: lost", "noticed_ms": 15.0}
+    mild |= {"force_max_n": 3.2, "force_share": 0.64}
+    hard |= {"force_max_n": 8.0, "force_share": 1.6, "above_ms": 30.0, "left_n": 2.0, "failures": ["true force"]}
+    row = table_rows([mild, hard])[0]
+    assert (row["fault"], row["runs"], row["force_max_n"], row["worst"]) == ("drop", 2, 8.0, "weave, contact, ideal")
+    assert (row["press_n"], row["weave_n"], row["explore_n"]) == (3.2, 8.0, None)
+    assert (row["noticed_ms"], row["unnoticed"], row["pressing"], row["left_n"]) == (15.0, 1, 1, 2.0)
+    assert (row["above_ms"], row["named"], row["failures"]) == (30.0, 100.0, 1)
+    told = findings([mild, hard])
+    assert "in 50.00% of the runs" in told[1] and "highest 1.60 ×" in told[1]
+    assert told[3].endswith("true force (canprobe study faults --seed 7)")
+
+
+# Files that are wrong.
+
+
+@pytest.mark.parametrize("what", ARM_FILES)
+def test_an_arm_with_a_wrong_file_stands_where_it_is_thought_to_stand_at_first(what):
+    case = WrongFile(what, 3, "ideal")
+    setup = case.plan().setup
+    believed, true, q0 = setup.arm.model, setup.truth.model, parked_posture(setup, setup.arm)
+    assert joints_to_units(true, q0) == pytest.approx(joints_to_units(believed, q0), abs=1e-6)
+    step = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])
+    moved = units_to_joints(true, joints_to_units(believed, q0 + step)) - q0
+    factor = {"true gear × ½": 2.0, "true gear × 2": 0.5, "other sign": -1.0, "zero off by 5°": 1.0}[what]
+    assert moved == pytest.approx(factor * step, abs=1e-9)
+    turn = forward(true.chain, q0)[:3, :3].T @ forward(believed.chain, q0)[:3, :3]
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+    assert angle == pytest.approx(5.0 if what == "zero off by 5°" else 0.0, abs=1e-4)
+
+
+def test_a_first_touch_with_a_wrong_file_has_its_row():
+    every = wrong_files(6)
+    assert len(every) == len(set(every)) == (4 * 6 + 5) * 2
+    refused = run_wrong_file(WrongFile("stiffness of the file × 10", 0, "ideal"))
+    assert refused["outcome"] == "refused by the plan" and refused["failures"] == []
+    weak = run_wrong_file(WrongFile("calibration of an array that reads × 0.7", 0, "ideal"))
+    assert pytest.approx(weak["force_max_n"], rel=0.15) == 3.0 / 0.7
 
 
 # Study `faults` on vcan0, what of it needs no interface: the cases, and a score that sees a lost log.

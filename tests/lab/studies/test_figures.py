@@ -18,14 +18,14 @@ import canprobe
 from canprobe.cell.results.figures import draw_run
 from canprobe.cell.results.plan_figure import draw_plan
 from canprobe.cell.results.surface_figure import draw_surface
-from canprobe.lab.studies import estimators, stability, workprec
+from canprobe.lab.studies import estimators, fault_cases, stability, workprec
+from canprobe.lab.studies import faults as faults_study
 from canprobe.lab.studies import stability as stability_figure
 from canprobe.lab.studies.bound_cases import NOISES, SIZES_M
 from canprobe.lab.studies.bound_figure import draw_bound
 from canprobe.lab.studies.cycle_times import CycleTimes
 from canprobe.lab.studies.estimators import draw_estimators
-from canprobe.lab.studies.fault_cases import DRAWN_KINDS
-from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults
+from canprobe.lab.studies.faults_vcan import draw_ends
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
@@ -132,11 +132,19 @@ def faults(count):
     rng = np.random.default_rng(0)
     ends = ("completed", "stopped for safety", "bus or node failure", "bring-up refused")
     runs = [
-        {"kinds": [one_of(DRAWN_KINDS, i)], "outcome": rng.choice(ends), "force_bound_n": 3.0, "failures": [],
-         "force_max_n": rng.normal(2.3, 0.04)}
+        {"kind": one_of(fault_cases.KINDS, i).name, "outcome": rng.choice(ends), "failures": [],
+         "force_share": rng.lognormal(-0.7, 0.3)}
         for i in range(count)
     ]  # fmt: skip
-    return lambda path: draw_faults(runs, path)
+    return lambda path: faults_study.draw(runs, path)
+
+
+def wrong_files(path):
+    rows = [
+        {"file": case.what, "plant": case.plant, "force_max_n": 3.0 + 0.3 * i}
+        for i, case in enumerate(fault_cases.wrong_files(6))
+    ]
+    faults_study.draw_forces(rows, "file", "plant", "Highest true force of a first touch with a wrong file", path)
 
 
 def ends(path):
@@ -212,8 +220,9 @@ PICTURES = {
     "workprec": plant,
     "workprec, quick": functools.partial(plant, stiffnesses=workprec.STIFFNESSES[:2], steps=workprec.STEPS_US[1:3]),
     "workprec, cell": whole_cell,
-    "faults": faults(400),
+    "faults": faults(1020),
     "faults, quick": faults(8),
+    "faults, files": wrong_files,
     "faults, vcan": ends,
     "stability": map_of_touches,
     "stability, extremes": extremes,

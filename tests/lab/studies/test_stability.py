@@ -13,11 +13,11 @@ from canprobe.cell.plant.ideal_arm import natural_frequency
 from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.scene.load import load_scene
 from canprobe.lab.studies import stability
-from canprobe.lab.studies.fault_scores import longest_above
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import write_study
 from canprobe.lab.studies.stability_extremes import EXTREMES, ExtremeCase, extreme_scene, judged, sync_delay_ns
 from canprobe.lab.studies.stability_runs import LoopCase, layer_stiffness, loop_of, scene_of, touch_in_posture, upright
+from canprobe.lab.studies.witnessed_run import longest_above
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
 from canprobe.mechanics.touch.contact import indentation_from_force
