@@ -18,7 +18,9 @@ from canprobe.cell.planning.model import (
 )
 from canprobe.cell.planning.timeline import timeline_rows
 from canprobe.cell.scene.setup import Setup
+from canprobe.cell.scene.surface_files import mesh_text
 from canprobe.fieldbus.protocol.pdo import PdoEntry
+from canprobe.mechanics.touch.mesh_fit import MeshHeights
 
 TIMELINE_WIDTH = 100
 """Longest row of the timeline, characters of one cycle."""
@@ -203,6 +205,8 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
     yield ["task", setup.kind]
     if setup.array is not None:
         yield ["array", f"{array_text(setup.array)}; {_measured(setup)}"]
+    if isinstance(setup.truth.object, MeshHeights):
+        yield ["object", mesh_text(setup.truth.object.fit)]
     if (scan := setup.scan) is not None:
         yield ["strategy", scan.name]
     if (shape := setup.shape) is not None:
