@@ -1,4 +1,4 @@
-"""The plan as text for a terminal."""
+"""The whole plan as text for a terminal: the verdict, then all tables."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.timeline import timeline_rows
+from canprobe.cell.planning.verdict import MIN_CHARACTERS, broken, verdict_lines
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.scene.surface_files import mesh_text
 from canprobe.fieldbus.protocol.pdo import PdoEntry
@@ -24,8 +25,6 @@ from canprobe.mechanics.touch.mesh_fit import MeshHeights
 
 TIMELINE_WIDTH = 100
 """Longest row of the timeline, characters of one cycle."""
-MIN_CHARACTERS = 40
-"""Least length of a line: no line is broken before it."""
 _BESIDE_TIMELINE, _NARROW, _LAST = 24, 8, 12
 
 
@@ -37,22 +36,18 @@ def plan_text(plan: Plan, width: int | None = None) -> str:
         width: characters after which a line is broken; None: lines stay whole.
     """
     room = None if width is None else max(width, MIN_CHARACTERS)
-    lines = (part for line in _lines(plan, room) for part in _broken(line, room))
+    lines = (part for line in _lines(plan, room) for part in broken(line, room, indent=2 + _indent(line)))
     return "\n".join(lines) + "\n"
 
 
-def _broken(line: str, width: int | None) -> list[str]:
-    """A line in parts of a width, the later ones indented."""
-    if width is None or len(line) <= width:
-        return [line]
-    return textwrap.wrap(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip()) + 2))
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip())
 
 
 def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     bus, sync = plan.setup.bus, plan.sync
-    yield f"{plan.setup.name}: {plan.setup.title}" if plan.setup.title else plan.setup.name
-    channels = " and ".join(one.channel for one in plan.buses)
-    yield f"bus {channels} ({bus.interface}), {bus.bitrate} bit/s"
+    yield from verdict_lines(plan)
+    yield ""
     if bus.fd:
         yield (
             f"CAN FD frames above 8 bytes, their data at {bus.data_bitrate} bit/s and counted in bits of "
@@ -67,7 +62,6 @@ def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     )
     if bus.transmit_queue == "fifo":
         yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat delays what follows it'
-    yield from (f"warning: {warning}" for warning in plan.warnings)
     yield from _titled("nodes", _node_rows(plan), width)
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan), width)
     yield from _titled("raw frames of the array, which is no CANopen node", _raw_rows(plan), width)

@@ -63,6 +63,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
         "warnings": list(plan.warnings),
+        "witnesses": list(plan.witnesses),
     }
 
 

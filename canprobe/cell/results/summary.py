@@ -103,6 +103,8 @@ def summarise(
     }
     if record.explored is not None:
         summary["explore"] = record.explored.summarised()
+    if scene.task.kind == "listen":
+        summary["listen"] = _listened(log)
     return {name: without_nan(value) for name, value in summary.items()}
 
 
@@ -163,6 +165,20 @@ def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) ->
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, **error} | {
         "losses": summarise_losses(record.losses)
+    }
+
+
+def _listened(log: Mapping[str, Floats]) -> dict[str, Any]:
+    """Images that the master read, and their force; None where no image came, or its force does not show."""
+    sampled = log["sample_cycle"][np.isfinite(log["sample_cycle"])]
+    force = log["force_n"][np.isfinite(log["force_n"])] if "force_n" in log else np.empty(0)
+    seconds = float(np.ptp(log["t_s"])) if len(log["t_s"]) > 1 else 0.0
+    images = len(np.unique(sampled))
+    return {
+        "images": images,
+        "images_per_s": images / seconds if seconds > 0 else None,
+        "force_mean_n": float(force.mean()) if len(force) else None,
+        "force_max_n": float(force.max()) if len(force) else None,
     }
 
 
