@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import pytest
 
 import canprobe
 from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.report_json import plan_dict
 from canprobe.cell.planning.verdict import verdict_text
+from canprobe.cell.planning.witnesses import witness_lines
 from canprobe.cell.scene.load import packaged_scenes
 from canprobe.cli import main
 
@@ -23,7 +22,9 @@ def test_a_plan_begins_with_a_verdict_of_at_most_five_lines(name, capsys):
     title, *verdict, more = capsys.readouterr().out.splitlines()
     assert title == f"{name}: {document['title']}" and "--full" in more
     lines = {line[2:13].strip(): line[13:] for line in verdict}
-    assert list(lines) == ["fits", "nodes", "load", "left out"] and document["witnesses"] == []
+    touches = ["witnesses"] * (name == "cylinder")
+    assert list(lines) == ["fits", "nodes", "load", *touches, "left out"] and len(lines) <= 5
+    assert bool(document["witnesses"]) == bool(touches)
     assert lines["fits"] == "on can0 (lockstep), 1000000 bit/s, 400 Hz"
     (bus,) = document["bus_load"].values()
     slack_us = min(pdo["slack_us"] for pdo in document["pdos"])
@@ -40,15 +41,25 @@ def test_a_plan_begins_with_a_verdict_of_at_most_five_lines(name, capsys):
     assert {"nodes:", "uses:", "leaves out:"} < set(full)
 
 
-def test_a_verdict_names_real_nodes_witnesses_and_warnings():
+def test_a_verdict_names_real_nodes_and_warnings():
     keys = {"joints.joint_2.emulated": False, "joints.joint_3.emulated": False, "arm.missed_syncs": 40}
-    plan = dataclasses.replace(canprobe.plan("cylinder", keys), witnesses=("the pad's own sum", "motor currents"))
+    plan = canprobe.plan("cylinder", keys)
     text = verdict_text(plan)
     assert "  nodes      6 drives (1–6), tactile array (16); real: 2–3, the others emulated\n" in text
-    assert "  witness    the pad's own sum\n  witness    motor currents\n  left out   " in text
     assert f"  warning    {plan.warnings[0]}\n" in text and plan.warnings[0].startswith("arm.missed_syncs = 40")
-    assert plan_dict(plan)["witnesses"] == ["the pad's own sum", "motor currents"]
     assert max(map(len, verdict_text(plan, 60).splitlines())) <= 60
+
+
+@pytest.mark.parametrize("keys", [{}, {"arm.torque": False}, {"task.speed_mm_s": 60}])
+def test_a_verdict_names_the_witnesses_that_watch_and_those_that_are_silent(keys):
+    plan = canprobe.plan("cylinder", keys)
+    said = dict(line.split(None, 1) for line in witness_lines(plan))
+    shown = next(line for line in verdict_text(plan).splitlines() if line.startswith("  witnesses  "))
+    watching, _, silent = shown.removeprefix("  witnesses  ").partition("; silent: ")
+    assert {*watching.split(", ")} | ({*silent.split(", ")} if silent else set()) == set(said)
+    for name, text in said.items():
+        assert (name in silent) == text.startswith(("silent", "none"))
+        assert text[:30] in plan_text(plan)
 
 
 def test_what_does_not_fit_begins_with_that(capsys):

@@ -336,7 +336,6 @@ class Plan:
         left_out: what this scene does not bring up, and why.
         not_available: what the devices lack by their EDS files, and what that means.
         warnings: what is carried out although a number of the plan does not hold for it.
-        witnesses: what tests the measured force while the cell runs, a line for each.
     """
 
     setup: Setup
@@ -351,7 +350,6 @@ class Plan:
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
-    witnesses: tuple[str, ...] = ()
 
     @property
     def scene(self) -> Scene:

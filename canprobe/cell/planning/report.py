@@ -17,7 +17,7 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.timeline import timeline_rows
-from canprobe.cell.planning.verdict import MIN_CHARACTERS, broken, verdict_lines
+from canprobe.cell.planning.verdict import MIN_CHARACTERS, broken, verdict_lines, witness_rows
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.scene.surface_files import mesh_text
 from canprobe.fieldbus.protocol.pdo import PdoEntry
@@ -76,6 +76,7 @@ def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     yield from _titled(f"{each} {parts}", timeline_rows(plan, characters), width)
     yield from _titled("chosen by the plan", ((f"{one.key} = {one.written}", one.why) for one in plan.choices), width)
     yield from _titled("joint speeds", _speed_rows(plan), width)
+    yield from _titled("witnesses of the force beside the array", witness_rows(plan), width)
     yield from _titled("uses", _use_rows(plan), width)
     yield from _titled("leaves out", plan.left_out, width)
     yield from _titled("could not have", plan.not_available, width)

@@ -17,6 +17,7 @@ from canprobe.cell.planning.model import (
     PlannedPdo,
 )
 from canprobe.cell.planning.timeline import timeline
+from canprobe.cell.planning.witnesses import witness_lines
 from canprobe.cell.scene.setup import Setup
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
 
@@ -63,7 +64,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
         "warnings": list(plan.warnings),
-        "witnesses": list(plan.witnesses),
+        "witnesses": witness_lines(plan),
     }
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.witnesses import witness_lines
 
 MIN_CHARACTERS = 40
 """Least length of a line: no line is broken before it."""
@@ -43,8 +44,8 @@ def _verdict(plan: Plan) -> Iterator[tuple[str, str]]:
     yield "fits", f"on {channels} ({bus.interface}), {bus.bitrate} bit/s, {plan.sync.rate_hz:g} Hz"
     yield "nodes", _nodes(plan)
     yield "load", _load(plan)
-    for witness in plan.witnesses:
-        yield "witness", witness
+    if witnesses := witness_rows(plan):
+        yield "witnesses", _witnesses(witnesses)
     yield "left out", f"{len(plan.left_out)}: {'; '.join(what for what, _ in plan.left_out)}"
     for choice in plan.choices:
         yield "chosen", f"{choice.key} = {choice.written}: {choice.why}"
@@ -82,6 +83,18 @@ def _load(plan: Plan) -> str:
         slack_ns, pdo = min(bounded, key=lambda one: one[0])
         parts.append(f"the tightest frame, {pdo.cob_id:03X}h, is {slack_ns / 1000:g} µs before its deadline")
     return "; ".join(parts)
+
+
+def witness_rows(plan: Plan) -> list[tuple[str, str]]:
+    """Each witness of the force and what it notices; none without a touch."""
+    return [(name, text.strip()) for name, _, text in (line.partition(" ") for line in witness_lines(plan))]
+
+
+def _witnesses(rows: Sequence[tuple[str, str]]) -> str:
+    """The witnesses that watch the force beside the array, and those that do not."""
+    silent = [name for name, text in rows if text.startswith(("silent", "none"))]
+    watching = ", ".join(name for name, _ in rows if name not in silent) or "none"
+    return watching + (f"; silent: {', '.join(silent)}" if silent else "")
 
 
 def id_ranges(ids: Iterable[int]) -> str:

@@ -68,8 +68,8 @@ def witness_lines(plan: Plan) -> list[str]:
             lines.append("torque  a push that the array does not measure, beyond 4σ of what friction may hide")
         else:
             lines.append(
-                f"torque  silent at the first contact, as {steady_s:.2f} s of approach are too short to know the torques"
-                f" without it: raise task.clearance_mm to {math.ceil(STEADY_S * approach.speed * 1e4) / 10:g}"
+                f"torque  silent at the first contact, as {steady_s:.2f} s of approach are too short to know the"
+                f" torques without it: raise task.clearance_mm to {math.ceil(STEADY_S * approach.speed * 1e4) / 10:g}"
             )
     else:
         approach = touch.approach
