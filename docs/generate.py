@@ -29,6 +29,8 @@ EXPECTED = DOCS.parent / "canprobe" / "scenes" / "expected.json"
 SCHEMAS = DOCS.parent / "canprobe" / "schemas"
 RULES_MARKED = re.compile(r"(<!-- rules -->).*?(<!-- /rules -->)", re.DOTALL)
 MARKED = re.compile(r"(<!-- measured (\w+) -->).*?(<!-- /measured -->)", re.DOTALL)
+PRINTED_MARKED = re.compile(r"(<!-- printed (\w+)((?: \w+)*) -->).*?(<!-- /printed -->)", re.DOTALL)
+"""What a command prints: all of it, or the lines of some subjects with what is set in below them."""
 GALLERY = """\
 # Gallery of scenes
 
@@ -52,7 +54,24 @@ def with_measured(page: str, measured: Mapping[str, Any]) -> str:
     def block(found: re.Match[str]) -> str:
         return f"{found[1]}\n\n{_block(found[2], measured)}\n\n{found[3]}" if found[2] in measured else found[0]
 
-    return MARKED.sub(block, page)
+    def printed(found: re.Match[str]) -> str:
+        lines = _of_subjects(measured[found[2]]["printed"], found[3].split())
+        return f"{found[1]}\n\n```text\n" + "\n".join(lines) + f"\n```\n\n{found[4]}"
+
+    return PRINTED_MARKED.sub(printed, MARKED.sub(block, page))
+
+
+def _of_subjects(lines: Sequence[str], subjects: Sequence[str]) -> list[str]:
+    """The lines that begin with one of some subjects, and what is set in below; all where none is named."""
+    if not subjects:
+        return list(lines)
+    chosen, keep = [], False
+    for line in lines:
+        if not line.startswith("   "):
+            keep = line.split()[0] in subjects and line.startswith("  ")
+        if keep:
+            chosen.append(line)
+    return chosen
 
 
 def _block(name: str, measured: Mapping[str, Any]) -> str:
@@ -119,6 +138,12 @@ def with_accuracy(readme: str, measured: Mapping[str, Any]) -> str:
     return re.sub(r"(and the curvature\sby\s)[\d.–]+ %", rf"\g<1>{curvature}", readme)
 
 
+def with_pace(page: str, measured: Mapping[str, Any]) -> str:
+    """The page on Python with how much faster a scan is without a bus."""
+    us = {row[0]: float(row[1].split()[0]) for row in measured["side_by_side"]["table"][1:]}
+    return re.sub(r"[\d.]+( times as fast \(\[cost\])", rf"{us['lockstep'] / us['direct']:.1f}\1", page)
+
+
 def gallery(measured: Mapping[str, Any]) -> str:
     """The page of pictures; `python docs/gallery.py` draws them."""
     scenes = measured["scenes"]
@@ -150,11 +175,13 @@ def pages() -> Iterator[tuple[Path, str]]:
     yield DOCS / "img" / "imports.svg", imports_svg()
     readme = DOCS.parent / "README.md"
     yield readme, with_accuracy(readme.read_text(encoding="utf-8"), measured)
+    python = DOCS / "python.md"
+    yield python, with_pace(python.read_text(encoding="utf-8"), measured)
     judge = DOCS / "judge.md"
     yield judge, with_rules(judge.read_text(encoding="utf-8"))
     for page in sorted(DOCS.glob("*.md")):
         text = page.read_text(encoding="utf-8")
-        if MARKED.search(text):
+        if MARKED.search(text) or PRINTED_MARKED.search(text):
             yield page, with_measured(text, measured)
 
 

@@ -1,19 +1,24 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
-`growth`, `held`, `gym`, `learning`, `bridges`, `local_node`,
-`canopen_node`, `exploration` (the study `explore`, as a scene has its name). Without names everything is measured but
-what takes more than half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the
-figures. Every entry has its own command, date, commit and machine, so that one can be measured anew without the others.
-Then `python docs/generate.py` writes the pages.
+`growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `exploration` (the study `explore`, as a
+scene has its name), `pictures`, or one of `PRINTED`, what a page shows of a command that the tests repeat. Without
+names everything is measured but what takes more than half an hour (`LONG`). Measure on a machine that does nothing
+else: computing time is among the figures. Every entry has its own command, date, commit and machine, so that one can
+be measured anew without the others. Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import datetime
+import hashlib
+import io
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -23,10 +28,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from moving_picture import draw_moving
 from PIL import Image
 
 import canprobe
 from canprobe.cell.results.expected import figures_of
+from canprobe.cell.results.figures import draw_run
+from canprobe.cell.results.surface_figure import draw_surface
 from canprobe.cell.scene.load import packaged_scenes
 from canprobe.lab.studies.result_files import processor
 from canprobe.lab.studies.sweep import STUDIES
@@ -303,6 +311,75 @@ def local_node() -> Entry:
     return {"command": command} | json.loads(printed(command))
 
 
+def shown(name: str) -> Entry:
+    """What the last of some commands prints, without its files and its time on the wall, and the pictures of it."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        lines = printed_by(name)
+    return {"command": " && ".join(shlex.join(["canprobe", *words]) for words in PRINTED[name]), "printed": lines}
+
+
+def printed_by(name: str) -> list[str]:
+    """The lines of `PRINTED`, by commands that run in the working folder and in this process."""
+    from canprobe.cli import main as command
+
+    for array in re.findall(r"```toml\n(\[array\].*?)```", (DOCS / "own-array.md").read_text(encoding="utf-8"), re.S)[
+        :1
+    ]:
+        Path("small.toml").write_text(array, encoding="utf-8")
+    said = io.StringIO()
+    for words in PRINTED[name]:
+        with contextlib.redirect_stdout(said := io.StringIO()):
+            if status := command([word.replace("canprobe/", f"{DOCS.parent}/canprobe/") for word in words]):
+                raise SystemExit(f"canprobe {shlex.join(words)}: ended with status {status}")
+    lines = [
+        line for line in said.getvalue().splitlines() if not line.startswith(("  files ", "next: ", "  expected "))
+    ]
+    return [re.sub(r" in [\d.]+ s \([\d.]+ × real time\)", "", line) for line in lines]
+
+
+PRINTED: Mapping[str, Sequence[Sequence[str]]] = {
+    "first_day": [["run", "cylinder", "--full", "--no-figures", "--out", "runs/first"]],
+    "own_arm": [
+        ["init", "my-cell", "--urdf", "canprobe/cells/prbt.urdf", "--eds", "canprobe/fieldbus/eds/prbt_joint.eds"],
+        ["run", "my-cell/first.toml", "--no-figures"],
+    ],
+    "own_array": [["run", "cylinder", "--set", "sensor.array=small.toml", "--no-figures"]],
+    "explored": [["run", "explore", "--bus", "direct", "--no-figures"]],
+}
+"""Commands of which a page shows what the last one prints."""
+
+
+def pictures() -> Entry:
+    """The pictures of the default scan, drawn anew; their figures are those of `first_day`."""
+    result = canprobe.run("cylinder", {"scene.figures": False})
+    draw_run(result, DOCS / "img" / "cylinder.png")
+    draw_surface(result, DOCS / "img" / "surface.png")
+    draw_moving(canprobe.run("cylinder", {"scene.figures": False}, duration_s=5.0), DOCS / "img" / "scan.webp")
+    for name in ("cylinder", "surface"):
+        path = DOCS / "img" / f"{name}.png"
+        Image.open(path).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(path, optimize=True)
+    return {"command": "python docs/measure.py pictures", "drawn_by": {name: drawing_code(name) for name in DRAWN_BY}}
+
+
+RESULTS = DOCS.parent / "canprobe" / "cell" / "results"
+DRAWN_BY: Mapping[str, Sequence[Path]] = {
+    "cylinder.png": [RESULTS / f"{name}.py" for name in ("figures", "picture", "surface_panels")],
+    "surface.png": [
+        RESULTS / f"{name}.py" for name in ("surface_figure", "picture", "surface_panels", "surface_sheet")
+    ],
+    "scan.webp": [DOCS / "moving_picture.py"],
+}
+"""Code that draws a picture: where it changes, the picture is drawn anew."""
+
+
+def drawing_code(name: str) -> str:
+    """Digest of the code that draws a picture."""
+    digest = hashlib.sha256()
+    for module in DRAWN_BY[name]:
+        digest.update(ast.dump(ast.parse(module.read_text(encoding="utf-8"))).encode())
+    return digest.hexdigest()[:16]
+
+
 OTHERS: Mapping[str, Callable[[], Entry]] = {
     "local_node": local_node,
     "canopen_node": canopen_node,
@@ -316,6 +393,8 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "learning": learning,
     "bridges": bridges,
     "exploration": partial(study, "explore"),
+    "pictures": pictures,
+    **{name: partial(shown, name) for name in PRINTED},
 }
 
 

@@ -28,6 +28,8 @@ from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 
 OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
+ARM_OPACITY = 0.35
+"""Opacity of the links beside an object: they may stand between it and the eye."""
 FORCE_M_PER_N = 0.012
 """Length of the shaft of the force arrow; its head is added, so that the smallest force has an arrow, too."""
 FORCE_HEAD_M = 0.007
@@ -94,7 +96,10 @@ class Stage:
             self.notes += undrawn
             self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
             for part in parts:
-                self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour, flat_shading=part.flat)
+                opacity = ARM_OPACITY if self._shape is not None else None
+                self._add(
+                    f"/arm/{part.frame}/{part.name}", part.mesh, part.colour, flat_shading=part.flat, opacity=opacity
+                )
         if scene.probe is not None:
             self._add_probe(scene.probe.radius_mm * 1e-3, array.pad if array is not None else None)
         self._add_contact()

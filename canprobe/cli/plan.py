@@ -1,5 +1,7 @@
 """Show what a scene would send on the bus, whether it fits, and what it leaves out. No bus is opened.
 
+A verdict of a few lines comes first; --full adds all tables.
+
 A scene that does not fit is refused with status 2, with every reason and with changes that make it fit. --rehearse also
 brings the cell up in lockstep with every node emulated, and carries out the beginning of its task.
 """
@@ -34,6 +36,7 @@ files of --export:
 
 examples:
   canprobe plan cylinder
+  canprobe plan cylinder --full
   canprobe plan mine.toml --auto
   canprobe plan mine.toml --rehearse
   canprobe plan cylinder --measured runs/cylinder-20260101-120000-000
@@ -47,6 +50,7 @@ EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 def add_arguments(parser: Parser) -> None:
     """Add the command's arguments."""
     add_scene(parser)
+    parser.add_argument("--full", action="store_true", help="print the tables of nodes, PDOs, times and choices too")
     parser.add_argument(
         "--measured",
         metavar="LOG",
@@ -98,6 +102,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.planning.open_keys import opened
     from canprobe.cell.planning.report import plan_text
     from canprobe.cell.planning.report_json import plan_dict, refused_dict
+    from canprobe.cell.planning.verdict import verdict_text
     from canprobe.cell.scene.resolve import resolve
     from canprobe.cell.session.joint_record import warned
 
@@ -114,6 +119,8 @@ def run(args: argparse.Namespace) -> int:
     except PlanError as error:
         if args.json:
             print_json(refused_dict(scene.name, error.problems, error.ways_out))
+        else:
+            print(f"{scene.name}: does not fit")
         raise
     if args.measured is not None:
         return _compare(plan, args.measured, args.json)
@@ -128,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     elif files:
         print("\n".join(str(file) for file in files))
     else:
-        print(plan_text(plan, columns(sys.stdout)), end="")
+        print((plan_text if args.full else verdict_text)(plan, columns(sys.stdout)), end="")
     if rehearsed is not None and not args.json:
         print(f"\nrehearsed in lockstep: {rehearsed}")
     return 0

@@ -26,6 +26,7 @@ examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
   canprobe run cylinder --set task.force_n=3 --set object.radius_mm=50
+  canprobe run cylinder --full
   canprobe run cylinder --no-figures
   canprobe run cylinder --tool runs/calibrate/tool.toml
   canprobe run cylinder --bus socketcan --channel vcan0 --patient
@@ -46,14 +47,15 @@ def add_arguments(parser: Parser) -> None:
         default=None,
         help="draw no report.png and surface.png [the scene's scene.figures]",
     )
+    parser.add_argument("--full", action="store_true", help="print the error of the force and every estimator too")
     add_options(parser, "--json")
     add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises.
+    """Run the scene; the verdict goes to stdout, the progress to stderr. A run that was stopped raises.
 
-    The summary is printed as soon as it holds the estimator in the loop; the errors of the others follow below it.
+    It is printed as soon as it holds the estimator in the loop; with --full the errors of the others follow below it.
     """
     scene = scene_of(args)
     if args.tool is not None:
@@ -70,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     def print_early(summary: Mapping[str, Any]) -> None:
         if not args.json:
             with contextlib.suppress(OSError):  # what follows is printed there too, and then it is reported
-                print_summary(with_scene(summary_text({**summary, "bridges": None}, None), args))
+                print_summary(with_scene(summary_text({**summary, "bridges": None}, None, full=args.full), args))
                 sys.stdout.flush()
 
     try:
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result.summary)
     else:
-        of_others = dict(list(result.summary["shape"].get("methods", {}).items())[1:])
+        of_others = dict(list(result.summary["shape"].get("methods", {}).items())[1:]) if args.full else {}
         print_lines([*method_lines(of_others), *bridge_lines(result.summary.get("bridges") or {}), *_expected(args)])
         print(folder_line(folder))
         view = BRIDGES["view"]

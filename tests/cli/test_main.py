@@ -384,7 +384,7 @@ def test_scenes(capsys):
 
 
 def test_plan_text_and_json(capsys):
-    assert main(["plan", "free"]) == 0
+    assert main(["plan", "free", "--full"]) == 0
     assert "leaves out:" in capsys.readouterr().out
     assert main(["plan", "free", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["scene"] == "free"

@@ -9,8 +9,64 @@ import pytest
 
 import canprobe
 from canprobe.cell.planning.report import plan_text
+from canprobe.cell.planning.verdict import verdict_text
+from canprobe.cell.planning.witnesses import witness_rows
 from canprobe.cell.scene.load import packaged_scenes
 from canprobe.cli import main
+
+
+@pytest.mark.parametrize("name", ["cylinder", "listen", "free"])
+def test_a_plan_begins_with_a_verdict_of_at_most_five_lines(name, capsys):
+    assert main(["plan", name, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert main(["plan", name]) == 0
+    title, *verdict, more = capsys.readouterr().out.splitlines()
+    assert title == f"{name}: {document['title']}" and "--full" in more
+    lines = {line[2:13].strip(): line[13:] for line in verdict}
+    touches = ["witnesses"] * (name == "cylinder")
+    assert list(lines) == ["fits", "nodes", "load", *touches, "left out"] and len(lines) <= 5
+    assert bool(document["witnesses"]) == bool(touches)
+    assert lines["fits"] == "on can0 (lockstep), 1000000 bit/s, 400 Hz"
+    (bus,) = document["bus_load"].values()
+    slack_us = min(pdo["slack_us"] for pdo in document["pdos"])
+    assert lines["load"].startswith(
+        f"{100 * bus['planned_worst']:.1f} % at worst; {bus['budget']['slack_us']:g} of 2500"
+    )
+    assert lines["load"].endswith(f"is {slack_us:g} µs before its deadline")
+    assert lines["left out"] == f"{len(document['left_out'])}: " + "; ".join(
+        one["what"] for one in document["left_out"]
+    )
+    assert main(["plan", name, "--full"]) == 0
+    full = capsys.readouterr().out.splitlines()
+    assert full[: len(verdict) + 1] == [title, *verdict]
+    assert {"nodes:", "uses:", "leaves out:"} < set(full)
+
+
+def test_a_verdict_names_real_nodes_and_warnings():
+    keys = {"joints.joint_2.emulated": False, "joints.joint_3.emulated": False, "arm.missed_syncs": 40}
+    plan = canprobe.plan("cylinder", keys)
+    text = verdict_text(plan)
+    assert "  nodes      6 drives (1–6), tactile array (16); real: 2–3, the others emulated\n" in text
+    assert f"  warning    {plan.warnings[0]}\n" in text and plan.warnings[0].startswith("arm.missed_syncs = 40")
+    assert max(map(len, verdict_text(plan, 60).splitlines())) <= 60
+
+
+@pytest.mark.parametrize("keys", [{}, {"arm.torque": False}, {"task.speed_mm_s": 60}])
+def test_a_verdict_names_the_witnesses_that_watch_and_those_that_are_silent(keys):
+    plan = canprobe.plan("cylinder", keys)
+    said = dict(witness_rows(plan))
+    shown = next(line for line in verdict_text(plan).splitlines() if line.startswith("  witnesses  "))
+    watching, _, silent = shown.removeprefix("  witnesses  ").partition("; silent: ")
+    assert {*watching.split(", ")} | ({*silent.split(", ")} if silent else set()) == set(said)
+    for name, text in said.items():
+        assert (name in silent) == text.startswith(("silent", "none"))
+        assert text[:30] in plan_text(plan)
+
+
+def test_what_does_not_fit_begins_with_that(capsys):
+    assert main(["plan", "cylinder", "--set", "cycle.rate_hz=1000"]) == 2
+    said = capsys.readouterr()
+    assert said.out == "cylinder: does not fit\n" and "worst-case load" in said.err
 
 
 def test_a_rehearsal_says_what_was_done(capsys):

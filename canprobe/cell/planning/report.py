@@ -1,4 +1,4 @@
-"""The plan as text for a terminal."""
+"""The whole plan as text for a terminal: the verdict, then all tables."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.timeline import timeline_rows
+from canprobe.cell.planning.verdict import MIN_CHARACTERS, broken, verdict_lines
 from canprobe.cell.planning.witnesses import witness_rows
 from canprobe.cell.scene.setup import Setup
+from canprobe.cell.scene.surface_files import mesh_text
 from canprobe.fieldbus.protocol.pdo import PdoEntry
+from canprobe.mechanics.touch.mesh_fit import MeshHeights
 
 TIMELINE_WIDTH = 100
 """Longest row of the timeline, characters of one cycle."""
-MIN_CHARACTERS = 40
-"""Least length of a line: no line is broken before it."""
 _BESIDE_TIMELINE, _NARROW, _LAST = 24, 8, 12
 
 
@@ -36,22 +37,18 @@ def plan_text(plan: Plan, width: int | None = None) -> str:
         width: characters after which a line is broken; None: lines stay whole.
     """
     room = None if width is None else max(width, MIN_CHARACTERS)
-    lines = (part for line in _lines(plan, room) for part in _broken(line, room))
+    lines = (part for line in _lines(plan, room) for part in broken(line, room, indent=2 + _indent(line)))
     return "\n".join(lines) + "\n"
 
 
-def _broken(line: str, width: int | None) -> list[str]:
-    """A line in parts of a width, the later ones indented."""
-    if width is None or len(line) <= width:
-        return [line]
-    return textwrap.wrap(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip()) + 2))
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip())
 
 
 def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     bus, sync = plan.setup.bus, plan.sync
-    yield f"{plan.setup.name}: {plan.setup.title}" if plan.setup.title else plan.setup.name
-    channels = " and ".join(one.channel for one in plan.buses)
-    yield f"bus {channels} ({bus.interface}), {bus.bitrate} bit/s"
+    yield from verdict_lines(plan)
+    yield ""
     if bus.fd:
         yield (
             f"CAN FD frames above 8 bytes, their data at {bus.data_bitrate} bit/s and counted in bits of "
@@ -66,7 +63,6 @@ def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     )
     if bus.transmit_queue == "fifo":
         yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat delays what follows it'
-    yield from (f"warning: {warning}" for warning in plan.warnings)
     yield from _titled("nodes", _node_rows(plan), width)
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan), width)
     yield from _titled("raw frames of the array, which is no CANopen node", _raw_rows(plan), width)
@@ -81,7 +77,7 @@ def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     yield from _titled(f"{each} {parts}", timeline_rows(plan, characters), width)
     yield from _titled("chosen by the plan", ((f"{one.key} = {one.written}", one.why) for one in plan.choices), width)
     yield from _titled("joint speeds", _speed_rows(plan), width)
-    yield from _titled("what else than the array bounds the force", witness_rows(plan), width)
+    yield from _titled("witnesses of the force beside the array", witness_rows(plan), width)
     yield from _titled("uses", _use_rows(plan), width)
     yield from _titled("leaves out", plan.left_out, width)
     yield from _titled("could not have", plan.not_available, width)
@@ -205,6 +201,8 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
     yield ["task", setup.kind]
     if setup.array is not None:
         yield ["array", f"{array_text(setup.array)}; {_measured(setup)}"]
+    if isinstance(setup.truth.object, MeshHeights):
+        yield ["object", mesh_text(setup.truth.object.fit)]
     if (scan := setup.scan) is not None:
         yield ["strategy", scan.name]
     if (shape := setup.shape) is not None:

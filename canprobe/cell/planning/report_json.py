@@ -19,6 +19,7 @@ from canprobe.cell.planning.model import (
 from canprobe.cell.planning.timeline import timeline
 from canprobe.cell.planning.witnesses import witness_rows
 from canprobe.cell.scene.setup import Setup
+from canprobe.mechanics.touch.mesh_fit import MeshHeights
 
 SCHEMA = 1
 
@@ -49,6 +50,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
         "raw_frames": [_in_us(asdict(frames)) for frames in plan.raw],
         "array": _array(setup),
+        "object": _mesh(setup),
         "bus_load": {one.channel: _bus(one) for one in plan.buses},
         "choices": [{"key": one.key, "value": one.written, "why": one.why} for one in plan.choices],
         "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
@@ -104,6 +106,19 @@ def _array(setup: Setup) -> dict[str, Any] | None:
         "rate_hz": array.rate_hz,
         "taxels_pressed": support.taxels if setup.touch is not None else None,
         "supports": {"force": True, "centroid": support.centroid, "curvature": support.curvature},
+    }
+
+
+def _mesh(setup: Setup) -> dict[str, Any] | None:
+    """The mesh that is the object, and the surface fitted to it; None for any other object."""
+    if not isinstance(setup.truth.object, MeshHeights):
+        return None
+    fit = setup.truth.object.fit
+    error = fit.curvature
+    return asdict(fit.state) | {
+        "spacing_mm": 1e3 * fit.spacing,
+        "curvature_error_per_m": None if error is None else error.error,
+        "curvature_per_m": None if error is None else error.curvature,
     }
 
 

@@ -12,8 +12,10 @@ from canprobe.cell.planning.window import (
     cut_patch,
 )
 from canprobe.cell.scene.setup import Array, Setup
+from canprobe.cell.scene.surface_files import mesh_warnings
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
+from canprobe.mechanics.touch.mesh_fit import MeshHeights
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 
@@ -75,6 +77,8 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     yield from _open_to_others(setup)
     if setup.arm is not None:
         yield from setup.arm.warnings
+    if isinstance(setup.truth.object, MeshHeights):
+        yield from mesh_warnings(setup.truth.object.fit)
     if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
         yield from long_waits(setup.arm.missed_syncs, setup.rate_hz)
     if setup.array is not None and setup.array.newtons == NO_FORCE_REFERENCE:

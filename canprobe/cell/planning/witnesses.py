@@ -42,11 +42,11 @@ def witness_rows(plan: Plan) -> list[tuple[str, str]]:
     margin = _depth(probe, limits.force_max) - _depth(probe, touch.force)
     speed = touch.scan.speed if isinstance(touch, Touch) and touch.scan is not None else 0.0
     error = CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * speed)
-    known = f"{touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm" + (
-        f" on new ground at {speed * 1e3:g} mm/s" if speed else ""
-    )
+    known = f"{touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm"
+    if speed:
+        known += f" on new ground at {speed * 1e3:g} mm/s"
     if error > margin:
-        known += f": silent there, up to {math.floor(_fastest(margin) * 1e3)} mm/s it watches"
+        known = f"silent above {math.floor(_fastest(margin) * 1e3)} mm/s: {known}"
     return [
         ("images", f"one that repeats or does not scatter is noticed within {within}"),
         ("depth", known),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure, SubFigure
@@ -44,7 +45,7 @@ def draw_run(result: RunData, path: Path) -> None:
     rows = _rows(result)
     if not rows:
         return
-    with picture(path, _title(result), 0.6 + 2.9 * len(rows)) as figure:
+    with picture(path, _title(result), 0.8 + 2.9 * len(rows)) as figure:
         _fill(figure, rows, result)
 
 
@@ -57,7 +58,7 @@ def run_figure(result: RunData) -> Figure:
     rows = _rows(result)
     if not rows:
         raise UsageError("plot: this run has no data for any panel")
-    with sheet(_title(result), 0.6 + 2.9 * len(rows)) as figure:
+    with sheet(_title(result), 0.8 + 2.9 * len(rows)) as figure:
         _fill(figure, rows, result)
     return figure
 
@@ -95,7 +96,29 @@ def _title(result: RunData) -> str:
     newtons = f" · {NO_FORCE_REFERENCE}" if summary["newtons"] == NO_FORCE_REFERENCE else ""
     end = "" if summary["completed"] else f"\nstopped: {summary['stop_reason']}"
     scene = result.plan.scene.title or summary["scene"]
-    return f"{scene}\n{summary['bus']}, seed {summary['seed']} · colour: measured and estimated; {truth}{newtons}{end}"
+    headline = f"\n{figures}" if (figures := _headline(summary)) else ""
+    shades = f"colour: measured and estimated; {truth}{newtons}"
+    return f"{scene}{headline}\n{summary['bus']}, seed {summary['seed']} · {shades}{end}"
+
+
+def _headline(summary: Mapping[str, Any]) -> str:
+    """The figures of the run in one line; those that apply."""
+    contact, shape, found = summary["contact"], summary["shape"], []
+    if (off := contact["force_rms_error_n"]) is not None:
+        which = "true" if contact["force_true_rms_error_n"] is not None else "measured"
+        found.append(f"{which} force off its target by {100 * off / contact['force_target_n']:.1f} %")
+    if (error := shape["kappa_rms_error_per_m"]) is not None:
+        percent = shape["kappa_rms_error_percent"]
+        found.append("curvature by " + (f"{error:.2g} 1/m" if percent is None else f"{percent:.1f} %") + " (RMS)")
+    if (surface := shape.get("map")) is not None and surface["rms_error_um"] is not None:
+        found.append(f"surface by {surface['rms_error_um']:.0f} µm")
+    if (share := contact["contact_fraction"]) is not None:
+        found.append(f"contact {100 * share:.1f} %")
+    if (listened := summary.get("listen")) is not None and listened["force_max_n"] is not None:
+        found.append(f"{listened['images']} images, force up to {listened['force_max_n']:.2f} N")
+    if (tool := summary["calibration"]) is not None and tool["error_mm"] and None not in tool["error_mm"]:
+        found.append(f"tool centre off by {math.hypot(*tool['error_mm']):.3f} mm")
+    return " · ".join(found)
 
 
 def _draw_tool(part: SubFigure, result: RunData) -> None:

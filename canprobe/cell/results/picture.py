@@ -143,8 +143,13 @@ def _number(value: float) -> str:
     return f"$10^{{{exponent:.0f}}}$"
 
 
-def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float, azim: float) -> None:
-    """Let axes in three dimensions fill their part: one scale for all, as many ticks as a side has room for."""
+def box(
+    part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float, azim: float, beside_in: float = 1.2
+) -> None:
+    """Let axes in three dimensions fill their part: one scale for all, as many ticks as a side has room for.
+
+    Labels, and what else stands in the part, take `beside_in` inches of its width.
+    """
     low, high = axes.get_zlim()
     spare = max(0.0, MIN_DEPTH_MM - (high - low)) / 2
     axes.set_zlim(low - spare, high + spare)
@@ -154,7 +159,9 @@ def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float
     sides = {axes.xaxis: axes.get_xlim(), axes.yaxis: axes.get_ylim(), axes.zaxis: axes.get_zlim()}
     corners = np.array(list(product(*sides.values(), (1.0,)))) @ axes.get_proj().T
     seen = np.ptp(axes.transData.transform(corners[:, :2] / corners[:, 3:]), axis=0) / axes.bbox.size
-    room = (part.bbox.size - DPI * np.array([1.6, 0.9])) / min(part.bbox.size)  # beside the labels
+    title_in = 0.2 * len(title.splitlines()) + 0.1  # it takes its place later
+    below = part.bbox.size - DPI * np.array([0.0, title_in])
+    room = (below - DPI * np.array([beside_in, 0.5])) / min(below)  # beside the labels
     axes.set_box_aspect(axes.get_box_aspect(), zoom=float(min(room / seen)))
     longest = max(high - low for low, high in sides.values())
     for (axis, (low, high)), label in zip(sides.items(), labels, strict=True):

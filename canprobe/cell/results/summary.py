@@ -105,6 +105,8 @@ def summarise(
     }
     if record.explored is not None:
         summary["explore"] = record.explored.summarised()
+    if scene.task.kind == "listen":
+        summary["listen"] = _listened(log)
     return {name: without_nan(value) for name, value in summary.items()}
 
 
@@ -176,6 +178,20 @@ def _witnesses(session: Session, record: TaskRecord) -> dict[str, Any] | None:
         "array_seen_alive": session.cell.supervisor.array_alive,
         "depth_watched_fraction": record.depth_watched,
         "torques_reported": reports_torque(session.plan),
+    }
+
+
+def _listened(log: Mapping[str, Floats]) -> dict[str, Any]:
+    """Images that the master read, and their force; None where no image came, or its force does not show."""
+    sampled = log["sample_cycle"][np.isfinite(log["sample_cycle"])]
+    force = log["force_n"][np.isfinite(log["force_n"])] if "force_n" in log else np.empty(0)
+    seconds = float(np.ptp(log["t_s"])) if len(log["t_s"]) > 1 else 0.0
+    images = len(np.unique(sampled))
+    return {
+        "images": images,
+        "images_per_s": images / seconds if seconds > 0 else None,
+        "force_mean_n": float(force.mean()) if len(force) else None,
+        "force_max_n": float(force.max()) if len(force) else None,
     }
 
 

@@ -84,15 +84,17 @@ def _draw_disagreement(part: SubFigure, view: MapView) -> None:
         axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
     points = view.map.points[drawn_rows(len(view.map))]
     places, beyond = view.plane.mm(points), view.map.disagreement(points)
-    for chosen, colour, what in ((beyond == 0.0, BLUE, "agree within their noise"), (beyond > 0.0, ORANGE, "disagree")):
+    groups = ((beyond == 0.0, BLUE, "agree within their noise"), (beyond > 0.0, ORANGE, "disagree"))
+    for chosen, colour, what in (group for group in groups if group[0].any()):
         size = np.clip(8.0 + 8.0 * beyond[chosen], 8.0, 60.0)
         axes.scatter(
             places[chosen, 0], places[chosen, 1], s=size, color=colour, linewidths=0.3, edgecolors="white",
             zorder=2, label=f"{chosen.sum()} nodes {what}",
         )  # fmt: skip
     axes.set_aspect("equal", adjustable="datalim")
+    apart = "where contacts disagree; size: χ² per degree of freedom above 1"
     axes.set(
-        title="where contacts disagree; size: χ² per degree of freedom above 1",
+        title=apart if (beyond > 0.0).any() else "contacts agree everywhere",
         xlabel="along the scan (mm)",
         ylabel="across (mm)",
     )

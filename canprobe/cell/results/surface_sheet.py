@@ -32,7 +32,7 @@ def draw_map_surface(part: Part, view: MapView) -> None:
     if view.path is not None:
         axes.plot(*plane.mm(view.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
-    box(part, axes, " · ".join(shown), labels, elev=42, azim=-68)
+    box(part, axes, " · ".join(shown), labels, elev=42, azim=-68, beside_in=2.0)
     scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
 
 

@@ -15,25 +15,34 @@ def _figure(value: float | None, unit: str, digits: int = 2) -> str:
     return "not observed" if value is None else f"{value:.{digits}f} {unit}".rstrip()
 
 
-def summary_text(summary: dict[str, Any], out: Path | None) -> str:
-    """A summary as text."""
+def summary_text(summary: dict[str, Any], out: Path | None, *, full: bool = True) -> str:
+    """A summary as text.
+
+    Args:
+        summary: content of ``summary.json``.
+        out: folder of the run; None: no line about it.
+        full: whether times, choices, the measured force and other estimators have their lines too; else it is the
+            verdict, with everything that was noted or warned of.
+    """
     contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
+    wall_s = f"{summary['wall_time_s']:.2f} s"
     pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] in VIRTUAL else "real time"
     rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
     lines = [
         f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "
         + ("done" if summary["completed"] else f"stopped: {summary['stop_reason']}"),
-        f"  time       {summary['sim_time_s']:.2f} s in {summary['wall_time_s']:.2f} s ({pace})",
+        f"  time       {summary['sim_time_s']:.2f} s in {wall_s} ({pace})",
         f"  cycle      {rate}, {cycle['overruns']} overruns,"
         f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
     ]
-    lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
+    if full:
+        lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
     if (summary.get("newtons") or "").startswith("nominal"):
         lines.append(
             f"  newtons    {summary['newtons']} of the array; forces and stiffness are as good as its full scale"
         )
     if contact["force_rms_error_n"] is not None:
-        lines += force_lines(contact)
+        lines += force_lines(contact) if full else force_lines(contact)[:1]
     if contact["speed_mean_m_s"] is not None:
         lines.append(
             f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
@@ -43,8 +52,10 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         lines.append(f"  witness    the depth watched the force at {100 * watched:.0f} % of the contacts")
     if contact["losses"]:
         lines.append(f"  {losses_text(contact['losses'])}")
+    if summary.get("listen") is not None:
+        lines.append(f"  images     {listened_text(summary['listen'])}")
     if shape["method"] is not None:
-        lines += shape_lines(shape)
+        lines += shape_lines(shape) if full else [_curvature_line(shape)]
     if summary.get("explore") is not None:
         lines.append(f"  explored   {explored_text(summary['explore'])}")
     if summary.get("calibration") is not None:
@@ -111,6 +122,28 @@ def curvature_text(values: Sequence[float | None] | None) -> str:
     if not observed:
         return "not observed"
     return f"{observed} 1/m" + (", the other one not observed" if None in values else "")
+
+
+def listened_text(listened: Mapping[str, Any]) -> str:
+    """The section ``listen`` of a summary as text."""
+    if not listened["images"]:
+        return "none came"
+    rate = "" if listened["images_per_s"] is None else f" ({listened['images_per_s']:.4g} a second)"
+    force = listened["force_max_n"]
+    shown = (
+        "force not measured" if force is None else f"force {listened['force_mean_n']:.2f} N mean, {force:.2f} N highest"
+    )
+    return f"{listened['images']}{rate}, {shown}"
+
+
+def _curvature_line(shape: Mapping[str, Any]) -> str:
+    """The curvature at the end with its error over the scan, in one line."""
+    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
+    error, percent = shape.get("kappa_rms_error_per_m"), shape.get("kappa_rms_error_percent")
+    off = (
+        "" if error is None else f"; RMS error {error:.2f} 1/m" + (f" ({percent:.1f} %)" if percent is not None else "")
+    )
+    return f"  curvature  {estimated}; true {true}{off}"
 
 
 def shape_lines(shape: dict[str, Any]) -> list[str]:

@@ -256,7 +256,7 @@ class ObjectSettings:
     """Unit of the lengths in the file: 1000 for metres, 25.4 for inches."""
     spacing_mm: Annotated[float | None, Range(1e-3, 1000), FILE_ONLY] = None
     """Spacing of the grid of heights; left out: the `spacing` in a .npz file, in its unit. Of a mesh: that of the grid
-    that is fitted to it, best twice the length of the mesh's edges; left out: 1 mm."""
+    that is fitted to it; left out: 1 mm, or the one that has the curvature of the mesh where 1 mm has not."""
     origin_mm: Annotated[Vec2 | None, FILE_ONLY] = None
     """Point x, y of the file that is the origin of the object frame; left out: the middle. x and y of heights are
     counted from the grid's first corner, those of a mesh are its own."""

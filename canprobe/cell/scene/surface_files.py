@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Iterator
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -17,7 +18,8 @@ from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.stl_files import stl_damage
 from canprobe.errors import UsageError, install_line, regular_file
 from canprobe.mechanics.touch.heights import Heights
-from canprobe.mechanics.touch.mesh_fit import HeightGrid, fit_mesh
+from canprobe.mechanics.touch.mesh_curvature import CurvatureError
+from canprobe.mechanics.touch.mesh_fit import HeightGrid, MeshHeights, fit_mesh
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.shapes import PlacedShape
@@ -25,7 +27,6 @@ from canprobe.mechanics.types import Floats
 
 HEIGHTS = (".npy", ".npz", ".csv", ".txt")
 MESHES = (".stl", ".obj", ".ply")
-_SPACING_MM = 1.0
 NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 65535.0)
 """Values that measuring machines and map programs write for missing heights; they count so only as far outliers."""
 _MAX_HEIGHT_MM, _FAR = 1e30, 10.0
@@ -56,14 +57,48 @@ def object_of_file(settings: ObjectSettings, T_base_object: Floats) -> PlacedSha
         changed_ns = regular_file(path).stat().st_mtime_ns
     except OSError as error:
         raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
-    spacing = (settings.spacing_mm or _SPACING_MM) * MM
+    spacing = None if settings.spacing_mm is None else settings.spacing_mm * MM
     fit = _mesh(path, changed_ns, settings.unit_mm * MM, spacing, settings.origin_mm)
     try:
-        return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+        return MeshHeights(T_base_object, fit)
     except ValueError as error:
         x, y = (1e3 * fit.spacing * (nodes - 1) for nodes in fit.heights.shape)
         way_out = "remove vertices far away, or give origin_mm"
         raise ValueError(f"file: {path.name}: the mesh is {x:.3g} mm by {y:.3g} mm; {error}: {way_out}") from error
+
+
+def mesh_text(fit: HeightGrid) -> str:
+    """A mesh and the surface that was fitted to it, in words."""
+    state = fit.state
+    closed = "watertight" if state.open_edges == state.odd_edges == 0 else f"{state.open_edges} open edges"
+    known = "" if fit.curvature is None else f", curvature within {_off(fit.curvature)} of the mesh's"
+    return (
+        f"mesh of {state.vertices} vertices and {state.facets} facets, {closed}; fitted every"
+        f" {1e3 * fit.spacing:.3g} mm{known}"
+    )
+
+
+def mesh_warnings(fit: HeightGrid) -> Iterator[str]:
+    """What was put in order in a mesh, and a curvature that the surface has not from it."""
+    state, error = fit.state, fit.curvature
+    found = {
+        f"{state.merged} vertices merged with others up to {1e9 * state.merged_m:.2g} nm away": state.merged,
+        f"{state.turned} of {state.facets} facets turned over, as their neighbours face": state.turned,
+        f"{state.odd_edges} edges belong to more than two facets": state.odd_edges,
+    }
+    if said := "; ".join(text for text, count in found.items() if count):
+        yield f"object.file: the mesh was put in order: {said}"
+    if error is None or error.is_small:
+        return
+    spacing = f"object.spacing_mm = {1e3 * fit.spacing:.3g}: the curvature is {_off(error)} off that of the mesh"
+    if fit.better is not None:
+        yield f"{spacing}; with object.spacing_mm = {1e3 * fit.better[0]:.3g} it is {_off(fit.better[1])} off"
+    else:
+        yield f"{spacing}, and no other spacing is much better: export the mesh finer, or smoother if it was measured"
+
+
+def _off(error: CurvatureError) -> str:
+    return f"{error.error:.2g} 1/m ({100 * error.share:.2g} %)" if error.curvature > 1.0 else f"{error.error:.2g} 1/m"
 
 
 def refuse_narrow(settings: ObjectSettings, shape: Heights, pad: Pad) -> None:
@@ -80,7 +115,7 @@ def refuse_narrow(settings: ObjectSettings, shape: Heights, pad: Pad) -> None:
 
 @lru_cache(maxsize=4)
 def _mesh(
-    path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: tuple[float, float] | None
+    path: Path, changed_ns: int, unit: float, spacing: float | None, origin_mm: tuple[float, float] | None
 ) -> HeightGrid:
     """The surface of a mesh; of a file that has not changed it is fitted once."""
     try:

@@ -2,9 +2,10 @@
 
 Scenes are drawn at random from everything that a cell may meet: five cells, eleven kinds of surfaces from planes to
 rough height fields with radii from 12 mm, weaves, straight paths and circles, 0.5 to 3 N, 5 to 40 mm/s, tool errors,
-arrays with blur, gains, hysteresis and creep of their own. Each is scanned without a bus, with the same numbers as in
-lockstep to the last bit. A scene that answers nothing (its plan refuses it, or it is stopped before) is counted, and
-another one is drawn in its place.
+arrays with blur, gains, hysteresis and creep of their own. Each is scanned without a bus, with the same numbers, to
+the last bit, as on a lockstep bus whose frames take no time (`bus.timed = false`). Frames that take time make images
+older, and errors of a single scan others. A scene that answers nothing (its plan refuses it, or it is stopped before)
+is counted, and another one is drawn in its place.
 
 All seeds follow from the number of the draw. Settings of the estimator come from draws with other numbers than
 `TEST_DRAW`. A scan is one draw of errors that last, so intervals come from drawing scenes anew (bootstrap), and

@@ -13,17 +13,27 @@ Source: Vlachos et al., Curved PN triangles, I3D 2001; Max, Weights for computin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.mechanics.touch.heights import MIN_NODES, Heights
+from canprobe.mechanics.touch.heights import MIN_NODES, Heights, Spline
+from canprobe.mechanics.touch.mesh_curvature import CurvatureError, VertexCurvature
+from canprobe.mechanics.touch.mesh_repair import Index, MeshState, repaired
 from canprobe.mechanics.touch.shapes import require_positive
 from canprobe.mechanics.types import Floats
 
-Index = npt.NDArray[np.intp]
-
+USUAL_SPACING_M = 1e-3
+SPACINGS_BY_EDGE = np.array([0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 4.5])
+"""Spacings that are tried where the first one has not the curvature of the mesh, over the usual length of its edges."""
+WORTH_SHARE = 0.7
+"""Share of the error of the curvature that another spacing must leave at most, to be named."""
+MAX_TRIED_NODES = 200_000
+"""Nodes of the largest grid that is tried."""
 MIN_EDGE_RAD = np.radians(30.0)
 """Least angle between two facets that counts as an edge; a smaller one is taken as curved."""
 MAX_FACET_TURN_RAD = np.radians(15.0)
@@ -34,14 +44,14 @@ HIDDEN_DEPTH_SPACINGS = 6.0
 """Depth below the highest sample of a cell, in spacings, from which on a sample counts as hidden."""
 MIN_COVERED_SHARE = 0.1
 """Least share of the grid that has a surface; below it single vertices far away make the grid."""
-MAX_COORDINATE_M = 1e6
-"""Largest coordinate of a mesh, m."""
 MAX_NODES = 1_000_000
 MAX_SAMPLES = 8_000_000
 RINGING_SPACINGS, EDGE_NODES = 0.02, 3
 """Distance of a sample from the fit, in spacings, that shows a wall, and number of nodes round it that are rounded."""
 FILL_WEIGHT = 0.01
 """Weight of a point of a curved triangle over that of a vertex: a vertex is exact, such points only fill gaps."""
+FILL_SHARE = 0.6
+"""Distance of such points over the spacing: with one in each cell alternating errors of the fit would not show."""
 BORDER_SPACINGS = 1e-3
 """Distance beyond the border, in spacings, up to which a node lies on it: files have single precision."""
 _SMOOTHING_WEIGHT = 1e-7
@@ -57,12 +67,18 @@ class HeightGrid:
         spacing: spacing of the nodes, m.
         origin: (2,) reference point, from the grid's middle, m.
         there: (m, n) whether the mesh has a surface at a node.
+        state: what was put in order in the mesh.
+        curvature: how far its curvature is from that of the mesh; None where the vertices do not show that.
+        better: a spacing, m, by which the curvature is nearer, and how near; None where none is known.
     """
 
     heights: Floats
     spacing: float
     origin: tuple[float, float]
     there: npt.NDArray[np.bool_]
+    state: MeshState
+    curvature: CurvatureError | None
+    better: tuple[float, CurvatureError] | None = None
 
 
 class MeshHeights(Heights):
@@ -70,84 +86,115 @@ class MeshHeights(Heights):
 
     Args:
         T_base_object: (4, 4) pose, m.
-        vertices, faces, spacing, origin: as `fit_mesh` takes them.
+        fit: its heights.
 
     Raises:
-        ValueError: the mesh has no smooth surface, or none over the origin.
+        ValueError: there is no surface over the origin.
     """
 
-    def __init__(
-        self,
+    def __init__(self, T_base_object: npt.ArrayLike, fit: HeightGrid) -> None:
+        super().__init__(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+        self.fit = fit
+
+    @classmethod
+    def of(
+        cls,
         T_base_object: npt.ArrayLike,
         vertices: npt.ArrayLike,
         faces: npt.ArrayLike,
-        spacing: float,
+        spacing: float | None,
         origin: npt.ArrayLike | None = None,
-    ) -> None:
-        fit = fit_mesh(vertices, faces, spacing, origin)
-        super().__init__(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+    ) -> Self:
+        """The surface of a mesh; arguments as for `fit_mesh`."""
+        return cls(T_base_object, fit_mesh(vertices, faces, spacing, origin))
 
 
 def fit_mesh(
-    vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float, origin: npt.ArrayLike | None = None
+    vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float | None = None, origin: npt.ArrayLike | None = None
 ) -> HeightGrid:
     """Heights of a mesh over x and y.
 
     Args:
         vertices: (k, 3) vertices, m.
         faces: (f, 3) indices of vertices, counter-clockwise as seen from outside.
-        spacing: spacing of the grid, m; about twice the length of the mesh's edges where it is fine.
+        spacing: spacing of the grid, m. None: 1 mm, or the one that has the curvature of the mesh where that has not.
         origin: (2,) x and y of the point that becomes the object's origin, m; None for the middle of the mesh.
 
     Raises:
         ValueError: the arrays are not a mesh, or the mesh is not seen from +z, inside out, too coarse or too large.
     """
-    require_positive(spacing=spacing)
-    points, corners = _merged(np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.intp))
-    turned = np.cross(points[corners[:, 1]] - points[corners[:, 0]], points[corners[:, 2]] - points[corners[:, 0]])
-    area = np.linalg.norm(turned, axis=1)
-    corners, normals = corners[area > 0.0], turned[area > 0.0] / area[area > 0.0, None]
-    _refuse_inside_out(points, corners)
+    if spacing is not None:
+        require_positive(spacing=spacing)
+    points, corners, state = repaired(np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.intp))
+    normals = np.cross(points[corners[:, 1]] - points[corners[:, 0]], points[corners[:, 2]] - points[corners[:, 0]])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
     up = normals[:, 2] > MIN_WALL_COSINE
     if not up.any():
         raise ValueError("no facet of the mesh faces +z: its faces are inside out, or it must be turned")
     _refuse_coarse(points, corners[up], normals[up])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))[:2]
     at = middle if origin is None else np.asarray(origin, dtype=float)
-    exact, filled = points[np.unique(corners[up])], _samples(points, corners, normals, up, spacing)
-    weights = np.repeat((1.0, FILL_WEIGHT), (len(exact), len(filled)))
-    samples = np.concatenate((exact, filled))
-    seen = _seen(samples, spacing)
-    facing = points[corners[normals[:, 2] > 0.0]]  # walls too, as they are bridged
-    return _fitted(samples[seen], weights[seen], facing[:, :, :2], spacing, at)
+    surfaces = _Surfaces((points, corners, normals, up), at, state)
+    first = surfaces.fit(USUAL_SPACING_M if spacing is None else spacing)
+    if first.curvature is None or first.curvature.is_small:
+        return first
+    others = [first, *surfaces.fits(SPACINGS_BY_EDGE * _usual_edge(points[corners[up]]))]
+    best, error = min(
+        ((one, one.curvature) for one in others if one.curvature is not None), key=lambda pair: pair[1].error
+    )
+    if spacing is None:
+        return best
+    return replace(first, better=(best.spacing, error)) if error.error < WORTH_SHARE * first.curvature.error else first
 
 
-def _merged(points: Floats, corners: Index) -> tuple[Floats, Index]:
-    """Checked mesh with vertices at one place made one vertex: an STL file has each several times."""
-    if points.ndim != 2 or points.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
-        raise ValueError(f"a mesh needs vertices (k, 3) and faces (f, 3), got {points.shape} and {corners.shape}")
-    if not (np.abs(points) < MAX_COORDINATE_M).all():
-        odd = points[~(np.abs(points) < MAX_COORDINATE_M).all(axis=1)][0].tolist()
-        raise ValueError(
-            f"vertices of a mesh must be finite and below {MAX_COORDINATE_M:g} m, got {odd}: export it again"
-        )
-    if corners.min() < 0 or corners.max() >= len(points):
-        raise ValueError(
-            f"faces name vertices 0 to {len(points) - 1}, got {corners.min()} to {corners.max()}: export it again"
-        )
-    unique, places = np.unique(points, axis=0, return_inverse=True)
-    return unique, places.reshape(-1)[corners]
+def _usual_edge(triangles: Floats) -> float:
+    """Median length of the sides of triangles (f, 3, 3), m."""
+    return float(np.median(np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)))
 
 
-def _refuse_inside_out(points: Floats, corners: Index) -> None:
-    """Refuse a closed mesh whose volume is negative; an open mesh has no volume to judge by."""
-    ends = np.concatenate((corners[:, (0, 1)], corners[:, (1, 2)], corners[:, (2, 0)]))
-    there = np.unique(ends[:, 0] * len(points) + ends[:, 1])
-    back = np.unique(ends[:, 1] * len(points) + ends[:, 0])
-    if np.array_equal(there, back):
-        a, b, c = (points[corners[:, i]] for i in range(3))
-        if np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0:
-            raise ValueError("the mesh is inside out (its volume is negative): turn its faces round")
+class _Surfaces:
+    """The surfaces of one mesh by different spacings.
+
+    Args:
+        mesh: vertices (k, 3), m, facets (f, 3), their unit normals (f, 3), and (f,) which of them are no walls.
+        at: (2,) x and y of the origin, m.
+        state: what was put in order in the mesh.
+    """
+
+    def __init__(
+        self,
+        mesh: tuple[Floats, Index, Floats, npt.NDArray[np.bool_]],
+        at: Floats,
+        state: MeshState,
+    ) -> None:
+        self._mesh, self._at, self._state = mesh, at, state
+        points, corners, normals, up = mesh
+        self._exact = points[np.unique(corners[up])]
+        self._facing = points[corners[normals[:, 2] > 0.0]][:, :, :2]  # walls too, as they are bridged
+        self._shown = VertexCurvature.of(self._exact)
+
+    def fit(self, spacing: float) -> HeightGrid:
+        """The surface by a spacing, m.
+
+        Raises:
+            ValueError: there is none, or it is too large.
+        """
+        filled = _samples(*self._mesh, spacing)
+        weights = np.repeat((1.0, FILL_WEIGHT), (len(self._exact), len(filled)))
+        samples = np.concatenate((self._exact, filled))
+        seen = _seen(samples, spacing)
+        heights, middle, there = _fitted(samples[seen], weights[seen], self._facing, spacing)
+        corner = middle - 0.5 * spacing * (np.array(heights.shape) - 1)
+        curvature = self._shown.against(Spline(heights, spacing, tuple(corner.tolist())))
+        ox, oy = (self._at - middle).tolist()
+        return HeightGrid(heights, spacing, (ox, oy), there, self._state, curvature)
+
+    def fits(self, spacings: Floats) -> Iterator[HeightGrid]:
+        """Those of the surfaces by spacings (n,), m, that there are, and that cost little."""
+        room = float(np.prod(np.ptp(self._exact[:, :2], axis=0)))
+        for spacing in spacings[spacings**2 * MAX_TRIED_NODES > room].tolist():
+            with contextlib.suppress(ValueError):
+                yield self.fit(spacing)
 
 
 def _refuse_coarse(points: Floats, corners: Index, normals: Floats) -> None:
@@ -168,17 +215,27 @@ def _refuse_coarse(points: Floats, corners: Index, normals: Floats) -> None:
 
 
 def _samples(points: Floats, corners: Index, normals: Floats, up: npt.NDArray[np.bool_], apart: float) -> Floats:
-    """(k, 3) points of curved triangles where the vertices are farther apart than `apart`, m."""
+    """(k, 3) points of curved triangles where the vertices are farther apart than `apart`, m.
+
+    They stand in rows along the longest side: a long sliver, as CAD programs write them, has as many as its area asks.
+    """
     edges = _corner_normals(points, corners, normals)[up]
     triangles = points[corners[up]]
-    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    parts = np.ceil(longest / apart - 1e-9).astype(np.intp).clip(1)
-    if (count := float(np.sum((parts + 1.0) * (parts + 2.0) / 2.0))) > MAX_SAMPLES:
+    sides = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)  # from the corner before to each
+    longest = sides.max(axis=1)
+    first = (sides.argmax(axis=1)[:, None] + np.arange(1, 4)) % 3  # the corner opposite to the longest side leads
+    triangles, edges = (np.take_along_axis(of, first[:, :, None], axis=1) for of in (triangles, edges))
+    double = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+    along, across = (
+        np.where(longest > apart, np.ceil(one / (FILL_SHARE * apart)), 1.0).astype(np.intp).clip(1)
+        for one in (longest, double / longest)
+    )
+    if (count := float(np.sum((along + 2.0) * (across + 1.0) / 2.0))) > MAX_SAMPLES:
         raise ValueError(f"the mesh gives {count:.2g} samples at this spacing, at most {MAX_SAMPLES:.0g}: widen it")
     found = [np.empty((0, 3))]
-    for n in np.unique(parts[parts > 1]).tolist():
-        chosen = parts == n
-        found.append(_curved(triangles[chosen], edges[chosen], n))
+    for n, rows in np.unique(np.column_stack((along, across))[along > 1], axis=0).tolist():
+        chosen = (along == n) & (across == rows)
+        found.append(_curved(triangles[chosen], edges[chosen], n, rows))
     return np.concatenate(found)
 
 
@@ -208,11 +265,16 @@ def _corner_normals(points: Floats, corners: Index, normals: Floats) -> Floats:
     return corner.reshape(-1, 3, 3)
 
 
-def _curved(triangles: Floats, normals: Floats, parts: int) -> Floats:
-    """(k, 3) points of PN triangles (f, 3, 3) with normals (f, 3, 3) at their corners, `parts` along each side."""
-    i, j = (axis.ravel() for axis in np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), indexing="ij"))
-    inside = i + j <= parts
-    share = np.stack((parts - i - j, i, j))[:, inside] / parts  # barycentric
+def _curved(triangles: Floats, normals: Floats, along: int, across: int) -> Floats:
+    """(k, 3) points of PN triangles (f, 3, 3) with normals (f, 3, 3) at their corners.
+
+    They lie in `across` rows from the first corner to the side opposite to it, that with `along` parts.
+    """
+    away = np.arange(across + 1) / across
+    parts = np.ceil(along * away - 1e-9).astype(np.intp).clip(1)
+    row = np.repeat(away, parts + 1)
+    place = np.concatenate([np.arange(n + 1) / n for n in parts.tolist()]) * row
+    share = np.stack((1.0 - row, row - place, place))[:, 1:]  # barycentric; the first row is one corner
     on_sides = np.zeros((len(triangles), 3))
     points = np.zeros((len(triangles), share.shape[1], 3))
     for a in range(3):
@@ -263,8 +325,13 @@ def _covered(triangles: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]
     return covered
 
 
-def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at: Floats) -> HeightGrid:
-    """The least-squares spline, at the grid's nodes; `facing` (f, 3, 2) are all facets that face upwards."""
+def _fitted(
+    samples: Floats, weights: Floats, facing: Floats, spacing: float
+) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
+    """The least-squares spline: heights at the grid's nodes, its middle (2,), and whether there is a surface.
+
+    `facing` (f, 3, 2) are all facets that face upwards.
+    """
     from scipy import ndimage, sparse  # only where a mesh is read
     from scipy.sparse.linalg import splu
 
@@ -319,8 +386,7 @@ def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at
         near = (A.T @ np.ones(count)).reshape(m, n)[1:-1, 1:-1]
         edges &= near > 0.0
         heights[edges] = (A.T @ samples[:, 2]).reshape(m, n)[1:-1, 1:-1][edges] / near[edges]
-    ox, oy = (at - 0.5 * (low + high)).tolist()
-    return HeightGrid(heights, spacing, (ox, oy), there)
+    return heights, 0.5 * (low + high), there
 
 
 def _basis(t: Floats) -> Floats:

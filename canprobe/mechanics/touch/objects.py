@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import atan2, cos, hypot, inf, pi, sin, sqrt
 from types import MappingProxyType
 
@@ -217,7 +217,7 @@ class Ellipsoid(Quadric):
         return inf
 
 
-_KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyType(
+_KINDS: Mapping[str, tuple[Callable[..., PlacedShape], tuple[str, ...]]] = MappingProxyType(
     {
         "plane": (Plane, ()),
         "sphere": (Sphere, ("radius",)),
@@ -230,7 +230,7 @@ _KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyTy
         "fillet": (Fillet, ("radius", "angle")),
         "quadric": (Quadric, ("matrix",)),
         "heights": (Heights, ("heights", "spacing", "origin")),
-        "mesh": (MeshHeights, ("vertices", "faces", "spacing", "origin")),
+        "mesh": (MeshHeights.of, ("vertices", "faces", "spacing", "origin")),
     }
 )
 

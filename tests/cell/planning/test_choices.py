@@ -173,7 +173,7 @@ def test_the_command_opens_what_stands_at_its_default(capsys):
     assert main(["plan", "cylinder", "--auto", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert {"key": "bus.fd", "value": "false", "why": "classical frames do"} in document["choices"]
-    assert main(["plan", "cylinder", "--auto"]) == 0
+    assert main(["plan", "cylinder", "--auto", "--full"]) == 0
     assert "chosen by the plan:" in capsys.readouterr().out
 
 
@@ -217,7 +217,7 @@ def test_a_window_that_cuts_the_patch_is_a_warning_with_numbers():
     (warning,) = small.warnings
     for part in ("6.7 taxels across", "at 2 N", "94 % of that force", "carried on", "errs by up to 10 %", "window = 8"):
         assert part in warning
-    assert f"\nwarning: {warning}\n" in plan_text(small)
+    assert f"\n  warning    {warning}\n" in plan_text(small)
     assert plan_dict(small)["warnings"] == [warning]
 
 

@@ -100,5 +100,5 @@ def test_the_command_draws_and_prints_it(tmp_path, capsys):
     }  # fmt: skip
     pdo = document["pdos"][0]
     assert pdo["slack_us"] == pdo["deadline_us"] - pdo["response_us"]
-    assert main(["plan", "cylinder"]) == 0
+    assert main(["plan", "cylinder", "--full"]) == 0
     assert "cycle 2  can0        SSS" in capsys.readouterr().out

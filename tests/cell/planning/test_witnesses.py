@@ -29,5 +29,5 @@ def test_a_short_approach_leaves_no_time_to_know_the_torques():
 def test_a_scene_without_a_touch_has_none_and_the_others_show_them():
     assert witness_rows(canprobe.plan("free")) == []
     plan = canprobe.plan("calibrate")
-    assert "what else than the array bounds the force:" in plan_text(plan)
+    assert "witnesses of the force beside the array:" in plan_text(plan)
     assert set(plan_dict(plan)["witnesses"]) == {"images", "depth", "torques"}

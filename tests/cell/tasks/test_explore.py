@@ -107,6 +107,15 @@ def test_contacts_contradict_a_smooth_surface_where_they_scatter_more_than_the_s
     assert explored.rough == rough and ("contradict" in explored.why) == (rough > 0.0)
 
 
+@pytest.mark.parametrize(("radius_mm", "seed"), [(14.0, 0), (18.0, 2)])
+def test_a_ridge_that_is_much_rounder_than_the_probe_is_smooth_ground(radius_mm, seed):
+    ridge = ObjectSettings("cylinder", radius_mm=radius_mm, position_mm=(-170, -175, 300), rotation_deg=(0, 0, 20))
+    explored = run(
+        {"task.length_mm": 30.0, "task.width_mm": 8.0, "task.target_sigma_um": 12.0, "scene.seed": seed}, object=ridge
+    ).summary["explore"]
+    assert explored["reached"] and explored["rough_fraction"] == 0.0, explored["why_not"]
+
+
 def height_field(folder, heights):
     """The object of a grid of heights, mm, half a millimetre apart."""
     np.savez(folder / "heights.npz", heights=heights, spacing=0.5)

@@ -206,4 +206,6 @@ def test_the_page_plays_in_chromium_and_asks_for_nothing(chromium, recorded):
         shown.add(result["result"].get("value"))
         asked += more
     assert all(re.fullmatch(r"[\d.]+ s", text) for text in shown - {None})
+    second = "getComputedStyle(document.querySelector('#root .mantine-NumberInput-root')).display"
+    assert chromium("Runtime.evaluate", expression=second)[0]["result"]["value"] == "none"  # one time on the page
     assert [url for url in asked if not url.startswith(("data:", "blob:")) and url != address] == []

@@ -241,6 +241,13 @@ def page_of_run(folder, plan):
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
+def test_the_arm_beside_an_object_is_seen_through_and_ticks_are_multiples(page):
+    opacity = {m["name"]: m["props"]["opacity"] for _, m in embedded(page)["messages"] if m["type"] == "MeshMessage"}
+    links = {value for name, value in opacity.items() if name.startswith("/arm/")}
+    assert links == {0.35} and opacity["/probe/holder"] is None
+    assert "k * step" in page and "v += step" not in page  # a sum of steps misses 0
+
+
 def test_a_run_has_a_page_that_loads_nothing(page):
     assert len(page) < 10e6
     loads = r"""(?:src|href|action)\s*=\s*["']?(?:https?:)?//|@import\s+["'u]|url\(\s*["']?(?:https?:)?//"""

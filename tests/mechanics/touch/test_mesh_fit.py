@@ -1,12 +1,14 @@
 """Meshes as smooth surfaces: against the bodies that they are meshes of, edges, and meshes that show no surface."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
 from canprobe.mechanics.touch.mesh_fit import fit_mesh
+from canprobe.mechanics.touch.mesh_repair import repaired
 from canprobe.mechanics.touch.objects import make_object
 
 EDGE, SPACING = 5e-4, 1e-3
@@ -135,6 +137,103 @@ def test_an_open_mesh_that_faces_down_and_an_origin_beside_it():
         mesh(vertices, faces, origin=(0.1, 0.0))
 
 
+def soup(vertices, faces, jitter_m, seed=0):
+    """Facets that share no vertex, each vertex of which a program has rounded for itself."""
+    apart = vertices[faces].reshape(-1, 3).astype(float)
+    return apart + np.random.default_rng(seed).uniform(-jitter_m, jitter_m, apart.shape), np.arange(len(apart)).reshape(
+        -1, 3
+    )
+
+
+@pytest.mark.parametrize("edge", [5e-4, 1e-3])
+@pytest.mark.parametrize("jitter_m", [0.0, 1e-9, 1e-8])
+def test_vertices_that_are_almost_at_one_place_are_one(jitter_m, edge):
+    params, height = BODIES["sphere"]
+    vertices, faces = patch_of(height, edge)
+    read = mesh(*soup(vertices, faces, jitter_m))
+    assert worst(make_object("sphere", T_base_object=np.eye(4), **params), read)[2] < 5e-3
+    state = read.fit.state
+    assert state.vertices == len(vertices) and state.merged_m < 4 * jitter_m + 1e-12
+    assert state.merged == (jitter_m > 0) * (3 * len(faces) - len(vertices))
+
+
+def test_no_detail_is_merged_away():
+    """A ball of facets, one part of which is a thousand times finer: 2 µm."""
+    fine = ball(2e-5)
+    vertices, faces = ball()
+    both = np.vstack((vertices, fine[0] + (0.05, 0, 0))), np.vstack((faces, fine[1] + len(vertices)))
+    points, corners, state = repaired(*both)
+    assert len(points) == len(vertices) + len(fine[0]) and len(corners) == len(both[1]) and state.merged == 0
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3])
+@pytest.mark.parametrize("edge", [5e-4, 2e-3])
+def test_facets_that_are_turned_over_are_turned_back(share, edge):
+    params, height = BODIES["sphere"]
+    vertices, faces = patch_of(height, edge)
+    over = np.random.default_rng(5).random(len(faces)) < share
+    mixed = np.where(over[:, None], faces[:, ::-1], faces)
+    whole, read = mesh(vertices, faces), mesh(vertices, mixed)
+    assert read.fit.state.turned == over.sum() > 0 and whole.fit.state.turned == 0
+    np.testing.assert_array_equal(read.fit.heights, whole.fit.heights)
+    assert worst(make_object("sphere", T_base_object=np.eye(4), **params), read)[2] < 5e-3
+
+
+def test_open_edges_and_edges_of_three_facets_are_counted():
+    vertices, faces = ball()
+    assert (repaired(vertices, faces)[2].open_edges, repaired(vertices, faces)[2].odd_edges) == (0, 0)
+    assert repaired(vertices, faces[1:])[2].open_edges == 3
+    fin = np.vstack((vertices, (0, 0, 0.05))), np.vstack((faces, (faces[0, 0], faces[0, 1], len(vertices))))
+    assert (repaired(*fin)[2].open_edges, repaired(*fin)[2].odd_edges) == (2, 1)
+
+
+@pytest.mark.parametrize(("radius", "rings"), [(0.05, 25), (0.04, 20), (0.03, 20), (0.02, 20)])
+def test_the_spacing_that_is_chosen_or_named_has_the_curvature_of_a_coarse_ball(radius, rings):
+    """Edges of 3 to 6 mm, by which no rule of thumb holds; the error is measured without the body."""
+    vertices, faces = ball(radius, rings, 2 * rings)
+    exact = make_object("sphere", T_base_object=np.eye(4), radius=radius)
+    usual, chosen = mesh(vertices, faces, 1e-3), mesh(vertices, faces, None)
+    assert worst(exact, chosen)[2] < 0.01 and chosen.fit.curvature.is_small
+    if usual.fit.curvature.is_small:
+        assert chosen.fit.spacing == 1e-3 and worst(exact, usual)[2] < 0.03
+    else:
+        spacing, error = usual.fit.better
+        assert spacing == chosen.fit.spacing and error.error < 0.7 * usual.fit.curvature.error
+        assert worst(exact, usual)[2] > 1.5 * worst(exact, chosen)[2]
+
+
+@pytest.mark.parametrize("edge", [5e-4, 1e-3])
+def test_the_error_of_a_measured_mesh_is_stated_and_a_wider_spacing_found(edge):
+    """Vertices with a scatter of 10 µm."""
+    params, height = BODIES["sphere"]
+    vertices, faces = patch_of(height, edge)
+    vertices = vertices + np.random.default_rng(6).normal(0.0, 1e-5, vertices.shape)
+    exact = make_object("sphere", T_base_object=np.eye(4), **params)
+    usual, chosen = mesh(vertices, faces, 1e-3), mesh(vertices, faces, None)
+    assert chosen.fit.spacing > 2e-3 and usual.fit.better[0] == chosen.fit.spacing
+    for read in (usual, chosen):
+        true = worst(exact, read)[2]
+        assert 0.1 * true < read.fit.curvature.share < true
+
+
+@pytest.mark.parametrize("sections", [180, 360])
+def test_a_cad_cylinder_of_long_slivers_costs_as_much_as_its_area(sections):
+    turn = 2.0 * math.pi * np.arange(sections) / sections
+    ring = np.column_stack((np.zeros(sections), 0.02 * np.sin(turn), 0.02 * np.cos(turn)))
+    i = np.arange(sections)
+    j = (i + 1) % sections
+    faces = np.concatenate((np.column_stack((i, i + sections, j)), np.column_stack((j, i + sections, j + sections))))
+    tracemalloc.start()
+    try:
+        read = mesh(np.concatenate([ring + np.array((end, 0.0, 0.0)) for end in (-0.08, 0.08)]), faces, 1e-3)
+        assert tracemalloc.get_traced_memory()[1] < 200e6
+    finally:
+        tracemalloc.stop()
+    exact = make_object("cylinder", T_base_object=np.eye(4), radius=0.02)
+    point, normal, bend = worst(exact, read)
+    assert point < 1e-7 and normal < 1e-4 and bend < 1e-2
+
+
 def grid_faces(n):
     """Facets of a grid of n by n vertices, row by row."""
     corner = np.array([n * i + j for i in range(n - 1) for j in range(n - 1)])[:, None]
@@ -199,6 +298,6 @@ def test_a_mesh_narrower_than_seven_spacings_or_with_a_far_vertex_is_refused():
     with pytest.raises(ValueError, match=r"8 mm by 8 mm, narrower than 7 spacings of 1.5 mm"):
         fit_mesh(points, faces, 1.5e-3)
     for far in (0.1, 0.2):
-        odd = np.concatenate((points, [[far, far, 0.0]])), np.concatenate((faces, [[0, len(points), 1]]))
+        odd = np.concatenate((points, [[-far, far, 0.0]])), np.concatenate((faces, [[0, 1, len(points)]]))
         with pytest.raises(ValueError, match=r"mm and nearly empty: remove vertices far away"):
             fit_mesh(*odd, 1e-3)

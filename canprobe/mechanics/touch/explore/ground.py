@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.mechanics.touch.map import nodes as column
+from canprobe.mechanics.touch.map.cells import observed_of
 from canprobe.mechanics.touch.map.discs import Discs
 from canprobe.mechanics.touch.map.local_fits import fit_discs, stiffness_error
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, THIRD
@@ -30,6 +31,9 @@ FIT_REACH_M = 6e-3
 """Distance from a cell at which new path makes its fit stale, m: the least radius of a fit."""
 NEAR_FLOOR = 1.1
 """A cell whose deviation is within this factor of what no path can shrink is as good as it gets."""
+CHANGED_SHARE, DUE_M = 0.2, 1e-6
+"""A fit that changes the curvature by more than this share of the probe's is not linear enough, and is due again, as if
+this path, m, were new beside it: after all others."""
 
 
 class GroundCells:
@@ -75,6 +79,7 @@ class GroundCells:
         self._map, self._origin, self._axes = surface_map, origin, axes
         self._stale = np.zeros(m)
         self._height = np.full(m, math.nan)
+        self._curvature = np.full((m, 3, 3), math.nan)
 
     def in_plane(self, point: Floats) -> tuple[float, float]:
         """Place of a point (3,), m, in the scan plane, m."""
@@ -119,16 +124,35 @@ class GroundCells:
         normal = rows[nearest, column.NORMAL]
         place = place + up * float((points[nearest] - place) @ normal) / max(float(up @ normal), 0.2)
         disc = Discs.at(place, tangent_rotation(normal.tolist()), points, rows)
+        tangents = disc.R[0, :, :2]
+        K_ref = tangents.T @ self._curvature_near(i) @ tangents
         try:
-            fits, _, _ = fit_discs(rows, disc, pad, self._map.noise, K_ref=np.zeros((1, 2, 2)), weight=disc.weight)
+            fits, _, _ = fit_discs(rows, disc, pad, self._map.noise, K_ref=K_ref[None], weight=disc.weight)
         except np.linalg.LinAlgError:  # of contacts that no surface explains
             return
+        if observed_of(fits, fits.covariance(fits.excess))[0][0, 2]:
+            self._curvature[i] = tangents @ fits.K[0] @ tangents.T
+            if np.abs(fits.K[0] - K_ref).max() * pad.radius > CHANGED_SHARE:
+                self._stale[i] = DUE_M
         self.change[i] = math.sqrt(float(np.mean(fits.a[0, THIRD] ** 2))) / LENGTH_M**2
         self.common = float(stiffness_error(rows, disc, pad, fits.K, self._stiffness_sigma)[0])
         variance = float(fits.covariance(fits.excess)[0, 0, 0]) * LENGTH_M**2
         floor2 = self.common**2 + float(self._map.noise.scatter2(fits.excess)[0])
         self.floor[i] = min(math.sqrt(floor2), UNKNOWN_M)
         self.sigma[i] = min(math.sqrt(floor2 + variance), UNKNOWN_M)
+
+    def _curvature_near(self, i: int) -> Floats:
+        """Curvature (3, 3) last observed in a cell, else in the nearest one with any, as a tensor in base, 1/m.
+
+        The depth of the layer and the scatter of the normals follow from it: about a plane, a probe on a ridge seems to
+        contradict every smooth surface.
+        """
+        known = np.flatnonzero(np.isfinite(self._curvature[:, 0, 0]))
+        if not len(known):
+            return np.zeros((3, 3))
+        away = np.hypot(*(self.places[known] - self.places[i]).T)
+        nearest: Floats = self._curvature[known[away.argmin()]]
+        return nearest
 
     def close(self, x: float, y: float, radius: float) -> None:
         """Close the cells within a distance, m, of a place of the scan plane, m, that were not touched."""

@@ -1,0 +1,46 @@
+"""What a page shows of a command, and pictures of a run: the commands are repeated, and code that draws is compared."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+sys.path.append(str(DOCS))  # as for `python docs/measure.py`
+measure = importlib.import_module("measure")
+generate = importlib.import_module("generate")
+MEASURED = json.loads((DOCS / "measured.json").read_text(encoding="utf-8"))
+PAGES = [DOCS.parent / "README.md", *DOCS.glob("*.md")]
+TEXTS = {path.relative_to(DOCS.parent).as_posix(): path.read_text(encoding="utf-8") for path in PAGES}
+
+
+@pytest.mark.parametrize("name", measure.PRINTED)
+def test_a_command_prints_what_its_page_shows(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert measure.printed_by(name) == MEASURED[name]["printed"], f"type: python docs/measure.py {name}"
+
+
+def test_each_of_them_is_on_a_page_and_a_choice_of_subjects_keeps_what_is_set_in():
+    shown = {match[2] for text in TEXTS.values() for match in generate.PRINTED_MARKED.finditer(text)}
+    assert shown == set(measure.PRINTED)
+    lines = ["scene: done", "  force   2 N", "          set in", "  contact 1", "    below it", "  map 3"]
+    page = "<!-- printed one force contact -->\nold\n<!-- /printed -->"
+    assert generate.with_measured(page, {"one": {"printed": lines}}).splitlines()[3:-3] == lines[1:5]
+
+
+@pytest.mark.parametrize("name", measure.DRAWN_BY)
+def test_a_picture_is_drawn_by_the_present_code(name):
+    assert any(f"img/{name})" in text for text in TEXTS.values())
+    assert MEASURED["pictures"]["drawn_by"][name] == measure.drawing_code(name), "type: python docs/measure.py pictures"
+
+
+def test_prose_beside_a_table_of_measurements_repeats_its_figure():
+    table = dict((row[0], row[1]) for row in MEASURED["side_by_side"]["table"][1:])
+    lockstep, direct = (float(table[name].split()[0]) for name in ("lockstep", "direct"))
+    said = re.search(r"([\d.]+) times as fast \(\[cost\]", TEXTS["docs/python.md"])
+    assert said is not None and float(said[1]) == pytest.approx(lockstep / direct, abs=0.05)
