@@ -43,6 +43,7 @@ COMMANDS = (
     "inject",
     "conform",
     "judge",
+    "adapters",
     "scan",
     "monitor",
     "replay",

@@ -13,7 +13,7 @@ from typing import Literal
 
 from canprobe.cell.planning.window import patch_radius_m
 from canprobe.cell.scene.setup import Array, Calibrate, Setup, Touch
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, at_most
 
 What = Literal["image", "start", "stop", "poll"]
 PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16
@@ -114,7 +114,7 @@ def array_problems(setup: Setup) -> Iterator[str]:
             yield (
                 f"task.speed_mm_s = {1e3 * setup.scan.speed:g}: the contact would move {moves:.3g} mm from one image to"
                 f" the next (sensor.rate_hz = {array.rate_hz:g}), more than the {1e3 * array.pad.pitch_m:g} mm between"
-                f" taxels; lower it to {1e3 * most:.3g}"
+                f" taxels; lower it to {at_most(1e3 * most)}"
             )
 
 

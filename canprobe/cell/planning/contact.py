@@ -19,6 +19,7 @@ import numpy as np
 
 from canprobe.cell.planning.window import measured_share
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
+from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.motors import position_per_unit
@@ -110,8 +111,8 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
     joint, beyond = model.joints[coarsest], spread / MAX_FORCE_SPREAD
     ways = [f"let the drive of {joint.name} count finer"]
     if task.force * beyond**2 <= force_max_n:
-        ways.append(f"raise task.force_n to {1.01 * task.force * beyond**2:.3g}")
-    ways.append(f"take a softer layer (probe.stiffness_n_m3 = {task.probe.stiffness / beyond**2:.3g})")
+        ways.append(f"raise task.force_n to {at_least(1.01 * task.force * beyond**2)}")
+    ways.append(f"take a softer layer (probe.stiffness_n_m3 = {at_most(task.probe.stiffness / beyond**2)})")
     return (
         f"joints.{joint.name}: one count moves the probe by {1e3 * each[worst, coarsest]:.2g} mm along the normal, and "
         f"all joints together by {1e3 * sigmas[worst]:.2g} mm (1σ), where {task.force:g} N press the layer in by "
@@ -135,17 +136,18 @@ def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
         return None  # a calibration with a flat array is refused elsewhere
     windowed = array.mode == "window" and array.window != "auto"
     inside = measured_share(task.force, probe, int(array.window), pitch) if windowed else 1.0
-    at_most = max(
+    worst = max(
         (pressed(task.force / inside, probe, array, one) for one in kappas.tolist()), key=lambda one: one.shown_pa
     )
-    if at_most.shown_pa <= full_pa:
+    if worst.shown_pa <= full_pa:
         return None
-    fits = at_most.depth - (at_most.shown_pa - full_pa) / probe.stiffness
-    lower, shown_pa = 0.99 * task.force * (fits / at_most.depth) ** 2, at_most.shown_pa
+    fits = worst.depth - (worst.shown_pa - full_pa) / probe.stiffness
+    lower, shown_pa = 0.99 * task.force * (fits / worst.depth) ** 2, worst.shown_pa
     return (
         f"sensor.full_scale_kpa = {1e-3 * full_pa:g}: at task.force_n = {task.force:g} the taxels under the middle of "
         f"the contact have up to {1e-3 * shown_pa:.3g} kPa and saturate, so that the force is not measured; lower "
-        f"task.force_n to {lower:.3g}, or take an array with {1.01e-3 * shown_pa:.3g} kPa"
+        f"task.force_n to {at_most(lower)}, or take an array with sensor.full_scale_kpa = "
+        f"{at_least(1.01e-3 * shown_pa)}"
     )
 
 

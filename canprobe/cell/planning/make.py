@@ -65,16 +65,9 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     unsuited = [*array_problems(setup)]
     problems += unsuited
     bus = _choose(setup, devices, problems) if not problems else None
-    ways: list[str] = []
     if bus is not None:
         setup = bus.setup
-        if bus.overload and find_ways:
-            known = frozenset(bus.problems)
-            ways += ways_out(setup, lambda changed: _fits(changed, known))
-        cut = cut_patch(setup)
-        if cut is not None and not cut.safe:
-            problems.append(cut.text)
-            ways = ways or [*cut.ways]
+        problems += _cut_problems(setup)
     problems += beyond
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
         problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
@@ -87,7 +80,9 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
-        raise PlanError(_shared(problems), ways)
+        ways = _ways_out(bus) if bus is not None and bus.overload and find_ways else []
+        alone = bus is not None and set(problems) <= {*bus.overload}
+        raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
     chosen = {choice.key: choice.value for choice in bus.choices}
     setup = setup.with_choices(chosen)
     absent = left_out(setup)
@@ -106,6 +101,28 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
     )
     return _with_configuration(plan)
+
+
+def _ways_out(bus: _BusPlan) -> list[str]:
+    """Changes that make an overloaded bus fit and ask for nothing new of the rest of the plan."""
+    known, elsewhere = frozenset(bus.problems), frozenset(_problems_beside_bus(bus.setup))
+    return ways_out(
+        bus.setup,
+        lambda changed: _fits(changed, known),
+        lambda closed: elsewhere.issuperset(_problems_beside_bus(closed)),
+    )
+
+
+def _problems_beside_bus(setup: Setup) -> list[str]:
+    """Problems of a setup with known devices, apart from those of its bus."""
+    devices, _ = _devices(setup)
+    unsuited = [*array_problems(setup), *range_problems(setup), *speed_problems(setup, devices), *_cut_problems(setup)]
+    return unsuited or check_motion(within_drives(setup, devices)[0])[1]
+
+
+def _cut_problems(setup: Setup) -> list[str]:
+    cut = cut_patch(setup)
+    return [] if cut is None or cut.safe else [f"{cut.text}; take {' or '.join(cut.ways)}"]
 
 
 def _shared(problems: Sequence[str]) -> list[str]:

@@ -19,11 +19,18 @@ Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
 """Closes a changed setup, and gives it with the traffic of its fullest bus; None where it does not fit either."""
 
 
-def ways_out(setup: Setup, fit: Fit) -> list[str]:
-    """Changes each of which makes the scene fit, with the load and the longest demand that it leaves."""
+def ways_out(setup: Setup, fit: Fit, sound: Callable[[Setup], bool]) -> list[str]:
+    """Changes each of which makes the scene fit its bus, with the load and the longest demand that it leaves.
+
+    Args:
+        setup: setup whose bus is overloaded.
+        fit: see `Fit`.
+        sound: function of a closed setup: whether the change asks for nothing new elsewhere in the plan.
+    """
     found = []
     for text, changed in (*_changes(setup), *_together(setup, fit), *_quicker(setup, fit), *_slower(setup, fit)):
-        if (fitting := fit(changed)) is not None:
+        fitting = fit(changed)
+        if fitting is not None and sound(fitting[0]):
             closed, traffic = fitting
             peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
             share = f"{peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
