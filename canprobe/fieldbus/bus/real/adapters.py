@@ -83,7 +83,6 @@ class Backend:
         return f"python-can[{self.extra}]"
 
 
-_SERIAL = {"package": "serial", "extra": "serial"}
 BACKENDS: Mapping[str, Backend] = {
     SOCKETCAN: Backend("adapters with a driver in the Linux kernel; vcan", "name of the interface", "can0"),
     "pcan": Backend(
@@ -110,7 +109,11 @@ BACKENDS: Mapping[str, Backend] = {
         "Vector VN, CANcase", "number, from 0", "0", driver="the XL Driver Library of vector.com", windows=True
     ),
     "slcan": Backend(
-        "CANable (slcan firmware), USBtin, Lawicel: a serial line", "serial port", "/dev/ttyACM0", **_SERIAL
+        "CANable (slcan firmware), USBtin, Lawicel: a serial line",
+        "serial port",
+        "/dev/ttyACM0",
+        package="serial",
+        extra="serial",
     ),
     "gs_usb": Backend(
         "candleLight, CANable (candleLight firmware), CANtact, by USB",
@@ -131,9 +134,11 @@ BACKENDS: Mapping[str, Backend] = {
         windows=True,
         module="usb_8dev",
     ),
-    "serial": Backend("python-can's own serial protocol", "serial port", "/dev/ttyUSB0", **_SERIAL),
+    "serial": Backend(
+        "python-can's own serial protocol", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"
+    ),
     "seeedstudio": Backend("Seeed USB-CAN analyzer", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"),
-    "robotell": Backend("Robotell USB-CAN", "serial port", "/dev/ttyUSB0", **_SERIAL),
+    "robotell": Backend("Robotell USB-CAN", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"),
     "cantact": Backend("CANtact", "number, from 0", "0", package="cantact", extra="cantact", indexed=True),
     "canalystii": Backend("CANalyst-II", "number, from 0", "0", package="canalystii", extra="canalystii"),
     "neovi": Backend("Intrepid neoVI, ValueCAN", "number, from 1", "1", package="ics", extra="neovi", indexed=True),
