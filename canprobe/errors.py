@@ -245,6 +245,7 @@ def _advised(value: float, digits: int, rounding: str) -> str:
 
 
 def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:
-    """The text `; did you mean X?`, empty when no known word is close."""
-    close = difflib.get_close_matches(got, list(known), n=1, cutoff=cutoff)
-    return f"; did you mean {close[0]}?" if close else ""
+    """The text `; did you mean X?`, whatever the case; empty when no known word is close."""
+    folded = {word.lower(): word for word in known}
+    close = difflib.get_close_matches(got.lower(), folded, n=1, cutoff=cutoff)
+    return f"; did you mean {folded[close[0]]}?" if close else ""
