@@ -9,7 +9,6 @@ from typing import Any, NoReturn
 
 from canprobe.errors import did_you_mean
 
-
 _KEYS = {
     "--bus": "bus.interface",
     "--channel": "bus.channel",

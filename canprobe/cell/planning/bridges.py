@@ -72,9 +72,8 @@ def check_bridges(names: Iterable[str], what: str = "bridge ") -> None:
     for name in names:
         if name not in BRIDGES:
             known = "; ".join(f"{known} ({info.what})" for known, info in BRIDGES.items())
-            raise UsageError(
-                f"bridge {name!r}: there is no such bridge{did_you_mean(name, BRIDGES)}; there are: {known}"
-            )
+            hint = did_you_mean(name, BRIDGES)
+            raise UsageError(f"bridge {name!r}: there is no such bridge{hint}; there are: {known}")
         info = BRIDGES[name]
         if info.missing:
             raise UsageError(f"{what}{name}: needs {', '.join(info.missing)}; type: {info.pip}")

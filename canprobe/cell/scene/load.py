@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe import __version__
-from canprobe.cell.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
+from canprobe.cell.scene.checks import MAX_NUMBER, MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
 from canprobe.cell.scene.model import DEFAULT_ARRAY, RENAMED_KEYS, TOUCH_KINDS, ArrayFile, CellFile, Scene
 from canprobe.cell.scene.offers import find_offer, offers
@@ -706,11 +706,8 @@ class Reader:
         try:
             value = convert(raw, annotation)
         except MismatchError as mismatch:
-            hint = (
-                did_you_mean(raw, choices_of(annotation))
-                if isinstance(raw, str)
-                else _other_unit(path, raw, annotation)
-            )
+            words = choices_of(annotation)
+            hint = did_you_mean(raw, words) if isinstance(raw, str) else _other_unit(path, raw, annotation)
             return self.complain(path, f"expected {mismatch}, got {toml_value(raw)}{hint}")
         if conditions_of(annotation, ScenePath) and self._folder and isfile(self._folder / value):
             value = self.paths[path] = str((self._folder / value).resolve())
@@ -741,13 +738,13 @@ _OTHER_UNITS = (
 
 def _other_unit(path: str, raw: object, annotation: Any) -> str:
     """A hint where a number out of range would be one in another unit; else empty."""
-    if not isinstance(raw, int | float):
+    if isinstance(raw, bool) or not isinstance(raw, int | float) or not abs(raw) < MAX_NUMBER:
         return ""
     for end, factor, unit in _OTHER_UNITS:
         value = float(f"{raw * factor:.12g}")
-        if path.endswith(end):
+        if re.search(f"(?<!_mm)(?<!_deg)(?<!_nm){end}$", path):
             with contextlib.suppress(MismatchError):
-                convert(round(value) if value == round(value) else value, annotation)
+                convert(int(value) if value.is_integer() else value, annotation)
                 return f"; did you mean {value:g}, for {raw:g} {unit}?"
     return ""
 
