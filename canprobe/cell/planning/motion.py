@@ -57,7 +57,7 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
                 joints = joints_on_way(task.arm, task.probe, q_start, lambda pose: round_ball(ball, pose))
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
                 kappas = np.full((1, 2), 1.0 / task.ball_radius)
-                found += [problem] if (problem := saturation_problem(task, kappas)) is not None else []
+                found += [problem] if (problem := saturation_problem(task, kappas, lambda _: True)) is not None else []
                 found += [*force_problems(setup, task), *first_touch_problems(setup, task, kappas[0].tolist())]
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)

@@ -118,11 +118,17 @@ def _slower(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     periods_us = {us for us in range(1000, _SLOWEST_US, 1000)} | {us for us in _DIVISORS_US if us < _SLOWEST_US}
     rates = sorted((float(f"{1e6 / us:.6g}") for us in periods_us), reverse=True)
     for rate in (rate for rate in rates if rate < setup.rate_hz):
-        changed, text = replace(setup, rate_hz=rate), f"cycle.rate_hz = {rate:.6g}"
-        if setup.array is not None:
-            tactile = rate / math.ceil(rate / setup.array.rate_hz)  # the cycle is a multiple
-            changed = changed.changed("array", rate_hz=tactile)
-            text += f" with sensor.rate_hz = {tactile:.6g}" * (tactile != setup.array.rate_hz)
+        images, changed = at_rate(setup, rate)
         if fit(changed) is not None:
-            yield text, changed
+            yield f"cycle.rate_hz = {rate:.6g}{images}", changed
             return
+
+
+def at_rate(setup: Setup, rate: float) -> tuple[str, Setup]:
+    """The setup at another rate of the cycle, Hz, and the rate of images that this asks for, as text."""
+    changed, images = replace(setup, rate_hz=rate), ""
+    if setup.array is not None:
+        tactile = rate / math.ceil(rate / setup.array.rate_hz - 1e-9)  # the cycle is a multiple
+        changed = changed.changed("array", rate_hz=tactile)
+        images = f" with sensor.rate_hz = {tactile:.6g}" * (abs(tactile / setup.array.rate_hz - 1.0) > 1e-5)
+    return images, changed

@@ -30,6 +30,7 @@ from canprobe.fieldbus.bus.real.socketcan import has_socketcan, how_to_make
 LOCAL_GROUP = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
 SOCKETCAN = "socketcan"
+_WHERE_SHOWN = "`canprobe adapters` shows what works here"
 _ARPHRD_CAN = "280"
 _NET_FOLDER, _DEVICE_FOLDER = Path("/sys/class/net"), Path("/dev")
 _USB_SERIAL = ("ttyACM*", "ttyUSB*")
@@ -193,7 +194,7 @@ def check_interface_name(name: str, own: Iterable[str] = ()) -> None:
     mine = f"canprobe has {' and '.join(own)} (for `run`), and " if own else ""
     raise UsageError(
         f"no interface {name!r}{did_you_mean(name, [*own, *known], 0.6)}; {mine}python-can has: {', '.join(known)};"
-        " `canprobe adapters` shows which work here"
+        f" {_WHERE_SHOWN}"
     )
 
 
@@ -209,7 +210,7 @@ def backend_channel(interface: str, channel: str) -> str | int:
     if not channel.isdecimal():
         raise UsageError(
             f"{interface}: its channels are numbers: expected --channel {backend.example}, for example, got {channel}"
-            + "".join(f"; {lacking}" for lacking in backend.missing)
+            + "".join(f"; {lacking}" for lacking in (*backend.missing, _WHERE_SHOWN))
         )
     return int(channel)
 
@@ -224,7 +225,7 @@ def open_failure(interface: str, channel: str, error: Exception) -> str:
     """
     backend = BACKENDS.get(interface)
     if backend is not None and (missing := backend.missing):
-        return f"{'; '.join(missing)}; `canprobe adapters` shows what works here"
+        return f"{'; '.join(missing)}; {_WHERE_SHOWN}"
     said = f"python-can says {type(error).__name__}: {error}"
     if backend is None:
         return f"is its driver installed? {said}"
