@@ -96,9 +96,9 @@ def urdf_cell(args: argparse.Namespace) -> str:
 
 
 def _without_drive(joints: Sequence[Joint]) -> Iterator[str]:
-    """A warning about joints that have no speed where others have one."""
+    """A warning about several joints without a speed where others have one; a single one is often just left open."""
     still = [joint.name for joint in joints if not joint.qd_max > 0.0]
-    if 0 < len(still) < len(joints):
+    if 1 < len(still) < len(joints):
         yield (
             f"{', '.join(still)}: no velocity in the <limit>, as of passive joints, which have no drive: an arm with"
             " some (a delta, a parallelogram) is no serial one, and no scan can be planned with it; of a joint with a"

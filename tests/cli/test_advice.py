@@ -48,7 +48,7 @@ MISSPELT = ("task.forc_n=2", "sensr.rate_hz=100", "task.spead_mm_s=20", "sensor.
 OTHER_UNITS = (
     "object.radius_mm=0.036",
     "probe.radius_mm=0.04",
-    "bus.bitrate=500",
+    "bus.bitrate=1000",
     "sensor.full_scale_kpa=100000",
     "bring_up.sdo_s=500",
     "sensor.pitch_mm=0.0015875",
@@ -186,7 +186,8 @@ def meant(words: list[str], line: str) -> Iterator[list[str]]:
 
 
 def subjects(lines: tuple[str, ...]) -> set[str]:
-    """What the lines of a refusal are about: their beginnings, without numbers."""
+    """What the lines of a refusal are about: their beginnings, without numbers; ways out are about nothing else."""
+    lines = tuple(line for line in lines if not line.startswith("ways out"))
     return {re.sub(r"[0-9.]+|\".*?\"", "", re.split(r": | = ", line)[0]) for line in lines if not line.startswith("  ")}
 
 
