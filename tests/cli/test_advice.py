@@ -44,7 +44,7 @@ CHOICES: dict[str, tuple[object, ...]] = {
     "bus.bitrate": (125000, 250000, 500000, 800000),
     "bus.transmit_queue": ("fifo", "priority"),
 }
-MISSPELT = ("task.forc_n=2", "sensr.rate_hz=100", "task.spead_mm_s=20", "sensor.mode=imag", "bus.bitrat=1000000")
+MISSPELT = ("task.forc_n=2", "sensr.rate_hz=100", "task.spead_mm_s=20", "sensor.mode=featurs", "bus.bitrat=1000000")
 OTHER_UNITS = (
     "object.radius_mm=0.036",
     "probe.radius_mm=0.04",
@@ -150,6 +150,8 @@ def advice(words: list[str], lines: tuple[str, ...]) -> Iterator[tuple[str, list
         subject = re.match(rf"({KEY}) = ", line)
         if line.startswith("  "):
             command = words
+            for key in re.findall(rf"without ({KEY})", line):
+                command = set_key(words, key, "")[:-2]
             for key, value in re.findall(rf"({KEY}) = ({VALUE})", line.rpartition(": load")[0]):
                 command = set_key(command, key, value)
             yield line, command
