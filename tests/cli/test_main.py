@@ -85,7 +85,6 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        ([], ("COMMAND",)),
         (["runn"], ("unknown command 'runn'", "did you mean run?")),
         (["run"], ("SCENE",)),
         (["--versoin"], ("unrecognized arguments: --versoin; did you mean --version?",)),
