@@ -20,8 +20,11 @@ from __future__ import annotations
 
 import difflib
 import errno
+import os
 import stat
+import sys
 from collections.abc import Iterable, Sequence
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +63,15 @@ class PlanError(UsageError):
 
     Attributes:
         problems: every reason with its numbers, one line each.
-        ways_out: changes of the scene, each of which makes it fit, with the load that it leaves.
+        ways_out: changes of the scene, each of which makes it fit its bus, with the load that it leaves.
     """
 
-    def __init__(self, problems: Sequence[str], ways_out: Sequence[str] = ()) -> None:
+    def __init__(self, problems: Sequence[str], ways_out: Sequence[str] = (), beside: str = "") -> None:
+        """Take problems and ways out; `beside` says what each way out does not mend."""
         self.problems = tuple(problems)
         self.ways_out = tuple(ways_out)
-        lines = ["ways out, each by itself:", *(f"  {way}" for way in self.ways_out)] if self.ways_out else []
+        head = f"ways out, each by itself{beside}:"
+        lines = [head, *(f"  {way}" for way in self.ways_out)] if self.ways_out else []
         super().__init__("\n".join((*self.problems, *lines)))
 
 
@@ -189,12 +194,16 @@ EXTRA_OF = {
 """Extra that installs a package, by the package's import name."""
 
 
+def package_line(requirement: str) -> str:
+    """Command line that installs another package beside canprobe."""
+    tool = _tool()
+    return f"{tool} install {'canprobe --with ' if tool == 'uv tool' else ''}'{requirement}'"
+
+
 def install_line(extra: str) -> str:
     """Command line that installs an extra, from where canprobe itself was installed, if that is known."""
     import importlib.metadata  # only where something is missing
     import json
-    import os
-    import sys
     from urllib.parse import unquote, urlsplit
 
     try:
@@ -208,16 +217,35 @@ def install_line(extra: str) -> str:
     elif "url" in origin:  # a wheel, or a repository
         vcs = origin.get("vcs_info", {}).get("vcs")
         wanted += f" @ {f'{vcs}+' if vcs else ''}{origin['url']}"
+    return f"{_tool()} install {editable}'{wanted}'"
+
+
+def _tool() -> str:
+    """The command that installs packages where canprobe is installed."""
     if os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json")):
-        tool = "pipx runpip canprobe"
-    elif os.path.exists(os.path.join(sys.prefix, "uv-receipt.toml")) or f"{os.sep}archive-v" in sys.prefix:
-        tool = "uv tool"  # also where uvx made an environment for one run, in its cache
-    else:
-        tool = "pip"
-    return f"{tool} install {editable}'{wanted}'"
+        return "pipx runpip canprobe"
+    if os.path.exists(os.path.join(sys.prefix, "uv-receipt.toml")) or f"{os.sep}archive-v" in sys.prefix:
+        return "uv tool"  # also where uvx made an environment for one run, in its cache
+    return "pip"
+
+
+def at_most(value: float, digits: int = 3) -> str:
+    """An advised upper bound as text: so many significant digits, rounded down, so that the number itself fits."""
+    return _advised(value, digits, ROUND_FLOOR)
+
+
+def at_least(value: float, digits: int = 3) -> str:
+    """An advised lower bound as text: so many significant digits, rounded up, so that the number itself fits."""
+    return _advised(value, digits, ROUND_CEILING)
+
+
+def _advised(value: float, digits: int, rounding: str) -> str:
+    exact = Decimal(f"{value:.12g}")  # without the rounding error of a float, which would cost 0.3 a digit
+    return f"{float(exact.quantize(Decimal((0, (1,), exact.adjusted() - digits + 1)), rounding)):.12g}"
 
 
 def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:
-    """The text `; did you mean X?`, empty when no known word is close."""
-    close = difflib.get_close_matches(got, list(known), n=1, cutoff=cutoff)
-    return f"; did you mean {close[0]}?" if close else ""
+    """The text `; did you mean X?`, whatever the case; empty when no known word is close."""
+    folded = {word.lower(): word for word in known}
+    close = difflib.get_close_matches(got.lower(), folded, n=1, cutoff=cutoff)
+    return f"; did you mean {folded[close[0]]}?" if close else ""

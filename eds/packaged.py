@@ -9,13 +9,12 @@ The vendor number is this project's own choice; CiA has not assigned it. Source 
 
 from __future__ import annotations
 
-import difflib
 import os
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.errors import EdsError
+from canprobe.errors import EdsError, did_you_mean
 
 if TYPE_CHECKING:
     import canopen
@@ -59,9 +58,10 @@ def eds_path(name: str) -> Path:
     stem = name.removesuffix(".eds")
     if stem in names:
         return _FOLDER / f"{stem}.eds"
-    near = difflib.get_close_matches(stem, names, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"packaged are {', '.join(names)}; another file needs its path"
-    raise EdsError(f"EDS {name!r}: no such file, and no such packaged file: {hint}")
+    raise EdsError(
+        f"EDS {name!r}: no such file, and no such packaged file{did_you_mean(stem, names)}; packaged are"
+        f" {', '.join(names)}; another file needs its path"
+    )
 
 
 def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:

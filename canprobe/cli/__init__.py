@@ -43,6 +43,7 @@ COMMANDS = (
     "inject",
     "conform",
     "judge",
+    "adapters",
     "scan",
     "monitor",
     "replay",
@@ -97,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
         os.environ.setdefault(name, "1")
     report, args = StepReport(), argparse.Namespace()
     try:
-        args = parser_of(arguments).parse_args(arguments)
+        args = parser_of(arguments).parse_args(arguments or ["--help"])
         args.report, report.verbosity = report, getattr(args, "verbosity", 0)
         report.words = partial(with_scene, args=args)
         with termination_interrupts():

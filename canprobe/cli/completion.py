@@ -61,7 +61,7 @@ def _packaged(kind: str) -> Callable[[], Iterable[str]]:
 
 
 def _buses() -> Iterable[str]:
-    from canprobe.fieldbus.bus.real.python_can import interface_names
+    from canprobe.fieldbus.bus.real.adapters import interface_names
 
     return ("lockstep", "direct", "config", *interface_names())
 

@@ -21,6 +21,7 @@ HELP = "write a cell file and a first scene for your own arm"
 EXAMPLE = """\
 examples:
   canprobe init my-cell
+  canprobe init my-cell --urdf arm.urdf --eds puma260_joint
   canprobe init my-cell --urdf arm.urdf --tip tool0 --eds drive.eds
   canprobe init my-cell --urdf arm.urdf --eds big.eds --eds big.eds --eds small.eds
   canprobe run my-cell/first.toml
@@ -36,10 +37,10 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--eds",
         metavar="FILE",
-        type=Path,
         action="append",
         default=[],
-        help="EDS or DCF of the drives: given once for all of them, or once for each joint from the base",
+        help="EDS or DCF of the drives, or the name of a packaged one: given once for all of them, or once for each"
+        " joint from the base",
     )
 
 
@@ -50,15 +51,16 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cli.init_cell import template_cell, urdf_cell
     from canprobe.cli.init_scene import write_with_first_scene
     from canprobe.fieldbus.bus.files import write_text, writing
+    from canprobe.fieldbus.eds.packaged import eds_file
     from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
     folder: Path = args.folder
     for name in ("cell.toml", "first.toml", schema_name("cell"), schema_name("scene")):
         if (folder / name).exists():
             raise UsageError(f"{folder / name} exists already: choose another folder, or remove it")
-    for path in (*args.eds, *([args.urdf] if args.urdf else [])):
-        if not path.is_file():
-            raise UsageError(f"{path}: no such file")
+    args.eds = [eds_file(name) for name in args.eds]
+    if args.urdf and not args.urdf.is_file():
+        raise UsageError(f"{args.urdf}: no such file")
     if args.urdf is None and (args.base or args.tip):
         raise UsageError("--base and --tip are links of a URDF: give it with --urdf FILE")
     cell = f"{schema_line('cell')}{written_by_line()}{urdf_cell(args) if args.urdf else template_cell(args)}"

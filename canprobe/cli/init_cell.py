@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.load import packaged_files, toml_key
 from canprobe.cli.progress import say
 from canprobe.errors import UsageError
@@ -18,10 +20,16 @@ from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import Joint
 from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf
+from canprobe.mechanics.types import Floats
 
 _ARRAY_EDS = "tactile_array"
 _TRIED_POSTURES = 400
 _REPORTED_TILT_RAD = math.radians(20)
+_TURNS = (((0, 90, 0), (0, -90, 0)), ((-90, 0, 0), (90, 0, 0)), ((0, 0, 0), (180, 0, 0)))
+"""Roll, pitch and yaw, deg, that turn z to x, y, z and to their opposites."""
+_MIN_ONWARD_M, _ALONG_COSINE = 1e-3, 0.9
+MAX_TRAVEL_M = 100.0
+"""Largest stop of a sliding joint in a cell file, m."""
 _GEAR, _COUNTS_PER_TURN, _COUNTS_PER_M = 100, 10_000, 1_000_000
 
 _HEAD = """\
@@ -59,12 +67,21 @@ sdo_s = 0.5
 def urdf_cell(args: argparse.Namespace) -> str:
     """Write the text of a cell file whose chain comes from a URDF, and warn of values that the URDF leaves open."""
     found = from_urdf(args.urdf, args.base, args.tip)
-    for warning in found.warnings:
+    for warning in (*found.warnings, *_without_drive(found.joints)):
         say(f"canprobe: {warning}")
+    if far := [joint for joint in found.joints if joint.prismatic and max(-joint.q_min, joint.q_max) > MAX_TRAVEL_M]:
+        raise UsageError(f"{args.urdf}: {far[0].name}: a joint slides {MAX_TRAVEL_M:g} m at most; correct its <limit>")
+    flange_deg = _flange_deg(found)
+    turned = transform((0.0, 0.0, 0.0), flange_deg)
+    found = replace(found, chain=replace(found.chain, T_last_flange=found.chain.T_last_flange @ turned))
     text = _HEAD.format(name=_cell_name(args.folder), bitrate=_common_bitrate(args.eds))
     text += "[arm]\n" + f'urdf = "{args.urdf.name}"\n'
     text += "".join(f'{key} = "{link}"\n' for key, link in (("base", args.base), ("tip", args.tip)) if link)
     text += "mount_mm = [0, 0, 0] # where the arm's base stands; the scene's coordinates count from there\n"
+    text += (
+        f"flange_deg = {list(flange_deg)} # turns the frame of the tip: the probe stands along its z"
+        f" axis, which is now the tip's {_axis_name(turned)}\n"
+    )
     text += _common_eds(args.eds, len(found.joints)) + _TAIL
     start, tilt = _start_posture(found)
     if tilt > _REPORTED_TILT_RAD:
@@ -76,6 +93,35 @@ def urdf_cell(args: argparse.Namespace) -> str:
     for number, (joint, value) in enumerate(zip(found.joints, start, strict=True), start=1):
         text += "\n" + _joint_section(number, joint, value, args.eds)
     return text
+
+
+def _without_drive(joints: Sequence[Joint]) -> Iterator[str]:
+    """A warning about several joints without a speed where others have one; a single one is often just left open."""
+    still = [joint.name for joint in joints if not joint.qd_max > 0.0]
+    if 1 < len(still) < len(joints):
+        yield (
+            f"{', '.join(still)}: no velocity in the <limit>, as of passive joints, which have no drive: an arm with"
+            " some (a delta, a parallelogram) is no serial one, and no scan can be planned with it; of a joint with a"
+            " drive, correct its speed in the cell file"
+        )
+
+
+def _flange_deg(found: UrdfArm) -> tuple[int, int, int]:
+    """Turn of the tip's frame after which z points on from the last joint, as a probe that prolongs the arm stands.
+
+    A tip in the axis of the last joint, or beside it, keeps its z axis.
+    """
+    onward = found.chain.T_last_flange[:3, :3].T @ found.chain.T_last_flange[:3, 3]
+    length = float(np.linalg.norm(onward))
+    axis = int(np.argmax(np.abs(onward)))
+    if length < _MIN_ONWARD_M or abs(onward[axis]) < _ALONG_COSINE * length:
+        return 0, 0, 0
+    return _TURNS[axis][0 if onward[axis] > 0.0 else 1]
+
+
+def _axis_name(turned: Floats) -> str:
+    axis = int(np.argmax(np.abs(turned[:3, 2])))
+    return f"{'-' if turned[axis, 2] < 0.0 else ''}{'xyz'[axis]}"
 
 
 def _common_bitrate(eds: Sequence[Path]) -> int:

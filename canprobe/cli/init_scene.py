@@ -14,6 +14,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import PlanError
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
 
@@ -74,13 +75,14 @@ def _touch(model: ArmModel, q: Floats, T_flange_probe: Floats, speed: float, len
     """A straight scan over a plane that faces the pole of the probe in the start posture."""
     T = forward(model.chain, q) @ T_flange_probe
     pole, place = T[:3, 2], 1e3 * T[:3, 3]
-    normal = -pole if model.n > 4 or abs(pole[2]) < 0.99 else np.array((0.0, 0.0, -math.copysign(1.0, pole[2])))
+    fixed = task_rows(model) == FIXED_POLE
+    normal = -pole if not fixed or abs(pole[2]) < 0.99 else np.array((0.0, 0.0, -math.copysign(1.0, pole[2])))
     start = place - 45.0 * normal
     rows = ", ".join(f"{value:.1f}" for value in start)
     roll, pitch = math.degrees(math.asin(-float(normal[1]))), math.degrees(math.atan2(normal[0], normal[2]))
     steep = abs(normal[2]) < 0.9  # then the heading lies in the xy-plane, across the normal
     heading = math.degrees(math.atan2(normal[0], -normal[1])) if steep else 0.0
-    rolling = "rolling_share = 1 # the arm holds its orientation\n" if model.n <= 4 else ""
+    rolling = "rolling_share = 1 # the arm holds its orientation\n" if fixed else ""
     return f"""
 [object] # the truth of the emulated contact; delete the section for a real object
 kind = "plane"

@@ -9,6 +9,16 @@ from typing import Any, NoReturn
 
 from canprobe.errors import did_you_mean
 
+_KEYS = {
+    "--bus": "bus.interface",
+    "--channel": "bus.channel",
+    "--bitrate": "bus.bitrate",
+    "--realtime": "cycle.realtime",
+    "--seed": "scene.seed",
+    "--duration": "task.duration_s",
+}
+"""Options of some commands that set a key of the scene."""
+
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
     """Paragraphs are as wide as the terminal; lists and examples, which are indented, stay as written."""
@@ -52,6 +62,12 @@ class Parser(argparse.ArgumentParser):
         return found, rest
 
     def refuse_unknown(self, words: Sequence[str]) -> NoReturn:
-        """Report unknown arguments and exit."""
+        """Report unknown arguments and exit; where the command takes --set, the key of an option of other commands."""
+        key = _KEYS.get(words[0].partition("=")[0]) if "--set" in self._option_string_actions else None
         hint = did_you_mean(words[0], self._option_string_actions, 0.7) if words[0].startswith("-") else ""
+        if key is not None:
+            given = words[0].partition("=")[2] or next(
+                (word for word in words[1:2] if not word.startswith("-")), "true"
+            )
+            hint = f"; did you mean --set {key}={given}?"
         self.error(f"unrecognized arguments: {' '.join(words)}{hint}")

@@ -109,10 +109,12 @@ def real_target(
         UsageError: when nothing names a channel, or --bus config is given and nothing is configured.
     """
     from canprobe.cell.session.target import Target
+    from canprobe.fieldbus.bus.real.adapters import check_interface_name
 
     interface = bus or "socketcan"
     if bus in (None, CONFIG) and (found := _configured(bus)) is not None:
         interface, channel, bitrate = found.interface, channel or found.channel, bitrate or found.bitrate
+    check_interface_name(interface)
     if (channel := channel or channel_else) is None:
         raise UsageError("--channel is missing: name the bus, such as --channel vcan0")
     return Target(interface, channel, bitrate or bitrate_else)

@@ -169,6 +169,7 @@ def test_a_misspelt_joint_is_said_with_all_other_mistakes(tmp_path, urdf, capsys
         (["--urdf", "nowhere.urdf"], "nowhere.urdf: no such file"),
         (["--urdf", "URDF", "--tip", "hand"], "no link 'hand'; it has"),
         (["--urdf", "URDF", "--eds", "URDF", "--eds", "URDF"], "one for each of the 7 joints, got 2"),
+        (["--urdf", "URDF", "--eds", "prbt_jont"], "no such packaged file; did you mean prbt_joint?"),
     ],
 )
 def test_what_is_refused(tmp_path, urdf, capsys, arguments, said):
@@ -275,3 +276,109 @@ def test_a_speed_limit_of_the_section_replaces_that_of_the_urdf_however_low(tmp_
     assert "joint 2 would need" in (said := capsys.readouterr().err) and "allowed 5e-08" in said, (
         "half of it by limits.joint_speed_share"
     )
+
+
+def chain_of(*joints, after=""):
+    """A URDF of joints in a row, each as (type, axis, origin, attributes of its limit or None)."""
+    links = "".join(f'<link name="l{i}"/>' for i in range(len(joints) + 1))
+    rows = [
+        f'<joint name="j{i}" type="{kind}"><parent link="l{i - 1}"/><child link="l{i}"/><origin xyz="{origin}"/>'
+        f'<axis xyz="{axis}"/>{"" if limit is None else f"<limit {limit}/>"}</joint>'
+        for i, (kind, axis, origin, limit) in enumerate(joints, 1)
+    ]
+    return f'<robot name="row">{links}{"".join(rows)}{after}</robot>'
+
+
+def fixed(name, parent, origin="0 0 0", rpy="0 0 0"):
+    joint = f'<joint name="to_{name}" type="fixed"><parent link="{parent}"/><child link="{name}"/>'
+    return f'<link name="{name}"/>{joint}<origin xyz="{origin}" rpy="{rpy}"/></joint>'
+
+
+TURNS = 'lower="-1.57" upper="1.57" effort="20" velocity="2"'
+ARM = (
+    ("revolute", "0 0 1", "0 0 0.26", TURNS),
+    ("revolute", "0 1 0", "0 0 0", TURNS),
+    ("revolute", "0 1 0", "0.05 0 0.28", TURNS),
+    ("revolute", "0 1 0", "0.3 0 0", TURNS),
+)
+ROLL = ("revolute", "1 0 0", "0.1 0 0", TURNS)
+
+
+def begun(tmp_path, text, *words):
+    """What init answers to a URDF, and the cell that it wrote."""
+    tmp_path.mkdir(exist_ok=True)
+    (tmp_path / "row.urdf").write_text(text)
+    status = main(["init", str(tmp_path / "cell"), "--urdf", str(tmp_path / "row.urdf"), *words])
+    cell = tmp_path / "cell" / "cell.toml"
+    return status, tomllib.loads(cell.read_text()) if cell.exists() else None
+
+
+GRIPPER = (
+    '<link name="finger"/><joint name="grip" type="prismatic"><parent link="l4"/><child link="finger"/>'
+    '<limit lower="0" upper="0.04" effort="1" velocity="1"/><mimic joint="j1"/></joint>'
+)
+
+
+@pytest.mark.parametrize("beside", [fixed("base_frame", "l0"), fixed("base_frame", "l0") + GRIPPER])
+def test_the_only_tip_that_drives_can_move_is_taken(tmp_path, beside):
+    """A frame that stands still, and a finger that mimics another joint, are no tips."""
+    status, cell = begun(tmp_path, chain_of(*ARM, after=fixed("tool0", "l4", "0.05 0 0") + beside))
+    assert status == 0 and list(cell["joints"]) == ["j1", "j2", "j3", "j4"]
+
+
+def test_of_several_tips_only_those_that_can_be_taken_are_listed(tmp_path, capsys):
+    text = chain_of(*ARM, after=fixed("left", "l4") + fixed("right", "l4") + GRIPPER + fixed("still", "l0"))
+    assert begun(tmp_path, text)[0] == 2
+    assert capsys.readouterr().err.rstrip().endswith("one of left, right")
+    assert begun(tmp_path, text, "--tip", "right")[0] == 0
+
+
+def test_five_axes_with_the_roll_last_scan_as_without_it(tmp_path, capsys):
+    tip = fixed("tool0", "l5", "0.02 0 0", "0 1.5708 0")
+    status, _ = begun(tmp_path, chain_of(*ARM, ROLL, after=tip))
+    assert status == 0 and "freely" not in capsys.readouterr().out
+    assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 0
+    assert "joint 5 only turns the probe about its pole" in capsys.readouterr().out
+    q = resolve(load_scene(tmp_path / "cell" / "first.toml")).task.arm.q_start
+    out = tmp_path / "run"
+    assert main(["run", str(tmp_path / "cell" / "first.toml"), "--duration", "1", "--out", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["contact"]["contact_fraction"] == 1.0
+    assert np.nanmax(np.abs(np.load(out / "log.npz")["q_target_rad"][:, 4] - q[4])) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("origin", "rpy", "turn", "axis"),
+    [
+        ("0.05 0 0", "0 0 0", [0, 90, 0], "x"),
+        ("0.05 0 0", "0 1.5708 0", [0, 0, 0], "z"),
+        ("0.05 0 0", "0 -1.5708 0", [180, 0, 0], "-z"),
+        ("0.05 0 0", "0 0 1.5708", [90, 0, 0], "-y"),
+        ("0 0 0", "0 0 0", [0, 0, 0], "z"),
+        ("0.05 0 0.04", "0 0 0", [0, 0, 0], "z"),
+    ],
+)
+def test_the_probe_prolongs_the_arm_and_the_cell_says_along_which_axis(tmp_path, origin, rpy, turn, axis):
+    status, cell = begun(tmp_path, chain_of(*ARM, after=fixed("tip", "l4", origin, rpy)))
+    assert status == 0 and cell["arm"]["flange_deg"] == turn
+    assert f"which is now the tip's {axis}\n" in (tmp_path / "cell" / "cell.toml").read_text()
+
+
+def test_millimetres_and_passive_joints_are_named(tmp_path, capsys):
+    tall = [(kind, axis, " ".join(str(1000 * float(x)) for x in xyz.split()), limit) for kind, axis, xyz, limit in ARM]
+    assert begun(tmp_path / "a", chain_of(*tall))[0] == 0
+    assert "add up to 844 m, which looks like millimetres; a URDF is in metres" in capsys.readouterr().err
+    slides = 'lower="0" upper="{}" effort="50" velocity="2"'
+    for name, most in (("b", 500), ("c", 50)):
+        text = chain_of(("prismatic", "1 0 0", "0 0 0.3", slides.format(most)), *ARM)
+        begun(tmp_path / name, text)
+        assert f"j1: <limit> from 0 to {most} m looks like millimetres; correct it" in capsys.readouterr().err
+    delta = chain_of(ARM[1], ("continuous", "0 1 0", "0.2 0 0", None), ("continuous", "0 1 0", "0 0 -0.4", None))
+    assert begun(tmp_path / "d", delta)[0] == 0
+    said = capsys.readouterr()
+    assert "j2, j3: no velocity in the <limit>, as of passive joints" in said.err and "freely" in said.out
+
+
+def test_a_packaged_eds_is_taken_by_its_name(tmp_path):
+    status, cell = begun(tmp_path, chain_of(*ARM), "--eds", "puma260_joint")
+    assert status == 0 and cell["arm"]["eds"] == "puma260_joint.eds"
+    assert (tmp_path / "cell" / "puma260_joint.eds").read_bytes() == eds_path("puma260_joint").read_bytes()

@@ -20,7 +20,8 @@ from canprobe.cli import COMMANDS, main
 from canprobe.cli.argument_types import channel, node_ids
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json
-from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
+from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError, at_least, at_most
+from canprobe.fieldbus.bus.real.adapters import BACKENDS
 from canprobe.fieldbus.bus.real.interrupts import Terminated
 from canprobe.fieldbus.eds.packaged import eds_path
 
@@ -84,7 +85,6 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        ([], ("COMMAND",)),
         (["runn"], ("unknown command 'runn'", "did you mean run?")),
         (["run"], ("SCENE",)),
         (["--versoin"], ("unrecognized arguments: --versoin; did you mean --version?",)),
@@ -228,7 +228,7 @@ def test_a_bus_that_python_can_does_not_know_is_wrong_usage(command, monkeypatch
     words = [*command.split(), "--bus", "token-ring", "--channel", "x"]
     assert main(words + (["--html", "page.html"] if command.startswith("view") else [])) == 2
     err = capsys.readouterr().err.splitlines()[-1]
-    assert err.startswith("canprobe: x: no interface 'token-ring'; python-can has: ") and "socketcan" in err
+    assert err.startswith("canprobe: no interface 'token-ring'; ") and "python-can has: " in err and "socketcan" in err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -459,3 +459,68 @@ def test_a_line_to_type_names_the_scene_that_was_given(monkeypatch, capsys):
     assert capsys.readouterr().err == (
         "canprobe: node 1: is not homed; type: canprobe up 'my cell.toml' --cell puma560 --home --bus socketcan\n"
     )
+
+
+def test_canprobe_alone_prints_its_help(capsys):
+    assert main([]) == 0
+    alone = capsys.readouterr()
+    assert main(["--help"]) == 0
+    assert alone.out == capsys.readouterr().out and not alone.err
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["--bitrate", "1000000"], "--set bus.bitrate=1000000"),
+        (["--seed=3"], "--set scene.seed=3"),
+        (["--realtime"], "--set cycle.realtime=true"),
+    ],
+)
+def test_an_option_of_other_commands_is_named_as_the_key_that_was_meant(words, meant, capsys):
+    assert main(["plan", "free", *words]) == 2
+    assert f"; did you mean {meant}?" in capsys.readouterr().err
+    assert main(["plan", "free", *meant.split()]) == 0
+
+
+@pytest.mark.parametrize(
+    ("key", "given", "meant"),
+    [
+        ("object.radius_mm", 0.036, "36, for 0.036 metres"),
+        ("bus.bitrate", 500, "500000, for 500 kbit/s"),
+        ("bring_up.sdo_s", 500, "0.5, for 500 milliseconds"),
+        ("sensor.full_scale_kpa", 100_000, "100, for 100000 Pa"),
+        ("task.speed_mm_s", 300, None),
+        ("object.radius_mm", -36, None),
+        ("object.radius_mm", float("inf"), None),
+    ],
+)
+def test_a_number_out_of_range_is_named_as_the_one_of_another_unit(key, given, meant, capsys):
+    assert main(["plan", "cylinder", "--set", f"{key}={given}"]) == 2
+    said = capsys.readouterr().err
+    assert f"{key}: expected" in said
+    assert f"; did you mean {meant}?" in said if meant else "did you mean" not in said
+
+
+def test_a_joint_that_the_cell_has_not_is_named_as_the_one_that_was_meant(capsys):
+    assert main(["plan", "cylinder", "--set", "joints.join_2.node_id=9"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "joints.join_2: the cell has no such joint; did you mean joint_2?" in line
+
+
+@pytest.mark.parametrize(
+    ("value", "most", "least"),
+    [(3.6949, "3.69", "3.7"), (0.3, "0.3", "0.3"), (112_999.0, "112000", "113000"), (9.999, "9.99", "10")],
+)
+def test_advised_numbers_are_rounded_to_the_safe_side(value, most, least):
+    assert (at_most(value), at_least(value)) == (most, least)
+
+
+def test_adapters_are_listed_with_what_each_lacks(capsys):
+    assert main(["adapters", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [one["interface"] for one in document["interfaces"]] == list(BACKENDS)
+    assert main(["adapters"]) == 0
+    out = capsys.readouterr().out
+    for one in document["interfaces"]:
+        assert one["interface"] in out and all(lack in out for lack in one["missing"])
+    assert all(one["type_next"] in out for one in document["found"])

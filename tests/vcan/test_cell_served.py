@@ -92,6 +92,8 @@ def test_a_busy_node_id_is_refused(served: Any, bench: Any) -> None:
 def test_a_run_whose_emulated_nodes_are_there_already(served: Any, bench: Any) -> None:
     (line,) = bench.start("run", "press", *ON_VCAN0, "--out", "results").end(3)
     assert line.startswith("canprobe: node 1: is on vcan0 already; its id is busy")
+    assert "take them as real ones: " in line and "--set arm.emulated=false --set sensor.emulated=false" in line
+    assert "--nodes" not in line
     assert served.running
 
 

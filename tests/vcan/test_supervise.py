@@ -157,7 +157,7 @@ def test_no_vcan_is_125_with_the_line_to_type(capfd: pytest.CaptureFixture[str])
     assert out == ""
     assert err.count("\n") == 1
     assert "on Debian type:" in err and "apt-get install -y user-mode-linux" in err
-    assert "modprobe vcan" in err and "--bus udp_multicast --patient" in err
+    assert "modprobe vcan" in err and "--bus udp_multicast --channel ff11::ca --patient" in err
 
 
 @pytest.mark.usefixtures("nowhere")

@@ -142,10 +142,12 @@ def _held_up(seen: Seen) -> str:
     patience_ns = seen.limits.missed_cycles * seen.limits.period_ns
     if seen.gap_ns <= patience_ns:
         return ""
+    patient = seen.limits.safety.late_share >= 1.0  # as --patient sets it, and the drives wait longer already
+    more = "or a larger arm.missed_syncs" if patient else "or for emulated nodes --patient"
     return (
         f"; the last SYNC was sent {seen.gap_ns * 1e-6:.0f} ms after the one before, and the drives stop by themselves"
         f" {patience_ns * 1e-6:g} ms after one (arm.missed_syncs = {seen.limits.missed_cycles}): the machine held the"
-        " master up; leave it more of the processor, see --realtime, or for emulated nodes --patient"
+        f" master up; leave it more of the processor, see --realtime, {more}"
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
+from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
 
 MAX_NEW_ALARMS = 64
@@ -30,7 +30,8 @@ class EmcyEvent:
     @property
     def what(self) -> str:
         """The message in words."""
-        return f"EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
+        late = " (no SYNC in time)" if self.emcy.code == SYNC_LOST_CODE else ""
+        return f"EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}{late}"
 
     def __str__(self) -> str:
         return f"node {self.node_id}: {self.what}"

@@ -13,7 +13,7 @@ from typing import Literal
 
 from canprobe.cell.planning.window import patch_radius_m
 from canprobe.cell.scene.setup import Array, Calibrate, Setup, Touch
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, at_most
 
 What = Literal["image", "start", "stop", "poll"]
 PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16
@@ -112,15 +112,21 @@ def array_problems(setup: Setup) -> Iterator[str]:
             f"{support.taxels:.1f} taxels of the array {array.name}, and fewer than {PRESS_TAXELS} do not show where "
             "on the probe it presses; raise task.force_n, or take a finer array"
         )
-    if setup.scan is not None and not array.pad.is_flat:
-        most = array.pad.pitch_m * array.rate_hz
-        if setup.scan.speed > most:
-            moves = 1e3 * setup.scan.speed / array.rate_hz
-            yield (
-                f"task.speed_mm_s = {1e3 * setup.scan.speed:g}: the contact would move {moves:.3g} mm from one image to"
-                f" the next (sensor.rate_hz = {array.rate_hz:g}), more than the {1e3 * array.pad.pitch_m:g} mm between"
-                f" taxels; lower it to {1e3 * most:.3g}"
-            )
+
+
+def speed_over_array_problems(setup: Setup) -> Iterator[str]:
+    """Why a scan is too fast for its array: the contact must be found again from one image to the next."""
+    array = setup.array
+    if setup.scan is None or array is None or array.pad.is_flat:
+        return
+    most = array.pad.pitch_m * array.rate_hz
+    if setup.scan.speed > most:
+        moves = 1e3 * setup.scan.speed / array.rate_hz
+        yield (
+            f"task.speed_mm_s = {1e3 * setup.scan.speed:g}: the contact would move {moves:.3g} mm from one image to"
+            f" the next (sensor.rate_hz = {array.rate_hz:g}), more than the {1e3 * array.pad.pitch_m:g} mm between"
+            f" taxels; lower task.speed_mm_s to {at_most(1e3 * most)}"
+        )
 
 
 def _unreadable(array: Array) -> Iterator[str]:

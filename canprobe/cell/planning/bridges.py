@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from canprobe.cell.scene.setup import Setup
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import UsageError, did_you_mean, install_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +71,8 @@ def check_bridges(names: Iterable[str], what: str = "bridge ") -> None:
     """
     for name in names:
         if name not in BRIDGES:
-            close = difflib.get_close_matches(name, BRIDGES, n=1, cutoff=0.5)
-            hint = f" (did you mean {close[0]}?)" if close else ""
             known = "; ".join(f"{known} ({info.what})" for known, info in BRIDGES.items())
+            hint = did_you_mean(name, BRIDGES)
             raise UsageError(f"bridge {name!r}: there is no such bridge{hint}; there are: {known}")
         info = BRIDGES[name]
         if info.missing:

@@ -12,13 +12,16 @@ Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
+from canprobe.cell.planning.force import highest_known_force
 from canprobe.cell.planning.window import measured_share
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
+from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.motors import position_per_unit
@@ -29,6 +32,7 @@ GAIN_SPREAD = 0.05
 """Share by which one taxel shows more than another: at the edge it may seem to be pressed harder by as much."""
 BLUR_TAXELS = 0.72
 """Standard deviation of the blur in taxels, from the packaged calibration: a finer array blurs over less distance."""
+_Touching = TypeVar("_Touching", Touch, Calibrate)
 _EVERY = 8
 """Every so many contacts along a path are enough for what changes little from one to the next."""
 
@@ -79,15 +83,26 @@ def contact_problems(task: Touch, joints: Floats, normals: Floats, kappas: Float
     """
     if task.array.pad.is_flat:
         return []
+    some, there = joints[::_EVERY], normals[::_EVERY]
+
+    def troubles(changed: Touch) -> set[str]:
+        """Problems of a changed task, by name: a way out of one must not lead into another."""
+        known = highest_known_force(changed.array, changed.probe, force_max_n, (0.0, changed.duration_s))
+        unheld = settling_problem(changed, some, there, lambda _: False)
+        hidden = saturation_problem(changed, kappas, lambda _: False)
+        each = {"high": changed.force > known, "settling": unheld is not None, "saturation": hidden is not None}
+        return {name for name, there in each.items() if there}
+
+    before = troubles(task)
     found = (
-        saturation_problem(task, kappas),
-        settling_problem(task, joints[::_EVERY], normals[::_EVERY], force_max_n),
+        saturation_problem(task, kappas, lambda changed: troubles(changed) <= before - {"saturation"}),
+        settling_problem(task, some, there, lambda changed: troubles(changed) <= before - {"settling"}),
         edge_problem(task, joints, normals, kappas),
     )
     return [problem for problem in found if problem is not None]
 
 
-def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: float) -> str | None:
+def settling_problem(task: Touch, joints: Floats, normals: Floats, holds: Callable[[Touch], bool]) -> str | None:
     """Problem where the force cannot settle, because the drives count too coarsely for the layer; else None.
 
     Rounding to whole counts displaces the probe by σ along the normal, and with F ~ δ² the force by 2 σ/δ of itself.
@@ -96,7 +111,7 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
         task: a scan or a press.
         joints: (m, n) positions at its contacts, rad or m.
         normals: (m, 3) outward unit normals there.
-        force_max_n: highest force that is allowed.
+        holds: whether a changed task has its force and shows it.
     """
     model, tool = task.arm.model, task.probe.T_flange_probe
     each = np.abs([position_per_unit(model, q, tool, normal) for q, normal in zip(joints, normals, strict=True)])
@@ -109,9 +124,11 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
     coarsest = int(np.argmax(each[worst]))
     joint, beyond = model.joints[coarsest], spread / MAX_FORCE_SPREAD
     ways = [f"let the drive of {joint.name} count finer"]
-    if task.force * beyond**2 <= force_max_n:
-        ways.append(f"raise task.force_n to {1.01 * task.force * beyond**2:.3g}")
-    ways.append(f"take a softer layer (probe.stiffness_n_m3 = {task.probe.stiffness / beyond**2:.3g})")
+    force, stiffness = at_least(1.01 * task.force * beyond**2), at_most(0.99 * task.probe.stiffness / beyond**2)
+    if holds(replace(task, force=float(force))):
+        ways.append(f"raise task.force_n to {force}")
+    if holds(replace(task, probe=replace(task.probe, stiffness=float(stiffness)))):
+        ways.append(f"take a softer layer (probe.stiffness_n_m3 = {stiffness})")
     return (
         f"joints.{joint.name}: one count moves the probe by {1e3 * each[worst, coarsest]:.2g} mm along the normal, and "
         f"all joints together by {1e3 * sigmas[worst]:.2g} mm (1σ), where {task.force:g} N press the layer in by "
@@ -120,7 +137,7 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
     )
 
 
-def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
+def saturation_problem(task: _Touching, kappas: Floats, holds: Callable[[_Touching], bool]) -> str | None:
     """Problem where the array cannot show the wanted force, because its taxels saturate; else None.
 
     Where a window cuts the patch, more than that force presses until the window measures it.
@@ -128,6 +145,7 @@ def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
     Args:
         task: the task that touches.
         kappas: (m, 2) principal curvatures of the object at its contacts, 1/m.
+        holds: whether a changed task holds its force.
     """
     probe, array, pitch = task.probe, task.array, task.array.pad.pitch_m
     full_pa = array.pad.full_scale_pa
@@ -135,17 +153,18 @@ def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
         return None  # a calibration with a flat array is refused elsewhere
     windowed = array.mode == "window" and array.window != "auto"
     inside = measured_share(task.force, probe, int(array.window), pitch) if windowed else 1.0
-    at_most = max(
+    worst = max(
         (pressed(task.force / inside, probe, array, one) for one in kappas.tolist()), key=lambda one: one.shown_pa
     )
-    if at_most.shown_pa <= full_pa:
+    if worst.shown_pa <= full_pa:
         return None
-    fits = at_most.depth - (at_most.shown_pa - full_pa) / probe.stiffness
-    lower, shown_pa = 0.99 * task.force * (fits / at_most.depth) ** 2, at_most.shown_pa
+    fits = worst.depth - (worst.shown_pa - full_pa) / probe.stiffness
+    lower, shown_pa = at_most(0.99 * task.force * (fits / worst.depth) ** 2), worst.shown_pa
+    way = f"lower task.force_n to {lower}, or " if fits > 0.0 and holds(replace(task, force=float(lower))) else ""
     return (
         f"sensor.full_scale_kpa = {1e-3 * full_pa:g}: at task.force_n = {task.force:g} the taxels under the middle of "
-        f"the contact have up to {1e-3 * shown_pa:.3g} kPa and saturate, so that the force is not measured; lower "
-        f"task.force_n to {lower:.3g}, or take an array with {1.01e-3 * shown_pa:.3g} kPa"
+        f"the contact have up to {1e-3 * shown_pa:.3g} kPa and saturate, so that the force is not measured; "
+        f"{way}take an array with sensor.full_scale_kpa = {at_least(1.01e-3 * shown_pa)}"
     )
 
 

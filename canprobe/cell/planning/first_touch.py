@@ -20,6 +20,7 @@ from canprobe.cell.planning.contact import BLUR_TAXELS
 from canprobe.cell.planning.force import highest_known_force
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
+from canprobe.errors import at_least, at_most
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
@@ -77,8 +78,11 @@ def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[
     needed_n = shown_n / MIN_SHOWN_SHARE
     if shown_n > TOUCH_FORCE and task.force < needed_n:
         pitch_mm, full_kpa, share = 1e3 * array.pad.pitch_m, 1e-3 * array.pad.full_scale_pa, task.force / needed_n
-        ways = [f"task.force_n = {1.01 * needed_n:.3g}"] if needed_n < 0.9 * limit_n else []
-        ways.append(f"an array with {0.99 * pitch_mm * math.sqrt(share):.3g} mm or {0.99 * full_kpa * share:.3g} kPa")
+        ways = [f"task.force_n = {at_least(1.01 * needed_n)}"] if needed_n < 0.9 * limit_n else []
+        ways.append(
+            f"sensor.pitch_mm = {at_most(0.99 * pitch_mm * math.sqrt(share))} or sensor.full_scale_kpa = "
+            f"{at_most(0.99 * full_kpa * share)} of another array"
+        )
         yield (
             f"sensor.pitch_mm = {pitch_mm:g}, sensor.full_scale_kpa = {full_kpa:g}: between its taxels the array shows "
             f"a contact from {shown_n:.2g} N on, and less than half of task.force_n = {task.force:g}; take "
@@ -95,5 +99,5 @@ def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[
         f"task.approach_mm_s = {1e3 * speed:g}: the array shows a contact from {shown_n:.2g} N on, and the probe stops "
         f"up to {1e3 * after_s:.0f} ms later (sensor.rate_hz = {array.rate_hz:g}), when {reached_n:.2g} N press, "
         f"measured up to {reached_n * limit_n / known_n:.2g} N (2σ), more than limits.force_max_n = {limit_n:g}; lower "
-        f"task.approach_mm_s to {1e3 * slower:.2g}, or raise sensor.rate_hz"
+        f"task.approach_mm_s to {at_most(1e3 * slower)}, or raise sensor.rate_hz"
     )

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
+from canprobe.errors import at_least, at_most
 from canprobe.mechanics.touch.patch.force_creep import decades_after, late_decades_after
 from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
 
@@ -57,6 +58,6 @@ def force_problems(setup: Setup, task: Touch | Calibrate) -> Iterator[str]:
     yield (
         f"task.force_n = {task.force:g}: the array measures it to ± {100.0 * share:.1f} % ({UPPER_SIGMAS:g}σ), so that "
         f"its upper end is above limits.force_max_n = {limit:g}, which stops the touch; lower task.force_n to "
-        f"{0.99 * highest:.3g}, raise limits.force_max_n to {1.01 * task.force * (1.0 + share):.3g}, or calibrate the "
-        "array (`canprobe calibrate array CELL`)"
+        f"{at_most(0.99 * highest)}, raise limits.force_max_n to {at_least(1.01 * task.force * (1.0 + share))}, or "
+        "calibrate the array (`canprobe calibrate array CELL`)"
     )

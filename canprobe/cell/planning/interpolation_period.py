@@ -87,8 +87,10 @@ def _period_offer(device: Abilities) -> str:
     return f"1006h takes {low} to {high} µs"
 
 
-def period_problem(rate_hz: float, period_us: int, exact: bool, devices: Iterable[Abilities]) -> str | None:
-    """Why a rate cannot be set, with the nearest rates that every drive can; None where it can.
+def period_problem(
+    rate_hz: float, period_us: int, exact: bool, devices: Iterable[Abilities]
+) -> tuple[str | None, list[float]]:
+    """Why a rate cannot be set, and the nearest rates that every drive can, Hz; None and none where it can.
 
     Args:
         rate_hz: rate that the scene asks for.
@@ -99,11 +101,12 @@ def period_problem(rate_hz: float, period_us: int, exact: bool, devices: Iterabl
     makes = {device.eds: device for device in devices}
     unable = [device for device in makes.values() if not _can_take(device, period_us)]
     if exact and not unable:
-        return None
+        return None, []
     why = "1006h counts µs" if not exact else "; ".join(f"{device.eds}: {_period_offer(device)}" for device in unable)
     near = _nearest_rates(1e6 / rate_hz, list(makes.values()))
-    take = f"take {' or '.join(f'{rate:.6g}' for rate in near)} Hz" if near else "no period suits all drives"
-    return f"cycle.rate_hz = {rate_hz:g}: a SYNC period of {1e6 / rate_hz:.6g} µs cannot be set ({why}); {take}"
+    unsuited = "" if near else "; no period suits all drives"
+    what = f"cycle.rate_hz = {rate_hz:g}: a SYNC period of {1e6 / rate_hz:.6g} µs cannot be set ({why}){unsuited}"
+    return what, near
 
 
 def _nearest_rates(period_us: float, devices: Sequence[Abilities]) -> list[float]:

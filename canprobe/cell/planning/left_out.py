@@ -14,7 +14,7 @@ from canprobe.cell.planning.window import (
 )
 from canprobe.cell.scene.setup import Arm, Setup, Touch, Touching
 from canprobe.errors import install_line
-from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
+from canprobe.mechanics.robot.inverse import FIXED_POLE, rolls_last, task_rows
 
 _NO_SHAPE = {
     "press": "one touch without motion shows no shape",
@@ -157,9 +157,11 @@ def long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
 def held_rows(arm: Arm) -> str:
     name = f"the {arm.model.name} arm of {arm.model.n} joints"
     if task_rows(arm.model) == FIXED_POLE:
+        rolls = arm.model.n > FIXED_POLE and rolls_last(arm.model)
+        last = f"; joint {arm.model.n} only turns the probe about its pole, and stays where it starts"
         return (
             f"{name} holds the place of the probe, not its tilt: task.rolling_share is 1, and the contact wanders "
-            "on the array"
+            f"on the array{last * rolls}"
         )
     return f"{name} holds position and pole of the probe and leaves the turn about the pole free"
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from canprobe.cell.planning.abilities import Abilities
-from canprobe.cell.planning.array import array_problems, as_supported
+from canprobe.cell.planning.array import array_problems, as_supported, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.demands import missing_bitrate, missing_objects
@@ -36,7 +36,7 @@ from canprobe.cell.planning.sync import plan_ratio, plan_sync
 from canprobe.cell.planning.traffic import plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.planning.warnings import warnings
-from canprobe.cell.planning.ways_out import ways_out
+from canprobe.cell.planning.ways_out import at_rate, ways_out
 from canprobe.cell.planning.window import cut_patch
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
@@ -63,18 +63,11 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     beyond = [*range_problems(setup), *(speed_problems(setup, devices) if not problems else ())]
     setup, narrowed = within_drives(setup, devices) if not problems and not beyond else (setup, ())
     unsuited = [*array_problems(setup)]
-    problems += unsuited
     bus = _choose(setup, devices, problems) if not problems else None
-    ways: list[str] = []
+    problems += [*unsuited, *speed_over_array_problems(setup)]
     if bus is not None:
         setup = bus.setup
-        if bus.overload and find_ways:
-            known = frozenset(bus.problems)
-            ways += ways_out(setup, lambda changed: _fits(changed, known))
-        cut = cut_patch(setup)
-        if cut is not None and not cut.safe:
-            problems.append(cut.text)
-            ways = ways or [*cut.ways]
+        problems += _cut_problems(setup)
     problems += beyond
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
         problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
@@ -87,7 +80,10 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
-        raise PlanError(_shared(problems), ways)
+        ways = _ways_out(bus) if bus is not None and bus.overload and find_ways else []
+        alone = bus is not None and set(problems) <= {*bus.overload}
+        problems = [problem if bus is None else _with_rates(problem, bus, devices) for problem in problems]
+        raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
     chosen = {choice.key: choice.value for choice in bus.choices}
     setup = setup.with_choices(chosen)
     absent = left_out(setup)
@@ -106,6 +102,36 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
     )
     return _with_configuration(plan)
+
+
+def _ways_out(bus: _BusPlan) -> list[str]:
+    """Changes that make an overloaded bus fit and ask for nothing new of the rest of the plan."""
+    setup, known, elsewhere = bus.setup, frozenset(bus.problems), frozenset(_problems_beside_bus(bus.setup))
+
+    def sound(closed: Setup) -> bool:
+        if closed.rate_hz == setup.rate_hz and _images(closed) == _images(setup):  # nothing else depends on the bus
+            return True
+        return elsewhere.issuperset(_problems_beside_bus(closed))
+
+    return ways_out(setup, lambda changed: _fits(changed, known), sound)
+
+
+def _images(setup: Setup) -> tuple[object, ...]:
+    """What the rest of a plan takes from the images of the array."""
+    return () if setup.array is None else (setup.array.mode, setup.array.window, setup.array.rate_hz)
+
+
+def _problems_beside_bus(setup: Setup) -> list[str]:
+    """Problems of a setup with known devices, apart from those of its bus."""
+    devices, _ = _devices(setup)
+    found = [*speed_over_array_problems(setup), *range_problems(setup), *speed_problems(setup, devices)]
+    found += _cut_problems(setup)
+    return [*found, *([*array_problems(setup)] or check_motion(within_drives(setup, devices)[0])[1])]
+
+
+def _cut_problems(setup: Setup) -> list[str]:
+    cut = cut_patch(setup)
+    return [] if cut is None or cut.safe else [f"{cut.text}; take {' or '.join(cut.ways)}"]
 
 
 def _shared(problems: Sequence[str]) -> list[str]:
@@ -140,6 +166,7 @@ class _BusPlan:
         choices: values of the keys that were open.
         problems: what is wrong at any bit rate.
         overload: what does not fit the bit rate.
+        untaken: problems with a rate, each with other rates as text and the setups that have them.
     """
 
     setup: Setup
@@ -151,6 +178,7 @@ class _BusPlan:
     problems: list[str]
     overload: list[str]
     not_available: tuple[tuple[str, str], ...]
+    untaken: list[tuple[str, list[tuple[str, Setup]]]]
 
     @property
     def misfit(self) -> tuple[int, float]:
@@ -186,13 +214,20 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
 def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
     sync, exact = plan_sync(setup)
     drives = [devices[node_id] for node_id in setup.arm.node_ids] if setup.arm is not None else []
-    problem = period_problem(setup.rate_hz, sync.period_us, exact, drives)
-    ratio, found = plan_ratio(setup)
+    unset, periods = period_problem(setup.rate_hz, sync.period_us, exact, drives)
+    ratio, untimed, image_rates = plan_ratio(setup)
     not_available = []
     if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if not _counts_syncs(device)]:
         sync = replace(sync, overflow=0)
         not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
-    problems = [*([problem] if problem is not None else []), *found]
+    untaken: list[tuple[str, list[tuple[str, Setup]]]] = []
+    if unset is not None:
+        slower = [(rate, *at_rate(setup, rate)) for rate in periods]
+        untaken.append((unset, [(f"{rate:.6g}{' Hz' * bool(more)}{more}", one) for rate, more, one in slower]))
+    if untimed is not None:
+        near = image_rates[:_TRIED_RATES]
+        untaken.append((untimed, [(f"{rate:.6g}", setup.changed("array", rate_hz=rate)) for rate in near]))
+    problems: list[str] = []
     channels = _channels(setup)
     channel_of = {node_id: channel for channel, node_ids in channels.items() for node_id in node_ids}
     planning = PdoPlanning(setup, sync, devices, channel_of, problems=problems, not_available=not_available)
@@ -212,10 +247,32 @@ def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Cho
         pdos=traffic.pdos,
         raw=traffic.raw,
         buses=traffic.buses,
-        problems=planning.problems,
+        problems=[*(problem for problem, _ in untaken), *planning.problems],
         overload=traffic.problems,
         not_available=tuple(dict.fromkeys(planning.not_available)),
+        untaken=untaken,
     )
+
+
+_OFFERED_RATES, _TRIED_RATES = 2, 12
+
+
+def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, Abilities]) -> str:
+    """A problem of a bus; one with a rate is followed by the first rates to take in its place that fit."""
+    changes = dict(bus.untaken).get(problem)
+    if not changes:
+        return problem
+    known, fitting = set(bus.problems) - {problem}, []
+    for text, changed in changes:
+        other = _plan_bus(changed, devices)
+        if not other.overload and known.issuperset(other.problems):
+            fitting.append(text)
+        if len(fitting) == _OFFERED_RATES:
+            break
+    offered = fitting or [text for text, _ in changes[:_OFFERED_RATES]]
+    unit = "" if "=" in offered[-1] else " Hz"
+    none_fits = "" if fitting else ", which the bus has no room for as it is"
+    return f"{problem}; take {' or '.join(offered)}{unit}{none_fits}"
 
 
 def _counts_syncs(device: Abilities) -> bool:

@@ -17,7 +17,7 @@ from canprobe.cell.planning.model import JointSpeeds
 from canprobe.cell.planning.surface_path import SurfacePath, in_mm, surface_path
 from canprobe.cell.planning.task_way import joints_on_way, over_path, poles_at_contacts, round_ball
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
-from canprobe.errors import PlanError
+from canprobe.errors import PlanError, at_least, at_most
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
@@ -57,7 +57,7 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
                 joints = joints_on_way(task.arm, task.probe, q_start, lambda pose: round_ball(ball, pose))
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
                 kappas = np.full((1, 2), 1.0 / task.ball_radius)
-                found += [problem] if (problem := saturation_problem(task, kappas)) is not None else []
+                found += [problem] if (problem := saturation_problem(task, kappas, lambda _: True)) is not None else []
                 found += [*force_problems(setup, task), *first_touch_problems(setup, task, kappas[0].tolist())]
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
@@ -229,7 +229,7 @@ def _check_touch(
     approach = task.approach
     down = stops.speeds(np.abs(joints[_POSES_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
     slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
-    problems += _too_fast(task.arm, down, f"lower task.approach_mm_s to {slowly:.3g}")
+    problems += _too_fast(task.arm, down, f"lower task.approach_mm_s to {at_most(slowly)}")
     if task.scan is None:
         return stops.speeds(np.zeros_like(task.arm.q_start)), problems
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
@@ -239,7 +239,7 @@ def _check_touch(
         along, across = np.abs(np.diff(path.points, axis=0) @ task.approach.axes[:2].T).T
         speeds = stops.speeds(np.hypot(rates[along >= across].max(axis=0), rates[along < across].max(axis=0)))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
-    way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
+    way_out = f"lower task.speed_mm_s to {at_most(possible)}, turn task.heading_deg, or raise task.rolling_share"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
 
 
@@ -251,7 +251,7 @@ def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -
         slower = 1e3 * task.scan.speed * min(rectangle.length, rectangle.width) / least
         return (
             f"task.length_mm and width_mm: an exploration at {1e3 * task.scan.speed:g} mm/s needs {1e3 * least:.3g} mm "
-            f"to turn round; make the rectangle larger, or lower task.speed_mm_s to {slower:.3g}"
+            f"to turn round; make the rectangle larger, or lower task.speed_mm_s to {at_most(slower)}"
         )
     why, missed, q = "", [], q_start
     for pose, point in zip(
@@ -287,7 +287,7 @@ def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeed
     problems = stops.problems(np.array((start - swing, start + swing))) if starts else []
     slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
     keys = " and ".join(dict.fromkeys(f"swing_{joint.unit}" for joint in task.arm.model.joints))
-    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less ({keys} of the joints)"
+    way_out = f"swing slower (task.swing_period_s = {at_least(slower)}) or less ({keys} of the joints)"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
 
 

@@ -23,23 +23,22 @@ def plan_sync(setup: Setup) -> tuple[SyncPlan, bool]:
     return SyncPlan(1e6 / period_us, period_us * 1000, period_us, SYNC_OVERFLOW), exact
 
 
-def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
-    """Number of SYNCs for one tactile frame (18xxh:02), and why the rate is not possible."""
+def plan_ratio(setup: Setup) -> tuple[int, str | None, list[float]]:
+    """Number of SYNCs for one tactile frame (18xxh:02), why the rate is not possible, and the possible ones, Hz.
+
+    The possible rates are listed where the rate is not, the nearest first.
+    """
     array = setup.array
     if array is None or (array.raw is not None and array.raw.sampling == "free"):
-        return 1, []
+        return 1, None, []
     exact = setup.rate_hz / array.rate_hz
     ratio = max(1, round(exact))
     if abs(exact / ratio - 1) < _TOLERANCE and (SYNC_OVERFLOW % ratio == 0 or array.raw is not None):
-        return ratio, []
+        return ratio, None, []
+    counts = [count for count in range(1, SYNC_OVERFLOW + 1) if array.raw is not None or SYNC_OVERFLOW % count == 0]
+    rates = [setup.rate_hz / count for count in sorted(counts, key=lambda count: abs(count - exact))]
+    what = f"sensor.rate_hz = {array.rate_hz:g}: "
     if array.raw is not None:
-        rates = f"{setup.rate_hz / ratio:.6g} or {setup.rate_hz / (ratio + 1):.6g}"
-        what = f"an image every {exact:.4g} cycles cannot be asked for; take {rates} Hz"
-        return ratio, [f"sensor.rate_hz = {array.rate_hz:g}: {what}"]
-    fitting = [count for count in range(1, SYNC_OVERFLOW + 1) if SYNC_OVERFLOW % count == 0]
-    near = sorted(fitting, key=lambda count: abs(count - exact))[:2]
-    rates = " or ".join(f"{setup.rate_hz / count:.6g}" for count in sorted(near))
-    return min(ratio, SYNC_OVERFLOW), [
-        f"sensor.rate_hz = {array.rate_hz:g}: a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC "
-        f"counter runs to {SYNC_OVERFLOW}, so cycle.rate_hz must be 1, 2, 3, 4, 5, 6, 8, … times it; take {rates} Hz"
-    ]
+        return ratio, f"{what}an image every {exact:.4g} cycles cannot be asked for", rates
+    what += f"a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC counter runs to {SYNC_OVERFLOW}, so"
+    return min(ratio, SYNC_OVERFLOW), f"{what} cycle.rate_hz must be 1, 2, 3, 4, 5, 6, 8, … times it", rates

@@ -13,14 +13,12 @@ from canprobe.cell.planning.window import (
 )
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.cell.scene.surface_files import mesh_warnings
+from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.patch.force_errors import UNSTATED
-
-LOCAL_GROUP = "ff11::ca"
-"""A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
 
 
 def _open_to_others(setup: Setup) -> Iterator[str]:

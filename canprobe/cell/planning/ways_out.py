@@ -19,11 +19,18 @@ Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
 """Closes a changed setup, and gives it with the traffic of its fullest bus; None where it does not fit either."""
 
 
-def ways_out(setup: Setup, fit: Fit) -> list[str]:
-    """Changes each of which makes the scene fit, with the load and the longest demand that it leaves."""
+def ways_out(setup: Setup, fit: Fit, sound: Callable[[Setup], bool]) -> list[str]:
+    """Changes each of which makes the scene fit its bus, with the load and the longest demand that it leaves.
+
+    Args:
+        setup: setup whose bus is overloaded.
+        fit: see `Fit`.
+        sound: function of a closed setup: whether the change asks for nothing new elsewhere in the plan.
+    """
     found = []
     for text, changed in (*_changes(setup), *_together(setup, fit), *_quicker(setup, fit), *_slower(setup, fit)):
-        if (fitting := fit(changed)) is not None:
+        fitting = fit(changed)
+        if fitting is not None and sound(fitting[0]):
             closed, traffic = fitting
             peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
             share = f"{peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
@@ -111,11 +118,17 @@ def _slower(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     periods_us = {us for us in range(1000, _SLOWEST_US, 1000)} | {us for us in _DIVISORS_US if us < _SLOWEST_US}
     rates = sorted((float(f"{1e6 / us:.6g}") for us in periods_us), reverse=True)
     for rate in (rate for rate in rates if rate < setup.rate_hz):
-        changed, text = replace(setup, rate_hz=rate), f"cycle.rate_hz = {rate:.6g}"
-        if setup.array is not None:
-            tactile = rate / math.ceil(rate / setup.array.rate_hz)  # the cycle is a multiple
-            changed = changed.changed("array", rate_hz=tactile)
-            text += f" with sensor.rate_hz = {tactile:.6g}" * (tactile != setup.array.rate_hz)
+        images, changed = at_rate(setup, rate)
         if fit(changed) is not None:
-            yield text, changed
+            yield f"cycle.rate_hz = {rate:.6g}{images}", changed
             return
+
+
+def at_rate(setup: Setup, rate: float) -> tuple[str, Setup]:
+    """The setup at another rate of the cycle, Hz, and the rate of images that this asks for, as text."""
+    changed, images = replace(setup, rate_hz=rate), ""
+    if setup.array is not None:
+        tactile = rate / math.ceil(rate / setup.array.rate_hz - 1e-9)  # the cycle is a multiple
+        changed = changed.changed("array", rate_hz=tactile)
+        images = f" with sensor.rate_hz = {tactile:.6g}" * (abs(tactile / setup.array.rate_hz - 1.0) > 1e-5)
+    return images, changed

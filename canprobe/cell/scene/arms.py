@@ -73,7 +73,7 @@ def arm_model(
         settled = {
             limit_warning(arm.urdf, joint)
             for joint, section in zip(found.joints, sections.values(), strict=True)
-            if section.min_deg is not None or section.max_deg is not None
+            if any(stop is not None for stop in _stops(joint, section))
         }
         warnings = tuple(warning for warning in found.warnings if warning not in settled)
     else:
@@ -117,7 +117,8 @@ def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str
     """Refuse a missing or tiny speed limit of the file where the section has none: it was hardly meant."""
     problems = [
         f"{urdf}: joint {joint.name}: expected a velocity in its <limit> of at least {slowest:.3g} {unit}/s, got"
-        f" {joint.qd_max:g}; put it right there, or set joints.{joint.name}.speed_{joint.unit}_s"
+        f" {joint.qd_max:g}; put it right there, or set joints.{joint.name}.speed_{joint.unit}_s; a passive joint, as"
+        " of a delta, has no drive, and its arm is no serial one"
         for joint, section in zip(joints, sections.values(), strict=True)
         for slowest, unit in [(MIN_SPEED_M_S, "m") if joint.prismatic else (MIN_SPEED_RAD_S, "rad")]
         if (section.speed_mm_s if joint.prismatic else section.speed_deg_s) is None and not joint.qd_max >= slowest

@@ -121,7 +121,7 @@ class ArmSettings:
     base: str | None = None
     """Link of the URDF that is the base. Left out: its root."""
     tip: str | None = None
-    """Link of the URDF that is the flange. Left out: the only link without children."""
+    """Link of the URDF that is the flange. Left out: the only link without children that drives can move."""
     convention: Convention = "standard"
     """Denavit-Hartenberg convention of the rows."""
     mount_mm: Vec3 = (0.0, 0.0, 0.0)

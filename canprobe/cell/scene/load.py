@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import re
 import tomllib
 import typing
@@ -22,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from canprobe import __version__
-from canprobe.cell.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
+from canprobe.cell.scene.checks import MAX_NUMBER, MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
 from canprobe.cell.scene.model import DEFAULT_ARRAY, RENAMED_KEYS, TOUCH_KINDS, ArrayFile, CellFile, Scene
 from canprobe.cell.scene.offers import find_offer, offers
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
-from canprobe.errors import PlanError, SceneError, UsageError, regular_file
+from canprobe.errors import PlanError, SceneError, UsageError, did_you_mean, regular_file
 from canprobe.mechanics.robot.urdf import from_urdf
 from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
@@ -336,7 +335,7 @@ def _complain_of_names(reader: Reader, arm: ArmSettings | None, joints: object) 
         names = from_urdf(arm.urdf, arm.base, arm.tip).chain.joints
         for name in joints:
             if name not in names:
-                hint = _did_you_mean(name, names)
+                hint = did_you_mean(name, names)
                 reader.complain(f"joints.{toml_key(name)}", f"no joint of {arm.urdf}{hint}")
 
 
@@ -380,7 +379,7 @@ def find_file(name: str, *kinds: str) -> tuple[Path, str]:
         if (offer := find_offer(kind, name)) is not None:
             return offer.path(), name
     packaged, others = [*packaged_files(f"{kinds[0]}s")], [offer.name for offer in offers(kinds[0])]
-    hint = _did_you_mean(name, packaged + others)
+    hint = did_you_mean(name, packaged + others)
     of_others = f"; of other packages: {', '.join(others)}" if others else ""
     raise SceneError(
         [f"{name}: no such {kinds[0]} or file{hint}; packaged {kinds[0]}s: {', '.join(packaged)}{of_others}"]
@@ -567,7 +566,22 @@ def _with_cell(own: Mapping[str, Any], file: str, folder: Path | None, unused: I
         raise SceneError([f"{file}: cell: expected the name or the path of a cell, got {toml_value(named)}"])
     cell = folder / named if folder is not None and isfile(folder / named) else named
     hardware = {name: table for name, table in load_cell(cell).items() if name not in unused}
+    _refuse_part_of_new_joint(own.get("joints"), hardware.get("joints"), file)
     return _merged(hardware, {name: table for name, table in own.items() if name != "cell"})
+
+
+def _refuse_part_of_new_joint(own: object, of_cell: object, file: str) -> None:
+    """Refuse keys of a joint that the cell has under another name: a joint of its own would state its counts."""
+    if not isinstance(own, dict) or not isinstance(of_cell, dict):
+        return
+    problems = [
+        f"{file}: joints.{toml_key(name)}: the cell has no such joint{did_you_mean(name, of_cell)}; it has"
+        f" {', '.join(of_cell)}"
+        for name, table in own.items()
+        if name not in of_cell and isinstance(table, dict) and not {"counts_per_turn", "counts_per_m"} & set(table)
+    ]
+    if problems:
+        raise SceneError(problems)
 
 
 def _with_array(document: dict[str, Any], folder: Path | None) -> dict[str, Any]:
@@ -670,7 +684,7 @@ class Reader:
         for key in table:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
-                hint = above or _did_you_mean(key, _keys_that_belong(cls, annotations, table))
+                hint = above or did_you_mean(key, _keys_that_belong(cls, annotations, table))
                 self.complain(f"{name}.{key}", f"unknown key{hint}")
         values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
@@ -692,7 +706,8 @@ class Reader:
         try:
             value = convert(raw, annotation)
         except MismatchError as mismatch:
-            hint = _did_you_mean(raw, choices_of(annotation)) if isinstance(raw, str) else ""
+            words = choices_of(annotation)
+            hint = did_you_mean(raw, words) if isinstance(raw, str) else _other_unit(path, raw, annotation)
             return self.complain(path, f"expected {mismatch}, got {toml_value(raw)}{hint}")
         if conditions_of(annotation, ScenePath) and self._folder and isfile(self._folder / value):
             value = self.paths[path] = str((self._folder / value).resolve())
@@ -705,6 +720,33 @@ class Reader:
             self.complain(path, f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
         elif not given and only.required and actual in only.values:
             self.complain(path, f'missing: {only.key} = "{actual}" needs it')
+
+
+_OTHER_UNITS = (
+    ("_mm", 1e3, "metres"),
+    ("_mm_s", 1e3, "m/s"),
+    ("_us", 1e6, "seconds"),
+    ("_ms", 1e3, "seconds"),
+    ("_s", 1e-3, "milliseconds"),
+    ("_kpa", 1e-3, "Pa"),
+    ("_n_m3", 1e9, "N/mm³"),
+    ("_hz", 1e3, "kHz"),
+    ("bitrate", 1e3, "kbit/s"),
+)
+"""End of a key, factor from another usual unit to that of the key, and that unit."""
+
+
+def _other_unit(path: str, raw: object, annotation: Any) -> str:
+    """A hint where a number out of range would be one in another unit; else empty."""
+    if isinstance(raw, bool) or not isinstance(raw, int | float) or not abs(raw) < MAX_NUMBER:
+        return ""
+    for end, factor, unit in _OTHER_UNITS:
+        value = float(f"{raw * factor:.12g}")
+        if re.search(f"(?<!_mm)(?<!_deg)(?<!_nm){end}$", path):
+            with contextlib.suppress(MismatchError):
+                convert(int(value) if value.is_integer() else value, annotation)
+                return f"; did you mean {value:g}, for {raw:g} {unit}?"
+    return ""
 
 
 def _keys_that_belong(cls: type[Any], annotations: Mapping[str, Any], table: Mapping[str, Any]) -> list[str]:
@@ -721,10 +763,4 @@ def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:
     """A hint for an unknown section: the section that has a key of that name, or the nearest section."""
     classes = {name: next(iter(typing.get_args(hint)), hint) for name, hint in sections.items()}
     keys = [f"{name}.{got}" for name, cls in classes.items() if got in getattr(cls, "__dataclass_fields__", {})]
-    return f"; did you mean {' or '.join(keys)}?" if keys else _did_you_mean(got, sections)
-
-
-def _did_you_mean(got: str, known: Iterable[str]) -> str:
-    folded = {word.lower(): word for word in known}
-    close = difflib.get_close_matches(got.lower(), folded, n=1, cutoff=0.5)
-    return f"; did you mean {folded[close[0]]}?" if close else ""
+    return f"; did you mean {' or '.join(keys)}?" if keys else did_you_mean(got, sections)

@@ -39,6 +39,10 @@ if TYPE_CHECKING:
     from canprobe.fieldbus.node.slave_node import SlaveNode
 
 
+ALL_CYCLES_PERCENT = 100
+"""`limits.late_cycles_max_percent` with which late cycles stop nothing."""
+
+
 class Onlooker(Protocol):
     """Somebody who looks on while nodes are served, and says when that ends."""
 
@@ -101,7 +105,7 @@ def emulate(
     array = plan.setup.array
     raw_at = names.get(array.channel, target.channel) if array is not None and array.raw and array.emulated else None
     wanted = ExpectedLink(target.bitrate, data_bitrate(plan.setup.bus))
-    way_out = "end that node, or name others with --nodes"
+    way_out = _where_served(scene) if outlasts else "end that node, or name others with --nodes"
     _make_places(truth_path, store_folder)
     with contextlib.ExitStack() as stack:
         ports: dict[str, Port] = {}
@@ -135,6 +139,19 @@ def emulate(
         finally:
             if truth_path is not None and world.recorder is not None:
                 write_npz(truth_path, world.recorder.columns())
+
+
+def _where_served(scene: Scene) -> str:
+    """What to type where another process serves the nodes that a run was about to serve itself."""
+    keys = [f"{part}.emulated=false" for part in ("arm", "sensor") if getattr(scene, part) is not None]
+    patient = scene.limits.late_cycles_max_percent == ALL_CYCLES_PERCENT
+    if patient and scene.arm is not None:  # the values of --patient, which real nodes refuse
+        keys += [f"arm.missed_syncs={scene.arm.missed_syncs}", f"limits.late_cycles_max_percent={ALL_CYCLES_PERCENT}"]
+    options = " ".join(f"--set {key}" for key in keys)
+    return (
+        "end that node, or, where `canprobe emulate` serves the nodes of this scene, take them as real ones:"
+        f" {'leave out --patient and add ' * patient}{options}"
+    )
 
 
 def emulate_eds(

@@ -9,9 +9,10 @@ from canprobe.cell.scene.hardware import DIRECT
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.real.adapters import SOCKETCAN, check_interface_name
 
 LOCKSTEP = "lockstep"
-VIRTUAL = frozenset({LOCKSTEP, DIRECT})
+VIRTUAL = (LOCKSTEP, DIRECT)
 """Interfaces in this process, in virtual time."""
 
 
@@ -57,6 +58,7 @@ class Target:
         given = (("interface", bus), ("channel", main), ("bitrate", bitrate))
         new = {f"bus.{key}": value for key, value in given if value not in (None, getattr(scene.bus, key))}
         settings = load_scene(scene, new).bus if new else scene.bus
+        check_interface_name(settings.interface, VIRTUAL)
         return cls(settings.interface, settings.channel, settings.bitrate, others)
 
     def applied_to(self, scene: Scene) -> Scene:
@@ -87,7 +89,9 @@ def refuse_virtual(interface: str, command: str) -> None:
     Raises:
         UsageError: when the interface is lockstep or direct.
     """
-    if interface == LOCKSTEP:
-        raise UsageError(f"{command}: a lockstep bus lives inside one run; name a real interface with --bus")
-    if interface == DIRECT:
-        raise UsageError(f"{command}: there is no bus in --bus direct; name a real interface with --bus")
+    if interface in VIRTUAL:
+        what = "a lockstep bus lives inside one run" if interface == LOCKSTEP else "there is no bus in --bus direct"
+        raise UsageError(
+            f"{command}: {what}; name a real one, such as --bus {SOCKETCAN} --channel can0 (`canprobe adapters` lists"
+            " those here)"
+        )

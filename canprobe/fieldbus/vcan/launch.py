@@ -80,7 +80,7 @@ def _check_guest(install: bool) -> int:
             return _no_vcan(
                 f"this kernel has no vcan, and what the guest that would needs is missing; on Debian type:  {line}"
                 f"  elsewhere take a kernel with vcan ({sudo()}modprobe vcan; Ubuntu has it in the package"
-                " linux-modules-extra-$(uname -r)), or --bus udp_multicast --patient"
+                " linux-modules-extra-$(uname -r)), or --bus udp_multicast --channel ff11::ca --patient"
             )
         if not _install(line):
             return _no_vcan(f"this failed:  {line}")

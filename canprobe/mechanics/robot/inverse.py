@@ -2,8 +2,9 @@
 
 A tool's pose has six rows, in this order: position (3), direction of the pole, the tool's z axis (2), and turn about
 the pole (1). Six or more joints hold all six; more than six also stay near a posture. Five joints hold position and
-pole. Fewer hold the position, and the pole is what follows from it. `task_rows` gives the number for a model, `in_rows`
-takes those rows out of a Jacobian or a twist; tasks and planning use both.
+pole, unless the last of them only rolls about the pole. Fewer hold the position, and the pole is what follows from it.
+`task_rows` gives the number for a model, `in_rows` takes those rows out of a Jacobian or a twist; tasks and planning
+use both.
 
 `inverse_near` finds the joints for a pose, starting from a known posture and within the joint limits
 (Levenberg-Marquardt). It stays on the branch of that posture, as an arm that moves there does. Why not a closed form:
@@ -26,6 +27,8 @@ from canprobe.mechanics.types import Floats
 
 ERROR_LENGTH_M = 0.2
 """Length by which linear rows are divided to compare with angular ones, m: about the length of a link."""
+_ROLL_COSINE = 0.999
+"""Cosine of the angle between the axis of the last joint and the pole from which that joint only rolls: 2.6°."""
 FULL_POSE, FIXED_POLE = 6, 3
 """Rows of an arm that holds a whole pose, and of one that holds the position alone."""
 
@@ -33,17 +36,22 @@ FULL_POSE, FIXED_POLE = 6, 3
 def task_rows(model: ArmModel) -> int:
     """Number of rows of a tool's pose that an arm can hold, by its number of joints.
 
-    It stops being true where the geometry wastes a joint: five joints of which the last one rolls about the pole cannot
-    lean it sideways. Such poses are out of reach of `inverse_near`, and `damped_step` is damped as near singular poses.
+    It stops being true where the geometry wastes a joint in another way than by `rolls_last`. Such poses are out of
+    reach of `inverse_near`, and `damped_step` is damped as near singular poses.
 
     Args:
         model: the arm.
 
     Returns:
-        6 for six joints or more (position, pole and the turn about it), 5 for five (position and pole), 3 for fewer
-        (position).
+        6 for six joints or more (position, pole and the turn about it), 5 for five (position and pole), 3 for fewer,
+        and for five of which the last one only rolls (position).
     """
-    return 6 if model.n >= 6 else 5 if model.n == 5 else 3
+    return 6 if model.n >= 6 else 5 if model.n == 5 and not rolls_last(model) else 3
+
+
+def rolls_last(model: ArmModel) -> bool:
+    """Whether the last joint turns about the flange's z axis, the pole of a probe, which it then cannot tilt."""
+    return not model.joints[-1].prismatic and abs(float(model.chain.T_last_flange[2, 2])) > _ROLL_COSINE
 
 
 def in_rows(rows: int, R_base_tool: Floats, six: Floats) -> Floats:

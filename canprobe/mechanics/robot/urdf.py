@@ -20,8 +20,10 @@ from canprobe.mechanics.robot.chain import MAX_JOINTS, Chain
 from canprobe.mechanics.robot.model import Body, Joint, lopsided_inertia
 from canprobe.mechanics.robot.urdf_tree import UrdfTree, source_name, z_along
 
-MAX_STOP_RAD = 4 * math.pi
-"""Largest stop of a revolute joint that does not look like one in degrees, rad."""
+MAX_STOP_RAD, MAX_STOP_M = 4 * math.pi, 5.0
+"""Largest stop of a joint that does not look like one in degrees, rad, or in millimetres, m."""
+MAX_REACH_M = 20.0
+"""Largest sum of the distances between joints that does not look like one in millimetres, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +52,7 @@ def from_urdf(
     Args:
         source: path of the file, or its text.
         base: link that is the base frame; the root by default.
-        tip: link whose frame is the flange; the only link without children by default.
+        tip: link whose frame is the flange; by default the only link without children that drives can move.
         name: name of the arm; by default that of the robot.
 
     Raises:
@@ -58,7 +60,8 @@ def from_urdf(
             drive, or `Chain` refuses the result.
     """
     tree = UrdfTree.read(source)
-    path = tree.path(base or tree.root(), tip or tree.only_end())
+    base = base or tree.root()
+    path = tree.path(base, tip or tree.only_end(base))
     moving = [edge for edge in path if edge.kind != "fixed"]
     if len(moving) > MAX_JOINTS:
         raise PlanError(
@@ -90,6 +93,12 @@ def from_urdf(
         T_last_flange=T,
     )
     warnings = [limit_warning(source, joint) for joint in joints]
+    reach = sum(float(np.linalg.norm(T[:3, 3])) for T in (*places, T))
+    if reach > MAX_REACH_M:
+        warnings.append(
+            f"{tree.where}: its origins from {base} to {path[-1].child} add up to {reach:.0f} m, which looks like"
+            " millimetres; a URDF is in metres: divide them by 1000"
+        )
     for edge, body in zip(moving, bodies, strict=True):
         if body is not None and (why := lopsided_inertia(body.tensor)) is not None:
             warnings.append(f"{tree.where}: link {edge.child}, with what it carries: no body has {why}; correct it")
@@ -97,15 +106,16 @@ def from_urdf(
 
 
 def limit_warning(source: str | Path, joint: Joint) -> str | None:
-    """A warning about the stops of a joint if they look like degrees; else None.
+    """A warning about the stops of a joint if they look like degrees or millimetres; else None.
 
     Args:
         source: path of the file, or its text.
         joint: as `from_urdf` read it.
     """
-    if joint.prismatic or max(-joint.q_min, joint.q_max) <= MAX_STOP_RAD:
+    most, unit, looks = (MAX_STOP_M, "m", "millimetres") if joint.prismatic else (MAX_STOP_RAD, "rad", "degrees")
+    if max(-joint.q_min, joint.q_max) <= most:
         return None
     return (
-        f"{source_name(source)}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} rad looks like degrees;"
-        " correct it, or set min_deg and max_deg of the joint"
+        f"{source_name(source)}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} {unit} looks like"
+        f" {looks}; correct it, or set min_{joint.unit} and max_{joint.unit} of the joint"
     )

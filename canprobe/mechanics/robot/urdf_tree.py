@@ -117,14 +117,27 @@ class UrdfTree:
             raise PlanError([f"{self.where}: expected one <link> that hangs on no other, got {got}"])
         return roots[0]
 
-    def only_end(self) -> str:
-        """The only link that carries no other; several are an error that names those that a joint moves."""
+    def only_end(self, base: str) -> str:
+        """The only link without children, or of several the only one that drives can move from a base.
+
+        Raises:
+            PlanError: it has to be chosen; the message names those that drives can move.
+        """
         parents = {edge.parent for edge in self.into.values()}
         ends = [link for link in self.links if link not in parents]
-        moved = [link for link in ends if any(edge.kind != "fixed" for edge in self.path(self.root(), link))]
-        if len(ends) != 1:
+        if len(ends) == 1:
+            return ends[0]
+        moved = [link for link in ends if self._can_be_driven(base, link)]
+        if len(moved) != 1:
             raise PlanError([f"{self.where}: name the tip (--tip LINK, or arm.tip): one of {', '.join(moved or ends)}"])
-        return ends[0]
+        return moved[0]
+
+    def _can_be_driven(self, base: str, tip: str) -> bool:
+        """Whether a joint moves a link, and drives can move every joint on the way to it."""
+        try:
+            return any([self.joint(edge) for edge in self.path(base, tip) if edge.kind != "fixed"])
+        except PlanError:
+            return False
 
     def path(self, base: str, tip: str) -> list[UrdfEdge]:
         """The joints from base to tip."""

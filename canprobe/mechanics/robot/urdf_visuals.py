@@ -55,7 +55,7 @@ def visuals_of(source: str | Path, base: str | None = None, tip: str | None = No
     """
     tree = UrdfTree.read(source)
     start = base or tree.root()
-    path = tree.path(start, tip or tree.only_end())
+    path = tree.path(start, tip or tree.only_end(start))
     names = {edge.name for edge in path}
     found = list(_visuals(tree, 0, start, names, np.eye(4)))
     for number, edge in enumerate((edge for edge in path if edge.kind != "fixed"), start=1):

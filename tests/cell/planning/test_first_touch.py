@@ -84,7 +84,7 @@ def test_the_force_at_a_depth_is_the_integral_of_the_pressure_and_never_below_it
 def test_taxels_that_do_not_show_the_force_are_refused_and_the_way_out_is_one(sensor):
     said = problem_of(press(MAT | {"full_scale_kpa": 100.0} | sensor, force_n=2.0, limit_n=12.0))
     assert said.startswith(f"sensor.pitch_mm = {sensor['pitch_mm']:g}, sensor.full_scale_kpa = ")
-    forces, pitches = re.findall(r"task.force_n = ([\d.]+)", said), re.findall(r"an array with ([\d.]+) mm", said)
+    forces, pitches = re.findall(r"task.force_n = ([\d.]+)", said), re.findall(r"or sensor.pitch_mm = ([\d.]+)", said)
     if forces[1:]:
         assert make_plan(
             resolve(press(MAT | {"full_scale_kpa": 100.0} | sensor, force_n=float(forces[1]), limit_n=12.0))

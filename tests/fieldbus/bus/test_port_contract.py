@@ -209,7 +209,7 @@ def test_a_missing_interface_is_named(interface: str, channel: str, message: str
     ("interface", "message"),
     [
         ("lockstep", "can0: a lockstep bus lives inside one run"),
-        ("virtuel", "can0: no interface 'virtuel'.*python-can has: .*virtual"),
+        ("virtuel", "no interface 'virtuel'; did you mean virtual.*python-can has: .*virtual"),
     ],
 )
 def test_an_interface_that_there_cannot_be_is_wrong_usage(interface: str, message: str) -> None:

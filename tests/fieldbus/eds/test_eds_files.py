@@ -365,7 +365,7 @@ def test_names_and_paths(tmp_path):
 @pytest.mark.parametrize(
     "source, node_id, words",
     [
-        ("puma260_joints", 1, ("puma260_joints", "did you mean 'puma260_joint'")),
+        ("puma260_joints", 1, ("puma260_joints", "did you mean puma260_joint?")),
         ("xyz", 1, ("xyz", "puma260_joint, tactile_array")),
         ("/nowhere/x.eds", 1, ("/nowhere/x.eds", "no such file")),
         ("puma260_joint", 0, ("node id 0", "1..127")),

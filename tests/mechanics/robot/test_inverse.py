@@ -1,6 +1,7 @@
 """Inverse kinematics of arms of 3 to 8 joints: it comes back to the posture, and says what it cannot reach."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.damped_inverse import damped_step
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
-from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, task_rows
+from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, rolls_last, task_rows
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.robot.remaining_drives import lifting_step
@@ -324,3 +325,20 @@ def test_drives_of_other_arms_make_the_move_too(model):
     units = lifting_step(model, J[:3], MOVE, np.ones(model.n, bool))
     after = units_to_joints(model, joints_to_units(model, q) + units)
     assert pose(model, after)[:3, 3] - T[:3, 3] == pytest.approx(MOVE, abs=2e-3 * np.linalg.norm(MOVE))
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 180.0])
+def test_five_joints_of_which_the_last_rolls_hold_the_position_alone(tilt_deg):
+    """A roll about the pole turns nothing of position and pole: the others hold what four joints hold."""
+    chain = five().chain
+    flange = np.eye(4)
+    flange[1:3, 1:3] = math.cos(math.radians(tilt_deg)) * np.eye(2)
+    flange[2, 3] = 0.1
+    model = model_of(replace(chain, T_last_flange=flange))
+    q = np.array((0.3, 0.5, -0.7, 0.4, 1.0))
+    assert rolls_last(model) and task_rows(model) == 3 and task_rows(five()) == 5
+    T = pose(model, q)
+    T[:3, 3] += (0.01, -0.02, 0.015)
+    found = inverse_near(model, T, TOOL, q)
+    assert pose(model, found)[:3, 3] == pytest.approx(T[:3, 3], abs=1e-9)
+    assert found[4] == pytest.approx(q[4]), "the roll stays where it was"

@@ -221,7 +221,8 @@ def test_soft_limits_narrow_the_range():
 def test_limits_that_look_like_degrees_are_warned_of():
     (warning,) = from_urdf(PLAIN.replace('upper="2"', 'upper="170"')).warnings
     assert "j: <limit> from -1 to 170 rad looks like degrees" in warning
-    assert from_urdf(robot(joint("j", "a", "b", "prismatic", LIMIT.replace('"2"', '"170"')))).warnings == ()
+    (warning,) = from_urdf(robot(joint("j", "a", "b", "prismatic", LIMIT.replace('"2"', '"170"')))).warnings
+    assert "j: <limit> from -1 to 170 m looks like millimetres" in warning
 
 
 def test_moments_that_no_body_has_are_warned_of_as_they_can_be_moved():

@@ -6,7 +6,6 @@ A frame costs some 10 µs; for SocketCAN use `canprobe.fieldbus.bus.real.socketc
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 from collections import deque
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from typing import Any
 
 import can
 
-from canprobe.errors import InterfaceError, UsageError, install_line
+from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.port import (
     ERR_BUS,
@@ -26,6 +25,7 @@ from canprobe.fieldbus.bus.port import (
     TimedFrame,
     state_after,
 )
+from canprobe.fieldbus.bus.real.adapters import backend_channel, check_interface_name, open_failure
 from canprobe.fieldbus.bus.real.echoes import Echoes
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
@@ -164,29 +164,20 @@ class PythonCanPort(PlainPort):
         self._reports.error_frame(can_id, data, t_ns)
 
 
-def interface_names() -> list[str]:
-    """The interfaces that python-can knows."""
-    return sorted(can.VALID_INTERFACES)
-
-
 def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.CRITICAL)
-    if interface not in (names := interface_names()):
-        raise UsageError(f"{channel}: no interface {interface!r}; python-can has: {', '.join(names)}")
-    options: dict[str, Any] = {"interface": interface, "channel": channel, "bitrate": bitrate}
+    check_interface_name(interface)
+    given = backend_channel(interface, channel)
+    options: dict[str, Any] = {"interface": interface, "channel": given, "bitrate": bitrate}
     if data_bitrate is not None:
         options |= {"fd": True, "data_bitrate": data_bitrate}
         if interface == "virtual":
             options = {**options, "protocol": can.CanProtocol.CAN_FD}
     try:
         return can.Bus(**options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
-        missing = interface == "udp_multicast" and importlib.util.find_spec("msgpack") is None
-        way = f": {install_line('can')}" if missing else ""
-        raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}{way}") from error
     except Exception as error:  # where the library of a driver is missing, python-can raises anything
-        why = f"is its driver installed? python-can says {type(error).__name__}: {error}"
-        raise InterfaceError(f"{channel}: {interface} cannot be opened; {why}") from error
+        why = open_failure(interface, channel, error)
+        raise InterfaceError(f"{channel}: {interface} cannot be opened: {why}") from error
 
 
 def _message(channel: str, can_id: int, data: bytes, fd: bool) -> can.Message:

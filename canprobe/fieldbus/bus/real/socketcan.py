@@ -426,15 +426,15 @@ def check_interface(channel: str, setting: str | None = None) -> None:
     """
     if not has_socketcan():
         raise InterfaceError(
-            f"{channel}: this kernel has no SocketCAN (AF_CAN); without it run on --bus lockstep (virtual time) or"
-            " --bus udp_multicast --channel 239.74.163.2 --patient (real time), or run COMMAND with a real vcan0 in a"
-            " virtual machine: canprobe vcan -- COMMAND"
+            f"{channel}: this kernel has no SocketCAN (AF_CAN); a virtual machine with a real vcan0 runs any COMMAND:"
+            " canprobe vcan -- COMMAND; without one `canprobe run` takes --bus lockstep (virtual time), and `canprobe"
+            " adapters` shows what else works here"
         )
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:
             flags = struct.unpack("=16sH14x", fcntl.ioctl(probe, _SIOCGIFFLAGS, _ifreq(channel)))[1]
         except OSError as error:
-            raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
+            raise InterfaceError(f"{channel}: no such interface; {how_to_make(channel)}") from error
         try:
             probe.bind((channel,))
         except OSError as error:
@@ -449,7 +449,7 @@ def _check_fd(channel: str, setting: str) -> None:
         try:
             mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
         except OSError as error:
-            raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
+            raise InterfaceError(f"{channel}: no such interface; {how_to_make(channel)}") from error
     if mtu < FD_MTU_BYTES:
         raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
 
@@ -465,10 +465,11 @@ def _down(channel: str, setting: str) -> InterfaceError:
     return InterfaceError(f"{channel}: interface is down; type: {setting}")
 
 
-def _how_to_make(channel: str) -> str:
+def how_to_make(channel: str) -> str:
+    """What to type where an interface is missing."""
     if channel.startswith("vcan"):
         return f"type: {sudo()}ip link add dev {channel} type vcan && {setting_line(channel, 1_000_000)}"
-    return "is the adapter plugged in? The interfaces there are: ip -br link show type can"
+    return "is the adapter plugged in? `canprobe adapters` lists the interfaces that there are"
 
 
 def _open(channel: str, only: Sequence[tuple[int, int]] | None = None, *, fd: bool) -> socket.socket:

@@ -1,0 +1,299 @@
+"""CAN adapters and the interfaces of python-can that reach them: what each needs, how its channels are written, and
+which are here.
+
+`BACKENDS` is the one table of that. Errors of a port that cannot be opened take their lines to type from it, and
+`canprobe adapters` prints it. Interfaces of python-can that are not in it work all the same; what they lack is what
+python-can says.
+
+On Linux most adapters (PEAK, Kvaser, candleLight, 8devices, Microchip) have a driver in the kernel, and are `socketcan`
+interfaces then: the libraries of their makers are for other systems, or for functions that the kernel's driver lacks.
+
+Source: python-can 4.6, manual, "Hardware Interfaces", and the modules of `can.interfaces`.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib
+import importlib.util
+import logging
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from canprobe.errors import UsageError, did_you_mean, package_line
+from canprobe.fieldbus.bus.real.link import missing_ip, read_link, setting_line, sudo
+from canprobe.fieldbus.bus.real.socketcan import has_socketcan, how_to_make
+
+LOCAL_GROUP = "ff11::ca"
+"""A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
+SOCKETCAN = "socketcan"
+_WHERE_SHOWN = "`canprobe adapters` shows what works here"
+_ARPHRD_CAN = "280"
+_NET_FOLDER, _DEVICE_FOLDER = Path("/sys/class/net"), Path("/dev")
+_USB_SERIAL = ("ttyACM*", "ttyUSB*")
+
+
+@dataclass(frozen=True, slots=True)
+class Backend:
+    """One interface of python-can.
+
+    Attributes:
+        hardware: adapters that it reaches, for people.
+        channel: form of its channels, for people.
+        example: one of its channels.
+        package: import name of the Python package that it needs; None where python-can alone does.
+        extra: extra of python-can that installs this package.
+        driver: driver or library that it needs, for people, with where it comes from; None where none is needed.
+        library: name of that library for the dynamic linker; None where none can be looked for.
+        windows: whether it exists on Windows only.
+        indexed: whether its channels are numbers.
+        module: driver of the Linux kernel for the same adapters, which are `socketcan` interfaces then.
+    """
+
+    hardware: str
+    channel: str
+    example: str
+    package: str | None = None
+    extra: str | None = None
+    driver: str | None = None
+    library: str | None = None
+    windows: bool = False
+    indexed: bool = False
+    module: str | None = None
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What it lacks here, each with the line to type or the place to get it."""
+        lacks = []
+        if self.windows and sys.platform != "win32":
+            lacks.append(f"{self.driver} is for Windows only")
+        if self.package is not None and importlib.util.find_spec(self.package) is None:
+            lacks.append(f"the package {self.package} is not installed; type: {package_line(self.required)}")
+        if self.library is not None and ctypes.util.find_library(self.library) is None:
+            lacks.append(f"{self.driver} is not installed")
+        if lacks and self.module is not None and sys.platform == "linux":
+            lacks.append(f"the kernel's own driver {self.module} makes it an interface of --bus {SOCKETCAN}")
+        return tuple(lacks)
+
+    @property
+    def required(self) -> str:
+        """The requirement that installs its package, for pip."""
+        return f"python-can[{self.extra}]"
+
+
+BACKENDS: Mapping[str, Backend] = {
+    SOCKETCAN: Backend("adapters with a driver in the Linux kernel; vcan", "name of the interface", "can0"),
+    "pcan": Backend(
+        "PEAK PCAN",
+        "name of the channel in PCAN-Basic",
+        "PCAN_USBBUS1",
+        driver="PCAN-Basic of peak-system.com",
+        library="PCANBasic" if sys.platform == "win32" else "pcanbasic",
+        module="peak_usb",
+    ),
+    "kvaser": Backend(
+        "Kvaser",
+        "number, from 0",
+        "0",
+        driver="CANlib of kvaser.com",
+        library="canlib32" if sys.platform == "win32" else "canlib",
+        indexed=True,
+        module="kvaser_usb",
+    ),
+    "ixxat": Backend(
+        "HMS Ixxat", "number, from 0", "0", driver="the VCI 4 driver of ixxat.com", windows=True, indexed=True
+    ),
+    "vector": Backend(
+        "Vector VN, CANcase", "number, from 0", "0", driver="the XL Driver Library of vector.com", windows=True
+    ),
+    "slcan": Backend(
+        "CANable (slcan firmware), USBtin, Lawicel: a serial line",
+        "serial port",
+        "/dev/ttyACM0",
+        package="serial",
+        extra="serial",
+    ),
+    "gs_usb": Backend(
+        "candleLight, CANable (candleLight firmware), CANtact, by USB",
+        "number, from 0",
+        "0",
+        package="gs_usb",
+        extra="gs-usb",
+        driver=f"libusb ({sudo()}apt-get install -y libusb-1.0-0)",
+        library="usb-1.0",
+        indexed=True,
+        module="gs_usb",
+    ),
+    "usb2can": Backend(
+        "8devices USB2CAN",
+        "serial number of the device",
+        "ED000200",
+        driver="usb2can.dll of 8devices",
+        windows=True,
+        module="usb_8dev",
+    ),
+    "serial": Backend(
+        "python-can's own serial protocol", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"
+    ),
+    "seeedstudio": Backend("Seeed USB-CAN analyzer", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"),
+    "robotell": Backend("Robotell USB-CAN", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"),
+    "cantact": Backend("CANtact", "number, from 0", "0", package="cantact", extra="cantact", indexed=True),
+    "canalystii": Backend("CANalyst-II", "number, from 0", "0", package="canalystii", extra="canalystii"),
+    "neovi": Backend("Intrepid neoVI, ValueCAN", "number, from 1", "1", package="ics", extra="neovi", indexed=True),
+    "udp_multicast": Backend(
+        "none: processes on this machine or network", "multicast address", LOCAL_GROUP, "msgpack", "multicast"
+    ),
+    "virtual": Backend("none: within one process", "any name", "vcan0"),
+}
+"""Interface of python-can → what reaches it, the usual ones first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Adapter:
+    """One channel that was found here.
+
+    Attributes:
+        interface: interface of python-can.
+        channel: its channel.
+        state: its state, for people.
+        is_up: whether it can be opened as it is.
+        type_next: line to type next.
+    """
+
+    interface: str
+    channel: str
+    state: str
+    is_up: bool
+    type_next: str
+
+
+def interface_names() -> list[str]:
+    """The interfaces that python-can knows, those of other packages included."""
+    import can  # here, as python-can is loaded only where a bus is opened
+
+    return sorted(can.VALID_INTERFACES)
+
+
+def check_interface_name(name: str, own: Iterable[str] = ()) -> None:
+    """Return if python-can has an interface of this name.
+
+    Args:
+        name: name of the interface.
+        own: buses of the caller that are none of python-can's.
+
+    Raises:
+        UsageError: it has none; the message has what was probably meant, and all names.
+    """
+    if name in BACKENDS or name in (own := tuple(own)):
+        return
+    if name in (known := interface_names()):
+        return
+    mine = f"canprobe has {' and '.join(own)} (for `run`), and " if own else ""
+    raise UsageError(
+        f"no interface {name!r}{did_you_mean(name, [*own, *known], 0.6)}; {mine}python-can has: {', '.join(known)};"
+        f" {_WHERE_SHOWN}"
+    )
+
+
+def backend_channel(interface: str, channel: str) -> str | int:
+    """A channel as its interface takes it.
+
+    Raises:
+        UsageError: the interface numbers its channels, and this is no number.
+    """
+    backend = BACKENDS.get(interface)
+    if backend is None or not backend.indexed:
+        return channel
+    if not channel.isdecimal():
+        raise UsageError(
+            f"{interface}: its channels are numbers: expected --channel {backend.example}, for example, got {channel}"
+            + "".join(f"; {lacking}" for lacking in (*backend.missing, _WHERE_SHOWN))
+        )
+    return int(channel)
+
+
+def open_failure(interface: str, channel: str, error: Exception) -> str:
+    """Why an interface cannot be opened: what it lacks here, else how its channels are written, else python-can's word.
+
+    Args:
+        interface: interface of python-can.
+        channel: channel that was asked for.
+        error: what python-can raised; where the library of a driver is missing, that is anything.
+    """
+    backend = BACKENDS.get(interface)
+    if backend is not None and (missing := backend.missing):
+        return f"{'; '.join(missing)}; {_WHERE_SHOWN}"
+    said = f"python-can says {type(error).__name__}: {error}"
+    if backend is None:
+        return f"is its driver installed? {said}"
+    return f"--channel takes a {backend.channel}, such as {backend.example}; {said}"
+
+
+def find_adapters() -> list[Adapter]:
+    """The channels that this machine has, those of the kernel first."""
+    return [*_kernel_interfaces(), *_detected(), *_serial_ports()]
+
+
+def _kernel_interfaces() -> list[Adapter]:
+    if not has_socketcan() or not _NET_FOLDER.is_dir():
+        return []
+    types = {path.parent.name: path.read_text().strip() for path in sorted(_NET_FOLDER.glob("*/type"))}
+    return [_kernel_interface(name) for name, number in types.items() if number == _ARPHRD_CAN]
+
+
+def _kernel_interface(name: str) -> Adapter:
+    link = read_link(name)
+    if link is None:  # no `ip`
+        return Adapter(SOCKETCAN, name, "state unknown", False, missing_ip() or setting_line(name, 1_000_000))
+    if not link.is_up:
+        return Adapter(SOCKETCAN, name, "down", False, setting_line(name, link.bitrate or 1_000_000))
+    parts = ["up", f"{link.bitrate} bit/s" if link.bitrate else link.kind, link.state]
+    return Adapter(SOCKETCAN, name, ", ".join(filter(None, parts)), True, _scan_line(SOCKETCAN, name))
+
+
+def _detected() -> list[Adapter]:
+    """Channels of makers' drivers, as python-can finds them."""
+    import can
+
+    logging.getLogger("can").setLevel(logging.CRITICAL)
+    asked = [name for name, one in BACKENDS.items() if one.driver is not None and not one.missing]
+    found: list[Any] = list(can.detect_available_configs(interfaces=asked)) if asked else []
+    rows = [(str(one["interface"]), str(one["channel"])) for one in found]
+    if "gs_usb" in asked:
+        rows += [("gs_usb", str(number)) for number in range(_gs_usb_devices())]
+    return [Adapter(*row, "found", True, _scan_line(*row)) for row in rows]
+
+
+def _gs_usb_devices() -> int:
+    try:
+        return len(importlib.import_module("gs_usb.gs_usb").GsUsb.scan())
+    except Exception:  # whatever libusb says: then there is none that can be opened
+        return 0
+
+
+def _serial_ports() -> list[Adapter]:
+    """Serial ports by USB, each of which may be an slcan adapter."""
+    ports = sorted(str(path) for pattern in _USB_SERIAL for path in _DEVICE_FOLDER.glob(pattern))
+    lacks = BACKENDS["slcan"].missing
+    state = "a serial port; whether an adapter is behind it only opening it shows"
+    return [
+        Adapter("slcan", port, state, not lacks, lacks[0] if lacks else _scan_line("slcan", port)) for port in ports
+    ]
+
+
+def _scan_line(interface: str, channel: str) -> str:
+    return f"canprobe scan --bus {interface} --channel {channel}"
+
+
+def missing_here(interface: str) -> tuple[str, ...]:
+    """What an interface of the table lacks on this machine, each with what to type."""
+    if interface != SOCKETCAN:
+        return BACKENDS[interface].missing
+    if not has_socketcan():
+        return ("this kernel has no SocketCAN; a vcan0 in a virtual machine: canprobe vcan -- COMMAND",)
+    if not _kernel_interfaces():
+        return (f"no interface; a virtual one: {how_to_make('vcan0').removeprefix('type: ')}",)
+    return ()
