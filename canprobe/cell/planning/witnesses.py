@@ -11,8 +11,8 @@ import math
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.pdos import TORQUE
 from canprobe.cell.scene.setup import Calibrate, Probe, Touch
-from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.depth_witness import CERTAIN_SIGMAS, SUSPECT_S, sigma_ahead
+from canprobe.mechanics.touch.stops import depth_on_plane
 
 STEADY_S = 0.25
 """Time of an approach after which the torques without a contact are known, s."""
@@ -74,7 +74,7 @@ def _torques(plan: Plan, touch: Touch | Calibrate) -> str:
 
 def _depth(probe: Probe, force: float) -> float:
     """Depth at a force, N, on a plane at the stated stiffness, m."""
-    return float(indentation_from_force(force, probe.stiffness, probe.radius, (0.0, 0.0)))
+    return depth_on_plane(force, probe.stiffness, probe.radius)
 
 
 def _force(probe: Probe, depth: float) -> float:

@@ -51,12 +51,12 @@ from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.tool_calibration import ball_approaches
-from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
 from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 from canprobe.mechanics.touch.servo import SurfaceGains
+from canprobe.mechanics.touch.stops import depth_on_plane
 from canprobe.mechanics.touch.strategies import Rectangle, make_strategy
 
 LAYER_STIFFNESS = 1.27e8
@@ -306,8 +306,7 @@ SEARCH = 8e-3
 
 def _blind_search(scene: Scene, probe: Probe) -> float:
     """Way beyond the expected place, m, on which a plane is pressed with the limit of the force and no more."""
-    way = float(indentation_from_force(scene.limits.force_max_n, probe.stiffness, probe.radius, (0.0, 0.0)))
-    return min(SEARCH, way)
+    return min(SEARCH, depth_on_plane(scene.limits.force_max_n, probe.stiffness, probe.radius))
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:

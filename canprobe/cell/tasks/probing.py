@@ -24,6 +24,7 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.depth_witness import DepthWitness
+from canprobe.mechanics.touch.pad import FLAT_RADIUS_M
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S, ArcMotion, LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
@@ -47,6 +48,9 @@ class Phase(IntEnum):
 
 COMING = (Phase.MOVE, Phase.APPROACH, Phase.SETTLE)
 """Phases in which the probe comes from free space: the way that it has taken leads off what it touches."""
+
+
+_IN_CONTACT = (Phase.SETTLE, Phase.SCAN, Phase.REGAIN)
 
 
 class ProbingTask(Task):
@@ -77,6 +81,7 @@ class ProbingTask(Task):
         self._touch = TouchState(limits_of(plan))
         self.depth = self._touch.depth = DepthWitness(sensing.radius, holds=holds)
         self._drives_witness = reports_torque(plan)
+        self._follows_depth = plan.setup.probe.radius < FLAT_RADIUS_M  # a flat pad has no foot on the object
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
         self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
@@ -163,6 +168,8 @@ class ProbingTask(Task):
         normal = contact.n_base if contact is not None else None
         touch.look(sample, patch, centre, sensing.image_sigma if contact is not None else None)
         self.array_alive = self.array_alive or touch.images.seen_alive
+        if not self._follows_depth or self.phase not in _IN_CONTACT:
+            return
         if centre is None or patch.saturated or patch.off_pad:
             return  # of a force that is only a lower bound no depth follows
         t_s, limit = sample.t_sample_ns * 1e-9, self._setup.limits.force_max

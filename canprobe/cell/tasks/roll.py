@@ -106,6 +106,7 @@ class RollTask(ProbingTask):
         self, plan: Plan, task: Touch, sensing: ContactSensing, presses: Sequence[Press], radius: float, rest_s: float
     ) -> None:
         super().__init__(plan, task.lag_s, sensing)
+        self._follows_depth = False  # what is calibrated here is the very force that a depth would contradict
         self.pressed: list[RollRecord] = []
         self.unloaded: list[NDArray[np.uint8]] = []
         self._approach_of = task.approach

@@ -32,6 +32,17 @@ MIN_REST_SAMPLES = 10
 """Least number of samples that are judged."""
 
 
+def depth_on_plane(force: float, stiffness: float, radius: float) -> float:
+    """Indentation of the layer of a sphere on a plane, m: `F = π k R δ²`.
+
+    Args:
+        force: N.
+        stiffness: K/h of the layer, N/m³.
+        radius: radius of the sphere, m.
+    """
+    return math.sqrt(force / (math.pi * stiffness * radius))
+
+
 class AtRest:
     """Spread and saturation from running means (Welford): constant time and memory."""
 
