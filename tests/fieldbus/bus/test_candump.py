@@ -120,7 +120,7 @@ PCAP = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 227)
         ("x.pcapng", b"\n\r\r\n\x1c\0\0\0", "a capture of Wireshark (pcapng), not a candump log; type: tshark -r"),
         (
             "x.log.gz",
-            gzip.compress(b"(1.000000) can0 123#00\n"),
+            gzip.compress(b"(1.000000) can0 123#00\n", mtime=0),
             "compressed by gzip, not a candump log; type: zcat < ",
         ),
         ("x.log.xz", lzma.compress(b"(1.000000) can0 123#00\n"), "compressed by xz, not a candump log; type: xzcat < "),
@@ -137,7 +137,7 @@ def test_a_file_of_another_kind_is_named_as_what_it_is(tmp_path: Path, name: str
 
 def test_the_way_out_of_a_compressed_log_works_as_it_is_typed(tmp_path: Path) -> None:
     path = tmp_path / "my log.gz"
-    path.write_bytes(gzip.compress(b"(1.000000) can0 123#00\n"))
+    path.write_bytes(gzip.compress(b"(1.000000) can0 123#00\n", mtime=0))
     with pytest.raises(UsageError) as raised:
         list(read_candump(path))
     subprocess.run(str(raised.value).rpartition("type: ")[2], shell=True, check=True, cwd=tmp_path)
