@@ -221,6 +221,53 @@ class Controller:
         return ()
 
 
+class WrappingController(Controller):
+    """Base of controllers that step another one: what it and the cell tell each other of the array passes through.
+
+    Attributes:
+        inner: the controller that is stepped; None while there is none.
+    """
+
+    inner: Controller | None = None
+    _alive = False
+
+    @property
+    def array_alive(self) -> bool:
+        """Whether an image of the array has changed since bring-up."""
+        return self._alive if self.inner is None else self.inner.array_alive
+
+    @array_alive.setter
+    def array_alive(self, alive: bool) -> None:
+        self._alive = alive
+        if self.inner is not None:
+            self.inner.array_alive = alive
+
+    @property
+    def array_blind(self) -> str | None:
+        """Why the controller does not believe the array any more."""
+        return None if self.inner is None else self.inner.array_blind
+
+    @array_blind.setter
+    def array_blind(self, why: str | None) -> None:
+        if self.inner is not None:
+            self.inner.array_blind = why
+
+    @property
+    def reader(self) -> SampleReader | None:
+        """The reader of the other controller's samples."""
+        return None if self.inner is None else self.inner.reader
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """The remarks of the other controller."""
+        return () if self.inner is None else self.inner.remarks
+
+    @property
+    def restarts(self) -> int:
+        """How often the other controller's estimator started again."""
+        return 0 if self.inner is None else self.inner.restarts
+
+
 class _Function(Controller):
     """A plain function as a controller."""
 

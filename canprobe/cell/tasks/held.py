@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.controller import Command, Controller, Measurement, WrappingController
 from canprobe.cell.master.trail import TakenWay
 from canprobe.mechanics.robot.model import Joint
 from canprobe.mechanics.types import Floats
@@ -44,7 +44,7 @@ class LastPlace:
         )
 
 
-class HeldTask(Controller):
+class HeldTask(WrappingController):
     """Holds the arm until motion is asked for, then steps another controller.
 
     Args:
@@ -61,7 +61,7 @@ class HeldTask(Controller):
         asked: Callable[[], bool] | None,
         resumed: Callable[[], None] = lambda: None,
     ) -> None:
-        self._controller = controller
+        self.inner: Controller = controller
         self._place = place
         self._asked, self._resumed = asked, resumed
         self.held = asked is not None
@@ -70,41 +70,36 @@ class HeldTask(Controller):
     def inspect(self, q: Floats) -> str | None:
         """Refuse an arm that stands elsewhere than before the loss."""
         elsewhere = self._place.difference(q) if self._place is not None else None
-        return elsewhere if elsewhere is not None else self._controller.inspect(q)
+        return elsewhere if elsewhere is not None else self.inner.inspect(q)
 
     def step(self, measurement: Measurement) -> Command:
         """Hold, or let the controller decide."""
         if self.held:
             assert self._asked is not None
-            wanted = self._controller.asks_to_go_on()  # which also drops what was asked of it during the hold
+            wanted = self.inner.asks_to_go_on()  # which also drops what was asked of it during the hold
             before, self._begun = not self._begun, True  # what was asked for before the hold does not count
             if before or not (self._asked() or wanted):
                 return Command()
             self.held = False
-            self._controller.go_on(measurement)
+            self.inner.go_on(measurement)
             self._resumed()
-        return self._controller.step(measurement)
+        return self.inner.step(measurement)
 
     def update(self) -> None:
         """Let the controller do its work."""
         if not self.held:
-            self._controller.update()
+            self.inner.update()
 
     @property
     def lets_go(self) -> bool:  # type: ignore[override]
         """Whether the controller lets go by itself; in the hold the cell does."""
-        return not self.held and self._controller.lets_go
+        return not self.held and self.inner.lets_go
 
     @property
     def trail(self) -> TakenWay | None:
         """The way by which the controller's probe has come; after a hold it is not known."""
-        return None if self.held else self._controller.trail
+        return None if self.held else self.inner.trail
 
     def retreat(self, reason: str) -> None:
         """Let the controller let go."""
-        self._controller.retreat(reason)
-
-    @property
-    def restarts(self) -> int:
-        """How often the controller's estimator started again."""
-        return self._controller.restarts
+        self.inner.retreat(reason)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.controller import Command, Controller, Measurement, WrappingController
 from canprobe.cell.master.trail import TakenWay
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.tasks.probing import ProbingTask
@@ -71,7 +71,7 @@ SPEED_RATE = 0.1
 """Rate at which a requested speed is approached, m/s²."""
 
 
-class RequestedTask(Controller):
+class RequestedTask(WrappingController):
     """Steps a task, and lets requests change it.
 
     Args:
@@ -90,7 +90,7 @@ class RequestedTask(Controller):
         period_s: float,
         plan: Plan | None = None,
     ) -> None:
-        self._task = task
+        self.inner = task
         self._plan = plan
         self._period_s = period_s
         self._time = MotionTime(round(1e9 * period_s))
@@ -112,30 +112,30 @@ class RequestedTask(Controller):
                 else:
                     self._take(request)
         self._step_s = 1e-9 * self._time.step(measurement.t_ns)
-        if self._task is None:
+        if self.inner is None:
             return Command()
-        columns = self._approach(self._task) if isinstance(self._task, TouchTask) else {}
-        command = self._task.step(measurement)
+        columns = self._approach(self.inner) if isinstance(self.inner, TouchTask) else {}
+        command = self.inner.step(measurement)
         if columns:
             command = replace(command, columns={**command.columns, **columns})
-        if self._stopping and not isinstance(self._task, ProbingTask):
+        if self._stopping and not isinstance(self.inner, ProbingTask):
             command = replace(command, done=True)
         if self._plan is not None and command.q_target is not None:
             self._targets = [*self._targets[-1:], command.q_target]
         if command.done and self._make is not None:
-            self._task, self._stopping, self._targets = None, False, []
+            self.inner, self._stopping, self._targets = None, False, []
             return replace(command, done=False)
         return command
 
     def update(self) -> None:
         """Let the task do its work once its commands are sent."""
-        if self._task is not None:
-            self._task.update()
+        if self.inner is not None:
+            self.inner.update()
 
     @property
     def can_go_on(self) -> bool:  # type: ignore[override]
         """Whether there is something to do after a loss: the next task that is asked for, or what goes on itself."""
-        return self._task is None or self._make is not None or self._task.can_go_on
+        return self.inner is None or self._make is not None or self.inner.can_go_on
 
     def asks_to_go_on(self) -> bool:
         """Whether a request asks for motion after a loss; the others are refused meanwhile: they came too early."""
@@ -148,42 +148,38 @@ class RequestedTask(Controller):
         """Wait for the next start, or let the task go on that can."""
         self._targets, self._stopping = [], False
         self._time = MotionTime(round(1e9 * self._period_s))
-        if self._task is not None and not self._task.can_go_on:
-            self._task = None
-        elif self._task is not None:
-            self._task.go_on(measurement)
+        if self.inner is not None and not self.inner.can_go_on:
+            self.inner = None
+        elif self.inner is not None:
+            self.inner.go_on(measurement)
 
     @property
     def lets_go(self) -> bool:  # type: ignore[override]
         """Whether the task lets go by itself."""
-        return self._task is not None and self._task.lets_go
+        return self.inner is not None and self.inner.lets_go
 
     @property
     def trail(self) -> TakenWay | None:
         """The way by which the task's probe has come."""
-        return None if self._task is None else self._task.trail
+        return None if self.inner is None else self.inner.trail
 
     def retreat(self, reason: str) -> None:
         """Let the task let go."""
-        if self._task is not None:
-            self._task.retreat(reason)
-
-    @property
-    def restarts(self) -> int:
-        """How often the task's estimator started again."""
-        return 0 if self._task is None else self._task.restarts
+        if self.inner is not None:
+            self.inner.retreat(reason)
 
     def _take(self, request: Request) -> None:
         if request.kind == "stop":
-            if isinstance(self._task, ProbingTask):
-                self._task.stop()
+            if isinstance(self.inner, ProbingTask):
+                self.inner.stop()
             elif self._plan is not None and len(self._targets) == 2:
-                self._task = Trajectory.braking(self._plan, *self._motion())
+                self.inner = Trajectory.braking(self._plan, *self._motion())
                 return
-            self._stopping = self._task is not None
+            self._stopping = self.inner is not None
         elif request.kind == "start":
-            if self._task is None and self._make is not None:
-                self._task = self._make()
+            if self.inner is None and self._make is not None:
+                self.inner = self._make()
+                self.inner.array_alive = self._alive
         else:
             self._asked[request.kind] = request.value
 
@@ -192,7 +188,7 @@ class RequestedTask(Controller):
         assert self._plan is not None and measurement.q is not None
         trajectory = Trajectory(self._plan, **way)
         trajectory.lead(*(self._motion() if len(self._targets) == 2 else (measurement.q, None)))
-        self._task, self._stopping = trajectory, False
+        self.inner, self._stopping = trajectory, False
 
     def _motion(self) -> tuple[Floats, Floats]:
         """Position and speed (n,) in this cycle, as the last two targets lead on."""
