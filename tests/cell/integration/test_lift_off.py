@@ -266,7 +266,8 @@ def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
                 task = make_task(session.plan)
                 session.run(lambda m, step=task.step: replace(step(m), done=task.phase is Phase.SCAN))  # noqa: B023
         told = left_pressing(session)
-        assert told == ([pytest.approx(session.truth["force_n"][-1], abs=0.3)] if pressed_again else [])
+        # the drives stop a count or two from where the last image was taken: 0.6 N a count of joint 3 at this force
+        assert told == ([pytest.approx(session.truth["force_n"][-1], abs=0.6)] if pressed_again else [])
         assert bool(session.truth["force_n"][-1] > 4.0) is pressed_again
     assert min(remembered) > TOUCH_FORCE, "by its size it could be a press"
 
