@@ -88,7 +88,7 @@ def test_without_a_urdf_the_file_begins_with_rows(tmp_path, capsys):
 
 def test_a_cell_alone_is_planned_as_free_motion(tmp_path, urdf, capsys):
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
-    assert main(["plan", str(tmp_path / "cell" / "cell.toml")]) == 0
+    assert main(["plan", str(tmp_path / "cell" / "cell.toml"), "--full"]) == 0
     assert "free" in capsys.readouterr().out
 
 

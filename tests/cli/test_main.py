@@ -49,7 +49,7 @@ def calls(monkeypatch):
 
         monkeypatch.setattr(api, name, call)
 
-    monkeypatch.setattr(text, "summary_text", lambda *_: "all went well")
+    monkeypatch.setattr(text, "summary_text", lambda *_, **__: "all went well")
     fake("run", FakeResult())
     fake("up")
     fake("emulate")
