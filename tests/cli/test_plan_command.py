@@ -120,7 +120,7 @@ def test_joints_of_real_drives_that_nobody_has_checked_are_a_warning_with_the_li
     )
     line = f"type: canprobe up '{scene}' --check-joints --bus socketcan --channel can1"
     assert main(["plan", str(scene)]) == 0
-    assert re.search(rf"^warning: whether the arm moves .* joints 1, .* {line}$", capsys.readouterr().out, re.M)
+    assert re.search(rf"^  warning +whether the arm moves .* joints 1, .* {line}$", capsys.readouterr().out, re.M)
     assert main(["plan", str(scene), "--json"]) == 0
     (warning,) = json.loads(capsys.readouterr().out)["warnings"]
     assert warning.endswith(line)

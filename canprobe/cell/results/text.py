@@ -48,7 +48,8 @@ def summary_text(summary: dict[str, Any], out: Path | None, *, full: bool = True
             f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
             f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
         )
-    if (watched := (summary.get("witnesses") or {}).get("depth_watched_fraction")) is not None:
+    watched = (summary.get("witnesses") or {}).get("depth_watched_fraction")
+    if full and watched is not None:
         lines.append(f"  witness    the depth watched the force at {100 * watched:.0f} % of the contacts")
     if contact["losses"]:
         lines.append(f"  {losses_text(contact['losses'])}")
