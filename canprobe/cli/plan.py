@@ -104,7 +104,6 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.planning.report_json import plan_dict, refused_dict
     from canprobe.cell.planning.verdict import verdict_text
     from canprobe.cell.scene.resolve import resolve
-    from canprobe.cell.session.joint_record import warned
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured compares a log with the plan and writes no --export or --figure")
@@ -113,7 +112,11 @@ def run(args: argparse.Namespace) -> int:
     scene = loaded(args)
     try:
         setup = resolve(scene)
-        plan = warned(make_plan(opened(setup) if args.auto else setup))
+        plan = make_plan(opened(setup) if args.auto else setup)
+        if plan.setup.arm is not None and not all(node.emulated for node in plan.nodes):
+            from canprobe.cell.session.joint_record import warned  # which knows the master: only for real drives
+
+            plan = warned(plan)
         plan = replace(plan, warnings=tuple(with_scene(one, args) for one in plan.warnings))
         rehearsed = _rehearse(plan) if args.rehearse else None
     except PlanError as error:

@@ -1,6 +1,6 @@
 """What else than the array knows of the force, and how well: the witnesses of a plan.
 
-The checks themselves are in `canprobe.cell.master.conditions`: rows `image_dead`, `depth`, `contact_vanished`,
+The checks themselves are in `canprobe.cell.master.conditions`: rows `image_dead`, `depth`, `force_fell`,
 `push_unfelt`.
 """
 
