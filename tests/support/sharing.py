@@ -1,4 +1,4 @@
-"""How the suite is shared between workers (pytest-xdist): a file at a time, and all vcan tests to one worker."""
+"""How the suite is shared between workers (pytest-xdist): a file at a time, the longest first; all vcan tests to one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import functools
 import json
 import os
 import tempfile
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,40 @@ from xdist.scheduler import LoadScopeScheduling
 _LIST = "canprobe_vcan_tests"
 _NICE = 10
 _PATH = pytest.StashKey[Path]()
+_TESTS = pytest.StashKey[Sequence[str]]()
+WEIGHTS = {
+    "tests/vcan/": 2.0,
+    "tests/cell/integration/": 0.3,
+    "tests/lab/": 0.2,
+    "tests/cli/": 0.2,
+    "tests/": 0.05,
+}
+"""Seconds that a test of a folder takes, about; the first prefix holds."""
+
+
+def weight(nodeid: str) -> float:
+    """How long a test takes, about."""
+    return next((weight for prefix, weight in WEIGHTS.items() if nodeid.startswith(prefix)), 1.0)
+
+
+def list_tests(config: pytest.Config, nodeids: Sequence[str]) -> None:
+    """Keep the tests of this session."""
+    config.stash[_TESTS] = nodeids
+
+
+def all_tests(config: pytest.Config) -> Sequence[str]:
+    """All tests of this session and of its workers."""
+    return config.stash.get(_TESTS, ())
+
+
+def longest_first(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """In a worker: the files that take longest at first, or one of them would be waited for at the end."""
+    if is_worker(config):
+        files = {item.nodeid: item.nodeid.partition("::")[0] for item in items}
+        long_s = Counter[str]()
+        for nodeid, file in files.items():
+            long_s[file] += weight(nodeid)  # type: ignore[assignment]
+        items.sort(key=lambda item: (-long_s[file := files[item.nodeid]], file))
 
 
 def is_worker(config: pytest.Config) -> bool:
@@ -51,6 +86,10 @@ def list_vcan_tests(config: pytest.Config, nodeids: Iterable[str]) -> None:
 
 class ByFile(LoadScopeScheduling):
     """A worker takes a file, so that what its tests share is made once; the vcan tests count as one file."""
+
+    def schedule(self) -> None:
+        super().schedule()
+        list_tests(self.config, self.collection or ())
 
     @functools.cached_property
     def _vcan_tests(self) -> frozenset[str]:

@@ -100,14 +100,14 @@ def most_mib(scene, seconds, out):
     return int(subprocess.run(words, env=env, stdout=subprocess.PIPE, check=True).stdout) / 1024
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="two minutes of a cell")
 @pytest.mark.timeout(600)
 def test_rows_of_two_minutes_take_no_memory(tmp_path):
     """44 000 cycles more: in memory they take 63 MiB (`files=False`); on disk 21, most of it while columns are made."""
     assert most_mib("free", 120, tmp_path / "long") < most_mib("free", 10, tmp_path / "short") + 40
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="two minutes of a cell")
 @pytest.mark.timeout(600)
 def test_a_scan_of_two_minutes_ends_with_all_its_files(tmp_path):
     """Contacts and answers are kept until 200 s and 400 s; an hour has no more of them."""

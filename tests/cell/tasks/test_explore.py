@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from patience import patience_s
 
 import canprobe
 from canprobe.cell.planning.make import make_plan
@@ -205,5 +206,7 @@ def test_other_scenes_load_nothing_of_it():
         "import sys, canprobe; from canprobe.cell.tasks.from_plan import make_task;"
         "make_task(canprobe.plan('cylinder')); print([m for m in sys.modules if 'explore' in m])"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=patience_s(60)
+    )
     assert found.stdout.strip() == "[]"

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
+from patience import patience_s
 from websockets.exceptions import InvalidHandshake
 from websockets.sync.client import connect
 
@@ -45,10 +46,10 @@ def bridge(recorded):
 
 def advertised(client):
     """Server info and channels, as they come on connecting."""
-    info = json.loads(client.recv(timeout=10))
+    info = json.loads(client.recv(timeout=patience_s(10)))
     channels = {}
     while len(channels) < len(TOPICS):
-        document = json.loads(client.recv(timeout=10))
+        document = json.loads(client.recv(timeout=patience_s(10)))
         if document["op"] == "advertise":
             channels |= {c["topic"]: c for c in document["channels"]}
     return info, channels

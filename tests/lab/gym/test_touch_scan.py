@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from patience import patience_s
 
 import canprobe.lab.gym
 from canprobe.cell.results.files import load_table
@@ -211,7 +212,7 @@ def test_the_example_ends_in_one_line_at_ctrl_c():
     with subprocess.Popen(command, **pipes) as process:
         assert process.stdout.readline().startswith("seed 0, generation 0")
         os.killpg(process.pid, signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=patience_s(60))
     assert (process.returncode, err) == (130, "interrupted\n")
 
 
