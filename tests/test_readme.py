@@ -146,6 +146,14 @@ def test_the_first_screen_has_two_lines_to_type_with_all_of_their_set_up():
     assert first.endswith(" && canprobe run cylinder") and tests.endswith(" && CANPROBE_INSTALL=1 python -m pytest")
 
 
+def test_the_line_for_every_test_is_that_of_ci():
+    """Where nothing may be skipped."""
+    line, ci = "python -m pytest -m ''", (ROOT / ".ci/run").read_text(encoding="utf-8")
+    assert f"`{line}`" in TEXTS["README.md"] and f"`{line}`" in TEXTS["CONTRIBUTING.md"]
+    assert re.search(r"^python -m pytest -q -ra -m ''$", ci, re.M) and "export CANPROBE_NO_SKIPS=1" in ci
+    assert "CANPROBE_NO_SKIPS=1 .ci/fresh" in ci
+
+
 def test_the_readme_names_each_package_that_pytest_installs():
     named = set(re.findall(r"`([\w-]+)`", TEXTS["README.md"]))
     assert named >= {*system_packages.PROGRAMS, *system_packages.LIBRARIES}

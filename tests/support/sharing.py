@@ -1,4 +1,4 @@
-"""How the suite is shared between workers (pytest-xdist): a file at a time, the longest first; all vcan tests to one."""
+"""How the suite is shared between workers (pytest-xdist): a file at a time, long ones first; all vcan tests to one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import json
 import os
 import tempfile
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,10 @@ WEIGHTS = {
 """Seconds that a test of a folder takes, about; the first prefix holds."""
 
 
+TOGETHER = ("tests/lab/bridge/",)
+"""Folders whose files share what takes long to make."""
+
+
 def weight(nodeid: str) -> float:
     """How long a test takes, about."""
     return next((weight for prefix, weight in WEIGHTS.items() if nodeid.startswith(prefix)), 1.0)
@@ -46,11 +50,15 @@ def all_tests(config: pytest.Config) -> Sequence[str]:
 def longest_first(config: pytest.Config, items: list[pytest.Item]) -> None:
     """In a worker: the files that take longest at first, or one of them would be waited for at the end."""
     if is_worker(config):
-        files = {item.nodeid: item.nodeid.partition("::")[0] for item in items}
-        long_s = Counter[str]()
-        for nodeid, file in files.items():
-            long_s[file] += weight(nodeid)  # type: ignore[assignment]
-        items.sort(key=lambda item: (-long_s[file := files[item.nodeid]], file))
+        scopes = {item.nodeid: _scope(item.nodeid) for item in items}
+        long_s: defaultdict[str, float] = defaultdict(float)
+        for nodeid, scope in scopes.items():
+            long_s[scope] += weight(nodeid)
+        items.sort(key=lambda item: (-long_s[scope := scopes[item.nodeid]], scope, item.nodeid.partition("::")[0]))
+
+
+def _scope(nodeid: str) -> str:
+    return next((folder for folder in TOGETHER if nodeid.startswith(folder)), nodeid.partition("::")[0])
 
 
 def is_worker(config: pytest.Config) -> bool:
@@ -85,7 +93,10 @@ def list_vcan_tests(config: pytest.Config, nodeids: Iterable[str]) -> None:
 
 
 class ByFile(LoadScopeScheduling):
-    """A worker takes a file, so that what its tests share is made once; the vcan tests count as one file."""
+    """A worker takes a file, so that what its tests share is made once; the vcan tests count as one file.
+
+    A folder whose files share runs is taken whole.
+    """
 
     def schedule(self) -> None:
         super().schedule()
@@ -96,7 +107,7 @@ class ByFile(LoadScopeScheduling):
         return frozenset(json.loads(self.config.stash[_PATH].read_text()))
 
     def _split_scope(self, nodeid: str) -> str:
-        return "vcan" if nodeid in self._vcan_tests else nodeid.partition("::")[0]
+        return "vcan" if nodeid in self._vcan_tests else _scope(nodeid)
 
 
 def give_way(config: pytest.Config) -> None:

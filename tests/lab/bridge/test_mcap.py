@@ -183,6 +183,7 @@ def test_a_recorded_run_gives_the_same_messages_again(recorded, tmp_path):
     assert again == live
 
 
+@pytest.mark.slow(reason="a full disk once more; tests/cli/test_full_disk.py has most files")
 def test_a_full_disk_leaves_no_part_of_the_file(recorded, tmp_path, capsys):
     folder = tmp_path / "full"
     folder.mkdir()
@@ -206,6 +207,7 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
     assert (frame.id, frame.len, bytes(frame.data)) == (0x181, 64, data)
 
 
+@pytest.mark.slow(reason="a second scene into a file")
 def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
     undrawn_run(canprobe.load_scene("free"), out=tmp_path, duration_s=0.1)
     with (tmp_path / "scene.toml").open("a") as scene:

@@ -84,7 +84,10 @@ def served(recorded):
     process.communicate()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+TERM = pytest.mark.slow(reason="the other signal")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), pytest.param(signal.SIGTERM, 143, marks=TERM)])
 def test_a_run_is_served_until_it_is_told_to_end(served, number, status):
     process, address = served
     assert "<title>Viser</title>" in page_at(address)

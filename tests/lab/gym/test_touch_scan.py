@@ -39,7 +39,10 @@ def features_of(env, observation):
     return dict(zip(env.names, observation.tolist(), strict=True))
 
 
-@pytest.mark.parametrize("kind", ["tactile", "oracle"])  # the first holds the vector of `features`
+ORACLE = pytest.mark.slow(reason="the checks of gymnasium on a second kind of observation")
+
+
+@pytest.mark.parametrize("kind", ["tactile", pytest.param("oracle", marks=ORACLE)])  # the first holds `features`
 def test_gymnasium_has_nothing_to_say_against_it(make, kind):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -154,6 +157,7 @@ def test_estimate_tells_the_curvature_and_features_hold_no_truth(make):
     assert not [name for name in make().names if name.startswith("true")]
 
 
+@pytest.mark.slow(reason="two environments at once")
 def test_a_vector_of_environments_goes_on_by_itself():
     envs = gymnasium.make_vec(
         "canprobe/TouchScan-v0",
@@ -206,6 +210,7 @@ def test_without_gymnasium_it_says_what_to_install(monkeypatch):
         __import__("canprobe.lab.gym")
 
 
+@pytest.mark.slow(reason="the whole example in a process; tests/cli/test_interrupts.py is of commands")
 def test_the_example_ends_in_one_line_at_ctrl_c():
     command = [sys.executable, "-m", "canprobe.lab.examples.learn_touch_scan", "--population", "2", "--episodes", "1"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}

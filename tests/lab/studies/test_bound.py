@@ -91,6 +91,7 @@ def test_outside_the_region_ml_is_honest(rows):
         assert row["coverage"] >= 0.82, row
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert main(["study", "bound", "--quick", "--out", str(tmp_path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -183,6 +183,7 @@ def test_wrong_options_are_refused(words, expected, tmp_path, capsys):
     assert expected in capsys.readouterr().err
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 @pytest.mark.timeout(600)  # a second of a whole cell takes long where many share a processor
 def test_a_small_draw_with_the_whole_sensor(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("canprobe.lab.studies.regions.QUICK_SCENES", 1)

@@ -298,6 +298,7 @@ def test_a_child_whose_parent_is_gone_before_it_asks_ends_at_once(number):
     assert subprocess.run([sys.executable, "-c", command], check=False, timeout=patience_s(60)).returncode == -number
 
 
+@pytest.mark.slow(reason="starts a cluster of dask with its processes")
 @pytest.mark.filterwarnings("default")
 def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
     import distributed
