@@ -34,11 +34,15 @@ SECTIONS = {
 }
 
 
+LONG_PAGES = ("docs/python.md", "docs/gym.md")
+PAGE = pytest.mark.slow(reason="the blocks of a page run cells for half a minute; the default runs those of the others")
+
+
 def blocks(language):
     """Every block of a language as (page, text); a block in a list is indented."""
     found = re.compile(rf"^( *)```{language}\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
-    return [pytest.param(match[2], id=f"{page}-{i}") for page, text in TEXTS.items()
-            for i, match in enumerate(found.finditer(text))]  # fmt: skip
+    return [pytest.param(match[2], id=f"{page}-{i}", marks=[PAGE] * (language == "python" and page in LONG_PAGES))
+            for page, text in TEXTS.items() for i, match in enumerate(found.finditer(text))]  # fmt: skip
 
 
 def commands():

@@ -68,6 +68,7 @@ def test_an_unknown_surface_is_named():
         make_ground("plane", 0.1, "spiral", 0.02, 10)
 
 
+@pytest.mark.slow(reason="every estimator over many noises")
 def test_inside_the_region_the_estimators_are_at_the_bound(rows):
     inside = [r for r in rows if r["inside"]]
     assert len(inside) == 2 * len(SUBSET)

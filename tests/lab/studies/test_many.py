@@ -169,6 +169,7 @@ def test_a_series_that_no_run_has(runs, out):
         many.Runs(runs.scene, runs.keys, runs.rows, runs.outcomes, ("forcen",), 0.01).to_xarray()
 
 
+@pytest.mark.slow(reason="a script with its processes; the default has many runs without one")
 def test_a_script_needs_no_guard(tmp_path):
     """Workers do not import the script that starts them."""
     (tmp_path / "script.py").write_text(

@@ -128,6 +128,7 @@ def test_an_earlier_run_is_compared_by_kind(tmp_path):
         earlier_rows(file)
 
 
+@pytest.mark.slow(reason="whole scenes of a study")
 def test_random_scenes_follow_from_their_seeds(tmp_path):
     """They differ, cells and arrays of all groups occur, nearly all can be planned."""
     seeds = [SceneSeed(2, kind, number).value() for kind in KINDS for number in (0, 3)]
@@ -197,6 +198,7 @@ def test_a_small_draw_with_the_whole_sensor(tmp_path, monkeypatch, capsys):
     assert lines[1].startswith("200000,plane,plane,")
 
 
+@pytest.mark.slow(reason="a whole scene of a study")
 def test_a_model_that_turned_over_on_a_straight_path_begins_again():
     """Contacts of a straight path do not tell how the gradient grows along it: here it passed zero, by 2.1 s."""
     scan = measure(106001)
