@@ -15,6 +15,7 @@ What takes long is `slow`, with its reason: `python -m pytest` leaves it out, `-
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
@@ -60,6 +61,10 @@ ALLOWED_SKIPS = (
     "SCHED_FIFO is not permitted",  # a right, which no installation gives
 )
 """Why a test may be skipped, by the beginning of its reason, where everything that can be installed is installed."""
+gc.disable()  # until all tests are collected: what is made meanwhile stays
+for _hook in sys.meta_path:  # the package is a plugin of pytest, too, whose asserts would be rewritten: there are few
+    if hasattr(_hook, "_must_rewrite"):
+        _hook._must_rewrite -= {name for name in _hook._must_rewrite if name.partition(".")[0] == "canprobe"}
 _NO_SKIPS = os.environ.get("CANPROBE_NO_SKIPS") == "1"
 _CHANNEL = "vcan0"
 _INNER = patience.GUEST_FOLDER
@@ -111,6 +116,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
+    gc.enable()
+    gc.freeze()  # modules and tests stay: no collection need look at them again
     sharing.list_tests(session.config, [item.nodeid for item in session.items])
     if session.config.option.collectonly:
         slow = [(item.nodeid.partition("::")[0], _reason(mark)) for item in session.items

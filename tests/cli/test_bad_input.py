@@ -301,6 +301,7 @@ def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, t
     assert last[0x710] == b"\x7f"
 
 
+@pytest.mark.slow(reason="a third way to end a run in a process")
 def test_a_run_that_ignores_the_terminal_is_ended_by_sigterm(tmp_path):
     """As `nohup` and the background of a script start it."""
     line = f"trap '' HUP INT; exec {sys.executable} -m canprobe run free --duration 600 --out results"

@@ -61,6 +61,7 @@ def test_a_canopen_master_that_is_not_ours(served: Any, vcan0: str) -> None:
         network.disconnect()
 
 
+@pytest.mark.slow(reason="a second touch on a real bus; the foreign drives are not emulated either")
 def test_a_run_that_emulates_nothing(served: Any, bench: Any) -> None:
     scene = bench.scene("press", emulated=False)
     command = bench.start("run", scene, *ON_VCAN0, "--duration", 1, "--out", "results")

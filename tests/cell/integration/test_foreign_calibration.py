@@ -68,6 +68,7 @@ def test_images_that_contradict_the_motion_are_left_out(blurred):
     assert np.linalg.eigvalsh(last.K) == pytest.approx([0.0, 1e3 / 36.0], abs=1.0)
 
 
+@pytest.mark.slow(reason="one more scan with such an array")
 def test_a_doubted_array_has_wider_regions():
     """Standard deviations of curvature are twice as large, and the curvature is the same."""
     plan = make_plan(resolve(load_scene("cylinder", SCAN | {"task.duration_s": 2.0})))
@@ -105,6 +106,7 @@ def test_another_array_is_noticed(config, pad, sign):
     assert re.search(sign, line)
 
 
+@pytest.mark.slow(reason="one more scan with such an array")
 def test_the_monitor_shows_the_blur():
     plan = make_plan(resolve(load_scene("press", {"task.duration_s": 4.0})))
     monitor, views = Monitor(plan), []

@@ -50,6 +50,7 @@ def test_a_run_that_is_killed_leaves_its_rows(tmp_path, capsys):
     assert len(canprobe.load_table(tmp_path / "log.npz")) == len(whole.log["t_s"])
 
 
+@pytest.mark.slow(reason="a long run in a process; tests/cli/test_bad_input.py interrupts a short one")
 def test_an_interrupt_leaves_all_files(tmp_path):
     process = started(tmp_path, "cylinder", "--bus", "direct", "--no-figures")
     process.send_signal(signal.SIGTERM)

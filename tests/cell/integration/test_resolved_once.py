@@ -143,6 +143,7 @@ def test_files_that_change_meanwhile_change_nothing(
     assert json.loads(json.dumps(again.summary["shape"])) == summary["shape"]
 
 
+@pytest.mark.slow(reason="a run with a second process; the default changes the files of two")
 def test_other_processes_of_a_run_have_its_files_too(inputs: Path, tmp_path: Path) -> None:
     """A recording carries the EDS files; its process reads them when it ends."""
     out = tmp_path / "run"

@@ -62,6 +62,7 @@ def test_the_summary_says_how_good_it_is(scan):
     assert f"{figures['contacts']} contacts in {figures['nodes']} nodes, σ " in result.text()
 
 
+@pytest.mark.slow(reason="one more scan")
 def test_the_contacts_of_a_folder_make_the_same_map_again(scan, tmp_path):
     """As for a run of an older canprobe, whose map is refused."""
     result, _ = scan

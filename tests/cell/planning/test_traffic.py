@@ -467,6 +467,7 @@ def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(be
     assert starts == tuple(us * 1000 for us in starts_us)
 
 
+@pytest.mark.slow(reason="plans for every way out")
 def test_a_controller_that_takes_too_long_is_refused(cylinder):
     setup = resolve(cylinder)
     budgets = [make_plan(setup.changed("arm", torque=torque)).traffic.budget for torque in (True, False)]

@@ -129,6 +129,7 @@ def height_field(folder, heights):
     )
 
 
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends")
 def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
     side, end = np.arange(-13, 13.1, 0.5)[:, None], np.arange(-25, 25.1, 0.5)[None]
     plate = height_field(tmp_path, -(side**2 + end**2) / 300.0)

@@ -162,6 +162,7 @@ def test_both_readers_see_the_same_messages(recorded):
     assert rows.max() - rows.min() < 8 and columns.max() - columns.min() < 8  # one patch within the window
 
 
+@pytest.mark.slow(reason="writes the whole file once more")
 def test_a_recorded_run_gives_the_same_messages_again(recorded, tmp_path):
     """From what the master measured, everything but the bridge's own state, message by message."""
     folder = tmp_path / "again"
@@ -218,6 +219,7 @@ def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
     assert topics.count("/joint_states") > 40 and "/wrench" not in topics
 
 
+@pytest.mark.slow(reason="one more run")
 def test_a_run_without_a_folder_cannot_have_a_file():
     with pytest.raises(canprobe.errors.UsageError, match="bridge mcap: it writes a file"):
         canprobe.run(canprobe.load_scene("free"), duration_s=0.1, files=False, bridge=("mcap",))

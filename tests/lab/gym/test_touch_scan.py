@@ -39,10 +39,8 @@ def features_of(env, observation):
     return dict(zip(env.names, observation.tolist(), strict=True))
 
 
-ORACLE = pytest.mark.slow(reason="the checks of gymnasium on a second kind of observation")
-
-
-@pytest.mark.parametrize("kind", ["tactile", pytest.param("oracle", marks=ORACLE)])  # the first holds `features`
+@pytest.mark.slow(reason="every check of gymnasium, which resets again and again")
+@pytest.mark.parametrize("kind", ["tactile", "oracle"])  # the first holds the vector of `features`
 def test_gymnasium_has_nothing_to_say_against_it(make, kind):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -135,7 +133,10 @@ def test_options_have_the_keys_and_the_checks_of_a_scene(make):
         env.reset(options={"bus.interface": "socketcan"})
 
 
-@pytest.mark.parametrize("kind", ["train", "held_out"])
+TRAIN = pytest.mark.slow(reason="more objects")
+
+
+@pytest.mark.parametrize("kind", [pytest.param("train", marks=TRAIN), "held_out"])
 def test_every_object_can_be_touched(make, kind):
     env = make(estimate=False, options={"objects": kind})
     for number, value in enumerate(canprobe.lab.gym.OBJECTS[kind].values):

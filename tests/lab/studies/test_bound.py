@@ -83,6 +83,7 @@ def test_inside_the_region_the_estimators_are_at_the_bound(rows):
     assert 0.6 < pooled < 1.1 * 1.13
 
 
+@pytest.mark.slow(reason="an estimator over many noises")
 def test_outside_the_region_ml_is_honest(rows):
     """A torus's cubic terms are ten times the bound; on the sphere the points' noise turns normals by 20 mrad."""
     torus, sphere = (r for r in rows if not r["inside"] and r["method"] == "ml")

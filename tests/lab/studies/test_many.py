@@ -185,6 +185,7 @@ def test_a_script_needs_no_guard(tmp_path):
     assert (tmp_path / "runs/many-listen/cells.jsonl").is_file()
 
 
+@pytest.mark.slow(reason="processes that are ended and go on")
 def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
     """A kill, the death of a worker and Ctrl-C, one after the other: nothing is left running, lost or done twice."""
     kept = tmp_path / "cells.jsonl"

@@ -148,6 +148,7 @@ def test_random_scenes_follow_from_their_seeds(tmp_path):
         SceneSeed.of(299_000)
 
 
+@pytest.mark.slow(reason="a scene of a study")
 def test_a_calibrated_array_has_the_gains_that_were_calibrated(tmp_path):
     drawn = random_scene(SceneSeed(2, "plane", 1).value(), tmp_path)
     assert drawn.group == "calibrated" and drawn.array is not None
@@ -158,6 +159,7 @@ def test_a_calibrated_array_has_the_gains_that_were_calibrated(tmp_path):
     assert found.image.stiffness == pytest.approx(drawn.scene.plant.stiffness_n_m3, rel=0.1)
 
 
+@pytest.mark.slow(reason="a scene of a study")
 def test_the_line_of_a_seed_repeats_its_scene(capsys):
     """A plane, whose regions hold the truth; the same numbers twice."""
     assert main(["study", "regions", "--seed", "200000", "--json", "-v"]) == 0
