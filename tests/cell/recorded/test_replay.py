@@ -7,6 +7,7 @@ import random
 import re
 
 import numpy as np
+import pytest
 from candump_lines import can_id_of, restamped, stamp_us
 from scenes import without_torque
 from undrawn import undrawn_run
