@@ -90,8 +90,12 @@ def pytest_configure(config: pytest.Config) -> None:
         system_packages.install_missing()
     if not _has_interface():
         config.pluginmanager.register(OuterRun(config))
-    if not sharing.is_worker(config) and (reporter := config.pluginmanager.get_plugin("terminalreporter")):
-        config.pluginmanager.register(progress.Progress(reporter, lambda: sharing.all_tests(config)))
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is not None and not sharing.is_worker(session.config):
+        session.config.pluginmanager.register(progress.Progress(reporter, lambda: sharing.all_tests(session.config)))
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
@@ -99,6 +103,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> sharing.ByFile:
+    gc.enable()  # workers collect the tests, not this session
     return sharing.ByFile(config, log)
 
 
