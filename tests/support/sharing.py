@@ -20,10 +20,16 @@ _PATH = pytest.StashKey[Path]()
 _TESTS = pytest.StashKey[Sequence[str]]()
 WEIGHTS = {
     "tests/vcan/": 2.0,
-    "tests/cell/integration/": 0.3,
+    "tests/lab/gym/": 0.8,
+    "tests/cell/recorded/": 0.7,
+    "tests/cell/integration/": 0.4,
     "tests/lab/": 0.2,
-    "tests/cli/": 0.2,
-    "tests/": 0.05,
+    "tests/cell/results/": 0.2,
+    "tests/cell/planning/": 0.14,
+    "tests/cell/session/": 0.14,
+    "tests/cli/": 0.14,
+    "tests/fieldbus/conformance/": 0.14,
+    "tests/": 0.04,
 }
 """Seconds that a test of a folder takes, about; the first prefix holds."""
 
