@@ -113,11 +113,11 @@ def pytest_configure_node(node: Any) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The vcan tests first and one after the other: no cell on vcan0 meets another test's frames."""
-    if forgot := [item.nodeid for item in items if (mark := item.get_closest_marker("slow")) and not _reason(mark)]:
-        raise pytest.UsageError(f"a slow test says why: @pytest.mark.slow(reason=...): {', '.join(forgot)}")
     sharing.longest_first(config, items)
     items.sort(key=lambda item: not _is_vcan(item))
     sharing.list_vcan_tests(config, [item.nodeid for item in items if _is_vcan(item)])
+    if forgot := [item.nodeid for item in items if (mark := item.get_closest_marker("slow")) and not _reason(mark)]:
+        raise pytest.UsageError(f"a slow test says why: @pytest.mark.slow(reason=...): {', '.join(forgot)}")
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
