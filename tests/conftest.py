@@ -5,12 +5,17 @@ and each one's outcome there, with its duration and failure text, becomes its ou
 they are skipped, and the summary says what to type. Folders of tests are shared between the processors (`sharing`):
 the vcan tests, one after the other, are the share of one worker, which waits for the guest on a processor of its own.
 
+What takes long is `slow`, with its reason: `python -m pytest` leaves it out, `-m ''` runs it, too, and `--collect-only
+-q -n0 -m slow` lists it. A test that keeps time without a vcan0 is `realtime`. No verdict hangs on a busy machine:
+`standstill` judges what keeps time, and `patience` stretches the time-outs.
+
     CANPROBE_NO_SKIPS=1   a test that is skipped has failed, unless its reason is one of `ALLOWED_SKIPS`
     CANPROBE_INSTALL=1    install the Debian packages that tests use and that are missing, with sudo (`system_packages`)
 """
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
@@ -19,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +32,8 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: workers share the processors, and matrices are small
 
 import hypothesis
+import patience
+import progress
 import pytest
 import sharing
 import standstill
@@ -53,9 +61,13 @@ ALLOWED_SKIPS = (
     "SCHED_FIFO is not permitted",  # a right, which no installation gives
 )
 """Why a test may be skipped, by the beginning of its reason, where everything that can be installed is installed."""
+gc.disable()  # until all tests are collected: what is made meanwhile stays
+for _hook in sys.meta_path:  # the package is a plugin of pytest, too, whose asserts would be rewritten: there are few
+    if hasattr(_hook, "_must_rewrite"):
+        _hook._must_rewrite -= {name for name in _hook._must_rewrite if name.partition(".")[0] == "canprobe"}
 _NO_SKIPS = os.environ.get("CANPROBE_NO_SKIPS") == "1"
 _CHANNEL = "vcan0"
-_INNER = "CANPROBE_TEST_VCAN_FOLDER"
+_INNER = patience.GUEST_FOLDER
 _NO_VCAN = 125
 _NOT_RUN = "not run for want of a vcan"
 _CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
@@ -80,11 +92,18 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(OuterRun(config))
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is not None and not sharing.is_worker(session.config):
+        session.config.pluginmanager.register(progress.Progress(reporter, lambda: sharing.all_tests(session.config)))
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return 0 if _INNER in os.environ else sharing.count_workers(config)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> sharing.ByFile:
+    gc.enable()  # workers collect the tests, not this session
     return sharing.ByFile(config, log)
 
 
@@ -94,8 +113,31 @@ def pytest_configure_node(node: Any) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The vcan tests first and one after the other: no cell on vcan0 meets another test's frames."""
+    sharing.longest_first(config, items)
     items.sort(key=lambda item: not _is_vcan(item))
     sharing.list_vcan_tests(config, [item.nodeid for item in items if _is_vcan(item)])
+    if forgot := [item.nodeid for item in items if (mark := item.get_closest_marker("slow")) and not _reason(mark)]:
+        raise pytest.UsageError(f"a slow test says why: @pytest.mark.slow(reason=...): {', '.join(forgot)}")
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    gc.enable()
+    gc.freeze()  # modules and tests stay: no collection need look at them again
+    sharing.list_tests(session.config, [item.nodeid for item in session.items])
+    if session.config.option.collectonly:
+        slow = [(item.nodeid.partition("::")[0], _reason(mark)) for item in session.items
+                if (mark := item.get_closest_marker("slow"))]  # fmt: skip
+        for (file, reason), count in sorted(Counter(slow).items()):
+            print(f"slow: {file}: {count}: {reason}")
+
+
+def _reason(mark: pytest.Mark) -> str:
+    return str(mark.kwargs.get("reason", ""))
+
+
+@pytest.hookimpl(tryfirst=True, optionalhook=True)
+def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> bool:
+    return patience.set_timer(item, settings)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -104,10 +146,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Run a vcan test where the vcan is; anything else gives way to those that keep the time of a bus."""
+    """Run a test that keeps time with an idle loop beside it; anything else gives way to those."""
     if not _is_vcan(item):
         sharing.give_way(item.config)
-        return None
+        if item.get_closest_marker("realtime") is None:
+            return None
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
     for report in standstill.run_protocol(item, nextitem):
         item.ihook.pytest_runtest_logreport(report=report)
@@ -245,7 +288,22 @@ class OuterRun:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
-        self._lines = _follow(folder / "reports.jsonl", self._process)
+        self._lines = self._follow(folder / "reports.jsonl", self._process)
+
+    def _follow(self, path: Path, process: subprocess.Popen[bytes]) -> Iterator[str]:
+        """Yield the lines of a file that grows until the process has ended, which hears of the machine's load."""
+        with path.open(encoding="utf-8") as file:
+            rest = ""
+            while True:
+                ended = process.poll() is not None
+                rest += file.read()
+                while "\n" in rest:
+                    line, _, rest = rest.partition("\n")
+                    yield line
+                if ended:
+                    return
+                patience.tell_guest(path.parent)
+                time.sleep(0.05)
 
     def _wait_for(self, item: pytest.Item) -> list[pytest.TestReport]:
         """Return the item's reports from the inner session; whatever is missing there is a failure here."""
@@ -282,18 +340,3 @@ class OuterRun:
 def _report(item: pytest.Item, outcome: Any, longrepr: Any) -> pytest.TestReport:
     keywords = dict.fromkeys(item.keywords, 1)
     return pytest.TestReport(item.nodeid, item.location, keywords, outcome, longrepr, "setup")
-
-
-def _follow(path: Path, process: subprocess.Popen[bytes]) -> Iterator[str]:
-    """Yield the lines of a file that grows until the process has ended."""
-    with path.open(encoding="utf-8") as file:
-        rest = ""
-        while True:
-            ended = process.poll() is not None
-            rest += file.read()
-            while "\n" in rest:
-                line, _, rest = rest.partition("\n")
-                yield line
-            if ended:
-                return
-            time.sleep(0.05)

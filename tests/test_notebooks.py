@@ -22,7 +22,13 @@ def run_cell(source, names):
     return None if shown is None else eval(compile(shown, "cell", "eval"), names)
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
+FIRST = "first-run"
+LONG = pytest.mark.slow(reason="a whole notebook; the default runs the first one")
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, id=path.stem, marks=[LONG] * (path.stem != FIRST)) for path in NOTEBOOKS]
+)
 def test_a_notebook_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with matplotlib.rc_context({"backend": "agg"}):

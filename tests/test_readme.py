@@ -34,11 +34,15 @@ SECTIONS = {
 }
 
 
+LONG_PAGES = ("docs/python.md", "docs/gym.md")
+PAGE = pytest.mark.slow(reason="the blocks of a page run cells for half a minute; the default runs those of the others")
+
+
 def blocks(language):
     """Every block of a language as (page, text); a block in a list is indented."""
     found = re.compile(rf"^( *)```{language}\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
-    return [pytest.param(match[2], id=f"{page}-{i}") for page, text in TEXTS.items()
-            for i, match in enumerate(found.finditer(text))]  # fmt: skip
+    return [pytest.param(match[2], id=f"{page}-{i}", marks=[PAGE] * (language == "python" and page in LONG_PAGES))
+            for page, text in TEXTS.items() for i, match in enumerate(found.finditer(text))]  # fmt: skip
 
 
 def commands():
@@ -144,6 +148,14 @@ def test_the_first_screen_has_two_lines_to_type_with_all_of_their_set_up():
     for line in (first, tests):
         assert "\n" not in line and line.startswith("sudo apt-get update && sudo apt-get install -y python3-venv && ")
     assert first.endswith(" && canprobe run cylinder") and tests.endswith(" && CANPROBE_INSTALL=1 python -m pytest")
+
+
+def test_the_line_for_every_test_is_that_of_ci():
+    """Where nothing may be skipped."""
+    line, ci = "python -m pytest -m ''", (ROOT / ".ci/run").read_text(encoding="utf-8")
+    assert f"`{line}`" in TEXTS["README.md"] and f"`{line}`" in TEXTS["CONTRIBUTING.md"]
+    assert re.search(r"^python -m pytest -q -ra -m ''$", ci, re.M) and "export CANPROBE_NO_SKIPS=1" in ci
+    assert "CANPROBE_NO_SKIPS=1 .ci/fresh" in ci
 
 
 def test_the_readme_names_each_package_that_pytest_installs():

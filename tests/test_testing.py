@@ -43,7 +43,7 @@ def run_inside(pytester, monkeypatch):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="makes an environment and runs pytest in it three times")
 def test_the_project_of_the_page_works_when_copied(tmp_path):
     assert list(PROJECT) == ["drive_master.py", "test_drive_master.py", "pyproject.toml", ".github/workflows/tests.yml"]
     for name, text in PROJECT.items():

@@ -10,6 +10,7 @@ from bridges_bench import size_of
 from canprobe.lab.studies.result_files import text_of
 
 
+@pytest.mark.slow(reason="a measurement of bridges")
 def test_a_short_study_has_a_row_a_case(monkeypatch):
     monkeypatch.setattr(bridges, "QUICK_SECONDS", 0.1)
     monkeypatch.setattr(bridges, "WARM_UP", 20)
@@ -25,6 +26,7 @@ def test_a_short_study_has_a_row_a_case(monkeypatch):
     assert "dropped in all" in text_of(result)
 
 
+@pytest.mark.slow(reason="a measurement of bridges")
 def test_a_size_counts_every_file_once_and_leaves_out_what_is_there_anyway():
     """mcap alone has its own files, and lz4 and zstandard, whose names differ from their imports."""
     own = sum(path.stat().st_size for path in Path(mcap.__file__).parent.rglob("*.py"))

@@ -234,7 +234,7 @@ def test_what_a_refusal_advises_helps(monkeypatch, tmp_path):
     check(7, QUICK, monkeypatch, tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="hundreds of refusals")
 @pytest.mark.timeout(3600)
 def test_what_many_refusals_advise_helps(monkeypatch, tmp_path):
     check(1, ALL, monkeypatch, tmp_path)

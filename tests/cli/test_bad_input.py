@@ -275,7 +275,10 @@ def test_brackets_without_an_end(tmp_path, monkeypatch, capsys):
     assert "press.toml as changed: a.a.a: expected tables and lists of at most 32" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+TERM = pytest.mark.slow(reason="the other signal")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=TERM)])
 def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, tmp_path):
     process = start(tmp_path, "run", "cylinder", "--out", "results")
     results = tmp_path / "results"
@@ -298,6 +301,7 @@ def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, t
     assert last[0x710] == b"\x7f"
 
 
+@pytest.mark.slow(reason="a third way to end a run in a process")
 def test_a_run_that_ignores_the_terminal_is_ended_by_sigterm(tmp_path):
     """As `nohup` and the background of a script start it."""
     line = f"trap '' HUP INT; exec {sys.executable} -m canprobe run free --duration 600 --out results"

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 from network_buses import bare, group  # noqa: F401
+from patience import patience_s
 
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.session.target import Target
@@ -37,7 +38,7 @@ def test_nodes_of_a_bus_yml_are_scanned_over_multicast(group, tmp_path, capsys):
         assert (node["node_id"], node["vendor_id"], node["product_code"]) == (16, 0xCA5E, 0x1616)
     finally:
         emulator.send_signal(signal.SIGINT)
-        assert emulator.wait(20) == 0
+        assert emulator.wait(patience_s(20)) == 0
         emulator.stderr.close()
 
 

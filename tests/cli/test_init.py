@@ -43,6 +43,7 @@ def urdf(tmp_path):
     return path
 
 
+@pytest.mark.slow(reason="one more arm whose first scene runs")
 def test_the_first_scene_of_an_arm_on_a_rail_runs_at_once(tmp_path, urdf, capsys):
     folder = tmp_path / "my cell"
     assert main(["init", str(folder), "--urdf", str(urdf)]) == 0
@@ -62,6 +63,7 @@ def test_the_first_scene_of_an_arm_on_a_rail_runs_at_once(tmp_path, urdf, capsys
     assert cell["joints"]["j6"]["speed_deg_s"] > 0, "the URDF has none"
 
 
+@pytest.mark.slow(reason="one more first scene")
 def test_a_run_takes_the_files_of_its_cell_along(tmp_path, urdf, capsys):
     folder, out = tmp_path / "cell", tmp_path / "run"
     assert main(["init", str(folder), "--urdf", str(urdf)]) == 0
@@ -124,12 +126,14 @@ def only(folder, name, *rates):
     return str(path)
 
 
+@pytest.mark.slow(reason="plans at several bit rates")
 def test_the_bus_has_the_fastest_bit_rate_that_all_files_have(tmp_path, capsys):
     files = [only(tmp_path, "slow.eds", 125, 500), *[only(tmp_path, "fast.eds", 125, 500, 1000)] * 5]
     assert main(["init", str(tmp_path / "cell"), *(word for file in files for word in ("--eds", file))]) == 0
     assert tomllib.loads((tmp_path / "cell" / "cell.toml").read_text())["bus"]["bitrate"] == 500_000
 
 
+@pytest.mark.slow(reason="plans of a slow bus, for every way out")
 def test_a_drive_of_250_kbit_is_planned_at_once(tmp_path, urdf, capsys):
     eds = only(tmp_path, "only_250k.eds", 250)
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", eds]) == 0

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import pytest
 from network_buses import group  # noqa: F401
 from scripted_masters import Master, TargetElsewhere
+from waiting import wait_until
 
 import canprobe
 from canprobe.cli import main
@@ -105,7 +106,7 @@ def test_wrong_usage(words, told, capsys):
 
 def test_a_command_is_started_and_judged(group, tmp_path, capsys):
     words = ["--passive", "--output", str(tmp_path / "out.txt"), "--log", str(tmp_path / "bus.log"), "--json"]
-    assert main(["judge", *NODE, *words, "--seconds", "20", "--", sys.executable, str(SMALL), "1"]) == 1
+    assert main(["judge", *NODE, *words, "--seconds", "600", "--", sys.executable, str(SMALL), "1"]) == 1
     document = json.loads(capsys.readouterr().out)
     found = {row["name"] for row in document["rows"] if row["verdict"] == "FAIL"}
     assert {"01 target at enable", "06 first RPDO zero-filled"} <= found
@@ -126,9 +127,16 @@ def test_a_command_that_fails_and_one_that_never_ends(group, tmp_path, capsys):
 
 def test_ctrl_c_ends_the_command_while_the_nodes_are_served(group, tmp_path, capsys):
     master = "import can, time\nbus = can.Bus()\nbus.send(can.Message(arbitration_id=0x80, is_extended_id=False))\n"
-    master += "try:\n    time.sleep(30)\nfinally:\n    bus.shutdown()\n    print('in order')"
-    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    master += (
+        "try:\n    print('ready', flush=True)\n    time.sleep(600)\nfinally:\n    bus.shutdown()\n    print('in order')"
+    )
     out = tmp_path / "out.txt"
+
+    def interrupt():
+        wait_until(lambda: out.exists() and "ready" in out.read_text(), lambda: True, str)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
     assert main(["judge", *NODE, "--passive", "--output", str(out), "--", sys.executable, "-c", master]) == 0
     assert "in order" in out.read_text() and "KeyboardInterrupt" in out.read_text()
 

@@ -23,6 +23,7 @@ def run(out: Path, *words: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow(reason="a whole run with other estimators and pictures")
 def test_the_summary_comes_before_other_estimators_and_pictures(tmp_path: Path) -> None:
     lines = run(tmp_path, "--full", "--set", 'shape.also=["chen1996"]')
     words = [line.split()[0] for line in lines]

@@ -154,6 +154,7 @@ def test_every_packaged_scene_has_figures_to_expect_and_the_list_shows_them(caps
     assert listed == scenes
 
 
+@pytest.mark.slow(reason="a whole packaged scene")
 def test_a_run_of_a_packaged_scene_as_it_is_shows_what_to_expect(capsys, tmp_path):
     assert main(["run", "press", "--bus", "direct", "--out", str(tmp_path / "a b"), "-q"]) == 0
     out, err = capsys.readouterr()

@@ -17,13 +17,21 @@ def send(can_id, data):
     bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
 
-def hear(can_id):
-    until = time.monotonic() + 2.0
+def heard(can_id, patience_s):
+    until = time.monotonic() + patience_s
     while time.monotonic() < until:
         message = bus.recv(0.1)
         if message is not None and message.arbitration_id == can_id:
             return bytes(message.data)
-    sys.exit(f"{can_id:03X} was not heard")
+    return None
+
+
+def hear(can_id):
+    return heard(can_id, 60.0) or sys.exit(f"{can_id:03X} was not heard")
+
+
+def read(index):
+    send(0x600 + node, struct.pack("<BHBi", 0x40, index, 0, 0))
 
 
 def write(index, subindex, value, size):
@@ -31,11 +39,14 @@ def write(index, subindex, value, size):
     hear(0x580 + node)
 
 
+read(0x1000)
+while heard(0x580 + node, 1.0) is None:  # until the nodes are served
+    read(0x1000)
 write(0x1006, 0, 20_000, 4)
 write(0x60C2, 1, 20, 1)
 write(0x60C2, 2, -3, 1)
 write(0x6060, 0, 8, 1)
-send(0x600 + node, struct.pack("<BHBi", 0x40, 0x6061, 0, 0))
+read(0x6061)
 hear(0x580 + node)
 send(0, bytes((1, node)))
 for word, state in ((0, 0x40), (6, 0x21), (7, 0x23), (15, 0x27), (15, 0x27), (2, 0x40), (0, 0x40)):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import patience_s as stretched
 from slow_scene import write_slow_scene
 from waiting import wait_until
 
@@ -85,7 +86,7 @@ class Command:
 
     def wait(self, patience_s: float = PATIENCE_S) -> int:
         """Wait for the end; return the exit status. Nothing may be left of it."""
-        status = self._process.wait(patience_s)
+        status = self._process.wait(stretched(patience_s))
         assert self.children == []
         return status
 
@@ -96,7 +97,7 @@ class Command:
             The lines on stderr, without the warnings of the patience that the scenes of a slow machine need, and of
             joints that nobody has checked.
         """
-        ended = self._process.wait(PATIENCE_S)
+        ended = self._process.wait(stretched(PATIENCE_S))
         assert ended == status, f"ended with {ended}: {self.err}"
         assert "Traceback" not in self.err
         assert self.children == []
@@ -158,7 +159,7 @@ class Bus:
 
     def until(self, done: Callable[[TimedFrame], bool], *alive: Command) -> None:
         """Until `done` holds for a frame; the commands must keep running until then."""
-        deadline_ns = self.clock.now_ns() + round(PATIENCE_S * 1e9)
+        deadline_ns = self.clock.now_ns() + round(stretched(PATIENCE_S) * 1e9)
         while not any([done(frame) for frame in self.hear()]):
             for command in alive:
                 assert command.running, f"ended too early: {command.err}"

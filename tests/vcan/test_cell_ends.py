@@ -11,13 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from canprobe.cli import main
+
 pytestmark = pytest.mark.vcan
 NODES = (1, 2, 3, 4, 5, 6, 16)
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 
 
 @pytest.mark.parametrize(
-    ("name", "cycles", "number", "status"), [("cylinder", 300, signal.SIGINT, 130), ("free", 50, signal.SIGTERM, 143)]
+    ("name", "cycles", "number", "status"),
+    [
+        ("cylinder", 300, signal.SIGINT, 130),
+        pytest.param("free", 50, signal.SIGTERM, 143, marks=pytest.mark.slow(reason="the other signal on a real bus")),
+    ],
 )
 def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int, status: int) -> None:
     command = bench.start("run", bench.scene(name), *ON_VCAN0, "--out", "results")
@@ -38,10 +44,8 @@ def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int
             assert any(fault.startswith("lift off, at ") for fault in results.summary["faults"])
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_a_second_cell_is_refused_and_leaves_the_first_one_up_which_ends_with_a_signal(
-    bench: Any, number: int, status: int
-) -> None:
+@pytest.mark.slow(reason="two cells on a real bus; test_another_master_is_at_work is of the same rule")
+def test_a_second_cell_is_refused_and_leaves_the_first_one_up(bench: Any) -> None:
     command = bench.start("up", bench.scene("free"), *ON_VCAN0)
     bench.bus.until_enabled(1, by=command)
     second = bench.start("up", bench.scene("free"), *ON_VCAN0)
@@ -50,13 +54,14 @@ def test_a_second_cell_is_refused_and_leaves_the_first_one_up_which_ends_with_a_
         assert not heard.intersection((0x000, *(base + n for base in (0x580, 0x600) for n in NODES)))
     assert second.end(3)[-1].endswith("another master is at work here; stop it first")
     bench.bus.until_enabled(1, by=command)
-    command.send(number)
-    lines = command.end(status)
+    command.send(signal.SIGINT)
+    lines = command.end(0)
     bench.bus.hear()
     bench.assert_left_safe(bench.bus.last, *NODES[:6])
     assert "the cell is up: nodes 1, 2, 3, 4, 5, 6; Ctrl-C stops it" in lines
 
 
+@pytest.mark.slow(reason="a killed process on a real bus; the default kills a node and a master")
 def test_the_emulator_is_killed_in_mid_scan(bench: Any) -> None:
     (bench.folder / "results").mkdir()
     (bench.folder / "results" / "truth.npz").write_text("of an earlier run")
@@ -112,7 +117,7 @@ def test_emulated_nodes_go_with_a_master_that_is_killed(bench: Any) -> None:
     ("frame", "what"),
     [
         ((0x77F, b"\x05"), "a heartbeat of node 127"),
-        ((0x080, b"\x01"), "SYNC"),
+        pytest.param((0x080, b"\x01"), "SYNC", marks=pytest.mark.slow(reason="the other sign on a real bus")),
     ],
 )
 def test_another_master_is_at_work(bench: Any, frame: tuple[int, bytes], what: str) -> None:
@@ -134,8 +139,12 @@ def test_another_master_is_at_work(bench: Any, frame: tuple[int, bytes], what: s
         ("emulate", "press", "--channel", "vcan7"),
     ],
 )
-def test_an_interface_that_is_not_there(bench: Any, words: tuple[str, ...]) -> None:
-    (line,) = bench.start(*words).end(3)
+def test_an_interface_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(list(words)) == 3
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("canprobe: vcan7: no such interface; type: ")
     assert "ip link add dev vcan7 type vcan" in line
-    assert not (bench.folder / "runs").exists()
+    assert not (tmp_path / "runs").exists()

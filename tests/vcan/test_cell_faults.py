@@ -35,6 +35,7 @@ def test_the_interface_goes_down_in_mid_run(bench: Any) -> None:
     assert any("while stopping" in fault for fault in results.summary["faults"])
 
 
+@pytest.mark.slow(reason="the default takes the interface down and leaves it there")
 def test_the_interface_comes_back_while_the_cell_stops(bench: Any) -> None:
     command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
     bench.bus.until_enabled(6, by=command, cycles=60)
@@ -44,6 +45,7 @@ def test_the_interface_comes_back_while_the_cell_stops(bench: Any) -> None:
     assert bench.results("results").summary["completed"] is False
 
 
+@pytest.mark.slow(reason="a stopped process on a real bus; the default kills one")
 def test_the_emulator_stands_still_and_the_drives_are_lost(bench: Any) -> None:
     command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
     bench.bus.until_enabled(6, by=command, cycles=60)
@@ -58,6 +60,7 @@ def test_the_emulator_stands_still_and_the_drives_are_lost(bench: Any) -> None:
     assert "lost: no usable TPDO" in line or "lost: no heartbeat" in line  # at 100 Hz both come within 250 ms
 
 
+@pytest.mark.slow(reason="a full disk on a real bus; without one in tests/cli/test_full_disk.py")
 def test_the_disk_is_full(bench: Any) -> None:
     small = bench.folder / "small"
     small.mkdir()
@@ -74,6 +77,7 @@ def test_the_disk_is_full(bench: Any) -> None:
         type_as_root("umount", str(small))
 
 
+@pytest.mark.slow(reason="a cell and a monitor on a real bus")
 def test_monitor_sees_the_cell_and_sends_nothing(bench: Any) -> None:
     command = bench.start("up", bench.scene("free"), *ON_VCAN0)
     bench.bus.until_enabled(1, by=command)
@@ -87,6 +91,7 @@ def test_monitor_sees_the_cell_and_sends_nothing(bench: Any) -> None:
     command.end(0)
 
 
+@pytest.mark.slow(reason="two recoveries on a real bus")
 def test_a_cell_that_recovers_outlives_a_power_cycle_and_an_interface_that_was_down(bench: Any) -> None:
     command = bench.start("up", bench.scene("free"), *ON_VCAN0, "--recover", "--verbose")
     command.until_told("the cell is up")

@@ -78,6 +78,7 @@ def full_scan(bench: Any) -> Any:
     return pytest.fail("\n\n".join(told))
 
 
+@pytest.mark.slow(reason="a whole scan at its rate on a real bus")
 @pytest.mark.timeout(ATTEMPTS * PATIENCE_S + 60.0)
 def test_the_cylinder_scan_at_400_hz(bench: Any, record_property: Callable[[str, object], None]) -> None:
     results = full_scan(bench)

@@ -9,7 +9,9 @@ from typing import Any
 
 import canopen
 import pytest
+from patience import patience_s
 
+from canprobe.cli import main
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
@@ -45,20 +47,21 @@ def test_a_canopen_master_that_is_not_ours(served: Any, vcan0: str) -> None:
         for subindex in (1, 2, 3):
             assert node.sdo[0x1018][subindex].raw == node.object_dictionary[0x1018][subindex].default
         node.sdo[0x1017].raw = 50
-        assert node.nmt.wait_for_heartbeat(timeout=10) == "PRE-OPERATIONAL"
+        assert node.nmt.wait_for_heartbeat(timeout=patience_s(10)) == "PRE-OPERATIONAL"
         node.nmt.state = "OPERATIONAL"
-        while node.nmt.wait_for_heartbeat(timeout=10) != "OPERATIONAL":
+        while node.nmt.wait_for_heartbeat(timeout=patience_s(10)) != "OPERATIONAL":
             pass
         node.sdo[0x6040].raw = 0x06
         assert node.sdo[0x6041].raw & 0x6F == 0x21, "ready to switch on"
         booted = threading.Event()
         network.subscribe(0x703, lambda can_id, data, t_s: booted.set() if data == b"\0" else None)
         node.nmt.state = "RESET"
-        assert booted.wait(10), "the boot-up"
+        assert booted.wait(patience_s(10)), "the boot-up"
     finally:
         network.disconnect()
 
 
+@pytest.mark.slow(reason="a second touch on a real bus; the foreign drives are not emulated either")
 def test_a_run_that_emulates_nothing(served: Any, bench: Any) -> None:
     scene = bench.scene("press", emulated=False)
     command = bench.start("run", scene, *ON_VCAN0, "--duration", 1, "--out", "results")
@@ -73,22 +76,25 @@ def test_a_run_that_emulates_nothing(served: Any, bench: Any) -> None:
     assert served.running
 
 
-def test_a_node_of_another_make_is_refused(served: Any, bench: Any) -> None:
+def test_a_node_of_another_make_is_refused(served: Any, bench: Any, capsys: pytest.CaptureFixture[str]) -> None:
     text = eds_path("puma260_joint").read_text()
     assert "DefaultValue=0x00000260" in text
     other = bench.folder / "other_drive.eds"
     other.write_text(text.replace("DefaultValue=0x00000260", "DefaultValue=0x00000261"))
     scene = bench.scene("free", emulated=False, eds=str(other))
-    (line,) = bench.start("run", scene, *ON_VCAN0, "--out", "results").end(3)
+    assert main(["run", str(scene), *ON_VCAN0, "--out", str(bench.folder / "results")]) == 3
+    *_, line = capsys.readouterr().err.splitlines()
     assert line.startswith("canprobe: node 1: (joint 1) is not the device of ")
     assert "other_drive.eds: 1018h:02 product code expected 0x261, got 0x260" in line
 
 
-def test_a_busy_node_id_is_refused(served: Any, bench: Any) -> None:
-    (line,) = bench.start("emulate", "cylinder", "--channel", "vcan0", "--nodes", "16,5").end(3)
+def test_a_busy_node_id_is_refused(served: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["emulate", "cylinder", "--channel", "vcan0", "--nodes", "16,5"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("canprobe: node 5: is on vcan0 already; its id is busy")
 
 
+@pytest.mark.slow(reason="starts a run to see it refused; emulate is refused alike")
 def test_a_run_whose_emulated_nodes_are_there_already(served: Any, bench: Any) -> None:
     (line,) = bench.start("run", "press", *ON_VCAN0, "--out", "results").end(3)
     assert line.startswith("canprobe: node 1: is on vcan0 already; its id is busy")

@@ -14,6 +14,7 @@ from canprobe.lab.studies.faults_vcan import ProcessFault
 pytestmark = pytest.mark.vcan
 
 
+@pytest.mark.slow(reason="a whole study on a real bus")
 @pytest.mark.timeout(300)
 def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
     type_as_root("ip", "link", "set", "vcan0", "up")  # the study takes it down, too
@@ -31,6 +32,7 @@ def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
     assert rows["nodes killed"]["drives"] == "gone"
 
 
+@pytest.mark.slow(reason="a whole study on a real bus")
 @pytest.mark.timeout(300)
 def test_cells_come_back_on_a_real_bus(tmp_path, capsys):
     """Quick: a node without power and one without heartbeats; jumps are read from the bus log."""

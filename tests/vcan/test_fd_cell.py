@@ -78,6 +78,7 @@ def test_an_interface_without_fd_says_what_to_type(vcan0: str) -> None:
         SocketCanPort(vcan0, MonotonicClock(), data_bitrate=FAST)
 
 
+@pytest.mark.slow(reason="a touch over CAN FD on a real bus; in lockstep: tests/cell/integration/test_fd_cell.py")
 def test_the_full_image_beside_the_arm_in_two_processes(bench: Any, fd_channel: str) -> None:
     scene = bench.scene("press")
     text = scene.read_text().replace("[sensor]\n", '[sensor]\nmode = "image"\neds = "tactile_array_fd.eds"\n')

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import patience_s
 
 import canprobe
 from canprobe.fieldbus.eds.packaged import eds_path
@@ -36,7 +37,7 @@ class Foreign:
     def end(self) -> dict[int, dict[str, Any]]:
         """End it; what each drive saw, by node id."""
         self._process.terminate()
-        out, _ = self._process.communicate(timeout=20)
+        out, _ = self._process.communicate(timeout=patience_s(20))
         assert self._process.returncode == 0
         return {seen["node_id"]: seen for seen in map(json.loads, out.splitlines())}
 
@@ -111,6 +112,7 @@ emulated = false
 """
 
 
+@pytest.mark.slow(reason="one foreign drive; the default runs six")
 @pytest.mark.parametrize(
     ("cell", "joint", "eds", "mode", "node_id", "position", "word"),
     [

@@ -11,6 +11,7 @@ import termios
 from pathlib import Path
 
 import pytest
+from patience import patience_s
 
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
 from canprobe.fieldbus.vcan.child import supervise
@@ -19,7 +20,7 @@ from canprobe.fieldbus.vcan.guest import PROGRAM, GuestError, GuestJob, missing_
 CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
 ROOT = Path(__file__).parents[2]
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(reason="boots a virtual machine for each test")
 needs_guest = pytest.mark.skipif(
     bool(missing_packages()), reason=f"no {PROGRAM}; type: apt-get install -y {' '.join(missing_packages())}"
 )
@@ -146,7 +147,7 @@ def test_a_process_that_only_computes_does_not_hold_the_guest_up(tmp_path: Path)
 @needs_guest
 def test_a_killed_command_is_told_what_kills_there(tmp_path: Path) -> None:
     process = start(tmp_path, "--", "sh", "-c", "kill -KILL $$")
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=patience_s(60))
     assert process.returncode == 128 + signal.SIGKILL
     few = int(Path("/proc/sys/vm/max_map_count").read_text()) < 1 << 20
     assert (b"sysctl vm.max_map_count=1048576" in error) == few

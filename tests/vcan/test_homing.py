@@ -25,6 +25,7 @@ home_deg = 0
 """
 
 
+@pytest.mark.slow(reason="homing of a cell and two runs on a real bus")
 def test_a_run_after_up_home(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(bench.folder / "state"))
     scene = bench.scene("free", emulated=False)

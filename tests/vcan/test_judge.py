@@ -34,6 +34,7 @@ def test_a_small_master_on_python_can_jumps(vcan0: str, capsys: Any) -> None:
     assert (status, names) == (1, {"01 target at enable", "06 first RPDO zero-filled"})
 
 
+@pytest.mark.slow(reason="three ways of another's master; the default judges a small one")
 @pytest.mark.parametrize(
     ("way", "expected"),
     [

@@ -17,6 +17,7 @@ SECONDS = 4
 ERROR_FRAMES = (0x20000002, 0x20000088, 0x200000A8)  # a lost arbitration, a protocol error, no acknowledgement
 
 
+@pytest.mark.slow(reason="four seconds of a cell on a real bus; in lockstep: tests/cell/integration")
 def test_a_run_counts_what_its_plan_lists(bench: Any) -> None:
     """At 100 Hz. Cycles that the machine could not keep are counted by the run itself and allowed for."""
     scene = bench.scene("press")

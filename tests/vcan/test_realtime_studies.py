@@ -11,6 +11,7 @@ from canprobe.cli import main
 pytestmark = pytest.mark.vcan
 
 
+@pytest.mark.slow(reason="a whole study on a real bus")
 @pytest.mark.timeout(300)
 def test_the_quick_study_measures_every_case(tmp_path, capsys):
     assert main(["study", "realtime", "--quick", "--json", "--out", str(tmp_path)]) == 0
@@ -34,6 +35,7 @@ def test_the_quick_study_measures_every_case(tmp_path, capsys):
     assert (tmp_path / "realtime.csv").read_text().count("\n") == 1 + len(rows)
 
 
+@pytest.mark.slow(reason="a whole study on a real bus")
 @pytest.mark.timeout(200)
 def test_the_soak_counts_what_the_interface_counts(tmp_path, capsys):
     assert main(["study", "realtime", "--soak", "--quick", "--json", "--out", str(tmp_path)]) == 0

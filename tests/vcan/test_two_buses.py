@@ -52,6 +52,7 @@ def second_bus() -> Iterator[SocketCanPort]:
     delete(SECOND)
 
 
+@pytest.mark.slow(reason="two interfaces; in lockstep: tests/cell/integration/test_two_buses.py")
 def test_an_arm_of_another_process_and_an_emulated_sensor_on_its_own_bus(bench: Any, second_bus: Any) -> None:
     arm = bench.start("emulate", "free", "--channel", "vcan0").until_told("serving nodes")
     scene = bench.folder / "split.toml"
@@ -97,6 +98,7 @@ duration_s = 1
 """
 
 
+@pytest.mark.slow(reason="two interfaces; in lockstep: tests/cell/integration/test_two_buses.py")
 def test_emulated_drives_of_one_arm_on_two_interfaces(bench: Any, second_bus: Any) -> None:
     """One process serves both buses from one plant, and one master runs the arm over both."""
     scene = bench.folder / "spread.toml"

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import pytest
+from patience import patience_s
 from slow_scene import write_slow_scene
 
 from canprobe.fieldbus.bus.candump import read_candump
@@ -52,7 +53,7 @@ class Tool:
     def __exit__(self, *_: object) -> None:
         self._process.send_signal(signal.SIGINT)
         try:
-            self._process.wait(20)
+            self._process.wait(patience_s(20))
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -147,6 +148,7 @@ def bring_up(start_shared: Any, tmp_path_factory: pytest.TempPathFactory) -> tup
     return read_log(ours), candump.frames, ours
 
 
+@pytest.mark.slow(reason="a bring-up for two tools; the default asks candump with less")
 def test_candump_saw_every_frame_that_we_logged(bring_up: tuple[Frames, Frames, Path]) -> None:
     ours, theirs = by_id(bring_up[0]), by_id(bring_up[1])
     assert len(bring_up[0]) > 1000
@@ -191,6 +193,7 @@ def rebuild(row: dict[str, str]) -> bytes:
     return data
 
 
+@pytest.mark.slow(reason="a bring-up for two tools; the default asks candump with less")
 def test_tshark_reads_every_frame_of_the_bring_up_as_we_wrote_it(bring_up: tuple[Frames, Frames, Path]) -> None:
     ours, _, path = bring_up
     words = [tool("tshark"), "-r", str(path), "-d", "can.subdissector,canopen", "-T", "fields", "-E", "separator=/t"]
@@ -233,6 +236,7 @@ def test_cansend_asks_and_candump_hears_the_answer(served: Any, bench: Any) -> N
     assert 0x185 not in by_id(heard), "TPDO1 of the drive is synchronous, and nobody sends a SYNC"
 
 
+@pytest.mark.slow(reason="one more tool of can-utils")
 def test_canbusload_counts_the_frames_and_bits_that_we_count(served: Any, bench: Any) -> None:
     """Bits for the worst stuffing, as canbusload counts unless it is told to leave stuffing out."""
     with Load(bench.folder / "worst.txt") as worst, Load(bench.folder / "best.txt", "-i") as best:
@@ -246,6 +250,7 @@ def test_canbusload_counts_the_frames_and_bits_that_we_count(served: Any, bench:
     assert best.total == (150, sum(map(best_case_bits, sizes)), 8 * sum(sizes))
 
 
+@pytest.mark.slow(reason="one more tool of can-utils")
 def test_nodes_survive_what_cangen_throws_at_them(served: Any, bench: Any) -> None:
     """Random identifiers and lengths, NMT commands and broken SDO requests among them."""
     words = [tool("cangen"), "vcan0", "-g", "1", "-n", "1500", "-I", "r", "-L", "r", "-D", "r", "-v"]

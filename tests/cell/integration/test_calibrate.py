@@ -63,6 +63,7 @@ def test_terminal_and_files_say_it(calibrated):
     assert "centre_lateral_mm = [0." in (calibrated.out / "tool.toml").read_text()
 
 
+@pytest.mark.slow(reason="a scan after the calibration")
 def test_a_scan_with_a_wrong_tool_gets_better_by_it(calibrated):
     scene = fast(canprobe.load_scene("cylinder"), plant={"tool_error_mm": ERROR_MM}, shape={"also": ()})
     better = with_tool(scene, calibrated.out / "tool.toml")

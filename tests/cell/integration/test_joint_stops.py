@@ -55,9 +55,17 @@ def with_stop(scene, name, end, value):
     return replace(scene, joints={**scene.joints, name: replace(joint, **{key: value})})
 
 
+OTHERS = pytest.mark.slow(reason="the stops of other arms")
+
+
 @pytest.mark.parametrize(
     ("urdf", "kind"),
-    [("ur5_robot.urdf", "scan"), ("panda.urdf", "scan"), ("xarm7.urdf", "scan"), ("xarm7.urdf", "calibrate")],
+    [
+        ("ur5_robot.urdf", "scan"),
+        pytest.param("panda.urdf", "scan", marks=OTHERS),
+        pytest.param("xarm7.urdf", "scan", marks=OTHERS),
+        pytest.param("xarm7.urdf", "calibrate", marks=OTHERS),
+    ],
 )
 def test_a_stop_on_the_way_of_the_run_is_refused_and_one_beyond_it_is_not(tmp_path, urdf, kind):
     scene = scene_of(tmp_path, urdf, kind)

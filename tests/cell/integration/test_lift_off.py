@@ -252,6 +252,7 @@ def test_a_light_press_after_a_strong_one_is_told():
     assert left_pressing(run.session) == [pytest.approx(run.session.truth["force_n"][-1], abs=0.15)]
 
 
+@pytest.mark.slow(reason="12 s of a press")
 def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
     """After 6 s at 7 N the array shows for a while what a touch would, although creep is corrected."""
     scene = canprobe.load_scene("press", {"task.duration_s": 6.0})

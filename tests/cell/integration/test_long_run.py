@@ -31,9 +31,8 @@ def started(out, *words):
     return process
 
 
-@pytest.mark.parametrize("scene", ["free", "cylinder"])
-def test_a_run_that_is_killed_leaves_its_rows(scene, tmp_path, capsys):
-    process = started(tmp_path, scene, "--bus", "direct")
+def test_a_run_that_is_killed_leaves_its_rows(tmp_path, capsys):
+    process = started(tmp_path, "cylinder", "--bus", "direct")
     process.kill()
     process.communicate()
     assert {path.name for path in tmp_path.iterdir()} == {"scene.toml", ROWS_FOLDER}
@@ -44,20 +43,19 @@ def test_a_run_that_is_killed_leaves_its_rows(scene, tmp_path, capsys):
     assert abs(len(truth) - len(table)) <= BLOCK_ROWS
     both = min(len(truth), len(table))
     np.testing.assert_allclose(truth["q_rad_1"][:both], table["q_rad_1"][:both], atol=1e-3)
-    if scene == "cylinder":
-        images = canprobe.load_table(tmp_path / "tactile.npz")
-        assert abs(2 * len(images) - len(table)) <= 2 * BLOCK_ROWS
+    images = canprobe.load_table(tmp_path / "tactile.npz")
+    assert abs(2 * len(images) - len(table)) <= 2 * BLOCK_ROWS
     whole = canprobe.run("free", bus="direct", duration_s=0.1, out=tmp_path, force=True)
     assert not (tmp_path / ROWS_FOLDER).exists()
     assert len(canprobe.load_table(tmp_path / "log.npz")) == len(whole.log["t_s"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_leaves_all_files(number, tmp_path):
+@pytest.mark.slow(reason="a long run in a process; tests/cli/test_bad_input.py interrupts a short one")
+def test_an_interrupt_leaves_all_files(tmp_path):
     process = started(tmp_path, "cylinder", "--bus", "direct", "--no-figures")
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     process.communicate()
-    assert process.returncode == 128 + number
+    assert process.returncode == 128 + signal.SIGTERM
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["completed"], summary["stop_reason"]) == (False, "interrupted")
     files = {"scene.toml", "summary.json", "log.npz", "tactile.npz", "truth.npz", "surface.npz"}
@@ -100,14 +98,14 @@ def most_mib(scene, seconds, out):
     return int(subprocess.run(words, env=env, stdout=subprocess.PIPE, check=True).stdout) / 1024
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="two minutes of a cell")
 @pytest.mark.timeout(600)
 def test_rows_of_two_minutes_take_no_memory(tmp_path):
     """44 000 cycles more: in memory they take 63 MiB (`files=False`); on disk 21, most of it while columns are made."""
     assert most_mib("free", 120, tmp_path / "long") < most_mib("free", 10, tmp_path / "short") + 40
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="two minutes of a cell")
 @pytest.mark.timeout(600)
 def test_a_scan_of_two_minutes_ends_with_all_its_files(tmp_path):
     """Contacts and answers are kept until 200 s and 400 s; an hour has no more of them."""

@@ -48,7 +48,7 @@ def test_a_touch_is_as_planned_to_the_frame(press):
     assert measured.load < measured.planned_worst
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="four whole runs; the default measures them where they run anyway")
 @pytest.mark.parametrize("name", ["axial", "cylinder", "free", "listen"])
 def test_a_packaged_scene_sends_what_its_plan_lists_and_nothing_else(name, tmp_path):
     """The others are measured where they run anyway, or differ from `cylinder` by the object, which no frame knows."""

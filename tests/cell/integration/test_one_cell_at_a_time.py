@@ -257,6 +257,7 @@ def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkey
     assert len(canprobe.load_table(tmp_path / "log.npz")) > 10
 
 
+@pytest.mark.slow(reason="one more run")
 def test_the_truth_of_a_shorter_run_is_told(tmp_path):
     scene = canprobe.load_scene("cylinder")
     long = undrawn_run(scene, out=tmp_path / "long", duration_s=1.4)

@@ -93,6 +93,9 @@ EPISODES = [
 ]
 
 
+STEEL = pytest.mark.slow(reason="the same stalls on a second object")
+
+
 class PatientScan(Injected):
     """A scan at 25 mm/s whose master is held up again and again, by turns before its SYNC and before its RPDOs."""
 
@@ -124,7 +127,7 @@ class PatientScan(Injected):
         self._stall(measurement, late_sync=1)
 
 
-@pytest.fixture(scope="module", params=["cylinder", "steel"])
+@pytest.fixture(scope="module", params=["cylinder", pytest.param("steel", marks=STEEL)])
 def patient(request: pytest.FixtureRequest) -> PatientScan:
     return PatientScan(request.param)
 

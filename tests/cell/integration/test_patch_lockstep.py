@@ -28,6 +28,7 @@ def score(session, records):
     return score_shape(records, session.truth, session.cell.log.arrays()["t_s"])
 
 
+@pytest.mark.slow(reason="a second path")
 def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
     session, controller = axial
     found = score(session, controller.shape.records)

@@ -63,7 +63,10 @@ class Disturbed(Wrapped):
         return times * 1e-9, forces
 
 
-@pytest.mark.parametrize("share", [1.0, 4.5], ids=["9 kN/m", "20 kN/m"])
+STIFF = pytest.mark.slow(reason="a second stiffness")
+
+
+@pytest.mark.parametrize("share", [1.0, pytest.param(4.5, marks=STIFF)], ids=["9 kN/m", "20 kN/m"])
 def test_an_object_that_gives_way_is_found_again_without_overshoot(share):
     run = Disturbed((0.0, 0.0, -1.8), share=share)
     times, forces = run.run()

@@ -23,7 +23,7 @@ TABLE = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="each packaged scene, whole")
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", TABLE)
 def test_scene_runs_completely_with_sensible_figures(name, tmp_path):
@@ -49,7 +49,7 @@ def test_scene_runs_completely_with_sensible_figures(name, tmp_path):
         assert shape["position_rms_mm"] > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="each packaged scene, whole")
 @pytest.mark.timeout(600)
 def test_a_dynamic_arm_is_as_deterministic_and_keeps_the_force(tmp_path):
     scene = canprobe.load_scene("press")

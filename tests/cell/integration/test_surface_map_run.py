@@ -62,14 +62,16 @@ def test_the_summary_says_how_good_it_is(scan):
     assert f"{figures['contacts']} contacts in {figures['nodes']} nodes, σ " in result.text()
 
 
+@pytest.mark.slow(reason="one more scan")
 def test_the_contacts_of_a_folder_make_the_same_map_again(scan, tmp_path):
     """As for a run of an older canprobe, whose map is refused."""
     result, _ = scan
-    replayed = canprobe.run(result.plan.scene, duration_s=1.5, out=tmp_path / "run", bus="direct")
+    replayed = canprobe.run(result.plan.scene, duration_s=0.5, out=tmp_path / "run", bus="direct")
     again = canprobe.replay(tmp_path / "run").surface_map
     np.testing.assert_array_equal(again.nodes.rows, replayed.surface_map.nodes.rows)
 
 
+@pytest.mark.slow(reason="seven more seconds of a scan")
 def test_answers_are_joined_with_earlier_passes_only_where_a_scene_asks(scan):
     """Ground is known 40 mm, two memories, behind the contact; the weave crosses itself, and a loop takes 5.8 s."""
     plain, _ = scan

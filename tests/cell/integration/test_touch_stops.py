@@ -89,6 +89,7 @@ def test_sensor_lives_but_never_sends_a_frame():
     assert truth["force_n"].max() == 0.0
 
 
+@pytest.mark.slow(reason="a whole touch")
 def test_samples_that_say_they_are_old_do_not_move_the_surface():
     """A sample older than the one before would turn the correction of the servo's surface round."""
     session = press_session()

@@ -11,7 +11,7 @@ import canprobe
 from canprobe.cell.scene.model import PlantSettings
 
 NOMINAL = 1.27e8  # N/m³: 9.4 kN/m at 2 N on the cylinder
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(reason="four whole touches of a servo")
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,7 @@ def scanned(wrap):
     return task.shape.records, session.cell.log.arrays()["q_target_rad"]
 
 
+@pytest.mark.slow(reason="two whole runs")
 def test_a_task_in_a_controller_that_never_updates_it_moves_and_answers_alike():
     """Whoever wraps a task's `step` alone has its estimates none the less, and the same."""
     (answers, targets), (wrapped, wrapped_targets) = scanned(lambda task: task), scanned(lambda task: task.step)

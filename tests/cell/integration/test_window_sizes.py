@@ -36,7 +36,7 @@ def press():
     return change(canprobe.load_scene("press"), arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"})
 
 
-@pytest.mark.parametrize("side", [4, 6, 10])
+@pytest.mark.parametrize("side", [10])
 def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
     scene = change(press, sensor={"window": side})
     result = canprobe.run(scene, out=tmp_path, duration_s=0.4)
@@ -50,6 +50,7 @@ def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
     assert [(w.value, w.read_back) for w in setup.writes if w.index == 0x2008] == [(side, True)]
 
 
+@pytest.mark.slow(reason="two scans of a soft object")
 def test_a_soft_contact_is_felt_by_every_window_that_is_planned_for_it():
     """The truth is the plant's: 10×10 taxels hold the patch of a soft pad; what 8×8 cut off is carried on."""
     foam = canprobe.load_scene("foam")

@@ -92,7 +92,6 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
     "sections",
     [
         {"sensor": {"mode": "image"}},
-        {"sensor": {"window": 12}},
         {"bus": {"transmit_queue": "fifo"}},
         {"cycle": {"rate_hz": 500.0}, "sensor": {"rate_hz": 250.0}},
     ],
@@ -128,6 +127,7 @@ def eight_drives():
     return dataclasses.replace(scene, joints=joints)
 
 
+@pytest.mark.slow(reason="plans of a large cell, for every way out")
 def test_eight_drives_with_an_array_need_a_second_bus_or_a_third_of_a_kilohertz():
     texts = follow_ways_out(eight_drives())
     assert "cycle.rate_hz = 333.333 with sensor.rate_hz = 166.667" in texts
@@ -467,6 +467,7 @@ def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(be
     assert starts == tuple(us * 1000 for us in starts_us)
 
 
+@pytest.mark.slow(reason="plans for every way out")
 def test_a_controller_that_takes_too_long_is_refused(cylinder):
     setup = resolve(cylinder)
     budgets = [make_plan(setup.changed("arm", torque=torque)).traffic.budget for torque in (True, False)]

@@ -63,6 +63,7 @@ def test_force_stiffness_and_curvature_of_an_unseen_array_are_within_the_goals()
     assert found["curvature_percent"] < 5.0
 
 
+@pytest.mark.slow(reason="a whole calibration once more")
 def test_gains_of_the_taxels_are_found(fit, touched):
     config, stiffness, rng = random_array(111)
     gains = TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness).gains
@@ -100,6 +101,7 @@ def test_the_force_of_each_second_is_within_what_is_stated(fit, touched):
     assert 0.5 < score["stated_percent"] / score["error_percent"] < 2.0 and score["within_percent"] > 75.0
 
 
+@pytest.mark.slow(reason="a whole calibration once more")
 def test_without_a_reference_newtons_are_nominal_and_stiffness_goes_with_them(fit, touched):
     nominal = calibrated(touched, reference="none").calibration
     assert nominal.nominal and "nominal newtons" in nominal.newtons and "nominal newtons" in dump_calibration(nominal)

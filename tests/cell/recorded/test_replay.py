@@ -7,6 +7,7 @@ import random
 import re
 
 import numpy as np
+import pytest
 from candump_lines import can_id_of, restamped, stamp_us
 from scenes import without_torque
 from undrawn import undrawn_run
@@ -84,6 +85,7 @@ def test_the_cycles_of_a_run_have_the_times_that_its_estimates_were_dated_by(tmp
     np.testing.assert_array_equal(run.times_s, times_ns * 1e-9)
 
 
+@pytest.mark.slow(reason="one more run to replay")
 def test_a_run_of_drives_that_send_no_torque_is_replayed_and_shown(lockstep_run, tmp_path):
     scene = without_torque(lockstep_run.plan.scene, tmp_path, fixed=True)
     run = undrawn_run(scene, out=tmp_path / "run", duration_s=0.8)
@@ -151,6 +153,7 @@ def test_another_tools_log_of_that_bus_gives_the_shape(delayed_run, tmp_path):
     assert result.summary["shape"]["kappa_true_per_m"] is None
 
 
+@pytest.mark.slow(reason="one more run to replay")
 def test_lost_lines_are_counted_and_cost_little(motion_run, copy_of):
     lost = {"tpdo": 0, "taxels": 0}
 
@@ -199,6 +202,7 @@ def test_a_sync_without_a_counter_places_the_frames_by_their_arrival(lockstep_ru
     assert_same(without.estimates["recursive"], counted.estimates["recursive"])
 
 
+@pytest.mark.slow(reason="one more run to replay")
 def test_another_controllers_log(other_run, tmp_path):
     """No counter, another channel beside it, error frames, remote requests, other nodes, another epoch and pace."""
     lines = []

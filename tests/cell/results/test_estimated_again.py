@@ -5,9 +5,12 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any
 
+import pytest
+
 import canprobe
 
 
+@pytest.mark.slow(reason="a long scan")
 def test_a_long_scan_asks_them_forty_times_and_the_early_summary_has_only_the_estimator_in_the_loop() -> None:
     early: list[Any] = []
     result = canprobe.run(

@@ -45,7 +45,7 @@ def install(tmp_path, monkeypatch):
             del sys.modules[name]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="pip builds a package")
 def test_the_package_of_the_page_is_built_and_used_by_name(tmp_path, monkeypatch, capsys):
     assert sum(len(text.splitlines()) for text in EXAMPLE.values()) <= 30
     for name, text in EXAMPLE.items():

@@ -162,7 +162,7 @@ def damaged(content, rng):
 
 
 @pytest.mark.parametrize("name", ["a.stl", "b.stl", "a.obj", "a.ply", "b.ply", "a.npy", "a.npz", "a.csv", "a.txt"])
-def test_of_a_hundred_damaged_files_each_is_read_or_named(name, tmp_path):
+def test_of_thirty_damaged_files_each_is_read_or_named(name, tmp_path):
     if name.startswith("b") or not name.endswith(("npy", "npz", "csv", "txt")):
         trimesh = pytest.importorskip("trimesh")
         whole = trimesh.load_mesh(cap(tmp_path, name).file, process=False)
@@ -174,7 +174,7 @@ def test_of_a_hundred_damaged_files_each_is_read_or_named(name, tmp_path):
         content = Path(write(tmp_path, name, BUMP_MM, spacing=1.0)).read_bytes()
         settings = ObjectSettings("heights", spacing_mm=1.0)
     rng, named = np.random.default_rng(0), 0
-    for number in range(100):
+    for number in range(30):
         path = tmp_path / f"odd{number}.{name[2:]}"
         path.write_bytes(damaged(content, rng))
         try:
@@ -182,7 +182,7 @@ def test_of_a_hundred_damaged_files_each_is_read_or_named(name, tmp_path):
         except ValueError as error:
             assert str(error).startswith(f"file: {path.name}"), error
             named += 1
-    assert named > 40
+    assert named > 10
 
 
 def test_a_decimal_comma_between_semicolons(tmp_path):

@@ -64,7 +64,13 @@ def the_beginning(plan):
     return step
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+FEW = ("axial", "free", "press", "listen")
+OTHERS = pytest.mark.slow(reason="each packaged scene, on two buses")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[OTHERS] * (name not in FEW)) for name, _ in packaged_scenes()]
+)
 def test_every_packaged_scene_begins_as_on_an_untimed_lockstep_bus(name):
     direct, lockstep = on_both(loaded(name), the_beginning)
     assert_same(direct, lockstep)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from patience import patience_s
 
 import canprobe
 from canprobe.cell.planning.make import make_plan
@@ -89,6 +90,7 @@ def test_the_log_shows_the_deviation_over_the_path(reached):
     assert sigma[known][-1] <= 15.0
 
 
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
 def test_a_target_below_what_the_scan_has_in_common_is_not_reached_and_it_says_why():
     explored = run(SMALL | {"task.target_sigma_um": 3.0}, 3.0).summary["explore"]
     assert not explored["reached"]
@@ -127,6 +129,7 @@ def height_field(folder, heights):
     )
 
 
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends")
 def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
     side, end = np.arange(-13, 13.1, 0.5)[:, None], np.arange(-25, 25.1, 0.5)[None]
     plate = height_field(tmp_path, -(side**2 + end**2) / 300.0)
@@ -137,6 +140,7 @@ def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
     assert result.summary["contact"]["force_max_n"] < 5.0
 
 
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
 def test_it_turns_back_from_a_hollow_as_tight_as_the_probe(tmp_path):
     """Beyond 14 mm the hollow has a radius of 31 mm: the probe of 40 mm would touch both of its walls."""
     x = np.arange(-25, 25.1, 0.5)
@@ -150,6 +154,7 @@ def test_it_turns_back_from_a_hollow_as_tight_as_the_probe(tmp_path):
     assert result.summary["contact"]["force_max_n"] < 5.0
 
 
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
 def test_it_turns_back_before_the_contact_runs_off_the_array():
     """The pad does not follow the surface, and the object is rounder than the scene says."""
     keys = {"task.length_mm": 30.0, "task.width_mm": 20.0, "task.rolling_share": 1.0, "task.duration_s": 2.5}
@@ -159,6 +164,7 @@ def test_it_turns_back_before_the_contact_runs_off_the_array():
     assert 0.0 < explored.closed < 0.6
 
 
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
 def test_it_turns_back_before_a_joint_comes_to_its_limit():
     """The margin of joint 1 is set so that a part of the rectangle lies beyond it, which the plan did not see."""
     plan = make_plan(resolve(scene_with(SMALL | {"task.duration_s": 3.0}, object=ball(60.0))))
@@ -205,5 +211,7 @@ def test_other_scenes_load_nothing_of_it():
         "import sys, canprobe; from canprobe.cell.tasks.from_plan import make_task;"
         "make_task(canprobe.plan('cylinder')); print([m for m in sys.modules if 'explore' in m])"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=patience_s(60)
+    )
     assert found.stdout.strip() == "[]"

@@ -11,6 +11,7 @@ import threading
 
 import pytest
 from network_buses import bare, group  # noqa: F401
+from patience import patience_s
 
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
@@ -151,10 +152,10 @@ def test_can_bridge_joins_two_buses_over_the_network(tmp_path):
     with (tmp_path / "said").open("w+") as said:
         bridge = subprocess.Popen(words, stdout=said, stderr=said)
         try:
-            assert far.heard.wait(20), (tmp_path / "said").read_text()
+            assert far.heard.wait(patience_s(20)), (tmp_path / "said").read_text()
         finally:
             bridge.send_signal(signal.SIGINT)
-            bridge.wait(20)
+            bridge.wait(patience_s(20))
             for server in (near, far):
                 server.listener.close()
                 server.join(10)

@@ -54,7 +54,7 @@ def test_frames_that_hypothesis_finds(make_bench):
     check()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="a million frames; with --benchmark-only")
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("kind", ["tiny", "drive"])
 def test_a_million_frames(benchmark, kind, make_bench, plant):

@@ -7,6 +7,7 @@ import sys
 from typing import get_args
 
 import pytest
+from patience import patience_s
 
 import canprobe
 from canprobe.cell.planning.bridges import BRIDGES, BridgeInfo, check_bridges
@@ -94,7 +95,9 @@ def test_a_run_without_a_bridge_imports_none():
         " or m.startswith('canprobe.lab.bridge.')]\n"
         "print(wrong)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=patience_s(60)
+    )
     assert done.stdout == "[]\n"
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
+from patience import patience_s
 from websockets.exceptions import InvalidHandshake
 from websockets.sync.client import connect
 
@@ -45,10 +46,10 @@ def bridge(recorded):
 
 def advertised(client):
     """Server info and channels, as they come on connecting."""
-    info = json.loads(client.recv(timeout=10))
+    info = json.loads(client.recv(timeout=patience_s(10)))
     channels = {}
     while len(channels) < len(TOPICS):
-        document = json.loads(client.recv(timeout=10))
+        document = json.loads(client.recv(timeout=patience_s(10)))
         if document["op"] == "advertise":
             channels |= {c["topic"]: c for c in document["channels"]}
     return info, channels
@@ -111,6 +112,7 @@ def test_a_plain_client_negotiates_lists_and_receives(recorded, bridge):
     assert status["error"] is None
 
 
+@pytest.mark.slow(reason="6 MB through a server")
 def test_a_client_that_does_not_read_holds_up_no_end(recorded, bridge):
     """It subscribes to everything and takes nothing: neither the server's queue nor the connection's ever empties."""
     one, address = bridge
@@ -136,6 +138,7 @@ def test_a_client_without_the_protocol_is_refused(bridge):
         pass
 
 
+@pytest.mark.slow(reason="a second server")
 def test_a_port_that_is_taken_is_named_with_the_way_out(bridge):
     port = bridge[1].rpartition(":")[2]
     plan = plan_with(canprobe.load_scene("free"), f"foxglove_port = {port}")

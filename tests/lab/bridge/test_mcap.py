@@ -162,6 +162,7 @@ def test_both_readers_see_the_same_messages(recorded):
     assert rows.max() - rows.min() < 8 and columns.max() - columns.min() < 8  # one patch within the window
 
 
+@pytest.mark.slow(reason="writes the whole file once more")
 def test_a_recorded_run_gives_the_same_messages_again(recorded, tmp_path):
     """From what the master measured, everything but the bridge's own state, message by message."""
     folder = tmp_path / "again"
@@ -183,6 +184,7 @@ def test_a_recorded_run_gives_the_same_messages_again(recorded, tmp_path):
     assert again == live
 
 
+@pytest.mark.slow(reason="a full disk once more; tests/cli/test_full_disk.py has most files")
 def test_a_full_disk_leaves_no_part_of_the_file(recorded, tmp_path, capsys):
     folder = tmp_path / "full"
     folder.mkdir()
@@ -206,6 +208,7 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
     assert (frame.id, frame.len, bytes(frame.data)) == (0x181, 64, data)
 
 
+@pytest.mark.slow(reason="a second scene into a file")
 def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
     undrawn_run(canprobe.load_scene("free"), out=tmp_path, duration_s=0.1)
     with (tmp_path / "scene.toml").open("a") as scene:
@@ -216,6 +219,7 @@ def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
     assert topics.count("/joint_states") > 40 and "/wrench" not in topics
 
 
+@pytest.mark.slow(reason="one more run")
 def test_a_run_without_a_folder_cannot_have_a_file():
     with pytest.raises(canprobe.errors.UsageError, match="bridge mcap: it writes a file"):
         canprobe.run(canprobe.load_scene("free"), duration_s=0.1, files=False, bridge=("mcap",))

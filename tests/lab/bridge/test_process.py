@@ -10,6 +10,7 @@ import sys
 
 import pytest
 from mcap.reader import make_reader
+from patience import patience_s
 from waiting import wait_for_size
 
 import canprobe
@@ -134,7 +135,7 @@ def test_an_interrupt_ends_run_and_bridge_with_a_whole_file(tmp_path):
     try:
         wait_for_size(tmp_path / "bus.log", 500_000, run)
         run.send_signal(signal.SIGINT)
-        _, error = run.communicate(timeout=60)
+        _, error = run.communicate(timeout=patience_s(60))
     finally:
         run.kill()
     assert run.returncode == 130 and b"interrupted" in error

@@ -88,6 +88,7 @@ def test_what_is_no_table_is_refused_in_a_line(tmp_path):
             load_table(tmp_path / name)
 
 
+@pytest.mark.slow(reason="a whole example")
 def test_the_example_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     example = resources.files("canprobe") / "lab" / "examples" / "first_look.py"

@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 import viser
 from msgspec import msgpack
+from patience import patience_s
 from websockets.sync.client import connect
 from zstandard import ZstdDecompressor
 
@@ -34,7 +35,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 
 
 def page_at(address):
-    with urllib.request.urlopen(address, timeout=20) as answer:
+    with urllib.request.urlopen(address, timeout=patience_s(20)) as answer:
         assert answer.status == 200
         return answer.read().decode()
 
@@ -83,13 +84,16 @@ def served(recorded):
     process.communicate()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+TERM = pytest.mark.slow(reason="the other signal")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), pytest.param(signal.SIGTERM, 143, marks=TERM)])
 def test_a_run_is_served_until_it_is_told_to_end(served, number, status):
     process, address = served
     assert "<title>Viser</title>" in page_at(address)
     messages(address, {"/arm/3/forearm", "/object/ghost", "/path/000", "GuiSliderMessage", "GuiUplotMessage"})
     process.send_signal(number)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=patience_s(30))
     assert (process.returncode, out, err) == (status, "", "")
     assert port_is_free(address)
     with pytest.raises(ProcessLookupError):
@@ -177,14 +181,14 @@ def call(client, method, parameters):
     client.send(json.dumps({"id": 1, "method": method, "params": parameters}))
     asked = []
     while True:
-        document = json.loads(client.recv(timeout=60))
+        document = json.loads(client.recv(timeout=patience_s(60)))
         if document.get("method") == "Network.requestWillBeSent":
             asked.append(document["params"]["request"]["url"])
         if document.get("id") == 1:
             return document["result"], asked
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="starts a browser")
 @pytest.mark.timeout(600)  # a browser on a busy machine
 def test_the_page_plays_in_chromium_and_asks_for_nothing(chromium, recorded):
     """Opened from the disk; the panel follows the slider, which moves by itself.

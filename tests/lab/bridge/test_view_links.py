@@ -86,7 +86,10 @@ def test_a_run_shows_the_meshes_as_long_as_they_are_there(lab, tmp_path, capsys)
     assert {part.frame for part in parts if not part.name.startswith("solid")} == {0, 1, 2}
 
 
-@pytest.mark.parametrize("left", [None, b"nothing that can be read"])
+CHANGED = pytest.mark.slow(reason="a changed mesh is told as one that is gone")
+
+
+@pytest.mark.parametrize("left", [None, pytest.param(b"nothing that can be read", marks=CHANGED)])
 def test_meshes_that_vanish_or_change_during_a_run_cost_only_their_picture(lab, tmp_path, capsys, left):
     """A run folder refers to them: robots have tens of megabytes of meshes, and no result needs them."""
     out, seen = tmp_path / "run", []

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from patience import patience_s
 
 import canprobe.lab.gym
 from canprobe.cell.results.files import load_table
@@ -38,6 +39,7 @@ def features_of(env, observation):
     return dict(zip(env.names, observation.tolist(), strict=True))
 
 
+@pytest.mark.slow(reason="every check of gymnasium, which resets again and again")
 @pytest.mark.parametrize("kind", ["tactile", "oracle"])  # the first holds the vector of `features`
 def test_gymnasium_has_nothing_to_say_against_it(make, kind):
     with warnings.catch_warnings():
@@ -131,7 +133,10 @@ def test_options_have_the_keys_and_the_checks_of_a_scene(make):
         env.reset(options={"bus.interface": "socketcan"})
 
 
-@pytest.mark.parametrize("kind", ["train", "held_out"])
+TRAIN = pytest.mark.slow(reason="more objects")
+
+
+@pytest.mark.parametrize("kind", [pytest.param("train", marks=TRAIN), "held_out"])
 def test_every_object_can_be_touched(make, kind):
     env = make(estimate=False, options={"objects": kind})
     for number, value in enumerate(canprobe.lab.gym.OBJECTS[kind].values):
@@ -153,6 +158,7 @@ def test_estimate_tells_the_curvature_and_features_hold_no_truth(make):
     assert not [name for name in make().names if name.startswith("true")]
 
 
+@pytest.mark.slow(reason="two environments at once")
 def test_a_vector_of_environments_goes_on_by_itself():
     envs = gymnasium.make_vec(
         "canprobe/TouchScan-v0",
@@ -205,13 +211,14 @@ def test_without_gymnasium_it_says_what_to_install(monkeypatch):
         __import__("canprobe.lab.gym")
 
 
+@pytest.mark.slow(reason="the whole example in a process; tests/cli/test_interrupts.py is of commands")
 def test_the_example_ends_in_one_line_at_ctrl_c():
     command = [sys.executable, "-m", "canprobe.lab.examples.learn_touch_scan", "--population", "2", "--episodes", "1"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     with subprocess.Popen(command, **pipes) as process:
         assert process.stdout.readline().startswith("seed 0, generation 0")
         os.killpg(process.pid, signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=patience_s(60))
     assert (process.returncode, err) == (130, "interrupted\n")
 
 

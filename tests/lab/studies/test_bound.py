@@ -68,6 +68,7 @@ def test_an_unknown_surface_is_named():
         make_ground("plane", 0.1, "spiral", 0.02, 10)
 
 
+@pytest.mark.slow(reason="every estimator over many noises")
 def test_inside_the_region_the_estimators_are_at_the_bound(rows):
     inside = [r for r in rows if r["inside"]]
     assert len(inside) == 2 * len(SUBSET)
@@ -82,6 +83,7 @@ def test_inside_the_region_the_estimators_are_at_the_bound(rows):
     assert 0.6 < pooled < 1.1 * 1.13
 
 
+@pytest.mark.slow(reason="an estimator over many noises")
 def test_outside_the_region_ml_is_honest(rows):
     """A torus's cubic terms are ten times the bound; on the sphere the points' noise turns normals by 20 mrad."""
     torus, sphere = (r for r in rows if not r["inside"] and r["method"] == "ml")
@@ -91,6 +93,7 @@ def test_outside_the_region_ml_is_honest(rows):
         assert row["coverage"] >= 0.82, row
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert main(["study", "bound", "--quick", "--out", str(tmp_path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

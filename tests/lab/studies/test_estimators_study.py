@@ -44,6 +44,7 @@ def test_errors_and_costs_of_every_setting(few):
     assert (costs > 0).all()
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert main(["study", "estimators", "--quick", "--out", str(tmp_path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

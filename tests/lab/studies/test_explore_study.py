@@ -38,6 +38,7 @@ def test_explore_is_compared_with_the_best_of_the_others():
     assert "no shape" in said[1]
 
 
+@pytest.mark.slow(reason="a scene of a study")
 def test_a_scan_shows_more_as_its_path_grows():
     found = measure(ExploreCase("ball-45", "explore", 1.6))
     assert found["stopped"] is None

@@ -71,6 +71,7 @@ def test_the_phases_of_a_task_follow_each_other(task):
     assert all(last - first > 0.1 * S for first, last in windows.values())
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert main(["study", "faults", "--quick", "--workers", "1", "--out", str(tmp_path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

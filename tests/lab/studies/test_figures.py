@@ -232,7 +232,11 @@ PICTURES = {
 }
 
 
-@pytest.mark.parametrize("name", PICTURES)
+SHOWN = ("plane, stopped", "free", "plan", "bound", "faults", "soak")
+OTHERS = pytest.mark.slow(reason="one more picture; the default draws one of each kind")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[OTHERS] * (name not in SHOWN)) for name in PICTURES])
 def test_a_picture_can_be_read(name, tmp_path, monkeypatch):
     sheet, texts = drawn(PICTURES[name], tmp_path / "picture.png", monkeypatch)
     wrong = list(defects(sheet, texts, matplotlib.image.imread(tmp_path / "picture.png")[..., :3]))

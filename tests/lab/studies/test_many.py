@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from patience import patience_s
 from waiting import wait_until
 
 import canprobe
@@ -168,6 +169,7 @@ def test_a_series_that_no_run_has(runs, out):
         many.Runs(runs.scene, runs.keys, runs.rows, runs.outcomes, ("forcen",), 0.01).to_xarray()
 
 
+@pytest.mark.slow(reason="a script with its processes; the default has many runs without one")
 def test_a_script_needs_no_guard(tmp_path):
     """Workers do not import the script that starts them."""
     (tmp_path / "script.py").write_text(
@@ -177,12 +179,13 @@ def test_a_script_needs_no_guard(tmp_path):
         "print(json.dumps([outcome['status'] for outcome in runs.outcomes]))\n"
     )
     command = [sys.executable, "script.py"]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=patience_s(120))
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout) == ["done", "done"] and ended.stderr == ""
     assert (tmp_path / "runs/many-listen/cells.jsonl").is_file()
 
 
+@pytest.mark.slow(reason="processes that are ended and go on")
 def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
     """A kill, the death of a worker and Ctrl-C, one after the other: nothing is left running, lost or done twice."""
     kept = tmp_path / "cells.jsonl"
@@ -198,7 +201,7 @@ def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
         process.communicate,
     )
     process.kill()
-    process.communicate(timeout=30)  # ends when no worker can print any more
+    process.communicate(timeout=patience_s(30))  # ends when no worker can print any more
     lines = [kept.read_bytes().count(b"\n")]
 
     def run():
@@ -234,7 +237,7 @@ def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
     store.close()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="starts a scheduler of dask with its processes")
 @pytest.mark.filterwarnings("default")
 def test_a_dask_scheduler_gives_the_same_table(runs, tmp_path):
     distributed = pytest.importorskip("distributed")

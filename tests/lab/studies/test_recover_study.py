@@ -11,8 +11,10 @@ from canprobe.lab.studies.recover import findings, table_rows
 from canprobe.lab.studies.recover_cases import Outage, RecoverCase, draw_case, shrink
 from canprobe.lab.studies.recover_runs import run_case
 
+MORE = pytest.mark.slow(reason="more seeds of a study")
 
-@pytest.mark.parametrize("seed", range(20))
+
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=MORE) for seed in range(6, 20))])
 def test_a_cell_comes_back_from_what_a_seed_takes(seed):
     outcome = run_case(draw_case(seed))
     assert outcome["failures"] == [], outcome

@@ -128,6 +128,7 @@ def test_an_earlier_run_is_compared_by_kind(tmp_path):
         earlier_rows(file)
 
 
+@pytest.mark.slow(reason="whole scenes of a study")
 def test_random_scenes_follow_from_their_seeds(tmp_path):
     """They differ, cells and arrays of all groups occur, nearly all can be planned."""
     seeds = [SceneSeed(2, kind, number).value() for kind in KINDS for number in (0, 3)]
@@ -147,6 +148,7 @@ def test_random_scenes_follow_from_their_seeds(tmp_path):
         SceneSeed.of(299_000)
 
 
+@pytest.mark.slow(reason="a scene of a study")
 def test_a_calibrated_array_has_the_gains_that_were_calibrated(tmp_path):
     drawn = random_scene(SceneSeed(2, "plane", 1).value(), tmp_path)
     assert drawn.group == "calibrated" and drawn.array is not None
@@ -157,6 +159,7 @@ def test_a_calibrated_array_has_the_gains_that_were_calibrated(tmp_path):
     assert found.image.stiffness == pytest.approx(drawn.scene.plant.stiffness_n_m3, rel=0.1)
 
 
+@pytest.mark.slow(reason="a scene of a study")
 def test_the_line_of_a_seed_repeats_its_scene(capsys):
     """A plane, whose regions hold the truth; the same numbers twice."""
     assert main(["study", "regions", "--seed", "200000", "--json", "-v"]) == 0
@@ -183,6 +186,7 @@ def test_wrong_options_are_refused(words, expected, tmp_path, capsys):
     assert expected in capsys.readouterr().err
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 @pytest.mark.timeout(600)  # a second of a whole cell takes long where many share a processor
 def test_a_small_draw_with_the_whole_sensor(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("canprobe.lab.studies.regions.QUICK_SCENES", 1)
@@ -196,6 +200,7 @@ def test_a_small_draw_with_the_whole_sensor(tmp_path, monkeypatch, capsys):
     assert lines[1].startswith("200000,plane,plane,")
 
 
+@pytest.mark.slow(reason="a whole scene of a study")
 def test_a_model_that_turned_over_on_a_straight_path_begins_again():
     """Contacts of a straight path do not tell how the gradient grows along it: here it passed zero, by 2.1 s."""
     scan = measure(106001)

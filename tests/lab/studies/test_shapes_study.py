@@ -235,6 +235,7 @@ def test_a_draw_is_repeated_and_like_no_other(tmp_path):
     assert {form_of(name)["kind"] for name in drawn(7)} == {form_of(name)["kind"] for name in TEST}
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 @pytest.mark.timeout(600)  # a second of a whole cell takes long where many share a processor
 def test_a_short_run_of_every_method(tmp_path, capsys):
     assert main(["study", "shapes", "--quick", "--out", str(tmp_path), "--json"]) == 0

@@ -157,6 +157,7 @@ ENDINGS = [
 ]
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 def test_quick_touches_end_as_they_may_and_are_drawn(tmp_path):
     result = stability.run(quick=True, sweep=InLine())
     for row, (ended, why) in zip(result.rows, ENDINGS, strict=True):

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from patience import patience_s
 from waiting import wait_until
 
 from canprobe.cli import main
@@ -88,7 +89,7 @@ def run_demo(folder, fate="", *more):
     path = os.pathsep.join([str(folder), os.path.dirname(os.path.dirname(sweep_store.PACKAGE / "x"))])
     return subprocess.run(
         [sys.executable, str(folder / "demo.py"), *more], env={**os.environ, "FATE": fate, "PYTHONPATH": path},
-        capture_output=True, text=True, check=False, timeout=60,
+        capture_output=True, text=True, check=False, timeout=patience_s(60),
     )  # fmt: skip
 
 
@@ -286,7 +287,7 @@ def test_a_killed_process_leaves_no_worker(tmp_path):
     process = subprocess.Popen([sys.executable, tmp_path / "script.py"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout.readline() == b"under way\n"
     process.kill()
-    process.communicate(timeout=60)  # a worker that is left would hold the streams open
+    process.communicate(timeout=patience_s(60))  # a worker that is left would hold the streams open
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
@@ -294,9 +295,10 @@ def test_a_child_whose_parent_is_gone_before_it_asks_ends_at_once(number):
     command = (
         f"from canprobe.cell.session.child_process import end_with_parent; end_with_parent(1 << 22, {int(number)})"
     )
-    assert subprocess.run([sys.executable, "-c", command], check=False, timeout=60).returncode == -number
+    assert subprocess.run([sys.executable, "-c", command], check=False, timeout=patience_s(60)).returncode == -number
 
 
+@pytest.mark.slow(reason="starts a cluster of dask with its processes")
 @pytest.mark.filterwarnings("default")
 def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
     import distributed

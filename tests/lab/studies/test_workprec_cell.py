@@ -39,6 +39,7 @@ def quick():
     return run_cell(quick=True, sweep=Here())
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 def test_quick_has_scans_and_the_plans_refusals(quick):
     done = [r for r in quick.rows if r["ended"] == "done"]
     assert {r["fidelity"] for r in done} == {"ideal", "dynamic"}
@@ -58,6 +59,7 @@ def test_quick_has_scans_and_the_plans_refusals(quick):
         assert f"Refused by the plan, bus {bus}: 500 Hz window." in quick.findings
 
 
+@pytest.mark.slow(reason="a whole study in its quick form")
 def test_files_of_a_study_with_two_tables(quick, tmp_path):
     whole = SimpleNamespace(**{name: getattr(quick, name) for name in ("columns", "findings", "facts")})
     whole.name, whole.rows, whole.more, whole.draw = "first", [], (quick,), lambda path: path.write_bytes(b"")

@@ -60,6 +60,7 @@ def rough(seed=3):
     return z - 3e-4 * np.exp(-(((X - 0.3 * Y - 2e-3) / 8e-4) ** 4))
 
 
+@pytest.mark.slow(reason="looks at all points of a surface")
 def test_the_foot_is_the_nearest_of_all_points_of_a_rough_surface():
     """Against the spline sampled every 20 µm."""
     shape = heights(rough(), pose=np.eye(4))
