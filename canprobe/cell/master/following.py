@@ -25,6 +25,8 @@ WHILES_S = (0.005, 0.02, 0.08, 0.32)
 """Whiles in which the motions are compared, s: a fast joint that stands shows in the first, a slow one in the last."""
 MARGIN_RAD = 0.5e-3
 """Angle of a joint by which a motion may differ: rounding of target and position, noise of the encoder, friction."""
+LATE_PERIODS = 1.5
+"""Periods from a SYNC to the next beyond which that one is late."""
 MIN_MARGIN_COUNTS = 3
 """Least margin in counts."""
 
@@ -47,17 +49,19 @@ class Following:
         self._usual = 1 + len(self._delays) // 2
         size = self._whiles[-1] + len(self._delays) + 1
         self._cycles: deque[tuple[int, Sequence[int], Sequence[int | None]]] = deque(maxlen=size)
+        self._moving_before = False  # before the first of these cycles
 
     def forget(self) -> None:
         """Forget all cycles, as before the first one."""
         self._cycles.clear()
+        self._moving_before = False
 
     def aim(self, targets: Sequence[int], counts: Sequence[int | None], t_ns: int) -> None:
         """Take a cycle: time of its SYNC, positions at it (None: not reported), and the targets that follow it."""
-        if self._cycles:
-            before_ns, last, _ = self._cycles[-1]
-            for _ in range(min(round((t_ns - before_ns) / self._period_ns) - 1, len(self._delays))):
-                self._cycles.append((before_ns, last, (None,) * len(last)))  # no target came: the drives came to rest
+        # behind a late cycle the drives have stopped at their last targets, and nothing before says how they go on
+        if self._cycles and t_ns - self._cycles[-1][0] > LATE_PERIODS * self._period_ns:
+            self._cycles.clear()
+            self._moving_before = True
         self._cycles.append((t_ns, targets, counts))
 
     def beyond(self, motor: int, counts: int, t_ns: int) -> float:
@@ -71,7 +75,7 @@ class Following:
         cycles, margin, most = self._cycles, self._margins[motor], 0.0
         last = len(cycles) - 1
         for span in self._whiles:
-            if span > last:
+            if span > last or (self._moving_before and last + 1 - self._delays[-1] < span):
                 break
             begin_ns, _, before = cycles[-span]
             if (was := before[motor]) is None:
