@@ -500,6 +500,7 @@ class Cell:
         self._note_alarms()
         seen = self.supervisor.seen
         seen.restarts = self._controller.restarts
+        seen.compares_motion = self._controller.compares_motion
         for remark in self._controller.remarks[self._remarks_noted :]:
             self._remarks_noted += 1
             self.notes.add(remark, t_s=(self.start_ns + measurement.t_ns) * 1e-9)

@@ -193,7 +193,7 @@ def _not_heard(seen: Seen, cycles: int, word: str) -> NodeError | None:
 @_checked("following", "joint that does not follow its targets", Reaction.LIFT, _cycles(2))
 def _following(seen: Seen) -> NodeError | None:
     drives = seen.drives
-    if drives is None or not (beyond := drives.beyond_lag()):
+    if drives is None or seen.compares_motion or not (beyond := drives.beyond_lag()):
         return None
     i = max(beyond, key=beyond.__getitem__)
     lag_ms = seen.limits.lag_ns * 1e-6
@@ -360,7 +360,7 @@ def _image_dead(contact: TouchState) -> SafetyStop | None:
     "force_fell",
     "measured force that falls faster than the probe moves off",
     Reaction.RETREAT,
-    lambda limits: round(NS_PER_S * CONTRADICTED_S) + _sample(limits),
+    lambda limits: round(NS_PER_S * CONTRADICTED_S) + _sample(limits) + _frame(limits),
     blind=True,
 )
 def _force_fell(contact: TouchState) -> SafetyStop | None:

@@ -146,12 +146,15 @@ class Controller:
             called. False, the default: the cell does both.
         can_go_on: True: after the cell has come back from a loss (``recover`` of `canprobe.open_cell`) the controller
             goes on from where the arm stands, once motion is asked for. False, the default: a loss ends it.
+        compares_motion: True: the controller itself compares the motion of the joints with what it has asked for, and
+            names what is wrong; False, the default: the cell does.
         array_alive: whether an image of the array has changed since bring-up; the cell sets it before the first step.
         array_blind: why the controller does not believe the array any more; None while it does.
     """
 
     lets_go: bool = False
     can_go_on: bool = False
+    compares_motion: bool = False
     array_alive: bool = False
     array_blind: str | None = None
 

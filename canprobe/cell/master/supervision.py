@@ -117,6 +117,7 @@ class Seen:
         silent_taxels: number of taxels that were found not to measure.
         preload: highest force in the images before the drives are enabled, N.
         log_failure: why frames are no longer written down; None while they are.
+        compares_motion: the controller compares the motion of the joints with its targets itself.
         unfelt: push in the drives' torques that the array does not measure, N; None without one.
         force: force that the array measures, N.
     """
@@ -139,6 +140,7 @@ class Seen:
     silent_taxels: int = 0
     preload: float = 0.0
     log_failure: str | None = None
+    compares_motion: bool = False
     unfelt: float | None = None
     force: float = 0.0
 

@@ -183,7 +183,8 @@ def _witnesses(session: Session, record: TaskRecord) -> dict[str, Any] | None:
 
 def _listened(log: Mapping[str, Floats]) -> dict[str, Any]:
     """Images that the master read, and their force; None where no image came, or its force does not show."""
-    sampled = log["sample_cycle"][np.isfinite(log["sample_cycle"])]
+    cycles = log.get("sample_cycle", np.empty(0))
+    sampled = cycles[np.isfinite(cycles)]
     force = log["force_n"][np.isfinite(log["force_n"])] if "force_n" in log else np.empty(0)
     seconds = float(np.ptp(log["t_s"])) if len(log["t_s"]) > 1 else 0.0
     images = len(np.unique(sampled))

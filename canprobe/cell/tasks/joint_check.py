@@ -65,6 +65,8 @@ class JointCheck(Controller):
         start: joint positions (n,), rad or m, before any motion; None as long as they are not known.
     """
 
+    compares_motion = True
+
     def __init__(self, plan: Plan, operator: Operator | None) -> None:
         assert plan.setup.arm is not None
         self._guard, self._model = JointGuard(plan), plan.setup.arm.model

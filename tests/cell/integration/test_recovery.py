@@ -210,7 +210,7 @@ def test_a_drive_that_counts_increments_is_homed_again_after_it_was_without_powe
     run = Returning("node 3: reboot for 300 ms", homed_scene())
     (error,) = run.errors
     assert "node 3: (joint 3) is not homed" in str(error)
-    assert "type: canprobe up free --home --bus lockstep --channel can0" in str(error)
+    assert "type: canprobe up free --home --bus socketcan --channel can0" in str(error)
     assert {time for _, time in run.enabled.distances} == {1}, "no drive was enabled after it"
 
 
