@@ -218,10 +218,13 @@ def canopen_network(emulated_bus: EmulatedBus) -> canopen.Network:
 @pytest.fixture
 def faults(request: pytest.FixtureRequest, canprobe_seed: int) -> Iterator[PlannedFaults]:
     """Throws faults at the emulated nodes of the test; those of markers are thrown when the nodes are powered on."""
-    from canprobe.cell.emulated.array_faults import CELL_FAULTS
     from canprobe.fieldbus.tools.faults.planned import PlannedFaults
 
-    thrown = PlannedFaults(canprobe_seed, CELL_FAULTS)
+    if "lockstep_cell" in request.fixturenames:
+        from canprobe.cell.emulated.array_faults import CELL_FAULTS as KINDS
+    else:
+        from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS as KINDS
+    thrown = PlannedFaults(canprobe_seed, KINDS)
     _record_of(request).faults = thrown
     for marker in reversed(list(request.node.iter_markers("fault"))):
         thrown.inject(*marker.args, **marker.kwargs)

@@ -524,3 +524,16 @@ def test_adapters_are_listed_with_what_each_lacks(capsys):
     for one in document["interfaces"]:
         assert one["interface"] in out and all(lack in out for lack in one["missing"])
     assert all(one["type_next"] in out for one in document["found"])
+
+
+def test_the_page_on_hardware_has_the_table():
+    page = Path(__file__).parents[2] / "docs" / "hardware.md"
+    rows = [line.strip("| \n").split(" | ") for line in page.read_text().splitlines() if line.startswith("| `")]
+    table = {row[0].strip("`"): row for row in rows if row[0].strip("`") in BACKENDS}
+    assert list(table) == list(BACKENDS)
+    for name, backend in BACKENDS.items():
+        _, hardware, channel, example, needs = table[name]
+        assert (hardware, channel, example) == (backend.hardware, backend.channel, f"`{backend.example}`")
+        assert (backend.package is None) or f"pip install '{backend.required}'" in needs
+        assert (backend.driver is None) or backend.driver.replace("sudo ", "") in needs
+        assert backend.windows == ("Windows only" in needs)

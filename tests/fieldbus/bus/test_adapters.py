@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import can
 import pytest
@@ -21,8 +20,6 @@ from canprobe.fieldbus.bus.real.adapters import (
 )
 from canprobe.fieldbus.bus.real.link import LinkState
 from canprobe.fieldbus.bus.real.opening import open_port
-
-HARDWARE = Path(__file__).resolve().parents[3] / "docs" / "hardware.md"
 
 
 def lacking(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,15 +122,3 @@ def test_a_kernel_driver_is_named_only_where_there_is_one(monkeypatch):
     monkeypatch.setattr(sys, "platform", "win32")
     assert BACKENDS["usb2can"].missing == () and len(BACKENDS["pcan"].missing) == 1
     assert Backend("none", "any", "x").missing == ()
-
-
-def test_the_page_on_hardware_has_the_table():
-    rows = [line.strip("| \n").split(" | ") for line in HARDWARE.read_text().splitlines() if line.startswith("| `")]
-    table = {row[0].strip("`"): row for row in rows if row[0].strip("`") in BACKENDS}
-    assert list(table) == list(BACKENDS)
-    for name, backend in BACKENDS.items():
-        _, hardware, channel, example, needs = table[name]
-        assert (hardware, channel, example) == (backend.hardware, backend.channel, f"`{backend.example}`")
-        assert (backend.package is None) or f"pip install '{backend.required}'" in needs
-        assert (backend.driver is None) or backend.driver.replace("sudo ", "") in needs
-        assert backend.windows == ("Windows only" in needs)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from puma_arm import UPENN
+from published_puma import UPENN
 
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.motors import joints_per_motor
