@@ -18,9 +18,10 @@ COUNTS_PER_RAD = abs(float(MODEL.units_per_q[0, 0]))
 class Motor:
     """Reaches each target two cycles later, behind the lag of a loop of second order."""
 
-    def __init__(self, lag_s, period_s=PERIOD_NS * 1e-9):
+    def __init__(self, lag_s, period_s=PERIOD_NS * 1e-9, damping=1.0):
         self.x = self.v = 0.0
-        self.w = 2.0 / lag_s if lag_s else math.inf
+        self.damping = damping
+        self.w = 2.0 * damping / lag_s if lag_s else math.inf
         self.period_s, self.share, self.stands = period_s, 1.0, False
         self.reference = [0.0] * 3
 
@@ -35,7 +36,7 @@ class Motor:
         n = 50
         for k in range(n):
             r = begin + (end - begin) * (k + 1) / n
-            self.v += (self.w**2 * (self.share * r - self.x) - 2.0 * self.w * self.v) * self.period_s / n
+            self.v += (self.w**2 * (self.share * r - self.x) - 2.0 * self.damping * self.w * self.v) * self.period_s / n
             self.x += self.v * self.period_s / n
         return round(self.x)
 
@@ -70,6 +71,14 @@ def motions(period_s=PERIOD_NS * 1e-9):
 @pytest.mark.parametrize("what", motions())
 def test_a_drive_with_any_lag_up_to_twice_the_stated_one_follows(what, lag_s):
     assert found(Motor(lag_s), motions()[what]) is None
+
+
+@pytest.mark.parametrize("damping", [0.5, 0.7])
+@pytest.mark.parametrize("lag_s", [0.5 * LAG_S, LAG_S])
+def test_a_drive_that_overshoots_a_sharp_turn_follows(lag_s, damping):
+    """Of the targets of a straight stroke over a cylinder, which goes back at once with 1 rad/s."""
+    targets = COUNTS_PER_RAD * np.abs(np.mod(np.arange(0.0, 1.0, PERIOD_NS * 1e-9), 0.4) - 0.2)
+    assert found(Motor(lag_s, damping=damping), targets - targets[0]) is None
 
 
 @pytest.mark.parametrize("rate_hz", [200, 1000])
