@@ -25,7 +25,7 @@ LAGS = 4.0
 WHILES_S = (0.005, 0.02, 0.08, 0.32)
 """Whiles in which the motions are compared, s: a fast joint that stands shows in the first, a slow one in the last."""
 OVERSHOOT_SHARE, SWING_LAGS = 0.25, 8.0
-"""Share of a jump of the target's speed by which a drive overshoots it, 18 % on the dynamic plant; and stated lags after
+"""Share of a jump of the speed by which a drive overshoots it, 18 % on the dynamic plant; and stated lags after
 which it does so at the latest, with a damping of 0.5."""
 MARGIN_RAD = 0.5e-3
 """Angle of a joint by which a motion may differ: rounding of target and position, noise of the encoder, friction."""
