@@ -309,7 +309,7 @@ def test_no_nodes(): pass
         ("node 1: mote", "*unknown kind 'mote'*"),
         ("node 1: delay mss=2", "*unknown parameter 'mss'*"),
         ("node 1: mute on enabeld", "*unknown event 'enabeld'*"),
-        ("node 16: stuck-imag", "*unknown kind 'stuck-imag'; did you mean stuck-image*"),
+        ("node 3: sdo-silen", "*unknown kind 'sdo-silen'; did you mean sdo-silent*"),
     ],
 )
 def test_an_unknown_fault_is_unknown_before_its_node_is_there(run_inside, text, told):

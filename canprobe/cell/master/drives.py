@@ -215,6 +215,8 @@ class DriveGroup:
         self._open = False
         self._cycle = -1
         self._sync_ns = self._sync_before_ns = 0
+        self._quickest_ns = period_ns
+        self._irregular = False
 
     def _places_of(self, axis: int, layout: PdoLayout, picks: tuple[int, ...]) -> list[int]:
         """Places of the values of a part in the list of controlwords, targets and constants."""
@@ -238,7 +240,7 @@ class DriveGroup:
         self._deadline_ns = t_ns if deadline_ns is None else deadline_ns
         self._sync_before_ns, self._sync_ns = self._sync_ns, t_ns
         self._pending = len(self._heard)
-        self._open = True
+        self._open, self._irregular = True, False
 
     @property
     def complete(self) -> bool:
@@ -254,6 +256,7 @@ class DriveGroup:
         k, source = self._sources[can_id]
         if not self._open or t_ns < self._sync_ns or self._heard[k] == self._cycle:
             self.late += 1
+            self._irregular = True
             self.lateness_ns[source.axis] = t_ns - (self._sync_ns if t_ns >= self._sync_ns else self._sync_before_ns)
             return
         try:
@@ -289,6 +292,10 @@ class DriveGroup:
         """End the collection window of this cycle: a TPDO that has not come counts as missed."""
         self.missed += self._pending
         self._open = False
+        if self._pending:
+            self._irregular = True
+        elif self.answer_ns < self._quickest_ns:
+            self._quickest_ns = self.answer_ns
 
     @property
     def heard_all(self) -> bool:
@@ -304,6 +311,16 @@ class DriveGroup:
     def rests(self) -> tuple[bool, ...]:
         """Whether each drive has reported the same position for a while."""
         return tuple([track.rested_ns >= REST_NS for track in self._tracks])
+
+    @property
+    def brakeable(self) -> tuple[bool, ...]:
+        """Whether each drive is enabled and reports that it moves: a target where it is brakes it."""
+        return tuple(
+            [
+                track.cycle == self._cycle and track.rested_ns == 0 and on
+                for track, on in zip(self._tracks, self.enabled_ones(), strict=True)
+            ]
+        )
 
     def joints(self) -> Floats:
         """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""
@@ -363,7 +380,7 @@ class DriveGroup:
         found = {}
         for i, track in enumerate(self._tracks):
             heard = track.cycle == self._cycle and self.statuswords[i] & _STATE_BITS == _ENABLED
-            if heard and (beyond := self._following.beyond(i, track.counts, self._sync_ns)):
+            if heard and (beyond := self._following.beyond(i, track.counts, self._sync_ns, self._jitter_ns)):
                 found[i] = beyond
         return {i: beyond for i, beyond in found.items() if self.axes[i].node_id not in self.stopped}
 
@@ -380,7 +397,12 @@ class DriveGroup:
             track.aim(abs(target - last), periods)
         self._aimed, self._aimed_ns = tuple(targets), self._deadline_ns
         now = [track.counts if track.cycle == self._cycle else None for track in self._tracks]
-        self._following.aim(self._aimed, now, self._sync_ns)
+        self._following.aim(self._aimed, now, self._sync_ns, self._jitter_ns)
+
+    @property
+    def _jitter_ns(self) -> int:
+        """Time by which the drives may have seen the SYNC of this cycle later than usual."""
+        return self._period_ns if self._irregular else max(self.answer_ns - self._quickest_ns, 0)
 
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle, as `commands`, packed."""

@@ -53,7 +53,7 @@ class Following:
         self._lags, self._delays = lags, range(1, swing + 1)
         self._usual = 1 + lags // 2
         size = self._whiles[-1] + swing + 1
-        self._cycles: deque[tuple[int, Sequence[int], Sequence[int | None]]] = deque(maxlen=size)
+        self._cycles: deque[tuple[int, Sequence[int], Sequence[int | None], int]] = deque(maxlen=size)
         self._moving_before = False  # before the first of these cycles
 
     def forget(self) -> None:
@@ -61,28 +61,36 @@ class Following:
         self._cycles.clear()
         self._moving_before = False
 
-    def aim(self, targets: Sequence[int], counts: Sequence[int | None], t_ns: int) -> None:
-        """Take a cycle: time of its SYNC, positions at it (None: not reported), and the targets that follow it."""
+    def aim(self, targets: Sequence[int], counts: Sequence[int | None], t_ns: int, jitter_ns: int = 0) -> None:
+        """Take a cycle.
+
+        Args:
+            targets: the targets that follow it.
+            counts: positions at its SYNC; None: not reported.
+            t_ns: time of its SYNC.
+            jitter_ns: time by which drives may have seen it later than usual: a gateway or an emulator that stalls.
+        """
         # behind a late cycle the drives have stopped at their last targets, and nothing before says how they go on
         if self._cycles and t_ns - self._cycles[-1][0] > LATE_PERIODS * self._period_ns:
             self._cycles.clear()
             self._moving_before = True
-        self._cycles.append((t_ns, targets, counts))
+        self._cycles.append((t_ns, targets, counts, jitter_ns))
 
-    def beyond(self, motor: int, counts: int, t_ns: int) -> float:
+    def beyond(self, motor: int, counts: int, t_ns: int, jitter_ns: int = 0) -> float:
         """Counts by which a motor's motion until now is less or more than its targets explain; 0 where it follows.
 
         Args:
             motor: number of the motor, from 0.
             counts: its position at the SYNC of this cycle.
             t_ns: time of that SYNC.
+            jitter_ns: time by which drives may have seen it later than usual.
         """
         cycles, margin, most = self._cycles, self._margins[motor], 0.0
         last = len(cycles) - 1
         for span in self._whiles:
             if span > last or (self._moving_before and last + 1 - self._delays[-1] < span):
                 break
-            begin_ns, _, before = cycles[-span]
+            begin_ns, _, before, _ = cycles[-span]
             if (was := before[motor]) is None:
                 continue
             moved = counts - was
@@ -93,7 +101,8 @@ class Following:
             ends = [cycles[max(last + 1 - delay, 0)][1][motor] for delay in self._delays]
             starts = [cycles[max(last + 1 - delay - span, 0)][1][motor] for delay in self._delays]
             asks = [end - start for end, start in zip(ends, starts, strict=True)]
-            uneven = abs(t_ns - begin_ns - span * self._period_ns) / self._period_ns
+            late_ns = max(jitter_ns, *[cycles[-k][3] for k in range(1, span + 1)])
+            uneven = (abs(t_ns - begin_ns - span * self._period_ns) + late_ns) / self._period_ns
             allowed = margin + OVERSHOOT_SHARE * (max(asks) - min(asks))
             allowed += uneven * max([abs(b - a) for a, b in pairwise((*starts, *ends))])
             asks = asks[: self._lags]

@@ -98,9 +98,13 @@ class LiftOff:
         return bool(self._free.any()) and not self._drives.disbelieved
 
     def begin(self) -> None:
-        """Stop the drives that do not obey."""
-        axes = zip(self._drives.axes, self._free, strict=True)
-        self._drives.stopped = frozenset(axis.node_id for axis, free in axes if not free)
+        """Stop the drives that do not obey.
+
+        One that moves, but not as it was told, gets its place as its target: that brakes it as hard as it can, and
+        with the others. Its quick stop has a ramp, on which it would go millimetres into the object without them.
+        """
+        axes = zip(self._drives.axes, self._free, self._drives.brakeable, strict=True)
+        self._drives.stopped = frozenset(axis.node_id for axis, free, brakes in axes if not (free or brakes))
 
     def command(self, supervisor: Supervisor) -> Command | None:
         """The command of this cycle; None at the end, and where a witness shows that the force grows."""

@@ -43,7 +43,7 @@ LOST_FORCE_SHARE = 0.1
 RETREAT_WAY = 6e-3
 """Way off the object, m."""
 RAMP_S = 0.05
-"""Time to reach the scan's speed."""
+"""Time to reach the scan's speed, at its begin and where its path has turned back."""
 CALIBRATE = "type `canprobe calibrate array CELL` and name its file as sensor.calibration"
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
@@ -310,7 +310,7 @@ class TouchTask(ProbingTask):
         scan = self._task.scan
         if scan is None or isinstance(scan.strategy, Rectangle):  # `ExploreTask` has a leader of its own
             return None
-        return PathFollower(scan.strategy)
+        return PathFollower(scan.strategy, scan.speed * RAMP_S / 2)
 
     def _sink_from(self, contact: ContactSample, pose: ProbePose) -> None:
         """Remember how deep and with which pole the probe touches, to go on from there without a bump."""

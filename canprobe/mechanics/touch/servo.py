@@ -202,7 +202,7 @@ class TactileServo:
         """
         foot, normal = self.surface.foot(self._reference)
         if speed > 0 and self._follower is not None:
-            foot, normal = self._march(self._follower, foot, normal, speed * dt)
+            foot, normal = self._march(self._follower, foot, normal, speed * self._follower.pace * dt)
         self._reference = foot
         reach, share = self._radius - depth, self._share
         (f0, f1, f2), (n0, n1, n2), (p0, p1, p2), flat = foot, normal, self._first_pole, 1 - share

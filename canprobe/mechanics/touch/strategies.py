@@ -13,10 +13,12 @@ from typing import Protocol
 
 TURN_PERIODS = 3.0
 """Time of a turn by a radian over the time constant of the servo's normal."""
+MIN_PACE = 0.05
+"""Share of the speed with which a path turns back."""
 
 
 class Strategy(Protocol):
-    """A smooth closed curve in the scan plane that starts at the origin."""
+    """A closed curve in the scan plane that starts at the origin."""
 
     def point(self, phase: float) -> tuple[float, float]:
         """Point of the curve (m, m: along the heading, across) at ``phase`` (rad)."""
@@ -88,6 +90,11 @@ class Straight:
     def tangent(self, phase: float) -> tuple[float, float]:
         return (self._slope if (phase + math.pi / 2) % (2 * math.pi) < math.pi else -self._slope), 0.0
 
+    def way_to_turn(self, phase: float) -> float:
+        """Way along the curve from ``phase`` to the nearest end, where it turns back at once, m."""
+        folded = (phase + math.pi / 2) % math.pi
+        return self._slope * min(folded, math.pi - folded)
+
 
 @dataclass(frozen=True, slots=True)
 class Rectangle:
@@ -133,11 +140,20 @@ class PathFollower:
 
     Args:
         strategy: the curve.
+        brake_m: way on which it brakes before it turns back, and gets faster behind that, m.
         cross_track_per_m: turn of the heading back to the curve, as the tangent of an angle over the distance, 1/m.
+
+    Attributes:
+        pace: share of the speed. Why not 1 everywhere: where the path turns back at once, the drives cannot, and the
+            probe would leave the surface.
     """
 
-    def __init__(self, strategy: Strategy, cross_track_per_m: float = 60.0) -> None:
+    pace = 1.0
+
+    def __init__(self, strategy: Strategy, brake_m: float = 0.0, cross_track_per_m: float = 60.0) -> None:
         self._strategy = strategy
+        self._turning = strategy if isinstance(strategy, Straight) else None
+        self._brake = brake_m
         self._gain = cross_track_per_m
         self._phase = 0.0
         self._tangent = strategy.tangent(0.0)
@@ -160,6 +176,8 @@ class PathFollower:
         norm = math.hypot(tx, ty)
         self._phase += distance_m / max(norm, 1e-4)
         self._tangent = self._strategy.tangent(self._phase)
+        if self._turning is not None and self._brake > 0.0:
+            self.pace = min(1.0, max(MIN_PACE, math.sqrt(self._turning.way_to_turn(self._phase) / self._brake)))
         px, py = self._strategy.point(self._phase)
         hx = tx / max(norm, 1e-9) + self._gain * (px - x)
         hy = ty / max(norm, 1e-9) + self._gain * (py - y)
