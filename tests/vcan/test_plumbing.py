@@ -87,7 +87,7 @@ def project(tmp_path: Path) -> Path:
 
 def run(project: Path, *arguments: str, **environment: str) -> tuple[int, str]:
     root = str(CONFTEST.parents[1])
-    clean = {name: value for name, value in os.environ.items() if not name.startswith(("CANPROBE_", "CI"))}
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("CANPROBE_", "CI", "PYTEST_"))}
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-rA", *arguments],
         cwd=project,

@@ -59,6 +59,7 @@ class Drives:
     axes = tuple(SimpleNamespace(node_id=i) for i in NODES)
     disbelieved = False
     stopped = frozenset()
+    brakeable = (False,) * 6
 
     def __init__(self):
         self.age, self.on, self.beyond = [0] * 6, [True] * 6, {}
@@ -119,6 +120,16 @@ def test_the_node_that_the_cell_is_stopped_for_does_not_lift_and_others_do():
         drives = Drives()
         lift(drives, error=error).begin()
         assert drives.stopped == still
+
+
+def test_a_drive_that_moves_otherwise_than_told_is_braked_by_its_place_and_not_by_its_quick_stop():
+    """On its ramp it would go on without the others: 16 N in a fast stroke."""
+    drives = Drives()
+    drives.brakeable = tuple(i == 3 for i in NODES)
+    way = lift(drives, error=NodeError(3, "does not follow its targets"))
+    way.begin()
+    assert drives.stopped == set()
+    assert not way._free[NODES.index(3)]
 
 
 def test_without_a_drive_that_obeys_or_with_one_that_may_be_moving_nothing_lifts():
