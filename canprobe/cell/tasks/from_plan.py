@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Controller
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.noise import Correlation
     from canprobe.mechanics.touch.estimate.online import Estimator
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+    from canprobe.mechanics.touch.online.estimator import AnswerStage
     from canprobe.mechanics.touch.patch.image_model import ImageModel
 
 
@@ -36,16 +37,8 @@ SIGMA_NORMAL_RAD = 0.3e-3
 """Error of a normal that does not come from its centroid: joint counts displace the probe by 11 µm, times 28 1/m."""
 SIGMA_STIFFNESS = 0.6
 """Standard deviation of the logarithm of the layer's stiffness before any touch."""
-SCALE_ERROR = 4e-3
-"""Relative error of curvature that no path averages."""
-PAD_DRAG = 0.03
-"""Error of the way of a contact over the pad, over this way (`drag_errors`), by hysteresis and creep. A probe that
-keeps its orientation measures the normal by this way alone; else the rolling share is its part in the turn of the
-normal. The value has the best log score on 15 scenes of a gantry of a development draw."""
-TOOL_SIGMA_M = 0.2e-3
-"""Standard deviation of the probe's centre along its pole, m, as a tool is known after its calibration."""
-PATCH_METHODS = ("recursive", "ml")
-"""Estimators that use the patch, and whose confidence regions follow changes; the others are as published."""
+REFINED_METHODS = ("recursive", "ml")
+"""Estimators whose answers are refined by the stages of `online`; the others are as published."""
 
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
@@ -79,6 +72,7 @@ def contact_correlation(array: Array) -> Correlation:
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
     """An estimator by its name, with the settings of a scan."""
     from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator  # only where a shape is asked for
+    from canprobe.mechanics.touch.online.estimator import OnlineEstimator
 
     assert task.shape is not None and task.scan is not None
     memory = task.shape.memory
@@ -95,26 +89,27 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         from canprobe.cell.tasks.own_estimators import OfferedEstimator, RenewedEstimator
 
         return RenewedEstimator(lambda: OfferedEstimator(offer, settings))
-    estimator = make_estimator(method, **settings)
-    if method not in PATCH_METHODS:
-        return estimator
-    from canprobe.mechanics.touch.estimate.following import FollowingEstimator
-    from canprobe.mechanics.touch.estimate.noise_level import LevelledEstimator
+    motion = make_estimator(method, **settings)
+    if method not in REFINED_METHODS:
+        return motion
+    return OnlineEstimator(motion, *_stages(task, memory, task.scan.rolling_share))
 
-    fused = _with_patch(task, estimator, memory) if _uses_patch(task) else estimator
-    rolling = task.scan.rolling_share
-    following = FollowingEstimator(
-        LevelledEstimator(fused, memory),
-        memory,
-        scale=SCALE_ERROR,
-        drag=PAD_DRAG * rolling,
-        offset=TOOL_SIGMA_M * (1.0 - rolling),
-    )
-    if not task.shape.revisit:
-        return following
-    from canprobe.mechanics.touch.map.known_ground import RevisitingEstimator
 
-    return RevisitingEstimator(following, make_surface_map(task), memory)
+def _stages(task: Touch, memory: float, rolling_share: float) -> Iterator[AnswerStage]:
+    """The stages of a task's answers, in order."""
+    from canprobe.mechanics.touch.online.map_fusion import MapFusion
+    from canprobe.mechanics.touch.online.noise_level import NoiseLevel
+    from canprobe.mechanics.touch.online.patch_curvature import PatchCurvature
+    from canprobe.mechanics.touch.online.patch_fusion import PatchFusion
+    from canprobe.mechanics.touch.online.systematic_errors import SystematicErrors
+
+    assert task.shape is not None
+    if _uses_patch(task):
+        yield PatchFusion(PatchCurvature(_image_model(task), SIGMA_STIFFNESS), memory)
+    yield NoiseLevel(memory)
+    yield SystematicErrors.of_scan(memory, rolling_share)
+    if task.shape.revisit:
+        yield MapFusion(make_surface_map(task), memory)
 
 
 def _typical_sigma(task: Touch) -> float:
@@ -122,14 +117,6 @@ def _typical_sigma(task: Touch) -> float:
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
     return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
-
-
-def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
-    """The estimator with the contact patch as its second sensor."""
-    from canprobe.mechanics.touch.patch.curvature import PatchCurvature
-    from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator
-
-    return PatchedEstimator(estimator, PatchCurvature(_image_model(task), SIGMA_STIFFNESS), memory)
 
 
 def _image_model(task: Touch) -> ImageModel:

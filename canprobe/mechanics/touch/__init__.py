@@ -1,7 +1,7 @@
 """Pure mathematics of touch: from a tactile image to the local shape of the object, and the servo that follows it.
 
-    image ─► Patch, moments ─► ContactSample ─┬► estimator ─► SurfaceEstimate ─► curvature ─► servo
-       patch/image, moments     contact       │   estimate/   estimate/answer
+    image ─► Patch, moments ─► ContactSample ─┬► motion ─► stages ─► SurfaceEstimate ─► curvature ─► servo
+       patch/image, moments     contact       │  estimate/  online/   estimate/answer
                                               └► SurfaceMap ─► Mesh
                                                   map/         meshing
 
@@ -16,7 +16,8 @@ Reading a touch:
 Shape:
 
     surface           second-order surfaces in one gauge: XᵀSX = 0 with S symmetric (4, 4), f < 0 inside
-    estimate/         local shape from contacts, online and in batches, with what was not observed
+    estimate/         local shape from contacts, one by one and in batches, with what was not observed
+    online/           the estimator in the loop: the stages that refine an answer, and what widens its region
     map/              one surface from all contacts of a scan, with its uncertainty
     meshing           triangles of any surface that gives the closest point to a place
     linear_algebra, tangent_frames   small matrices, input checks, frames on a tangent plane
@@ -33,5 +34,5 @@ name, and the quadrics), `heights` (a spline over a grid), `mesh_fit` (such a sp
 Invariants: SI units, base frame unless a name says otherwise. z of a contact frame is the inward normal; in its own
 contact frame a surface has c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [[c11, c12], [c12, c22]] is the curvature;
 κ > 0 is convex. Source: Chen, Rink, Zhang, "Local Object Shape From Tactile Sensing", with the corrections that the
-docstrings name. Start reading at `contact`, then `estimate/`.
+docstrings name. Start reading at `contact`, then `estimate/` and `online/`.
 """

@@ -29,9 +29,6 @@ Estimators, one sample after another:
     omitted_terms       the terms of `misfit`, in constant time and memory
     sandwich            the covariance of weighted and correlated rows
     change              the test for a changed surface
-    following           wider regions where the answers change along the path
-    noise_level         variances by the level of the innovations
-    widened             wider regions of an array that is not as its calibration says
 
 Answers:
 
@@ -40,5 +37,6 @@ Answers:
     answer              a solution carried to the contact frame: the estimate
     fit                 the entry: `fit_surface` for recorded points, `make_estimator` by name
 
-An answer is computed in one piece: 0.4 ms, after the cycle's commands are out. Start reading at `quadric`, then `fit`.
+An answer is computed in one piece: 0.4 ms, after the cycle's commands are out. In the loop the stages of `touch.online`
+refine it. Start reading at `quadric`, then `fit`.
 """

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -196,29 +196,24 @@ class Solution(NamedTuple):
     root: Floats | None = None
 
 
-def build_estimate(
-    solution: Solution,
-    *,
-    length: float,
-    T_frame_contact: Floats,
-    problem_root: Floats,
-    innovation: float,
-    distance: float,
-    samples: float,
-    method: str,
-    prior: str,
-    notes: tuple[str, ...] = (),
-    evidence: CurvatureInformation | None = None,
-    stiffness: float | None = None,
-    contradicted: bool = False,
-) -> SurfaceEstimate:
-    """An estimate from a solution in units of `length` (m)."""
+def build_estimate(solution: Solution, *, length: float, T_frame_contact: Floats, **facts: Any) -> SurfaceEstimate:
+    """An estimate from a solution in units of `length` (m); `facts` are the fields that no solution gives."""
+    T = read_only(T_frame_contact)
+    return SurfaceEstimate(T_frame_contact=T, **_shape(solution, T, length), **facts)
+
+
+def with_solution(answer: SurfaceEstimate, solution: Solution, **facts: Any) -> SurfaceEstimate:
+    """An estimate with another solution in its contact frame, in 1/m; `facts` are other fields that change."""
+    return replace(answer, **_shape(solution, answer.T_frame_contact, 1.0), **facts)
+
+
+def _shape(solution: Solution, T: Floats, length: float) -> dict[str, Any]:
+    """The fields of an estimate in the contact frame T (4, 4) that a solution in units of `length` (m) gives."""
     S = matrix_of(solution.c)
     S[:3, :3] /= length
     k = 2.0 * S[:2, :2]
     decision = solution.decision
     covariance = solution.covariance / length**2
-    T = read_only(T_frame_contact)
     if decision.rank == 3:
         kappa, local = _principal(k)
         observed = np.array([True, True])
@@ -227,30 +222,19 @@ def build_estimate(
         k, covariance, kappa, local, observed = _partly(k, covariance, decision, solution.has_prior, length)
         umbilic = False
     V = decision.vectors
-    return SurfaceEstimate(
-        S=S,
-        T_frame_contact=T,
-        K=k,
-        kappa=kappa,
-        directions=local.dot(T[:3, :2].T),
-        covariance=covariance,
-        observed=observed,
-        rank=decision.rank,
-        combinations=V[:, decision.passed].T.copy(),
-        information=(V * decision.information).dot(V.T) * length**2,
-        umbilic=umbilic,
-        problem_root=problem_root,
-        innovation=innovation,
-        distance=distance,
-        samples=samples,
-        method=method,
-        prior=prior,
-        notes=notes,
-        model_root=None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
-        evidence=evidence,
-        stiffness=stiffness,
-        contradicted=contradicted,
-    )
+    return {
+        "S": S,
+        "K": k,
+        "kappa": kappa,
+        "directions": local.dot(T[:3, :2].T),
+        "covariance": covariance,
+        "observed": observed,
+        "rank": decision.rank,
+        "combinations": V[:, decision.passed].T.copy(),
+        "information": (V * decision.information).dot(V.T) * length**2,
+        "umbilic": umbilic,
+        "model_root": None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
+    }
 
 
 def _principal(K: Floats) -> tuple[Floats, Floats]:

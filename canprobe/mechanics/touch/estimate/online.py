@@ -57,30 +57,6 @@ class Estimator(Protocol):
         """Forget everything but the settings: contact was lost, or the array was reset."""
 
 
-class OuterEstimator:
-    """Base class of an estimator round another one: contacts go in, and its answers come out changed.
-
-    Args:
-        inner: the estimator.
-    """
-
-    def __init__(self, inner: Estimator) -> None:
-        self._inner = inner
-
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by reason."""
-        return self._inner.dropped
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        self._inner.add(sample)
-
-    def reset(self) -> None:
-        """Forget everything but the settings."""
-        self._inner.reset()
-
-
 class Gate:
     """Passes the samples that an estimator can use, and counts the rest.
 

@@ -21,8 +21,7 @@ From an image:
 Curvature:
 
     image_model         the forward model: force and moments of an image, from curvature, force and five parameters
-    curvature           its inverse over several images: a likelihood of K, fused with what the motion has shown
-    fused_estimator     an estimator of motion with the patch as its second sensor, and the answer of both
+                        its inverse over several images, fused with the motion, is a stage of `touch.online`
 
 Calibration:
 

@@ -6,7 +6,7 @@
   not show newtons. So does an object or an arm that gives way, which the message says.
 - **Disagreement.** On a surface that is known, the slope of the touch gives a stiffness, and so does the bend of the
   pressure in an image. Another pitch makes one of them smaller and the other larger, each by its square.
-- **Contradiction.** Images mean another curvature than the motion shows, in most answers (`fused_estimator`).
+- **Contradiction.** Images mean another curvature than the motion shows, in most answers (`patch_fusion`).
 
 Each sign is a median or a share of what was seen so far, from a least number on, and up to a number from which the
 array counts as the calibrated one: a check costs nothing after that. The limits come from a development draw of study
@@ -14,7 +14,7 @@ array counts as the calibrated one: a check costs nothing after that. The limits
 
 Until the array is calibrated, its answers are less certain. A force has the spread of a make and half of what stiffness
 and disagreement are off: two standard deviations reach the force that other gains would mean. Regions of curvature are
-wider (`estimate.widened`) where any sign but the stiffness shows that images mean another curvature. Why not for
+wider (`regions.scaled`) where any sign but the stiffness shows that images mean another curvature. Why not for
 another stiffness: estimators find it, and regions that were widened for it were three times the error. Images that
 contradict the motion in most answers are not asked for curvature any more.
 """

@@ -8,16 +8,11 @@ import pytest
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
-from canprobe.mechanics.touch.map.known_ground import (
-    MEMORIES_BETWEEN,
-    KnownCurvature,
-    RevisitingEstimator,
-    ground_at,
-    joined,
-)
 from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+from canprobe.mechanics.touch.online.estimator import OnlineEstimator
+from canprobe.mechanics.touch.online.map_fusion import MEMORIES_BETWEEN, KnownCurvature, MapFusion, ground_at, joined
 
 RADIUS, PAD, STIFFNESS, SIGMA = 0.05, 0.04, 1.2e8, {"sigma_point": 3e-5, "sigma_normal": 1e-3}
 NOISE = MapNoise(3e-5, 3e-5, 1e-3)
@@ -118,7 +113,7 @@ def test_a_path_that_comes_back_knows_more():
     samples = list(contacts(weave(3)))
     make = lambda: make_estimator("recursive", **SIGMA, memory_m=MEMORY)  # noqa: E731
     alone = answers(make(), samples)
-    returning = RevisitingEstimator(make(), SurfaceMap(PadLayer(PAD, STIFFNESS), NOISE), MEMORY)
+    returning = OnlineEstimator(make(), MapFusion(SurfaceMap(PadLayer(PAD, STIFFNESS), NOISE), MEMORY))
     both = answers(returning, samples)
     with_ground = ["touched before" in str(one.notes) for one in both]
     first_loop = sum(len(weave(1)) > 8 * k for k in range(len(both)))
@@ -134,7 +129,8 @@ def test_a_path_that_comes_back_knows_more():
 
 def test_only_contacts_that_share_no_data_are_ground():
     ground = SurfaceMap(PadLayer(PAD, STIFFNESS), NOISE)
-    estimator = RevisitingEstimator(make_estimator("recursive", **SIGMA, memory_m=MEMORY), ground, MEMORY)
+    motion = make_estimator("recursive", **SIGMA, memory_m=MEMORY)
+    estimator = OnlineEstimator(motion, MapFusion(ground, MEMORY))
     answers(estimator, contacts(line(-0.02, 0.018)))
     assert len(ground) == 0
     still = np.tile([[0.018, 0.0]], (2000, 1))

@@ -1,4 +1,4 @@
-"""An estimator whose answers are joined with what the map knows of the ground from earlier passes.
+"""Answers joined with what the map knows of the ground from earlier passes.
 
 Contacts that are further back along the path than `MEMORIES_BETWEEN` memories of the estimator go into a map of their
 own: what it says shares no data with the answer. At every answer one quartic is fitted to the nodes round the contact.
@@ -17,10 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
+from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, with_solution
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import Decision
-from canprobe.mechanics.touch.estimate.online import Estimator, OuterEstimator
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, parameters_of
 from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted, solved
@@ -30,6 +29,7 @@ from canprobe.mechanics.touch.map.local_fits import fit_discs
 from canprobe.mechanics.touch.map.nodes import step_of
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND, THIRD
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
+from canprobe.mechanics.touch.online.estimator import AnswerStage
 from canprobe.mechanics.types import Floats
 
 MEMORIES_BETWEEN = 2.0
@@ -55,40 +55,31 @@ class KnownCurvature(NamedTuple):
     covariance: Floats
 
 
-class RevisitingEstimator(OuterEstimator):
-    """An estimator that knows the ground which it comes back to.
+class MapFusion(AnswerStage):
+    """Joins answers with the map of the ground that the contact comes back to.
 
     Args:
-        inner: the estimator.
-        surface_map: an empty map for the contacts of its pad.
-        memory_m: path that the estimator remembers, m.
+        surface_map: an empty map for the contacts of the estimator's pad.
+        memory_m: path that the motion remembers, m.
     """
 
-    def __init__(self, inner: Estimator, surface_map: SurfaceMap, memory_m: float) -> None:
-        super().__init__(inner)
+    def __init__(self, surface_map: SurfaceMap, memory_m: float) -> None:
         self._map = surface_map
         self._between = MEMORIES_BETWEEN * memory_m
         self._waiting: deque[tuple[float, ContactSample]] = deque()
         self._travel = Travel(step_of(surface_map.noise.lateral))
 
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        before = self._inner.dropped.total
-        super().add(sample)
-        if self._inner.dropped.total == before:
-            self._travel.add(sample.p_base)
-            if len(self._waiting) < MAX_WAITING:
-                self._waiting.append((self._travel.total, sample))
+    def take(self, sample: ContactSample) -> None:
+        self._travel.add(sample.p_base)
+        if len(self._waiting) < MAX_WAITING:
+            self._waiting.append((self._travel.total, sample))
 
     def reset(self) -> None:
         """Forget everything but the settings and the ground."""
-        super().reset()
         self._learn(math.inf)
 
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
+    def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
         self._learn(self._travel.total - self._between)
-        answer = self._inner.estimate()
         if answer is None or not answer.rank:  # what was withdrawn stays so
             return answer
         known = ground_at(self._map, answer)
@@ -144,18 +135,8 @@ def joined(answer: SurfaceEstimate, known: KnownCurvature) -> SurfaceEstimate:
         rows[:, 6:] = np.linalg.cholesky(ground).T / C_PER_Q
         root = np.concatenate([root, rows])
     share = float((covariance * ground).sum()) / 3.0
-    return build_estimate(
+    return with_solution(
+        answer,
         Solution(c, covariance / _OF_Q, Decision(values, vectors, np.ones(3, bool)), False, root),
-        length=1.0,
-        T_frame_contact=answer.T_frame_contact,
-        problem_root=answer.problem_root,
-        innovation=answer.innovation,
-        distance=answer.distance,
-        samples=answer.samples,
-        method=answer.method,
-        prior=answer.prior,
         notes=(*answer.notes, f"{100.0 * share:.0f} % {JOINED_NOTE}"),
-        evidence=answer.evidence,
-        stiffness=answer.stiffness,
-        contradicted=answer.contradicted,
     )

@@ -7,17 +7,18 @@ import pytest
 
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.noise_level import MIN_LEVEL, LevelledEstimator
+from canprobe.mechanics.touch.online.estimator import OnlineEstimator
+from canprobe.mechanics.touch.online.noise_level import MIN_LEVEL, NoiseLevel
 
 RADIUS, MEMORY = 0.05, 0.02
 T = np.eye(4)
 
 
-def levelled(method, stated):
-    inner = make_estimator(
+def levelled(method, stated, level):
+    motion = make_estimator(
         method, sigma_point=2e-5 * stated, sigma_normal=2e-3 * stated, memory_m=MEMORY, window=160, prior=None
     )
-    return LevelledEstimator(inner, MEMORY)
+    return OnlineEstimator(motion, level)
 
 
 def scanned(one, rng, path=0.08, step=1.25e-4):
@@ -38,16 +39,16 @@ def scanned(one, rng, path=0.08, step=1.25e-4):
 def test_a_noise_that_is_stated_wrongly_is_set_right(method, stated):
     rng, squares = np.random.default_rng(3), []
     for _ in range(10):
-        answer = scanned(levelled(method, stated), rng, path=0.04)[-1]
+        answer = scanned(levelled(method, stated, NoiseLevel(MEMORY)), rng, path=0.04)[-1]
         off = (answer.K - np.eye(2) / RADIUS)[[0, 0, 1], [0, 1, 1]]
         squares.append(off @ np.linalg.solve(answer.covariance, off) / 3.0)
     assert 0.6 < np.mean(squares) < 1.8  # 30 degrees of freedom: 0.56 to 1.57 in 95 %; stated are 4 and 0.6
 
 
 def test_it_begins_at_what_is_stated_and_keeps_a_half():
-    one = levelled("recursive", 5.0)
+    one = levelled("recursive", 5.0, level := NoiseLevel(MEMORY))
     answers = scanned(one, np.random.default_rng(0))
-    assert one.level == MIN_LEVEL
+    assert level.level == MIN_LEVEL
     plain = make_estimator("recursive", sigma_point=1e-4, sigma_normal=1e-2, memory_m=MEMORY, window=160)
     without = scanned(plain, np.random.default_rng(0))
     ratio = [a.covariance[0, 0] / b.covariance[0, 0] for a, b in zip(answers, without, strict=True) if b.rank == 3]
@@ -55,5 +56,5 @@ def test_it_begins_at_what_is_stated_and_keeps_a_half():
     assert ratio[-1] == pytest.approx(MIN_LEVEL)
     np.testing.assert_array_equal(answers[-1].K, without[-1].K)
     one.reset()
-    assert one.level == 1.0
+    assert level.level == 1.0
     assert one.estimate() is None

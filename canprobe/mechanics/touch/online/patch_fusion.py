@@ -1,20 +1,19 @@
-"""An estimator of motion with the contact patch as its second sensor, and its answers."""
+"""The contact patch as a second sensor of the motion: one answer of both."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
+from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate, with_solution
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import SIGMA_LIMIT, Decision, nothing_observed
-from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, matrix_of, parameters_of
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted
-from canprobe.mechanics.touch.patch.curvature import Fused, PatchCurvature
+from canprobe.mechanics.touch.online.estimator import AnswerStage
+from canprobe.mechanics.touch.online.patch_curvature import Fused, PatchCurvature
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
@@ -23,60 +22,43 @@ MIN_NAMED_SHARE = 0.1
 _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
-class PatchedEstimator:
-    """An estimator with answers that the patch completes (`with_patch`); before the contact moves, the patch's alone.
+class PatchFusion(AnswerStage):
+    """Completes the answers of the motion by the patch (`with_patch`); before the contact moves, the patch's alone.
 
     Args:
-        motion: estimator from points and normals.
         patch: estimator from images.
-        length: memory of `motion`, m.
+        length: memory of the motion, m.
     """
 
-    def __init__(self, motion: Estimator, patch: PatchCurvature, length: float) -> None:
+    def __init__(self, patch: PatchCurvature, length: float) -> None:
         self.patch = patch
-        self._motion = motion
         self._length = length
-        self._last: ContactSample | None = None
         self._place: Floats | None = None
 
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that neither sensor used, by reason."""
-        return self._motion.dropped
+    def take(self, sample: ContactSample) -> None:
+        self.patch.add(sample)
 
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact with its moments."""
-        before = self._motion.dropped.total
-        self._motion.add(sample)
-        if self._motion.dropped.total == before:
-            self._last = sample
-            self.patch.add(sample)
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
-        motion = self._motion.estimate()
-        if motion is None:
-            return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
-        if motion.evidence is None:
-            return motion
-        found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
-        moved = 0.0 if self._place is None else float(np.linalg.norm(motion.point - self._place))
-        self._place = motion.point
+    def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
+        if answer is None:
+            return patch_estimate(sample, self.patch, self._length)
+        if answer.evidence is None:
+            return answer
+        found = self.patch.fuse(answer.T_frame_contact, answer.evidence)
+        moved = 0.0 if self._place is None else float(np.linalg.norm(answer.point - self._place))
+        self._place = answer.point
         if found is None:
-            return motion
+            return answer
         if not found.contradicted:
             new = min(moved / self._length, 1.0)
             self.patch.stiffness.take(found.log_stiffness, found.stiffness_information, new)
-        return replace(with_patch(motion, found, self._length), stiffness=self.patch.stiffness.value)
+        return with_patch(answer, found, self._length, self.patch.stiffness.value)
 
     def reset(self) -> None:
-        """Forget everything but the settings."""
-        self._motion.reset()
         self.patch.reset()
-        self._last = self._place = None
+        self._place = None
 
 
-def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceEstimate:
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float, stiffness: float) -> SurfaceEstimate:
     """A motion estimate, with its curvature replaced by that of motion and patch together.
 
     Where the two contradict each other nothing is observed.
@@ -88,6 +70,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceE
         motion: the estimate, with its `evidence`.
         found: the curvature of both (`PatchCurvature.fuse`).
         length: memory of the estimator, m; curvatures below its inverse count as flat.
+        stiffness: stiffness K/h of the layer, N/m³, that the answer states.
     """
     assert motion.evidence is not None
     weight = CHI2_95 / max(found.cost, CHI2_95)
@@ -105,18 +88,13 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceE
     notes = [f"{100.0 * share:.0f} % of the curvature from the patch"]
     if found.contradicted:
         notes.append("the patch contradicts the motion")
-    return build_estimate(
+    return with_solution(
+        motion,
         _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
-        length=1.0,
-        T_frame_contact=motion.T_frame_contact,
-        problem_root=motion.problem_root,
-        innovation=motion.innovation,
-        distance=motion.distance,
-        samples=motion.samples,
         method=motion.method + "+patch" if share >= MIN_NAMED_SHARE else motion.method,
-        prior=motion.prior,
         notes=(*motion.notes, *notes),
-        stiffness=found.stiffness,
+        evidence=None,
+        stiffness=stiffness,
         contradicted=found.contradicted,
     )
 

@@ -11,13 +11,20 @@ from scipy.spatial.transform import Rotation
 
 from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad, indentation_from_force
 from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.following import FollowingEstimator
 from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
 from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.online.estimator import OnlineEstimator
+from canprobe.mechanics.touch.online.patch_curvature import (
+    MAX_RECENT_FRAMES,
+    MIN_FRAMES,
+    RECENT_OUTLIER_SHARE,
+    PatchCurvature,
+    _Mean,
+)
+from canprobe.mechanics.touch.online.patch_fusion import PatchFusion, patch_estimate
+from canprobe.mechanics.touch.online.systematic_errors import SystematicErrors
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.creep import PadMemory
-from canprobe.mechanics.touch.patch.curvature import MIN_FRAMES, PatchCurvature
-from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator, patch_estimate
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, ImageModel
 from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
@@ -385,6 +392,18 @@ def test_a_thousand_images_know_no_more_than_the_floor():
     assert math.sqrt(sizes[1]) > 0.5
 
 
+def test_a_mean_of_moments_takes_a_row_of_far_ones_for_a_change_and_a_single_one_for_wrong():
+    mean = _Mean(MAX_RECENT_FRAMES, RECENT_OUTLIER_SHARE)
+    for _ in range(20):
+        mean.add(1.0, 0.0, 1.0)
+    mean.add(5.0, 0.0, 5.0)
+    mean.add(1.0, 0.0, 1.0)
+    assert mean.moments[0] == pytest.approx(1.0, abs=0.05)
+    for _ in range(MIN_FRAMES + 1):
+        mean.add(2.0, 0.1, 1.5)
+    assert mean.moments == pytest.approx((2.0, 0.1, 1.5))
+
+
 # fused
 
 
@@ -400,9 +419,9 @@ def cylinder_touch(x, y, t, moments):
     return ContactSample(t, point, normal, T, inner, FORCE, moments=exact(entries(k)) if moments else None)
 
 
-def estimator(method="recursive"):
+def estimator(method="recursive", *later):
     motion = make_estimator(method, sigma_point=3e-5, sigma_normal=2e-3, memory_m=0.02)
-    return PatchedEstimator(motion, PatchCurvature(model()), 0.02)
+    return OnlineEstimator(motion, PatchFusion(PatchCurvature(model()), 0.02), *later)
 
 
 def after_path(line, *, moments=True, method="recursive", seed=4):
@@ -461,7 +480,7 @@ def test_along_a_straight_path_over_a_torus_both_are_right_or_say_so(torus_line)
     for end in (-0.9, 0.9, 1.3):
         line = torus_line(0.11, 0.04, end, 0.8, length=0.04, samples=320)
         rng = np.random.default_rng(1)
-        one = FollowingEstimator(estimator(), 0.02)  # as in the loop
+        one = estimator("recursive", SystematicErrors(0.02))  # as in the loop
         for i, (point, normal) in enumerate(zip(*line.felt(2e-5, 1e-3, rng), strict=True)):
             T = homogeneous(tangent_rotation(-normal), point + (RADIUS - 0.4e-3) * normal)
             k = T[:3, :2].T @ line.tensor(point) @ T[:3, :2]
@@ -646,16 +665,17 @@ def test_a_standing_contact_is_answered_by_the_patch_alone_and_a_reset_forgets_b
 
 
 def test_a_sample_that_the_motion_drops_is_not_taken_from_the_patch_either():
-    one = estimator()
+    motion, patch = make_estimator("recursive", sigma_point=3e-5, sigma_normal=2e-3), PatchCurvature(model())
+    one = OnlineEstimator(motion, PatchFusion(patch, 0.02))
     one.add(cylinder_touch(0.0, 0.0, 1.0, True))
     one.add(cylinder_touch(0.0, 0.0, 1.0, True))
     assert one.dropped.repeated == 1
-    assert one.patch.frames == 1
+    assert patch.frames == 1
 
 
 def test_a_prior_on_curvature_counts_once_and_the_patch_still_observes():
     motion = make_estimator("ml", sigma_point=3e-5, sigma_normal=2e-3, prior=Prior.flat(0.02, 10.0))
-    one = PatchedEstimator(motion, PatchCurvature(model()), 0.02)
+    one = OnlineEstimator(motion, PatchFusion(PatchCurvature(model()), 0.02))
     for i, (x, y) in enumerate(AXIAL[:160]):
         one.add(cylinder_touch(x, y, i * 5e-3, True))
     before, both = motion.estimate(), one.estimate()
@@ -702,7 +722,7 @@ def test_stiffness_follows_from_the_images_where_the_motion_knows_curvature():
     """The slope of the touch is 10 % off. Along a weave k gets better, and it does not jump from answer to answer."""
     slope = Slope(1.1 / indentation_from_force(1.0, STIFFNESS, RADIUS, (27.8, 0.0)), 30.0)
     motion = make_estimator("recursive", sigma_point=3e-5, sigma_normal=2e-3, memory_m=0.02)
-    one, found = PatchedEstimator(motion, PatchCurvature(model(), 0.6), 0.02), []
+    one, found = OnlineEstimator(motion, PatchFusion(PatchCurvature(model(), 0.6), 0.02)), []
     for i, (x, y) in enumerate(WEAVE + WEAVE[::-1]):
         one.add(replace(cylinder_touch(x, y, i * 5e-3, True), slope=slope))
         if i % 20 == 19:

@@ -1,4 +1,4 @@
-"""An estimator whose covariance follows the level of its innovations.
+"""The level of the noise, by the innovations: all variances of an answer are multiplied by it.
 
 The stated noise of contacts is that of a usual scan. On one scan it is less, where the contact rests on one place of
 the pad, on another more, where it runs over the pad, or where curvature varies faster than the estimator follows. The
@@ -21,47 +21,39 @@ import math
 
 import numpy as np
 
+from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.online import Estimator, OuterEstimator
-from canprobe.mechanics.touch.estimate.widened import widened
+from canprobe.mechanics.touch.online.estimator import AnswerStage
+from canprobe.mechanics.touch.online.regions import scaled
 from canprobe.mechanics.types import Floats
 
 MIN_LEVEL = 0.5
 """Least level of the variances."""
 
 
-class LevelledEstimator(OuterEstimator):
-    """An estimator with variances multiplied by the mean of its innovations over the path.
+class NoiseLevel(AnswerStage):
+    """Multiplies variances by the mean of the innovations over the path.
 
     Args:
-        inner: the estimator.
         memory_m: path over which the mean falls to 1/e, m.
 
     Attributes:
         level: the mean, from `MIN_LEVEL` on.
     """
 
-    def __init__(self, inner: Estimator, memory_m: float) -> None:
-        super().__init__(inner)
+    def __init__(self, memory_m: float) -> None:
         self._memory = memory_m
-        self._restart()
+        self.reset()
 
-    def _restart(self) -> None:
+    def reset(self) -> None:
         self._mean = self.level = 1.0
         self._place: Floats | None = None
 
-    def reset(self) -> None:
-        """Forget everything but the settings."""
-        super().reset()
-        self._restart()
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
-        answer = self._inner.estimate()
+    def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
         if answer is None:
             return None
         moved = 0.0 if self._place is None else float(np.linalg.norm(answer.point - self._place))
         self._place = answer.point
         self._mean += (1.0 - math.exp(-moved / self._memory)) * (answer.innovation - self._mean)
         self.level = max(self._mean, MIN_LEVEL)
-        return widened(answer, math.sqrt(self.level))
+        return scaled(answer, math.sqrt(self.level))
