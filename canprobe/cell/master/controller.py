@@ -15,7 +15,7 @@ from canprobe.mechanics.types import Floats
 if TYPE_CHECKING:
     from canprobe.cell.master.trail import TakenWay
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-    from canprobe.mechanics.touch.patch.image import Patch
+    from canprobe.mechanics.touch.image.patch import Patch
 
 
 @dataclass(frozen=True, slots=True)

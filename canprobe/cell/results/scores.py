@@ -13,7 +13,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.online import Gate, PadWay
-from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS, ForceSigma
+from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
 

@@ -25,9 +25,9 @@ from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
 from canprobe.mechanics.touch.explore.ground import UNKNOWN_M, GroundCells
 from canprobe.mechanics.touch.explore.spacing import LaneForecast
 from canprobe.mechanics.touch.explore.stretches import STEP_M
+from canprobe.mechanics.touch.image.patch import Patch
 from canprobe.mechanics.touch.map.cells import STATED_STIFFNESS_SIGMA
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
-from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import Rectangle, turn_radius

@@ -14,18 +14,18 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
+from canprobe.mechanics.touch.array_calibration.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.contact import ContactSample, indentation_from_force
-from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
-from canprobe.mechanics.touch.patch.moments import MomentImage
+from canprobe.mechanics.touch.image.image_model import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.image.moments import MomentImage
 from canprobe.mechanics.touch.strategies import Rectangle
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.noise import Correlation
     from canprobe.mechanics.touch.estimate.online import Estimator
+    from canprobe.mechanics.touch.image.image_model import ImageModel
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.online.estimator import AnswerStage
-    from canprobe.mechanics.touch.patch.image_model import ImageModel
 
 
 HEIGHT_CORRELATION = (2e-3, 0.2)

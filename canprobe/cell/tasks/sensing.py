@@ -21,12 +21,12 @@ from canprobe.mechanics.touch.contact import (
     contact_sample,
     indentation_from_force,
 )
+from canprobe.mechanics.touch.image.calibration import ContactNoise, Lag
+from canprobe.mechanics.touch.image.moments import MomentImage, Moments
+from canprobe.mechanics.touch.image.pad_lag import PadLag
+from canprobe.mechanics.touch.image.patch import Patch, PatchCalibration
+from canprobe.mechanics.touch.image.silent_taxels import mended
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
-from canprobe.mechanics.touch.patch.array_calibration import ContactNoise, Lag
-from canprobe.mechanics.touch.patch.dead_taxels import mended
-from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
-from canprobe.mechanics.touch.patch.moments import MomentImage, Moments
-from canprobe.mechanics.touch.patch.pad_lag import PadLag
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:

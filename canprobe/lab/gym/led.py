@@ -15,7 +15,7 @@ from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
-from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch.image.patch import Patch
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import PathFollower
 from canprobe.mechanics.types import Floats

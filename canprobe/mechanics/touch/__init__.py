@@ -1,14 +1,15 @@
 """Pure mathematics of touch: from a tactile image to the local shape of the object, and the servo that follows it.
 
     image ─► Patch, moments ─► ContactSample ─┬► motion ─► stages ─► SurfaceEstimate ─► curvature ─► servo
-       patch/image, moments     contact       │  estimate/  online/   estimate/answer
+       image/                   contact       │  estimate/  online/   estimate/answer
                                               └► SurfaceMap ─► Mesh
                                                   map/         meshing
 
 Reading a touch:
 
     pad               where the taxels are, and what their counts mean
-    patch/            images: force, centroid, moments, and curvature from them
+    image/            images: force, centroid, moments, and the model of an array
+    array_calibration/   the calibration of an array by touches of known objects, and its check
     contact           from the centroid on the wrapped pad to the object's point and normal in base
     layer_stiffness   the stiffness of the layer: from a push, and as a state of a scan
     stops             the limits at which a touch is stopped, and why a touch at rest must not go on

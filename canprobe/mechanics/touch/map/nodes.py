@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
 from canprobe.mechanics.touch.estimate.travel import Travel
+from canprobe.mechanics.touch.image.moments import PadMemory, overlapping
 from canprobe.mechanics.touch.map.noise import MapNoise
-from canprobe.mechanics.touch.patch.creep import PadMemory, overlapping
 from canprobe.mechanics.types import Floats
 
 NODE_M = 1e-3

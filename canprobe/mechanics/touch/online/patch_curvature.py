@@ -28,11 +28,10 @@ from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformati
 from canprobe.mechanics.touch.estimate.noise import CHI2_999
 from canprobe.mechanics.touch.estimate.observed import turned
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
+from canprobe.mechanics.touch.image.image_model import ImageModel
+from canprobe.mechanics.touch.image.moments import Moments, PadMemory, overlapping
 from canprobe.mechanics.touch.layer_stiffness import ScanStiffness, stiffness_from_slope
 from canprobe.mechanics.touch.linear_algebra import inverted, positive, principal_of, solved
-from canprobe.mechanics.touch.patch.creep import PadMemory, overlapping
-from canprobe.mechanics.touch.patch.image_model import ImageModel
-from canprobe.mechanics.touch.patch.moments import Moments
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation, transported
 from canprobe.mechanics.types import Floats, Vec
 
@@ -56,7 +55,7 @@ SLOPE_SIGMA = 0.08
 """Standard deviation of ln(stiffness) from the slope of a touch, by the error of the force; that of the slope comes on
 top."""
 TRACE_ERROR_SHARE = 0.5
-"""Standard deviation of what traces of earlier places do to the moments (`creep`), over what is taken off for them."""
+"""Standard deviation of what traces of earlier places do to the moments, over what is taken off for them."""
 _STIFFNESS_STEP = 0.01
 _ROOT2 = math.sqrt(2.0)
 SETTLED_STEP, MAX_LAST_STEP = 0.002, 0.05
@@ -225,8 +224,8 @@ class PatchCurvature:
     def fuse(self, T_base_contact: Floats, motion: CurvatureInformation | None = None) -> Fused | None:
         """Curvature by the patch and the motion's evidence about q, in a contact frame (4, 4), m.
 
-        None where the patch has too few frames, is no ellipse without the traces of earlier places (`creep`), or the
-        iteration does not settle.
+        None where the patch has too few frames, is no ellipse without the traces of earlier places, or the iteration
+        does not settle.
         """
         if self.frames < MIN_FRAMES:
             return None

@@ -12,7 +12,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, indentation_from_force
 from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
+from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 
 SIGMA = (2e-5, 1e-3)

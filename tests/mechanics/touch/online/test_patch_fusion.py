@@ -13,6 +13,10 @@ from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_
 from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
 from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentErrors
+from canprobe.mechanics.touch.image.image_model import USUAL_LIGHTNESS, ImageModel
+from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, MomentImage, PadMemory
+from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.online.estimator import OnlineEstimator
 from canprobe.mechanics.touch.online.patch_curvature import (
     MAX_RECENT_FRAMES,
@@ -23,11 +27,6 @@ from canprobe.mechanics.touch.online.patch_curvature import (
 )
 from canprobe.mechanics.touch.online.patch_fusion import PatchFusion, patch_estimate
 from canprobe.mechanics.touch.online.systematic_errors import SystematicErrors
-from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
-from canprobe.mechanics.touch.patch.creep import PadMemory
-from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, ImageModel
-from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 RADIUS, STIFFNESS, PITCH, COUNT_PA = 0.040, 1.27e8, 1.5875e-3, 100e3 / 255

@@ -1,7 +1,7 @@
 """Calibrate an array by touches of a plane and a ball that were rolled to and fro; a rod verifies.
 
 `parameter_fit` finds the parameters of the image model, `pad_fit` the errors of centroids, `taxel_gains` the gains of
-taxels, and `layer_fit` the stiffness by the arm's way into the object. Errors are held out: each fifth of the touches
+taxels, and `push_fit` the stiffness by the arm's way into the object. Errors are held out: each fifth of the touches
 is predicted by a fit to the others.
 """
 
@@ -14,10 +14,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.array_calibration.pad_fit import fit_noise
+from canprobe.mechanics.touch.array_calibration.parameter_fit import (
+    Pairs,
+    ParameterFit,
+    curvature_errors,
+    fit_parameters,
+    moment_errors,
+    taxel_gains,
+)
+from canprobe.mechanics.touch.array_calibration.push_fit import fit_force, stiffness_by_depth
+from canprobe.mechanics.touch.array_calibration.touches import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
 from canprobe.mechanics.touch.contact import indentation_from_force
-from canprobe.mechanics.touch.linear_algebra import rms
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import (
+from canprobe.mechanics.touch.image.calibration import (
     ArrayCalibration,
     CentroidDelays,
     ContactNoise,
@@ -28,22 +37,11 @@ from canprobe.mechanics.touch.patch.array_calibration import (
     Residuals,
     StiffnessSources,
 )
-from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.force_errors import MAKE_SPREAD, USUAL_LIGHTNESS
-from canprobe.mechanics.touch.patch.force_fit import fit_force
-from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.image_fit import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
-from canprobe.mechanics.touch.patch.image_model import MOMENT_ERROR_POWER
-from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
-from canprobe.mechanics.touch.patch.pad_fit import fit_noise
-from canprobe.mechanics.touch.patch.parameter_fit import (
-    Pairs,
-    ParameterFit,
-    curvature_errors,
-    fit_parameters,
-    moment_errors,
-)
-from canprobe.mechanics.touch.patch.taxel_gains import taxel_gains
+from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, USUAL_LIGHTNESS
+from canprobe.mechanics.touch.image.image_model import MOMENT_ERROR_POWER, make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.image.patch import PatchCalibration
+from canprobe.mechanics.touch.linear_algebra import rms
+from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
 
 FORM_SIGMA = 0.01

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.patch.array_calibration import Lag
-from canprobe.mechanics.touch.patch.creep import TIME_CONSTANTS_S, PadMemory
-from canprobe.mechanics.touch.patch.pad_lag import GAP_S, PadLag
+from canprobe.mechanics.touch.image.calibration import Lag
+from canprobe.mechanics.touch.image.moments import TIME_CONSTANTS_S, PadMemory
+from canprobe.mechanics.touch.image.pad_lag import GAP_S, PadLag
 
 
 def remembered(t, uv):

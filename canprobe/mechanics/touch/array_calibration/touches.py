@@ -18,12 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.patch.array_calibration import MomentErrors
-from canprobe.mechanics.touch.patch.creep import PadMemory
-from canprobe.mechanics.touch.patch.dead_taxels import Image
-from canprobe.mechanics.touch.patch.force_errors import STRAIGHT_SHARE
-from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
-from canprobe.mechanics.touch.patch.moments import MomentImage
+from canprobe.mechanics.touch.image.calibration import MomentErrors
+from canprobe.mechanics.touch.image.force_errors import STRAIGHT_SHARE
+from canprobe.mechanics.touch.image.moments import MomentImage, PadMemory
+from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
+from canprobe.mechanics.touch.image.silent_taxels import Image
 from canprobe.mechanics.types import Floats
 
 BLUR_PRIOR_PITCH = (0.7, 0.2)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 
-from canprobe.mechanics.touch.patch.array_calibration import Lag
+from canprobe.mechanics.touch.image.calibration import Lag
 
 GAP_S = 0.1
 """Time without contact, s, after which the lag starts afresh."""

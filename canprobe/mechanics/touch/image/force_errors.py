@@ -1,7 +1,7 @@
 """Errors of the force that an array measures, and the standard deviation of one reading.
 
 Four causes, taken for independent: the reference of newtons; the array (gains of taxels, hysteresis, what is lost below
-the threshold, the form of the image model); creep, as far as `force_creep` does not correct it; and taxels that do not
+the threshold, the form of the image model); creep, as far as `ForceCreep` does not correct it; and taxels that do not
 measure, whose share is interpolated. A saturated patch and one that runs off the pad show only a lower bound: their
 standard deviation is infinite.
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from canprobe.mechanics.touch.patch.array_calibration import CentroidDelays, ContactNoise, Lag
-from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
+from canprobe.mechanics.touch.array_calibration.touches import Dwell, Shown
+from canprobe.mechanics.touch.image.calibration import CentroidDelays, ContactNoise, Lag
 from canprobe.mechanics.types import Floats
 
 REACH_M, REACH_LOG_SIGMA = 200e-6, 0.2

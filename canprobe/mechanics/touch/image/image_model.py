@@ -4,7 +4,7 @@ On a Winkler layer of stiffness k a probe of radius R_p leaves an elliptic patch
 with `A = ½ (I/R_p + K)` and `F = π k δ² / (2 √det A)` the pressure is `k (δ − xᵀ A x)₊`, and its second moments are
 `(δ/6) A⁻¹`. The array blurs that pressure, spreads some of it over rows and columns, scales it, and shows the part
 above a level. Five parameters describe it: stiffness, scale, blur, crosstalk, and memory, the share of earlier places
-in the image (`creep.PadMemory`). The level and the pitch are those of the device.
+in the image (`moments.PadMemory`). The level and the pitch are those of the device.
 
 The blurred patch has no closed form: the pressure is computed on a grid of thirds of a pitch over one quadrant, in the
 principal axes, and blurred by a folded Gaussian matrix. The model is not true where taxels saturate, where the patch is
@@ -17,15 +17,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from canprobe.mechanics.touch.image.calibration import ArrayCalibration, ImageParameters, MomentErrors
+from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS
+from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, Moments
+from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.linear_algebra import positive, read_only
-from canprobe.mechanics.touch.pad import COUNTS_MAX
-from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
-from canprobe.mechanics.touch.patch.force_errors import USUAL_LIGHTNESS
-from canprobe.mechanics.touch.patch.moments import Moments
+from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
 from canprobe.mechanics.types import Floats
 
 STEPS_PER_PITCH = 3
@@ -48,6 +49,12 @@ _DIFFERENCE_STEP = 1e-3
 _ROOT2 = math.sqrt(2.0)
 _MIN_CURVATURE_DIFFERENCE = 1e-4
 """Least difference of the principal curvatures, relative, at which the shear of the image is a quotient."""
+LIST_BLUR_TAXELS = 0.1
+"""Blur of taxels that are separate, in pitches: the least of the image model."""
+GAIN_FORCES_N = (0.5, 1.0, 2.0, 4.0)
+GAIN_CURVATURES = ((0.0, 0.0), (0.8, 0.8), (1.6, 1.6), (1.2, 0.0), (0.6, -0.5))
+"""Forces, and principal curvatures over that of the probe, between which the force gains hold: plane, balls, cylinder,
+saddle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,3 +302,37 @@ def _in_axes(v1: float, v2: float, axes: tuple[float, float]) -> Moments:
     """xx, xy, yy of a tensor with principal values v1, v2, the direction of the first given by cosine and sine."""
     c, s = axes
     return c * c * v1 + s * s * v2, c * s * (v1 - v2), s * s * v1 + c * c * v2
+
+
+def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCalibration:
+    """From counts to force, for an array of these taxels.
+
+    On a flat array, which has no image model, the force is the plain sum of pressure times area over the scale. The
+    taxels of a list are separate: their model has the least blur. At another full scale than that of the calibration,
+    level, threshold and noise are the same counts of another pressure; layer, blur, crosstalk and scale stay.
+    """
+    reference = 0.0 if calibration.nominal else calibration.force_sigma
+    plain = PatchCalibration(pad, force_errors=calibration.force, reference_sigma=reference)
+    if pad.is_flat:
+        return replace(plain, force_gain=1.0 / calibration.image.scale, dead=calibration.dead)
+    if not pad.is_grid:
+        image = calibration.image
+        calibration = replace(calibration, image=replace(image, blur=min(image.blur, LIST_BLUR_TAXELS * pad.pitch_m)))
+    plain = replace(plain, gains=calibration.gains)
+    gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
+    return replace(plain, force_gain=gain, edge_gain=edge, dead=calibration.dead, blur_m=calibration.image.blur)
+
+
+def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:
+    """The image model of an array; `seen` is the number of taxels along the side of the window, None for all."""
+    count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
+    return ImageModel(
+        calibration.image,
+        patch.radius_m,
+        patch.pitch_m,
+        level=LEVEL_COUNTS * count,
+        count=count,
+        side=side,
+        seen=side if seen is None else seen,
+        errors=calibration.moments,
+    )

@@ -1,8 +1,8 @@
 """The calibration of one tactile array.
 
-`canprobe calibrate array` finds it by touching a plane and a ball (`calibrate`), and writes it to a file. Images alone
-do not show newtons: stiffness, full scale and mean gain times 1.3 give identical images and 1.3 times the force. So a
-calibration names its force reference; without one, forces and stiffness are in nominal newtons.
+`canprobe calibrate array` finds it by touching a plane and a ball (`touch.array_calibration`), and writes it to a file.
+Images alone do not show newtons: stiffness, full scale and mean gain times 1.3 give identical images and 1.3 times the
+force. So a calibration names its force reference; without one, forces and stiffness are in nominal newtons.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.patch.force_errors import UNSTATED, ForceErrors
+from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors
 
 ForceReference = Literal["scale", "weights", "unit", "none"]
 NO_FORCE_REFERENCE = "nominal newtons: no force reference"
@@ -20,7 +20,7 @@ NO_FORCE_REFERENCE = "nominal newtons: no force reference"
 
 @dataclass(frozen=True, slots=True)
 class ImageParameters:
-    """Parameters of an array's image model, found by touching known objects (`calibrate`).
+    """Parameters of an array's image model, found by touching known objects.
 
     Attributes:
         stiffness: stiffness K/h of the layer, N/m³.

@@ -29,13 +29,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.mechanics.touch.array_calibration.blur_fit import fit_blur
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, Slope
+from canprobe.mechanics.touch.image.calibration import ArrayCalibration
+from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, STRAIGHT_SHARE
+from canprobe.mechanics.touch.image.patch import Patch
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
-from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
-from canprobe.mechanics.touch.patch.blur_fit import fit_blur
-from canprobe.mechanics.touch.patch.force_errors import MAKE_SPREAD, STRAIGHT_SHARE
-from canprobe.mechanics.touch.patch.image import Patch
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate

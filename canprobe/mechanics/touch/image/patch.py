@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
+from canprobe.mechanics.touch.image.beyond_window import MAX_EDGE_SHARE, MIN_PEAK_RATIO, Continuation
+from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors, ForceSigma
+from canprobe.mechanics.touch.image.silent_taxels import may_be_dead, mended
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
-from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK_RATIO, Continuation
-from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
-from canprobe.mechanics.touch.patch.force_errors import UNSTATED, ForceErrors, ForceSigma
 from canprobe.mechanics.touch.stops import OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 from canprobe.mechanics.types import Floats
 
@@ -107,7 +107,7 @@ class PatchCalibration:
 
     The pressure of a taxel is `full_scale_pa · counts / 255`. The force is `force_gain · S + edge_gain · √(S · 1 N)`
     with S the sum of pressure times area; the second term stands for what the patch loses at its rim under the
-    threshold. Both gains follow from the image model (`array_models.make_patch_calibration`).
+    threshold. Both gains follow from the image model (`image_model.make_patch_calibration`).
 
     Attributes:
         pad: the taxels, with their pressure at the largest count.
