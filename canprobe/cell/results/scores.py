@@ -11,8 +11,8 @@ import numpy as np
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
-from canprobe.mechanics.touch.estimate.online import Gate, PadWay
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
@@ -195,7 +195,7 @@ def bound_of_scan(
     normals = np.array([s.n_base for s in samples])
     gate = Gate(1.0, sigma_normal)
     point, height, normal = np.array([gate.sigmas(s) for s in samples]).T
-    pad = PadWay(float(np.median(point)))
+    pad = PadPathLength(float(np.median(point)))
     share, way = np.array([pad.step(s, sigma) for s, sigma in zip(samples, point.tolist(), strict=True)]).T
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):

@@ -21,8 +21,8 @@ from canprobe.mechanics.touch.image.moments import MomentImage
 from canprobe.mechanics.touch.strategies import Rectangle
 
 if TYPE_CHECKING:
+    from canprobe.mechanics.touch.estimate.gate import Estimator
     from canprobe.mechanics.touch.estimate.noise import Correlation
-    from canprobe.mechanics.touch.estimate.online import Estimator
     from canprobe.mechanics.touch.image.image_model import ImageModel
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.online.estimator import AnswerStage

@@ -15,7 +15,7 @@ from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth, inden
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.contact import ContactSample
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-    from canprobe.mechanics.touch.estimate.online import Estimator
+    from canprobe.mechanics.touch.estimate.gate import Estimator
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 

@@ -10,7 +10,7 @@ Model and assumptions:
     terms               the cubic and quartic terms beside them, their gradients, and changes of the origin
     residuals           residuals of samples and their Jacobian, from which every fit starts
     noise, prior        errors of points and normals, correlated along the path; the surface before it is touched
-    travel              how far a contact has moved beyond its noise, and how its places spread
+    path_length         how far a contact has moved beyond its noise, and how its places spread
 
 Fits of a batch:
 
@@ -21,8 +21,8 @@ Fits of a batch:
 
 Estimators, one sample after another:
 
-    online              their interface (`add`, `estimate`, `reset`), and the gate that every sample passes
-    window              over the last samples: `ml` and `chord`; `chen1996` is the paper's
+    gate                their interface (`add`, `estimate`, `reset`), and the gate that every sample passes
+    window              over the last samples: `ml`, `chord`, and `chen1996`, the scheme of the paper
     recursive           what runs in the loop: forgets per millimetre, starts afresh where the surface changes
     information         the square-root information filter under it
     start               its first stretch, solved as a whole by single Gauss–Newton steps

@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.chen1996 import Chen1996Estimator
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, lag_pairs, solve_pairs, usable_lag
+from canprobe.mechanics.touch.estimate.gate import Estimator
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, checked_arrays, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
-from canprobe.mechanics.touch.estimate.online import Estimator
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.recursive import RecursiveEstimator
-from canprobe.mechanics.touch.estimate.window import ChordEstimator, MlEstimator
+from canprobe.mechanics.touch.estimate.window import Chen1996Estimator, ChordEstimator, MlEstimator
 from canprobe.mechanics.touch.linear_algebra import whole
 
 METHODS = ("chen1996", "chord", "ml", "recursive")

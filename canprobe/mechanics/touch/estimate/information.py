@@ -109,7 +109,7 @@ class InformationFilter:
         c: (9,) parameters (`quadric`).
         root: (9, 9) root of their information, which is `rootᵀ root`.
         inverse: (9, 9) inverse of `root`.
-        left_out: sums for the terms that a quadric leaves out, and for the covariance of the answer.
+        omitted: sums for the terms that a quadric leaves out, and for the covariance of the answer.
     """
 
     def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
@@ -117,7 +117,7 @@ class InformationFilter:
         self.root: Floats
         self.inverse: Floats
         self._prior_rows = _prior_rows(prior, length)
-        self.left_out = OmittedTerms(self._prior_rows.T @ self._prior_rows, correlation)
+        self.omitted = OmittedTerms(self._prior_rows.T @ self._prior_rows, correlation)
         self.begin(np.eye(4))
 
     def begin(self, T: Floats) -> None:
@@ -127,7 +127,7 @@ class InformationFilter:
         self._inflation = 1.0
         self._path = _Path()
         self.root, self.inverse = self._prior_rows, inverted_upper(self._prior_rows)
-        self.left_out.reset()
+        self.omitted.reset()
 
     def adopt(  # noqa: PLR0917 - what a batch solution is
         self,
@@ -155,7 +155,7 @@ class InformationFilter:
         self._path = _Path(travelled, travelled)
         self.root = upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)]))
         self.inverse = inverted_upper(self.root)
-        self.left_out.start(rows, residuals, travelled, slow)
+        self.omitted.start(rows, residuals, travelled, slow)
 
     def take(self, rows: Floats, residuals: Floats, moved: float, slow: SlowErrors | None = None) -> None:
         """Forget over a step of the path (m), then add weighted rows (n, 3, 18) and minus residuals (n, 3): one QR.
@@ -178,7 +178,7 @@ class InformationFilter:
         self.inverse = inverted_upper(self.root)
         step = self.inverse.dot(full[:9, 9])
         self.c = self.c + step
-        self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2, slow)
+        self.omitted.take(rows, residuals, step, moved, kept, share**2 - left**2, slow)
 
     def equations(self, touches: Sequence[MeasuredContact]) -> tuple[Floats, Floats]:
         """Whitened rows (n, 3, 18) and minus residuals (n, 3) of new contacts, as `take` wants them."""
@@ -214,7 +214,7 @@ class InformationFilter:
         self.c[:3] = 0.0
         back = inverted(M)
         self.root, self.inverse = self.root.dot(back), M.dot(self.inverse)
-        self.left_out.carry(back, x[0], x[1])
+        self.omitted.carry(back, x[0], x[1])
         R = self.T[:3, :3]
         self.T = homogeneous(R.dot(turned), self.T[:3, 3] + self.length * R.dot(x))
 

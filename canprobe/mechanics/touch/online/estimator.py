@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
+from canprobe.mechanics.touch.estimate.gate import Dropped, Estimator
 
 
 class AnswerStage:

@@ -20,8 +20,8 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, with_solution
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import Decision
+from canprobe.mechanics.touch.estimate.path_length import PathLength
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, parameters_of
-from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted, solved
 from canprobe.mechanics.touch.map.cells import observed_of, robust
 from canprobe.mechanics.touch.map.discs import Discs
@@ -67,19 +67,19 @@ class MapFusion(AnswerStage):
         self._map = surface_map
         self._between = MEMORIES_BETWEEN * memory_m
         self._waiting: deque[tuple[float, ContactSample]] = deque()
-        self._travel = Travel(step_of(surface_map.noise.lateral))
+        self._path_length = PathLength(step_of(surface_map.noise.lateral))
 
     def take(self, sample: ContactSample) -> None:
-        self._travel.add(sample.p_base)
+        self._path_length.add(sample.p_base)
         if len(self._waiting) < MAX_WAITING:
-            self._waiting.append((self._travel.total, sample))
+            self._waiting.append((self._path_length.total, sample))
 
     def reset(self) -> None:
         """Forget everything but the settings and the ground."""
         self._learn(math.inf)
 
     def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
-        self._learn(self._travel.total - self._between)
+        self._learn(self._path_length.total - self._between)
         if answer is None or not answer.rank:  # what was withdrawn stays so
             return answer
         known = ground_at(self._map, answer)

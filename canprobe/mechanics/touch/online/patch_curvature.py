@@ -58,7 +58,7 @@ TRACE_ERROR_SHARE = 0.5
 """Standard deviation of what traces of earlier places do to the moments, over what is taken off for them."""
 _STIFFNESS_STEP = 0.01
 _ROOT2 = math.sqrt(2.0)
-SETTLED_STEP, MAX_LAST_STEP = 0.002, 0.05
+LAST_STEP, MAX_LAST_STEP = 0.002, 0.05
 """Step, in units of the probe's curvature, that ends the iteration; largest last step of a solution that is used."""
 
 
@@ -306,7 +306,7 @@ class PatchCurvature:
                 x = x + way
                 *of_q, of_stiffness = map(abs, way.tolist())
                 step = max(*of_q, of_stiffness / self.model.radius)
-                if step < SETTLED_STEP / self.model.radius:
+                if step < LAST_STEP / self.model.radius:
                     break
         except (ValueError, np.linalg.LinAlgError):
             return None

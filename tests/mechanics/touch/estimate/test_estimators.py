@@ -13,8 +13,8 @@ from canprobe.mechanics.touch.estimate import quadric, residuals
 from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.estimate.noise import make_noise
+from canprobe.mechanics.touch.estimate.path_length import PathLength, Spread
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.travel import Spread, Travel
 
 NOISE = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
 WEIGHT = np.array([1.0, 2.0, 1.0])
@@ -249,12 +249,12 @@ def test_settings_are_checked(kw, field):
 class TestTravel:
     def test_noise_is_no_path(self):
         rng = np.random.default_rng(0)
-        travel = Travel(3 * 5e-5)
+        travel = PathLength(3 * 5e-5)
         assert sum(travel.add(x) for x in 5e-5 * rng.normal(size=(50000, 3))) == 0.0
 
     def test_motion_is(self):
         rng = np.random.default_rng(0)
-        travel = Travel(0.5e-3)
+        travel = PathLength(0.5e-3)
         x = np.outer(np.arange(800) * 0.125e-3, [0.6, 0.8, 0.0])
         got = sum(travel.add(p) for p in x + 5e-5 * rng.normal(size=x.shape))
         assert got == pytest.approx(0.1, rel=0.05)

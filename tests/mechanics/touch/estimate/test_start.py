@@ -36,7 +36,7 @@ def test_it_has_settled_where_the_full_iteration_ends(name, truth):
         found = touches(truth, name, seed)
         start = stepwise(found)
         assert start.over
-        assert start.settled
+        assert start.steady
         full = fit(batch_design(start.T, MEMORY, found), PRIOR.rows(MEMORY))
         assert full.converged
         off = full.root @ (start.solution.target - full.c)
@@ -54,7 +54,7 @@ def test_wrong_places_do_not_lead_it_astray(truth):
             found[i] = found[i]._replace(point=found[i].point + 5e-3 * rng.normal(size=3))
         clean = [t for i, t in enumerate(found) if i not in wrong]
         start = stepwise(found)
-        assert start.settled
+        assert start.steady
         assert np.count_nonzero(start.solution.weight < 0.1) == 6
         without = fit(batch_design(start.T, MEMORY, clean), PRIOR.rows(MEMORY))
         off = without.root @ (start.solution.target - without.c)

@@ -14,7 +14,7 @@ _MAX_SQUARE_RATIO, _USUAL_UPDATE_SHARE = 16.0, 0.05
 """Largest squared distance from the median, over the usual one, at full weight; share of one point in the usual one."""
 
 
-class Travel:
+class PathLength:
     """Path of a noisy point: its running mean over some samples, taken in steps well above the noise.
 
     Why not the sum of distances between samples: noise alone would add up to a path, and a filter that forgets along

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from canprobe.mechanics.touch.contact import ContactSample, Doubt
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.travel import Travel
+from canprobe.mechanics.touch.estimate.path_length import PathLength
 from canprobe.mechanics.touch.linear_algebra import positive
 
 
@@ -120,7 +120,7 @@ class Gate:
         )
 
 
-class PadWay:
+class PadPathLength:
     """Follows contacts over the pad, along whose way their slow errors change.
 
     Args:
@@ -128,7 +128,7 @@ class PadWay:
     """
 
     def __init__(self, sigma_point: float) -> None:
-        self._travel = Travel(sigma_point)
+        self._path_length = PathLength(sigma_point)
 
     def step(self, sample: ContactSample, sigma_point: float) -> tuple[float, float]:
         """Take a contact with its standard deviation along the surface, as `Gate.sigmas` gives it, m.
@@ -136,8 +136,8 @@ class PadWay:
         Returns:
             Slow errors of the contact over this standard deviation, at most 1; and the way over the pad up to it, m.
         """
-        self._travel.add(sample.r_probe)
-        return min(_widening(sample) * sample.sigma_slow / sigma_point, 1.0), self._travel.total
+        self._path_length.add(sample.r_probe)
+        return min(_widening(sample) * sample.sigma_slow / sigma_point, 1.0), self._path_length.total
 
 
 def _widening(sample: ContactSample) -> float:
