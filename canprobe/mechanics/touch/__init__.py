@@ -37,3 +37,88 @@ contact frame a surface has c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [
 κ > 0 is convex. Source: Chen, Rink, Zhang, "Local Object Shape From Tactile Sensing", with the corrections that the
 docstrings name. Start reading at `contact`, then `estimate/` and `online/`.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.array_calibration.calibrate import calibrate_array
+    from canprobe.mechanics.touch.array_calibration.calibration_check import CalibrationCheck
+    from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope, contact_sample, indentation_from_force
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
+    from canprobe.mechanics.touch.estimate.gate import Estimator
+    from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+    from canprobe.mechanics.touch.estimate.noise import Correlation
+    from canprobe.mechanics.touch.estimate.prior import Prior
+    from canprobe.mechanics.touch.image.calibration import ArrayCalibration
+    from canprobe.mechanics.touch.image.force_reading import ForceReading
+    from canprobe.mechanics.touch.image.image_model import ImageModel, make_image_model, make_patch_calibration
+    from canprobe.mechanics.touch.image.moments import MomentImage
+    from canprobe.mechanics.touch.image.patch import Patch, PatchCalibration, compute_patch
+    from canprobe.mechanics.touch.map.fit import fit_map
+    from canprobe.mechanics.touch.map.local_fits import PadLayer
+    from canprobe.mechanics.touch.map.noise import PAD_NOISE, MapNoise
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+    from canprobe.mechanics.touch.meshing import Mesh
+    from canprobe.mechanics.touch.objects import make_object
+    from canprobe.mechanics.touch.online.estimator import OnlineEstimator
+    from canprobe.mechanics.touch.online.map_fusion import MapFusion
+    from canprobe.mechanics.touch.online.noise_level import NoiseLevel
+    from canprobe.mechanics.touch.online.patch_curvature import PatchCurvature
+    from canprobe.mechanics.touch.online.patch_fusion import PatchFusion
+    from canprobe.mechanics.touch.online.systematic_errors import SystematicErrors
+    from canprobe.mechanics.touch.pad import Pad
+    from canprobe.mechanics.touch.surface import SurfaceMatrix
+
+_NAMES = {
+    "array_calibration.calibrate": ("calibrate_array",),
+    "array_calibration.calibration_check": ("CalibrationCheck",),
+    "contact": ("ContactSample", "Doubt", "Slope", "contact_sample", "indentation_from_force"),
+    "estimate.answer": ("SurfaceEstimate",),
+    "estimate.fit": ("fit_surface", "make_estimator"),
+    "estimate.gate": ("Estimator",),
+    "estimate.likelihood": ("cramer_rao",),
+    "estimate.noise": ("Correlation",),
+    "estimate.prior": ("Prior",),
+    "image.calibration": ("ArrayCalibration",),
+    "image.force_reading": ("ForceReading",),
+    "image.image_model": ("ImageModel", "make_image_model", "make_patch_calibration"),
+    "image.moments": ("MomentImage",),
+    "image.patch": ("Patch", "PatchCalibration", "compute_patch"),
+    "map.fit": ("fit_map",),
+    "map.local_fits": ("PadLayer",),
+    "map.noise": ("MapNoise", "PAD_NOISE"),
+    "map.surface_map": ("SurfaceMap",),
+    "meshing": ("Mesh",),
+    "objects": ("make_object",),
+    "online.estimator": ("OnlineEstimator",),
+    "online.map_fusion": ("MapFusion",),
+    "online.noise_level": ("NoiseLevel",),
+    "online.patch_curvature": ("PatchCurvature",),
+    "online.patch_fusion": ("PatchFusion",),
+    "online.systematic_errors": ("SystematicErrors",),
+    "pad": ("Pad",),
+    "surface": ("SurfaceMatrix",),
+}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = ["ContactSample", "Doubt", "Pad", "Slope", "contact_sample", "indentation_from_force"]
+__all__ += ["ForceReading", "ImageModel", "MomentImage", "Patch", "PatchCalibration", "compute_patch"]
+__all__ += ["ArrayCalibration", "CalibrationCheck", "calibrate_array", "make_image_model", "make_patch_calibration"]
+__all__ += ["Correlation", "Estimator", "Prior", "SurfaceEstimate", "cramer_rao", "fit_surface", "make_estimator"]
+__all__ += ["MapFusion", "NoiseLevel", "OnlineEstimator", "PatchCurvature", "PatchFusion", "SystematicErrors"]
+__all__ += ["PAD_NOISE", "MapNoise", "Mesh", "PadLayer", "SurfaceMap", "SurfaceMatrix", "fit_map", "make_object"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch import SurfaceMatrix, indentation_from_force
 from canprobe.mechanics.touch import contact as c
-from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.layer_stiffness import MIN_PUSH_SAMPLES, PushFit, stiffness_from_slope
 from canprobe.mechanics.touch.stops import MIN_REST_SAMPLES, AtRest
-from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, rotation_vectors, tangent_rotation
 
 H = 1e-3

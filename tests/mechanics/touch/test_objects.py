@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
+from canprobe.mechanics.touch import make_object
+from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS
 
 POSE = np.eye(4)
 POSE[:3, :3] = Rotation.from_euler("xyz", (12, -25, 70), degrees=True).as_matrix()

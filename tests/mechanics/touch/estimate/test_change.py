@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Correlation, make_estimator
 from canprobe.mechanics.touch.estimate.change import ChangeTest
-from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.recursive import CHANGING_NOTE
 
 MEMORY = 0.02

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Prior, cramer_rao, make_estimator
 from canprobe.mechanics.touch.estimate import quadric, residuals
-from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator
-from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+from canprobe.mechanics.touch.estimate.fit import METHODS
 from canprobe.mechanics.touch.estimate.noise import make_noise
 from canprobe.mechanics.touch.estimate.path_length import PathLength, Spread
-from canprobe.mechanics.touch.estimate.prior import Prior
 
 NOISE = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
 WEIGHT = np.array([1.0, 2.0, 1.0])

@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample, Doubt, indentation_from_force
-from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
-from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
-from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch import (
+    ContactSample,
+    Doubt,
+    PatchCalibration,
+    SurfaceMatrix,
+    compute_patch,
+    cramer_rao,
+    fit_surface,
+    indentation_from_force,
+    make_estimator,
+)
+from canprobe.mechanics.touch.estimate.fit import METHODS
 
 SIGMA = (2e-5, 1e-3)
 WEIGHT = np.array([1.0, 2.0, 1.0])

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
-from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.noise import Correlation
-from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch import (
+    Correlation,
+    Prior,
+    SurfaceEstimate,
+    SurfaceMatrix,
+    cramer_rao,
+    fit_surface,
+    make_estimator,
+)
+from canprobe.mechanics.touch.estimate.fit import METHODS
 
 TINY = {"sigma_point": 1e-9, "sigma_normal": 1e-9}
 WEIGHT = np.array([1.0, 2.0, 1.0])

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Prior, make_estimator
 from canprobe.mechanics.touch.estimate import start as first_stretch
-from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
-from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.start import MAX_CONTACTS, TAKEOVER_SHARE, Start, isolation
 
 MEMORY, SIGMA = 0.02, (2e-5, 1e-3)

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from canprobe.mechanics.touch import ForceReading, Patch, PatchCalibration
 from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors, upper_end
-from canprobe.mechanics.touch.image.force_reading import ForceCreep, ForceReading, decades_after
-from canprobe.mechanics.touch.image.patch import Patch, PatchCalibration
+from canprobe.mechanics.touch.image.force_reading import ForceCreep, decades_after
 
 ERRORS = ForceErrors(creep=0.05, creep_sigma=0.006, creep_decades=1.8, array=0.01, spread=0.0)
 CALIBRATION = PatchCalibration(force_errors=ERRORS, reference_sigma=0.005)

@@ -7,16 +7,21 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample, Slope, indentation_from_force
+from canprobe.mechanics.touch import (
+    PAD_NOISE,
+    ContactSample,
+    ImageModel,
+    MapNoise,
+    PadLayer,
+    Slope,
+    SurfaceMap,
+    fit_map,
+    indentation_from_force,
+)
 from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentErrors
-from canprobe.mechanics.touch.image.image_model import ImageModel
 from canprobe.mechanics.touch.map import discs, local_fits, nodes, surface_map
-from canprobe.mechanics.touch.map.fit import fit_map
-from canprobe.mechanics.touch.map.local_fits import PadLayer
-from canprobe.mechanics.touch.map.noise import PAD_NOISE, MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND_DERIVATIVES, fourth_of, heights_and_slopes, terms
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 SIGMA_POINT, SIGMA_NORMAL = 30e-6, 1e-3
 LINE = np.arange(-100, 100) * 0.125e-3

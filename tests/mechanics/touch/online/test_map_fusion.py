@@ -5,14 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
+from canprobe.mechanics.touch import (
+    ContactSample,
+    MapFusion,
+    MapNoise,
+    OnlineEstimator,
+    PadLayer,
+    SurfaceMap,
+    fit_surface,
+    make_estimator,
+)
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
-from canprobe.mechanics.touch.map.local_fits import PadLayer
-from canprobe.mechanics.touch.map.noise import MapNoise
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-from canprobe.mechanics.touch.online.estimator import OnlineEstimator
-from canprobe.mechanics.touch.online.map_fusion import MEMORIES_BETWEEN, KnownCurvature, MapFusion, ground_at, joined
+from canprobe.mechanics.touch.online.map_fusion import MEMORIES_BETWEEN, KnownCurvature, ground_at, joined
 
 RADIUS, PAD, STIFFNESS, SIGMA = 0.05, 0.04, 1.2e8, {"sigma_point": 3e-5, "sigma_normal": 1e-3}
 NOISE = MapNoise(3e-5, 3e-5, 1e-3)

@@ -5,10 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.online.estimator import OnlineEstimator
-from canprobe.mechanics.touch.online.noise_level import MIN_LEVEL, NoiseLevel
+from canprobe.mechanics.touch import ContactSample, NoiseLevel, OnlineEstimator, make_estimator
+from canprobe.mechanics.touch.online.noise_level import MIN_LEVEL
 
 RADIUS, MEMORY = 0.05, 0.02
 T = np.eye(4)

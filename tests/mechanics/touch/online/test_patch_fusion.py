@@ -9,24 +9,27 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad, indentation_from_force
-from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
-from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentErrors
-from canprobe.mechanics.touch.image.image_model import USUAL_LIGHTNESS, ImageModel
-from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, MomentImage, PadMemory
-from canprobe.mechanics.touch.image.patch import PatchCalibration
-from canprobe.mechanics.touch.online.estimator import OnlineEstimator
-from canprobe.mechanics.touch.online.patch_curvature import (
-    MAX_RECENT_FRAMES,
-    MIN_FRAMES,
-    RECENT_OUTLIER_SHARE,
+from canprobe.mechanics.touch import (
+    ContactSample,
+    ImageModel,
+    MomentImage,
+    OnlineEstimator,
+    PatchCalibration,
     PatchCurvature,
-    _Mean,
+    PatchFusion,
+    Prior,
+    Slope,
+    SystematicErrors,
+    indentation_from_force,
+    make_estimator,
 )
-from canprobe.mechanics.touch.online.patch_fusion import PatchFusion, patch_estimate
-from canprobe.mechanics.touch.online.systematic_errors import SystematicErrors
+from canprobe.mechanics.touch.contact import direction_to_pad
+from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentErrors
+from canprobe.mechanics.touch.image.image_model import USUAL_LIGHTNESS
+from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, PadMemory
+from canprobe.mechanics.touch.online.patch_curvature import MAX_RECENT_FRAMES, MIN_FRAMES, RECENT_OUTLIER_SHARE, _Mean
+from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 RADIUS, STIFFNESS, PITCH, COUNT_PA = 0.040, 1.27e8, 1.5875e-3, 100e3 / 255

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.fit import fit_surface
+from canprobe.mechanics.touch import ContactSample, SystematicErrors, fit_surface
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.online.regions import with_errors
-from canprobe.mechanics.touch.online.systematic_errors import LAG_SHARE, SPAN_SHARE, SystematicErrors
+from canprobe.mechanics.touch.online.systematic_errors import LAG_SHARE, SPAN_SHARE
 
 MEMORY = 0.02
 SIGMAS = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
