@@ -1,12 +1,14 @@
-"""What the pad remembers, against the sum over all past places."""
+"""Moments of an image by hand, and what the pad remembers against the sum over all past places."""
 
 import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
+from canprobe.mechanics.touch import MomentImage, PatchCalibration
 from canprobe.mechanics.touch.image.calibration import Lag
-from canprobe.mechanics.touch.image.moments import TIME_CONSTANTS_S, PadMemory
+from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, TIME_CONSTANTS_S, PadMemory
 from canprobe.mechanics.touch.image.pad_lag import GAP_S, PadLag
 
 
@@ -115,3 +117,53 @@ def test_a_new_contact_starts_without_a_past():
     pad.step(0.0, 0.0, 0.0)
     pad.step(0.005, 1e-3, 0.0)
     assert pad.step(0.01 + GAP_S, 5e-3, 2e-3) == (5e-3, 2e-3)
+
+
+# images
+
+PITCH, RADIUS = 1.5875e-3, 0.040
+
+
+def test_moments_of_an_image_by_hand():
+    rng = np.random.default_rng(3)
+    image = np.zeros((16, 16), np.uint8)
+    image[5:11, 4:12] = rng.integers(0, 120, (6, 8))
+    calibration = PatchCalibration()
+    sums = np.zeros(6)
+    for i in range(16):
+        for j in range(16):
+            v, u = (i - 7.5) * PITCH, (j - 7.5) * PITCH
+            rho = math.hypot(u, v) / RADIUS
+            p = max(int(image[i, j]) - LEVEL_COUNTS, 0) * math.sin(rho) / rho
+            sums += p * np.array([1.0, u, v, u * u, u * v, v * v])
+    _, u, v, uu, uv, vv = sums / sums[0]
+    expected = (uu - u * u, uv - u * v, vv - v * v)
+    assert MomentImage(calibration).moments(image) == pytest.approx(expected, rel=1e-9)
+
+
+def test_image_without_an_ellipse_has_no_moments():
+    image = np.zeros((16, 16), np.uint8)
+    moment_image = MomentImage(PatchCalibration())
+    assert moment_image.moments(image) is None
+    image[4:9, 4:9] = LEVEL_COUNTS
+    assert moment_image.moments(image) is None
+    image[6, 6] = 90
+    assert moment_image.moments(image) is None  # a point
+
+
+def test_moments_do_not_jump_where_a_taxel_passes_the_threshold():
+    """A blurred patch slides by one pitch: its moments wander by less than three quarters of what a plain cut makes of
+    them."""
+    fine = (np.arange(16 * 9) + 0.5) / 9 - 8.0
+    u, v = np.meshgrid(fine, fine)
+    moment_image, plain = MomentImage(PatchCalibration()), MomentImage(PatchCalibration(threshold_counts=1), 0)
+    found, jumping = [], []
+    for shift in np.linspace(0.0, 1.0, 21):
+        field = 130.0 * np.maximum(1.0 - ((u - shift) / 2.55) ** 2 - (v / 3.7) ** 2, 0.0)
+        blurred = gaussian_filter(field, 0.65 * 9).reshape(16, 9, 16, 9).mean(axis=(1, 3))
+        image = np.rint(blurred).astype(np.uint8)
+        image[image < LEVEL_COUNTS] = 0
+        found.append(moment_image.moments(image)[0])
+        jumping.append(plain.moments(image)[0])
+    assert np.ptp(found) / np.mean(found) < 0.75 * np.ptp(jumping) / np.mean(jumping)
+    assert np.ptp(found) / np.mean(found) < 0.035
