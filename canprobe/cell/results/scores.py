@@ -10,11 +10,10 @@ import numpy as np
 
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Correlation, SurfaceMatrix
 from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
+from canprobe.mechanics.touch.estimate.noise import Noise, SlowErrors
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
-from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
 
 RUN_IN_M = 0.020

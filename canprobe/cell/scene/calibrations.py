@@ -21,8 +21,8 @@ from canprobe.cell.scene.load import (
     with_writer,
     written_by_line,
 )
+from canprobe.mechanics.touch import ArrayCalibration
 from canprobe.mechanics.touch.image.calibration import (
-    ArrayCalibration,
     CentroidDelays,
     ContactNoise,
     ForceReference,

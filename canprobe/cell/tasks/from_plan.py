@@ -14,17 +14,18 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
-from canprobe.mechanics.touch.array_calibration.calibration_check import CalibrationCheck
-from canprobe.mechanics.touch.contact import ContactSample, indentation_from_force
-from canprobe.mechanics.touch.image.image_model import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.image.moments import MomentImage
+from canprobe.mechanics.touch import (
+    CalibrationCheck,
+    ContactSample,
+    MomentImage,
+    indentation_from_force,
+    make_image_model,
+    make_patch_calibration,
+)
 from canprobe.mechanics.touch.strategies import Rectangle
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.gate import Estimator
-    from canprobe.mechanics.touch.estimate.noise import Correlation
-    from canprobe.mechanics.touch.image.image_model import ImageModel
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+    from canprobe.mechanics.touch import Correlation, Estimator, ImageModel, SurfaceMap
     from canprobe.mechanics.touch.online.estimator import AnswerStage
 
 
@@ -63,7 +64,7 @@ def centroid_coupling(probe: Probe) -> float:
 
 def contact_correlation(array: Array) -> Correlation:
     """Correlation of the noise of an array's contacts along their path, and over the pad."""
-    from canprobe.mechanics.touch.estimate.noise import Correlation  # only where a shape is asked for
+    from canprobe.mechanics.touch import Correlation
 
     length, share = HEIGHT_CORRELATION
     return Correlation(length, 0.0, share, array.calibration.noise.slow_way)
@@ -71,8 +72,8 @@ def contact_correlation(array: Array) -> Correlation:
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
     """An estimator by its name, with the settings of a scan."""
-    from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator  # only where a shape is asked for
-    from canprobe.mechanics.touch.online.estimator import OnlineEstimator
+    from canprobe.mechanics.touch import OnlineEstimator, make_estimator
+    from canprobe.mechanics.touch.estimate.fit import METHODS
 
     assert task.shape is not None and task.scan is not None
     memory = task.shape.memory
@@ -97,11 +98,7 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
 
 def _stages(task: Touch, memory: float, rolling_share: float) -> Iterator[AnswerStage]:
     """The stages of a task's answers, in order."""
-    from canprobe.mechanics.touch.online.map_fusion import MapFusion
-    from canprobe.mechanics.touch.online.noise_level import NoiseLevel
-    from canprobe.mechanics.touch.online.patch_curvature import PatchCurvature
-    from canprobe.mechanics.touch.online.patch_fusion import PatchFusion
-    from canprobe.mechanics.touch.online.systematic_errors import SystematicErrors
+    from canprobe.mechanics.touch import MapFusion, NoiseLevel, PatchCurvature, PatchFusion, SystematicErrors
 
     assert task.shape is not None
     if _uses_patch(task):
@@ -128,9 +125,7 @@ def _image_model(task: Touch) -> ImageModel:
 
 def make_surface_map(task: Touch) -> SurfaceMap:
     """An empty map for the contacts of a task's pad."""
-    from canprobe.mechanics.touch.map.local_fits import PadLayer
-    from canprobe.mechanics.touch.map.noise import PAD_NOISE
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap  # only where a shape is asked for
+    from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap
 
     return SurfaceMap(PadLayer(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
 

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth, indentation_from_force
+from canprobe.mechanics.touch import indentation_from_force
+from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.contact import ContactSample
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-    from canprobe.mechanics.touch.estimate.gate import Estimator
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+    from canprobe.mechanics.touch import ContactSample, Estimator, SurfaceEstimate, SurfaceMap
 
 
 GAP_S = 0.1

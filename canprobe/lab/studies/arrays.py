@@ -29,13 +29,11 @@ from canprobe.lab.studies.array_forces import GROUPS, HOLD_S, HOLDS, result_of, 
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit, calibrate_array
+from canprobe.mechanics.touch import Pad, PatchCalibration, calibrate_array, make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
 from canprobe.mechanics.touch.array_calibration.parameter_fit import curvature_errors, moment_errors
 from canprobe.mechanics.touch.array_calibration.touches import Dwell, what_is_shown
-from canprobe.mechanics.touch.image.image_model import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.linear_algebra import rms
-from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
 
 RADIUS_M = 0.040

@@ -32,9 +32,8 @@ from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.shapes.scans import DEVELOPMENT, drawn, form_of, scene_of
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, SurfaceMap
 from canprobe.mechanics.touch.estimate.path_length import PathLength
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Circle, Strategy, Weave
 from canprobe.mechanics.types import Floats
