@@ -281,10 +281,8 @@ def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibrati
 
 
 def _offsets(pairs: Pairs) -> tuple[Floats, Floats]:
-    """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m.
-
-    A gradient of the taxels' gains and an error of the tool turn with the probe; a wrong place of the object does not.
-    """
+    """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m."""
+    # a gradient of the taxels' gains and an error of the tool turn with the probe; a wrong place of the object does not
     unknown = np.full(2, math.nan)
     mine, its = [], []
     for name in sorted({d.name for d, _ in pairs if abs(d.turn) > 0.5 and d.name != "rod"}):

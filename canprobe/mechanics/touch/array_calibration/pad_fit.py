@@ -111,11 +111,9 @@ def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
 
 
 def _slow(errors: Sequence[Floats], ways: Sequence[Floats], sigma: Floats) -> tuple[float, float]:
-    """Standard deviation of the slow part of errors (n, 2), and its correlation length along the pad, m.
-
-    Half the mean square difference of two errors that are w apart on the pad is the variance from image to image plus
-    `slow² (1 − exp(−w / length))`.
-    """
+    """Standard deviation of the slow part of errors (n, 2), and its correlation length along the pad, m."""
+    # half the mean square difference of two errors that are w apart on the pad is the variance from image to image plus
+    # `slow² (1 − exp(−w / length))`
     count = round(MAX_SLOW_WAY_M / SLOW_BIN_M)
     sums, pairs = np.zeros(count), np.zeros(count)
     for r, way, noise in zip(errors, ways, sigma, strict=True):

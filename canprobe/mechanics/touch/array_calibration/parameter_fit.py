@@ -19,9 +19,8 @@ from canprobe.mechanics.touch.array_calibration.touches import (
     Dwell,
     Shown,
 )
-from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentErrors
+from canprobe.mechanics.touch.image.calibration import ImageParameters
 from canprobe.mechanics.touch.image.image_model import STEPS_PER_PITCH, ImageModel
-from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS
 from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
@@ -40,20 +39,6 @@ class ParameterFit(NamedTuple):
 def _as_parameters(z: Floats, pitch: float) -> ImageParameters:
     k, scale, blur, crosstalk, memory = z.tolist()
     return ImageParameters(math.exp(k), math.exp(scale), max(blur, 0.1) * pitch, crosstalk, memory)
-
-
-def _model(parameters: ImageParameters, plain: PatchCalibration, seen: int, errors: MomentErrors) -> ImageModel:
-    count = plain.full_scale_pa / 255
-    return ImageModel(
-        parameters,
-        plain.radius_m,
-        plain.pitch_m,
-        LEVEL_COUNTS * count,
-        count,
-        side=max(plain.pad.shape),
-        seen=seen,
-        errors=errors,
-    )
 
 
 def fit_parameters(  # noqa: PLR0917
@@ -90,9 +75,9 @@ def fit_parameters(  # noqa: PLR0917
         parameters = _as_parameters(z[:5], plain.pitch_m)
         force = np.exp(z[5:])
         depth = np.sqrt(2.0 * force * np.sqrt(a * b) / (math.pi * parameters.stiffness))
-        whole = _model(parameters, plain, side, NO_ERRORS)
+        whole = ImageModel.of(parameters, NO_ERRORS, plain, seen=side)
         image = whole.shown(depth, a, b)
-        part = whole if seen == side else _model(parameters, plain, seen, NO_ERRORS)
+        part = whole if seen == side else ImageModel.of(parameters, NO_ERRORS, plain, seen=seen)
         M = np.array(part.moments_of(image if part is whole else part.shown(depth, a, b)))
         own = (V - parameters.memory * D)[:, [0, 2]]
         return np.concatenate(

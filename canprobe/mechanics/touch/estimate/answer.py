@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
 from canprobe.mechanics.touch.estimate.observed import Decision, outside, tensor
-from canprobe.mechanics.touch.estimate.quadric import TO_Q, matrix_of
+from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of
 from canprobe.mechanics.touch.estimate.residuals import transport
 from canprobe.mechanics.touch.linear_algebra import checked, principal, read_only
 from canprobe.mechanics.touch.surface import SurfaceMatrix
@@ -281,7 +281,7 @@ def partial_covariance(V: Floats, information: Floats, hidden: Floats) -> Floats
         information: (k,) information about each of them.
         hidden: (3,) whether an entry of K is hidden.
     """
-    C: Floats = (V / information) @ V.T / np.outer(TO_Q, TO_Q)
+    C: Floats = (V / information) @ V.T / TO_Q_SQUARED
     C[hidden] = C[:, hidden] = math.nan
     C[hidden, hidden] = math.inf
     return C
@@ -295,11 +295,9 @@ def _projector(t: Floats) -> Floats:
 
 
 def _observed_direction(decision: Decision) -> Floats:
-    """The tangent direction whose normal curvature the data know best.
-
-    With one unobserved combination it is the null direction of that combination; with two it is the main direction of
-    the observed one.
-    """
+    """The tangent direction whose normal curvature the data know best."""
+    # with one unobserved combination it is the null direction of that combination; with two it is the main direction of
+    # the observed one
     if decision.rank == 0:
         return np.array([1.0, 0.0])
     open_one = decision.rank == 2

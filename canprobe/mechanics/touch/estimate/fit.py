@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,29 +54,16 @@ def make_estimator(
     Raises:
         UsageError: the method is unknown, or a value is out of range.
     """
+    of_all: dict[str, Any] = {"sigma_point": sigma_point, "sigma_normal": sigma_normal, "window": window}
+    of_models: dict[str, Any] = {"prior": prior, "coupling": coupling, "correlation": correlation}
     if method == "recursive":
-        return RecursiveEstimator(
-            sigma_point=sigma_point,
-            sigma_normal=sigma_normal,
-            memory_m=memory_m,
-            window=window,
-            prior=prior,
-            correlation=correlation,
-            coupling=coupling,
-        )
+        return RecursiveEstimator(**of_all, **of_models, memory_m=memory_m)
     if method == "ml":
-        return MlEstimator(
-            sigma_point=sigma_point,
-            sigma_normal=sigma_normal,
-            window=window,
-            prior=prior,
-            coupling=coupling,
-            correlation=correlation,
-        )
+        return MlEstimator(**of_all, **of_models)
     if method == "chord":
-        return ChordEstimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
+        return ChordEstimator(**of_all)
     if method == "chen1996":
-        return Chen1996Estimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, lag=lag)
+        return Chen1996Estimator(**of_all, lag=lag)
     raise unknown_method(method)
 
 
@@ -189,11 +177,9 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
 
 
 def _memory_of(touches: ContactBatch) -> float:
-    """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow.
-
-    Why not always the whole path: the filter's unit of length, its steps and its prior are shares of the memory, and on
-    a long path over a small patch the steps would be larger than the patch.
-    """
+    """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow."""
+    # why not always the whole path: the filter's unit of length, its steps and its prior are shares of the memory, and
+    # on a long path over a small patch the steps would be larger than the patch
     off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
     square = float(np.square(turned).sum())
     radius = math.sqrt(float(np.square(off).sum()) / square) if square > 0.0 else math.inf  # exact on a sphere

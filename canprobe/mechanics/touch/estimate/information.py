@@ -51,6 +51,11 @@ class MeasuredContact(NamedTuple):
     slow: float = 0.0
     way: float = 0.0
 
+    def widened(self, factor: float) -> MeasuredContact:
+        """The contact with standard deviations that are `factor` times as large."""
+        point, height, normal = (factor * s for s in (self.sigma_point, self.sigma_height, self.sigma_normal))
+        return self._replace(sigma_point=point, sigma_height=height, sigma_normal=normal)
+
 
 def slow_errors(touches: Sequence[MeasuredContact]) -> SlowErrors:
     """Slow errors of contacts."""

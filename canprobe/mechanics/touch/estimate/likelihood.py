@@ -16,13 +16,13 @@ from canprobe.mechanics.touch.estimate.answer import (
     build_estimate,
     partial_covariance,
 )
-from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import MENTIONED_PROBABILITY, correct, misfit_notes
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors, make_noise, mixed
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION, fit
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, parameters_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise
 from canprobe.mechanics.touch.linear_algebra import MAX_LENGTH, checked, instance, inverted, solved, upper_root
 from canprobe.mechanics.touch.surface import SurfaceMatrix

@@ -21,7 +21,7 @@ from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEs
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, PadPathLength
 from canprobe.mechanics.touch.estimate.information import InformationFilter, MeasuredContact, slow_errors
-from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
@@ -29,7 +29,7 @@ from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit
 from canprobe.mechanics.touch.estimate.path_length import PathLength, Spread
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, size_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, size_of
 from canprobe.mechanics.touch.estimate.start import Start
 from canprobe.mechanics.touch.linear_algebra import instance, inverted, inverted_upper, lower_root, positive, upper_root
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
@@ -205,10 +205,8 @@ class RecursiveEstimator:
         )
 
     def _flat(self, a: Anchor) -> Floats:
-        """(2, 2) covariance of the samples in the tangent plane of an answer, over the variance of their noise.
-
-        It is 0 for a start that is not steady, so that nothing counts as observed.
-        """
+        """(2, 2) covariance of the samples in the tangent plane of an answer, over the variance of their noise."""
+        # it is 0 for a start that is not steady, so that nothing counts as observed
         P = a.T_frame_contact[:3, :2]
         certain = float(self._steady) / self._gate.sigma_point**2
         flat: Floats = P.T.dot(self._spread.covariance * certain).dot(P)
@@ -254,11 +252,9 @@ class RecursiveEstimator:
                     self._begin_again()
 
     def _begin_again(self) -> None:
-        """Forget the surface: it has changed, or the model has turned over.
-
-        On a straight path gradients that grow along it change neither the surface below it nor its normals. Where they
-        pass zero the quadric's other side is up, and its normal points the wrong way.
-        """
+        """Forget the surface: it has changed, or the model has turned over."""
+        # On a straight path gradients that grow along it change neither the surface below it nor its normals. Where
+        # they pass zero the quadric's other side is up, and its normal points the wrong way.
         self._spread.fade(0.0)
         self._start, self._steady = Start(self._memory, self._prior), False
 
@@ -276,10 +272,8 @@ class RecursiveEstimator:
         return left if self._change.usual_again(left.squares) else None
 
     def _judged(self, rows: Floats, residuals: Floats, unexplained: Floats) -> _Compared:
-        """Contacts weighted by their places and, beyond a limit of the squared innovation d², by `(limit / d²)²`.
-
-        The limit is the 99.9 % point of χ² times the running innovation: where all samples disagree, none is wrong.
-        """
+        """Contacts weighted by their places and, beyond a limit of the squared innovation d², by `(limit / d²)²`."""
+        # the limit is the 99.9 % point of χ² times the running innovation: where all samples disagree, none is wrong
         squares = self._filter.squared_innovations(rows, unexplained)
         limit = CHI2_999 * max(1.0, self._change.innovation)
         weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
@@ -289,17 +283,7 @@ class RecursiveEstimator:
         """Add a step (m) to the solution of the first stretch, and give the filter the solution so far."""
         wider = 1.0 / math.sqrt(self._weigh(moved, np.ones(len(self._pending))))
         touches = [p.touch for p in self._pending]
-        start.add(
-            [
-                t._replace(
-                    sigma_point=wider * t.sigma_point,
-                    sigma_height=wider * t.sigma_height,
-                    sigma_normal=wider * t.sigma_normal,
-                )
-                for t in touches
-            ],
-            moved,
-        )
+        start.add([touch.widened(wider) for touch in touches], moved)
         self._steady = start.steady
         found = start.solution
         if found is None:

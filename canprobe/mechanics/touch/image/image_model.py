@@ -108,6 +108,15 @@ class ImageModel:
         object.__setattr__(self, "_turned_blur", read_only(np.ascontiguousarray(blur.T)))
         object.__setattr__(self, "_moments", read_only(sums))
 
+    @classmethod
+    def of(
+        cls, parameters: ImageParameters, errors: MomentErrors, patch: PatchCalibration, *, seen: int | None
+    ) -> ImageModel:
+        """The model of the taxels of a calibration; `seen` is the side of the window in taxels, None for all."""
+        count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
+        seen = side if seen is None else seen
+        return cls(parameters, patch.radius_m, patch.pitch_m, LEVEL_COUNTS * count, count, side, seen, errors)
+
     @property
     def memory(self) -> float:
         """Share of the patch's earlier places in its moments (`ImageParameters.memory`)."""
@@ -325,14 +334,4 @@ def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCali
 
 def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:
     """The image model of an array; `seen` is the number of taxels along the side of the window, None for all."""
-    count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
-    return ImageModel(
-        calibration.image,
-        patch.radius_m,
-        patch.pitch_m,
-        level=LEVEL_COUNTS * count,
-        count=count,
-        side=side,
-        seen=side if seen is None else seen,
-        errors=calibration.moments,
-    )
+    return ImageModel.of(calibration.image, calibration.moments, patch, seen=seen)

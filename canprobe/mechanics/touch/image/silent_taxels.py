@@ -232,13 +232,9 @@ class SilentTaxels:
 
 
 def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
-    """Where taxels above and below, and on both sides, are pressed as they cannot be beside a whole one that is not.
-
-    Args:
-        image: (rows, columns) counts.
-        steep: least count on one side that is enough where the next taxel of the row or column shows the same; one
-            taxel alone may be the rim of a patch on an array with less blur than its calibration has.
-    """
+    """Where taxels above and below, and on both sides, are pressed as they cannot be beside a whole one that is not."""
+    # one side alone is enough from a count of `steep` on, where the next taxel of the row or column shows the same: one
+    # taxel may be the rim of a patch on an array with less blur than its calibration has
     rows, columns = image.shape
     stride = columns + _SIDE  # rows one after the other, apart by what keeps the end of one from the next
     flat = np.zeros((rows + 2 * _SIDE + 1) * stride, np.uint8)

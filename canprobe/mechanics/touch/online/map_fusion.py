@@ -21,7 +21,7 @@ from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, 
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import Decision
 from canprobe.mechanics.touch.estimate.path_length import PathLength
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, parameters_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, TO_Q_SQUARED, parameters_of
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted, solved
 from canprobe.mechanics.touch.map.cells import observed_of, robust
 from canprobe.mechanics.touch.map.discs import Discs
@@ -30,6 +30,7 @@ from canprobe.mechanics.touch.map.nodes import step_of
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND, THIRD
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.online.estimator import AnswerStage
+from canprobe.mechanics.touch.online.regions import with_information
 from canprobe.mechanics.types import Floats
 
 MEMORIES_BETWEEN = 2.0
@@ -45,7 +46,6 @@ JOINED_NOTE = "of the curvature from ground that was touched before"
 MIN_NODES = 4
 """Least number of nodes of a quartic."""
 _OUTWARD, _MIRRORED = np.array([1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0])
-_OF_Q = np.outer(TO_Q, TO_Q)
 
 
 class KnownCurvature(NamedTuple):
@@ -120,7 +120,7 @@ def ground_at(surface_map: SurfaceMap, answer: SurfaceEstimate) -> KnownCurvatur
 def joined(answer: SurfaceEstimate, known: KnownCurvature) -> SurfaceEstimate:
     """An answer and the map's curvature as one; the answer alone where they contradict each other."""
     C, q = answer.combinations, parameters_of(answer.S)[6:] / C_PER_Q
-    V = C @ (answer.covariance * _OF_Q) @ C.T if answer.rank == 3 else inverted(C @ answer.information @ C.T)
+    V = C @ (answer.covariance * TO_Q_SQUARED) @ C.T if answer.rank == 3 else inverted(C @ answer.information @ C.T)
     apart = C @ (known.q - q)
     if float(apart @ solved(V + C @ known.covariance @ C.T, apart)) > CHI2_95:
         return answer
@@ -129,14 +129,10 @@ def joined(answer: SurfaceEstimate, known: KnownCurvature) -> SurfaceEstimate:
     values, vectors = eigen(own + ground)
     c = parameters_of(answer.S)
     c[6:] = C_PER_Q * (covariance @ (own @ q + ground @ known.q))
-    root = answer.model_root
-    if root is not None:
-        rows = np.zeros((3, 9))
-        rows[:, 6:] = np.linalg.cholesky(ground).T / C_PER_Q
-        root = np.concatenate([root, rows])
+    root = with_information(answer.model_root, np.asarray(np.linalg.cholesky(ground).T, np.float64))
     share = float((covariance * ground).sum()) / 3.0
     return with_solution(
         answer,
-        Solution(c, covariance / _OF_Q, Decision(values, vectors, np.ones(3, bool)), False, root),
+        Solution(c, covariance / TO_Q_SQUARED, Decision(values, vectors, np.ones(3, bool)), False, root),
         notes=(*answer.notes, f"{100.0 * share:.0f} % {JOINED_NOTE}"),
     )

@@ -266,11 +266,7 @@ class PatchCurvature:
         return fused
 
     def _iterated(self, x: Floats, seen: _Seen, motion: CurvatureInformation) -> tuple[Floats, Fused] | None:
-        """Gauss–Newton from x (4,) = (q, ln of the stiffness).
-
-        Returns:
-            The last x, and the answer; None where the steps do not settle.
-        """
+        """Gauss–Newton from x (4,) = (q, ln of the stiffness): its last x, and the answer; None without an end."""
         known, mean = np.zeros((4, 4)), np.array([*motion.q, self.stiffness.log])
         known[:3, :3], known[3, 3] = motion.information, self.stiffness.information
         J = np.empty((3, 4))

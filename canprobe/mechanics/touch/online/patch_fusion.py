@@ -14,6 +14,7 @@ from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, matrix_of, 
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted
 from canprobe.mechanics.touch.online.estimator import AnswerStage
 from canprobe.mechanics.touch.online.patch_curvature import Fused, PatchCurvature
+from canprobe.mechanics.touch.online.regions import with_information
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
@@ -78,11 +79,8 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, stiffness: 
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
     data = weight * motion.information if has_prior else evidence
     decision = nothing_observed() if found.contradicted else _decide(data + patch, found.q, length)
-    root = None
-    if motion.model_root is not None:
-        rows = np.zeros((3, 9))
-        rows[:, 6:] = _root(patch) / C_PER_Q
-        root = np.concatenate([math.sqrt(weight) * motion.model_root, rows])
+    root = None if motion.model_root is None else math.sqrt(weight) * motion.model_root
+    root = with_information(root, _root(patch))
     inverse = inverted(evidence + patch)
     share = float((inverse * patch).sum()) / 3.0
     notes = [f"{100.0 * share:.0f} % of the curvature from the patch"]

@@ -26,7 +26,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate, is_umbilic
 from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
-from canprobe.mechanics.touch.estimate.quadric import TO_Q
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q
 from canprobe.mechanics.types import Floats
 
 FOREIGN_ARRAY_FACTOR = 2.0
@@ -73,6 +73,15 @@ def with_errors(answer: SurfaceEstimate, *errors: Floats) -> SurfaceEstimate:
         model_root=root,
         umbilic=is_umbilic(answer.K, covariance),
     )
+
+
+def with_information(root: Floats | None, root_q: Floats) -> Floats | None:
+    """A root (n, 9) of a model (None: not known) with that (3, 3) of more information about q = (K11, √2 K12, K22)."""
+    if root is None:
+        return None
+    rows = np.zeros((3, 9))
+    rows[:, 6:] = root_q / C_PER_Q
+    return np.concatenate([root, rows])
 
 
 def _with_error(root: Floats, error: Floats) -> Floats:
