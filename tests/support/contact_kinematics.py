@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.tangent_frames import homogeneous, inverse_transform, tangent_rotation
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
 
@@ -18,7 +18,7 @@ def probe_contact_frame(direction: Floats, radius: float) -> Floats:
 
 def point_in_object(T_base_object: Floats, p_base: Floats) -> Floats:
     """The contact point in the object's frame (21), (22)."""
-    T = inverse_transform(T_base_object)
+    T = np.linalg.inv(T_base_object)
     result: Floats = T[:3, :3] @ p_base + T[:3, 3]
     return result
 

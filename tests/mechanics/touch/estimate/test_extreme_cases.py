@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -265,39 +266,38 @@ BAD_TIMES = {
 }
 
 
-class TestBadData:
-    @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("row", BAD)
-    def test_batch_names_the_field(self, row, method, truth):
-        change, field, _ = BAD[row]
-        path = truth.path("sphere")
-        given = {"points": path.points.copy(), "normals": path.normals.copy()}
-        sigma = {"sigma_point": np.full(160, SIGMA[0]), "sigma_normal": np.full(160, SIGMA[1])}
-        for name, value in change.items():
-            target = given.get(name, sigma.get(name))
-            target[80] = target[80] * value if name in given else value
-        with pytest.raises(UsageError, match=f"^{field}: expected"):
-            fit_surface(given["points"], given["normals"], **sigma, method=method)
+@pytest.mark.parametrize("row", BAD)
+def test_a_batch_names_the_field_that_is_bad(row, truth):
+    change, field, _ = BAD[row]
+    path = truth.path("sphere")
+    given = {"points": path.points.copy(), "normals": path.normals.copy()}
+    sigma = {"sigma_point": np.full(160, SIGMA[0]), "sigma_normal": np.full(160, SIGMA[1])}
+    for name, value in change.items():
+        target = given.get(name, sigma.get(name))
+        target[80] = target[80] * value if name in given else value
+    with pytest.raises(UsageError, match=f"^{field}: expected"):
+        fit_surface(given["points"], given["normals"], **sigma)
 
-    @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("row", [*BAD, *BAD_TIMES])
-    def test_online_drops_and_counts(self, row, method, truth):
-        good = list(truth.samples(*truth.path("sphere").noisy(*SIGMA, 0)))
-        s = good[80]
-        t, p, n, sp, sn = s.t_s + 1e-3, s.p_base, s.n_base, None, None
-        if row in BAD:
-            change, _, counter = BAD[row]
-            p, n = p * change.get("points", 1.0), n * change.get("normals", 1.0)
-            sp, sn = change.get("sigma_point"), change.get("sigma_normal")
-        else:
-            late, counter = BAD_TIMES[row]
-            t = s.t_s + late
-        bad = ContactSample(t, p, n, s.T_base_probe, s.r_probe, 1.0, sp, sn)
-        estimator = make(method)
-        e = fed(estimator, [*good[:81], bad, *good[81:]])
-        assert getattr(estimator.dropped, counter) == 1
-        assert estimator.dropped.total == 1
-        assert np.array_equal(e.K, fed(make(method), good).K)
+
+def spoilt(s, row):
+    """A sample after s that is bad as a row says."""
+    if row in BAD_TIMES:
+        return dataclasses.replace(s, t_s=s.t_s + BAD_TIMES[row][0])
+    change = BAD[row][0]
+    p, n = s.p_base * change.get("points", 1.0), s.n_base * change.get("normals", 1.0)
+    sigmas = change.get("sigma_point"), change.get("sigma_normal")
+    return ContactSample(s.t_s + 1e-3, p, n, s.T_base_probe, s.r_probe, 1.0, *sigmas)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_online_bad_samples_are_dropped_and_counted(method, truth):
+    good = list(truth.samples(*truth.path("sphere").noisy(*SIGMA, 0)))
+    estimator = make(method)
+    e = fed(estimator, [*good[:81], *(spoilt(good[80], row) for row in (*BAD, *BAD_TIMES)), *good[81:]])
+    wanted = Counter(counter for *_, counter in (*BAD.values(), *BAD_TIMES.values()))
+    assert {name: getattr(estimator.dropped, name) for name in wanted} == wanted
+    assert estimator.dropped.total == wanted.total()
+    assert np.array_equal(e.K, fed(make(method), good).K)
 
 
 def with_outliers(path, share, size, seed):
