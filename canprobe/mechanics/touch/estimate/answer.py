@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
 from canprobe.mechanics.touch.estimate.observed import Decision, outside, tensor
-from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of
+from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import transport
 from canprobe.mechanics.touch.linear_algebra import checked, principal, read_only
 from canprobe.mechanics.touch.surface import SurfaceMatrix
@@ -104,27 +104,18 @@ class SurfaceEstimate:
             K: (2, 2) shape operator along its x and y, 1/m; positive where the object is convex.
             method: name of the estimator.
         """
-        K = checked("K", K, (2, 2)).copy()
-        T_frame_contact = checked("T_frame_contact", T_frame_contact, (4, 4))
-        T, (kappa, local) = read_only(T_frame_contact), _principal(K)
-        return cls(
-            S=SurfaceMatrix.from_curvature(K).S.copy(),
-            T_frame_contact=T,
-            K=K,
-            kappa=kappa,
-            directions=local @ T[:3, :2].T,
-            covariance=np.full((3, 3), math.inf),
-            observed=np.array([True, True]),
-            rank=3,
-            combinations=np.eye(3),
-            information=np.zeros((3, 3)),
-            umbilic=False,
+        c = parameters_of(SurfaceMatrix.from_curvature(checked("K", K, (2, 2))).S)
+        known = Decision(np.zeros(3), np.eye(3), np.ones(3, dtype=bool))
+        return build_estimate(
+            Solution(c, np.full((3, 3), math.inf), known, has_prior=False),
+            length=1.0,
+            T_frame_contact=checked("T_frame_contact", T_frame_contact, (4, 4)),
+            problem_root=np.eye(3),
             innovation=math.nan,
             distance=math.nan,
             samples=math.nan,
             method=method,
             prior="none",
-            problem_root=np.eye(3),
         )
 
     @property
