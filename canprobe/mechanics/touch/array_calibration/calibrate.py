@@ -16,7 +16,6 @@ import numpy as np
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.array_calibration.pad_fit import fit_noise
 from canprobe.mechanics.touch.array_calibration.parameter_fit import (
-    Pairs,
     ParameterFit,
     curvature_errors,
     fit_parameters,
@@ -24,7 +23,14 @@ from canprobe.mechanics.touch.array_calibration.parameter_fit import (
     taxel_gains,
 )
 from canprobe.mechanics.touch.array_calibration.push_fit import fit_force, stiffness_by_depth
-from canprobe.mechanics.touch.array_calibration.touches import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
+from canprobe.mechanics.touch.array_calibration.touches import (
+    LAST_IMAGE_S,
+    NO_ERRORS,
+    Dwell,
+    Shown,
+    Touches,
+    what_is_shown,
+)
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.image.calibration import (
     ArrayCalibration,
@@ -131,10 +137,10 @@ def calibrate_array(
     seen = max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
     blank = _blank(array, date, made_on, reference, reference_sigma, pad.full_scale_pa)
 
-    def fit(pairs: Pairs, own: PatchCalibration) -> tuple[ArrayCalibration, ParameterFit]:
+    def fit(touches: Touches, own: PatchCalibration) -> tuple[ArrayCalibration, ParameterFit]:
         sigma = reference_sigma if by_force else 1.0
-        found = fit_parameters([d for d, _ in pairs], [s for _, s in pairs], own, scale_sigma, sigma, seen)
-        crept = [s.crept for d, s in pairs if d.force is not None]
+        found = fit_parameters(touches, own, scale_sigma, sigma, seen)
+        crept = [s.crept for d, s in touches if d.force is not None]
         scale = found.parameters.scale * (float(np.mean(crept)) if crept else 1.0)
         return replace(blank, image=replace(found.parameters, scale=scale), gains=own.gains), found
 
@@ -149,21 +155,20 @@ def calibrate_array(
         good = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in good]
         fitted = [(d, s) for d, s in good if d.name != "rod"]
         first, found = fit(fitted, own)
-    errors, curvatures, force_errors = _held_out(fitted, lambda pairs: fit(pairs, own)[0], own, seen)
-    ds, ss = [d for d, _ in fitted], [s for _, s in fitted]
+    errors, curvatures, force_errors = _held_out(fitted, lambda touches: fit(touches, own)[0], own, seen)
     stiffness = found.parameters.stiffness
     by_images = stiffness, stiffness * math.sqrt(float(found.covariance[0, 0]))
-    by_depth = stiffness_by_depth(ds, ss, found.forces.tolist(), pad.radius_m, by_images)
+    by_depth = stiffness_by_depth(fitted, found.forces.tolist(), pad.radius_m, by_images)
     rods = [(d, s) for d, s in good if d.name == "rod"]
     across = rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
     patch = make_patch_calibration(first, pad)
     depths = [_depths(d, s, patch, stiffness) for d, s in fitted]
-    noise, centroid, scatter = fit_noise(ds, ss, depths)
+    noise, centroid, scatter = fit_noise(fitted, depths)
     spread = 0.0 if own_gains else spread
     calibration = replace(
         first,
-        force=fit_force(ds, ss, patch, stiffness, force_errors, spread),
-        moments=_moment_errors(errors, ss),
+        force=fit_force(fitted, patch, stiffness, force_errors, spread),
+        moments=_moment_errors(errors, [s for _, s in fitted]),
         noise=noise,
         centroid=centroid,
         stiffness=StiffnessSources(*by_images, *by_depth),
@@ -171,11 +176,11 @@ def calibrate_array(
         dead=dead if own_gains else (),
     )
     offset, of_object = _offsets(good)
-    forces = np.array([_force(patch, s) for s in ss])
+    forces = np.array([_force(patch, s) for _, s in fitted])
     return ArrayFit(
         calibration=calibration,
-        dwells=ds,
-        shown=ss,
+        dwells=[d for d, _ in fitted],
+        shown=[s for _, s in fitted],
         forces=forces,
         errors=errors,
         curvature_errors=curvatures,
@@ -221,26 +226,27 @@ def _depths(dwell: Dwell, s: Shown, patch: PatchCalibration, stiffness: float) -
 
 
 def _checked(
-    calibration: ArrayCalibration, pairs: Pairs, plain: PatchCalibration, seen: int
+    calibration: ArrayCalibration, touches: Touches, plain: PatchCalibration, seen: int
 ) -> tuple[Floats, Floats, Floats]:
     """Errors (n, 3) of moments, (n, 2) of curvatures and (m,) of reference forces of touches by a calibration."""
     patch = make_patch_calibration(calibration, plain.pad)
     model = make_image_model(calibration, patch, seen=seen)
-    measured = [_force(patch, s) for _, s in pairs]
-    parts = [d for d, _ in pairs], [s for _, s in pairs], measured
+    measured = [_force(patch, s) for _, s in touches]
     # a reference load is read over the whole touch, and creep is part of it
-    forces = [f * s.crept / d.force - 1.0 for f, (d, s) in zip(measured, pairs, strict=True) if d.force is not None]
-    return moment_errors(model, *parts), curvature_errors(model, *parts), np.array(forces)
+    forces = [f * s.crept / d.force - 1.0 for f, (d, s) in zip(measured, touches, strict=True) if d.force is not None]
+    return moment_errors(model, touches, measured), curvature_errors(model, touches, measured), np.array(forces)
 
 
 def _held_out(
-    pairs: Pairs, fit: Callable[[Pairs], ArrayCalibration], plain: PatchCalibration, seen: int
+    touches: Touches, fit: Callable[[Touches], ArrayCalibration], plain: PatchCalibration, seen: int
 ) -> tuple[Floats, Floats, Floats]:
     """As `_checked`, each fifth of the touches by a calibration that was fitted to the others."""
-    errors, curvatures, forces = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 2)), []
+    errors, curvatures, forces = np.zeros((len(touches), 3)), np.zeros((len(touches), 2)), []
     for fold in range(FOLDS):
-        out = list(range(fold, len(pairs), FOLDS))
-        found = _checked(fit([p for i, p in enumerate(pairs) if i not in out]), [pairs[i] for i in out], plain, seen)
+        out = list(range(fold, len(touches), FOLDS))
+        found = _checked(
+            fit([p for i, p in enumerate(touches) if i not in out]), [touches[i] for i in out], plain, seen
+        )
         errors[out], curvatures[out] = found[:2]
         forces.append(found[2])
     return errors, curvatures, np.concatenate(forces)
@@ -259,35 +265,37 @@ def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
 
 
 def _gains(
-    pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibration
+    touches: Touches, calibration: ArrayCalibration, plain: PatchCalibration
 ) -> tuple[Floats, tuple[tuple[int, int], ...]]:
     """(16, 16) gains of the taxels by these touches, and dead ones."""
     patch = make_patch_calibration(calibration, plain.pad)
     model = make_image_model(calibration, patch, seen=None)
-    forces = [_force(patch, s) for _, s in pairs]
-    return taxel_gains(plain.pad, model, [d for d, _ in pairs], [s for _, s in pairs], forces)
+    forces = [_force(patch, s) for _, s in touches]
+    return taxel_gains(plain.pad, model, touches, forces)
 
 
-def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibration, seen: int) -> tuple[float, float]:
+def _by_gains(
+    touches: Touches, calibration: ArrayCalibration, plain: PatchCalibration, seen: int
+) -> tuple[float, float]:
     """RMS error of the moments of each half of the touches, with gains of the taxels from the other, and without."""
     gained, alike = [], []
     for half in (0, 1):
-        gains = _gains(pairs[half::2], calibration, plain)[0]
+        gains = _gains(touches[half::2], calibration, plain)[0]
         own = replace(plain, gains=tuple(tuple(row) for row in gains.tolist()))
-        check = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in pairs[1 - half :: 2]]
+        check = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in touches[1 - half :: 2]]
         gained.append(_checked(calibration, check, plain, seen)[0][:, :2])
-        alike.append(_checked(calibration, pairs[1 - half :: 2], plain, seen)[0][:, :2])
+        alike.append(_checked(calibration, touches[1 - half :: 2], plain, seen)[0][:, :2])
     return rms(np.concatenate(gained)), rms(np.concatenate(alike))
 
 
-def _offsets(pairs: Pairs) -> tuple[Floats, Floats]:
+def _offsets(touches: Touches) -> tuple[Floats, Floats]:
     """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m."""
     # a gradient of the taxels' gains and an error of the tool turn with the probe; a wrong place of the object does not
     unknown = np.full(2, math.nan)
     mine, its = [], []
-    for name in sorted({d.name for d, _ in pairs if abs(d.turn) > 0.5 and d.name != "rod"}):
-        straight = [s.off.mean(axis=0) for d, s in pairs if d.name == name and d.turn == 0.0]
-        turned = [s.off.mean(axis=0) for d, s in pairs if d.name == name and abs(d.turn) > 0.5]
+    for name in sorted({d.name for d, _ in touches if abs(d.turn) > 0.5 and d.name != "rod"}):
+        straight = [s.off.mean(axis=0) for d, s in touches if d.name == name and d.turn == 0.0]
+        turned = [s.off.mean(axis=0) for d, s in touches if d.name == name and abs(d.turn) > 0.5]
         if straight:
             mine.append(0.5 * (np.mean(straight, axis=0) + np.mean(turned, axis=0)))
             its.append(0.5 * (np.mean(straight, axis=0) - np.mean(turned, axis=0)))

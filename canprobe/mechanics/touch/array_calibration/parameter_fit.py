@@ -16,16 +16,13 @@ from canprobe.mechanics.touch.array_calibration.touches import (
     MIN_CURVATURE_SHARE,
     NO_ERRORS,
     TOUCH_SIGMA,
-    Dwell,
-    Shown,
+    Touches,
 )
 from canprobe.mechanics.touch.image.calibration import ImageParameters
 from canprobe.mechanics.touch.image.image_model import STEPS_PER_PITCH, ImageModel
 from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
-
-Pairs = Sequence[tuple[Dwell, Shown]]
 
 
 class ParameterFit(NamedTuple):
@@ -41,29 +38,23 @@ def _as_parameters(z: Floats, pitch: float) -> ImageParameters:
     return ImageParameters(math.exp(k), math.exp(scale), max(blur, 0.1) * pitch, crosstalk, memory)
 
 
-def fit_parameters(  # noqa: PLR0917
-    dwells: Sequence[Dwell],
-    shown: Sequence[Shown],
-    plain: PatchCalibration,
-    scale_sigma: float | None,
-    reference_sigma: float,
-    seen: int,
+def fit_parameters(
+    touches: Touches, plain: PatchCalibration, scale_sigma: float | None, reference_sigma: float, seen: int
 ) -> ParameterFit:
     """Least squares over sums and moments of touches, reference forces and priors.
 
     Args:
-        dwells, shown: the touches.
+        touches: the touches.
         plain: full scale, pitch and radius of the probe.
         scale_sigma: standard deviation of ln(scale) about 0, where the stated full scale is the reference; None where
             forces are.
         reference_sigma: relative standard deviation of reference forces.
         seen: number of taxels along the side of the window.
     """
-    n = len(dwells)
-    kappa = np.array([d.kappa for d in dwells])
-    S, V, D = (np.array([getattr(s, name) for s in shown]) for name in ("total", "moments", "remembered"))
-    known = np.array([i for i, d in enumerate(dwells) if d.force is not None], dtype=int)
-    reference = np.array([dwells[i].force for i in known], dtype=float)
+    kappa = np.array([d.kappa for d, _ in touches])
+    S, V, D = (np.array([getattr(s, name) for _, s in touches]) for name in ("total", "moments", "remembered"))
+    known = np.array([i for i, (d, _) in enumerate(touches) if d.force is not None], dtype=int)
+    reference = np.array([touches[i][0].force for i in known], dtype=float)
     a, b = (0.5 * (1.0 / plain.radius_m + kappa)).T
     side = max(plain.pad.shape)
     prior = np.array([math.log(1e8), 0.0, BLUR_PRIOR_PITCH[0], CROSSTALK_PRIOR[0], MEMORY_PRIOR[0]])
@@ -90,17 +81,15 @@ def fit_parameters(  # noqa: PLR0917
         )
 
     start = np.concatenate([prior, np.log(np.maximum(S, 1e-3))])
-    found: Any = least_squares(residuals, start, x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.03] + n * [0.05]))
+    found: Any = least_squares(residuals, start, x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.03] + len(touches) * [0.05]))
     covariance = np.linalg.inv(found.jac.T @ found.jac)[:5, :5]
     return ParameterFit(_as_parameters(found.x[:5], plain.pitch_m), covariance, np.exp(found.x[5:]))
 
 
-def moment_errors(
-    model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
-) -> Floats:
+def moment_errors(model: ImageModel, touches: Touches, forces: Sequence[float]) -> Floats:
     """(n, 3) relative errors of V_1, V_2 and of V_12 over their root, at measured forces, N."""
     errors = []
-    for dwell, s, force in zip(dwells, shown, forces, strict=True):
+    for (dwell, s), force in zip(touches, forces, strict=True):
         k = (dwell.kappa[0], 0.0, dwell.kappa[1])
         xx, _, yy = model.moments(k, force)
         v = s.moments - model.memory * s.remembered
@@ -108,12 +97,10 @@ def moment_errors(
     return np.array(errors)
 
 
-def curvature_errors(
-    model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
-) -> Floats:
-    """(n, 2) errors of the principal curvatures from each dwell's moments alone, relative to (κ + 1/R_p)."""
+def curvature_errors(model: ImageModel, touches: Touches, forces: Sequence[float]) -> Floats:
+    """(n, 2) errors of the principal curvatures from each touch's moments alone, relative to (κ + 1/R_p)."""
     result = []
-    for dwell, s, force in zip(dwells, shown, forces, strict=True):
+    for (dwell, s), force in zip(touches, forces, strict=True):
         v = tuple((s.moments - model.memory * s.remembered).tolist())
         v = (v[0], 0.0, v[2])
         shows = (dwell.kappa[0], 0.0, dwell.kappa[1])
@@ -134,7 +121,7 @@ def curvature_errors(
 
 
 def taxel_gains(
-    pad: Pad, model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
+    pad: Pad, model: ImageModel, touches: Touches, forces: Sequence[float]
 ) -> tuple[Floats, tuple[tuple[int, int], ...]]:
     """Gain of each taxel over the mean, and dead taxels.
 
@@ -143,7 +130,7 @@ def taxel_gains(
     Args:
         pad: the taxels.
         model: the image model.
-        dwells, shown: the touches.
+        touches: the touches.
         forces: their forces, N.
 
     Returns:
@@ -153,7 +140,7 @@ def taxel_gains(
 
     seen, wanted, dead = np.zeros((3, *pad.shape))
     u, v = (pad.uv.T / pad.pitch_m).reshape(2, *pad.shape)
-    for dwell, s, force in zip(dwells, shown, forces, strict=True):
+    for (dwell, s), force in zip(touches, forces, strict=True):
         a, b = (0.5 * (1.0 / model.radius + x) for x in dwell.kappa)
         quadrant = model.shown(np.array([model.depth(force, a * b)]), np.array([a]), np.array([b]))[0]
         c, si = math.cos(dwell.angle), math.sin(dwell.angle)

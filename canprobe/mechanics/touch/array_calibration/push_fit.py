@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from canprobe.mechanics.touch.array_calibration.touches import FIRST_IMAGE_S, LAST_IMAGE_S, Dwell, Shown
+from canprobe.mechanics.touch.array_calibration.touches import FIRST_IMAGE_S, LAST_IMAGE_S, Dwell, Touches
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS, ForceErrors
 from canprobe.mechanics.touch.image.force_reading import ForceCreep
@@ -33,31 +33,27 @@ CREEP_ROUNDS = 3
 """Number of rounds of the fit of the growth, which bends the load that it follows."""
 
 
-def fit_force(  # noqa: PLR0917
-    dwells: Sequence[Dwell],
-    shown: Sequence[Shown],
-    patch: PatchCalibration,
-    stiffness: float,
-    held_out: Floats,
-    spread: float,
+def fit_force(
+    touches: Touches, patch: PatchCalibration, stiffness: float, held_out: Floats, spread: float
 ) -> ForceErrors:
     """Errors of the force of an array.
 
     Args:
-        dwells, shown: touches of plane and ball.
+        touches: touches of plane and ball.
         patch: from counts to force, with the force gains of the calibration.
         stiffness: stiffness K/h of the layer, N/m³.
         held_out: (m,) relative errors of the reference loads by fits that have not seen them; empty without any.
         spread: standard deviation from array to array, relative.
     """
+    dwells = [d for d, _ in touches]
     forces = [_forces(d, patch) for d in dwells]
     units = [math.sqrt(2.0 * math.sqrt(_det(d, patch.radius_m)) / (math.pi * stiffness)) for d in dwells]
     creep, sigma = _creep(dwells, forces, units)
     loads = [i for i, d in enumerate(dwells) if d.force is not None]
     pairs = zip(dwells, forces, strict=True)
     corrected, decades = np.array([_corrected(d, f, creep, full=d.force is not None) for d, f in pairs]).T
-    more = np.sqrt(np.maximum(np.array([s.lightness for s in shown]) / USUAL_LIGHTNESS, 1.0))
-    scatter = _scatter(dwells, shown, corrected, np.array(units)) / more
+    more = np.sqrt(np.maximum(np.array([s.lightness for _, s in touches]) / USUAL_LIGHTNESS, 1.0))
+    scatter = _scatter(touches, corrected, np.array(units)) / more
     array = rms(scatter)
     if len(held_out):
         array = math.hypot(array, rms(held_out) / rms(more[loads]))
@@ -127,10 +123,10 @@ def _corrected(dwell: Dwell, forces: Floats, creep: float, *, full: bool) -> tup
     return float(force[part].mean()), float(decades[part].mean())
 
 
-def _scatter(dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Floats, units: Floats) -> Floats:
+def _scatter(touches: Touches, forces: Floats, units: Floats) -> Floats:
     """(n,) relative errors of the force against the arm's way, held out, with one height and slope for each object."""
-    depths, names = units * np.sqrt(forces), np.array([d.name for d in dwells])
-    push = np.array([s.push for s in shown])
+    depths, names = units * np.sqrt(forces), np.array([d.name for d, _ in touches])
+    push = np.array([s.push for _, s in touches])
     of_name = np.stack([names == name for name in dict.fromkeys(names.tolist())], axis=1).astype(float)
     columns = np.column_stack([depths, of_name])
     found, *_ = np.linalg.lstsq(columns, push, rcond=None)
@@ -141,11 +137,7 @@ def _scatter(dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Floats, un
 
 
 def stiffness_by_depth(
-    dwells: Sequence[Dwell],
-    shown: Sequence[Shown],
-    forces: Sequence[float],
-    radius: float,
-    by_images: tuple[float, float],
+    touches: Touches, forces: Sequence[float], radius: float, by_images: tuple[float, float]
 ) -> tuple[float, float, float, float]:
     """Stiffness by the arm's way between touches of one place with different forces, and the arm's compliance.
 
@@ -154,7 +146,7 @@ def stiffness_by_depth(
     of the scatter of the ways and of the images' stiffness.
 
     Args:
-        dwells, shown: the touches.
+        touches: the touches.
         forces: their forces, N.
         radius: radius of the probe, m.
         by_images: stiffness K/h from the images and its σ, N/m³.
@@ -164,12 +156,12 @@ def stiffness_by_depth(
     """
     stiffness, stiffness_sigma = by_images
     rows = []
-    for name, place, turn in sorted({(d.name, d.place, d.turn) for d in dwells}):
-        group = [i for i, d in enumerate(dwells) if (d.name, d.place, d.turn) == (name, place, turn)]
+    for name, place, turn in sorted({(d.name, d.place, d.turn) for d, _ in touches}):
+        group = [i for i, (d, _) in enumerate(touches) if (d.name, d.place, d.turn) == (name, place, turn)]
         if len(group) < 2:
             continue
-        unit = np.array([indentation_from_force(forces[i], 1.0, radius, dwells[i].kappa) for i in group])
-        push, force = np.array([shown[i].push for i in group]), np.array([forces[i] for i in group])
+        unit = np.array([indentation_from_force(forces[i], 1.0, radius, touches[i][0].kappa) for i in group])
+        push, force = np.array([touches[i][1].push for i in group]), np.array([forces[i] for i in group])
         rows += list(zip(unit - unit.mean(), force - force.mean(), push - push.mean(), strict=True))
     if not rows:
         return (math.nan,) * 4

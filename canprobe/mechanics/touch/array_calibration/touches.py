@@ -110,6 +110,10 @@ class Shown(NamedTuple):
     sums: Floats
 
 
+Touches = Sequence[tuple[Dwell, Shown]]
+"""Touches with what their images show."""
+
+
 def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf) -> Shown:
     """Mean sum and moments of a dwell's images.
 
