@@ -1,4 +1,4 @@
-"""Does an array behave as its calibration says? Found while it scans: four signs tell the file of another array.
+"""Whether an array behaves as its calibration says, found while it scans by four signs of another array's file.
 
 - **Blur.** Each image shows how far the cover blurs it (`blur_fit`), whatever is touched.
 - **Stiffness.** The slope of the touch, the images' moments and the motion show the stiffness of the layer, and

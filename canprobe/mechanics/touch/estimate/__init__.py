@@ -21,7 +21,7 @@ Fits of a batch:
 
 Estimators, one sample after another:
 
-    gate                their interface (`add`, `estimate`, `reset`), and the gate that every sample passes
+    gate                their interface (`add`, `estimate`, `reset`), the gate of every sample, and its errors behind it
     window              over the last samples: `ml`, `chord`, and `chen1996`, the scheme of the paper
     recursive           what runs in the loop: forgets per millimetre, starts afresh where the surface changes
     information         the square-root information filter under it

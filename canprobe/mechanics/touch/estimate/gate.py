@@ -1,16 +1,21 @@
-"""The interface of an online estimator, and the gate that every sample passes."""
+"""The interface of an online estimator, the gate that every sample passes, and the errors that it has behind it."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
+
+import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample, Doubt
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.estimate.noise import Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.path_length import PathLength
 from canprobe.mechanics.touch.linear_algebra import positive
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(slots=True)
@@ -120,6 +125,47 @@ class Gate:
         )
 
 
+class MeasuredContact(NamedTuple):
+    """A contact with its errors, as estimators take it.
+
+    Attributes:
+        point: (3,) contact point in base, m.
+        normal: (3,) outward unit normal of the object there, in base.
+        sigma_point: standard deviation of the point along the surface, per axis, m.
+        sigma_height: standard deviation of the point along the normal, m.
+        sigma_normal: standard deviation of the normal per tangent axis, rad.
+        coupling: coupling of their errors (`Noise.coupling`), 1/m.
+        slow: share of its slow errors (`SlowErrors.share`).
+        way: way over the pad up to this contact, m.
+    """
+
+    point: Floats
+    normal: Floats
+    sigma_point: float
+    sigma_height: float
+    sigma_normal: float
+    coupling: float = 0.0
+    slow: float = 0.0
+    way: float = 0.0
+
+    def widened(self, factor: float) -> MeasuredContact:
+        """The contact with standard deviations that are `factor` times as large."""
+        point, height, normal = (factor * s for s in (self.sigma_point, self.sigma_height, self.sigma_normal))
+        return self._replace(sigma_point=point, sigma_height=height, sigma_normal=normal)
+
+
+def noise_of(touches: Sequence[MeasuredContact]) -> Noise:
+    """Noise of contacts."""
+    point, height, normal = np.array([(t.sigma_point, t.sigma_height, t.sigma_normal) for t in touches]).T
+    return Noise(point, normal, touches[0].coupling, height)
+
+
+def slow_errors(touches: Sequence[MeasuredContact]) -> SlowErrors:
+    """Slow errors of contacts."""
+    share, way = np.array([(t.slow, t.way) for t in touches]).T
+    return SlowErrors(share, way)
+
+
 class PadPathLength:
     """Follows contacts over the pad, along whose way their slow errors change.
 
@@ -130,14 +176,13 @@ class PadPathLength:
     def __init__(self, sigma_point: float) -> None:
         self._path_length = PathLength(sigma_point)
 
-    def step(self, sample: ContactSample, sigma_point: float) -> tuple[float, float]:
-        """Take a contact with its standard deviation along the surface, as `Gate.sigmas` gives it, m.
-
-        Returns:
-            Slow errors of the contact over this standard deviation, at most 1; and the way over the pad up to it, m.
-        """
+    def measured(self, sample: ContactSample, gate: Gate, coupling: float = 0.0) -> MeasuredContact:
+        """The next contact with its errors: standard deviations by the gate, and the coupling of its errors, 1/m."""
         self._path_length.add(sample.r_probe)
-        return min(_widening(sample) * sample.sigma_slow / sigma_point, 1.0), self._path_length.total
+        point, height, normal = gate.sigmas(sample)
+        slow = min(_widening(sample) * sample.sigma_slow / point, 1.0)
+        way = self._path_length.total
+        return MeasuredContact(sample.p_base, sample.n_base, point, height, normal, coupling, slow, way)
 
 
 def _widening(sample: ContactSample) -> float:

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import foot
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
+from canprobe.mechanics.touch.estimate.gate import MeasuredContact, noise_of
+from canprobe.mechanics.touch.estimate.noise import Correlation, SlowErrors
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.omitted_terms import OmittedTerms
 from canprobe.mechanics.touch.estimate.prior import NUISANCE_SIGMA, Prior
@@ -28,50 +29,11 @@ from canprobe.mechanics.touch.tangent_frames import homogeneous, transported
 from canprobe.mechanics.types import Floats, Vec
 
 
-class MeasuredContact(NamedTuple):
-    """A contact as the filter takes it.
-
-    Attributes:
-        point: (3,) contact point in base, m.
-        normal: (3,) outward unit normal of the object there, in base.
-        sigma_point: standard deviation of the point along the surface, per axis, m.
-        sigma_height: standard deviation of the point along the normal, m.
-        sigma_normal: standard deviation of the normal per tangent axis, rad.
-        coupling: coupling of their errors (`Noise.coupling`), 1/m.
-        slow: share of its slow errors (`SlowErrors.share`).
-        way: way over the pad up to this contact, m.
-    """
-
-    point: Floats
-    normal: Floats
-    sigma_point: float
-    sigma_height: float
-    sigma_normal: float
-    coupling: float = 0.0
-    slow: float = 0.0
-    way: float = 0.0
-
-    def widened(self, factor: float) -> MeasuredContact:
-        """The contact with standard deviations that are `factor` times as large."""
-        point, height, normal = (factor * s for s in (self.sigma_point, self.sigma_height, self.sigma_normal))
-        return self._replace(sigma_point=point, sigma_height=height, sigma_normal=normal)
-
-
-def slow_errors(touches: Sequence[MeasuredContact]) -> SlowErrors:
-    """Slow errors of contacts."""
-    share, way = np.array([(t.slow, t.way) for t in touches]).T
-    return SlowErrors(share, way)
-
-
 def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredContact]) -> Design:
     """The design (`residuals.design`) of contacts in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]).dot(R) / length
-    sigma_point, sigma_height, sigma_normal = np.array(
-        [(t.sigma_point, t.sigma_height, t.sigma_normal) for t in touches]
-    ).T
-    noise = Noise(sigma_point / length, sigma_normal, touches[0].coupling * length, sigma_height / length)
-    return design(points, np.array([t.normal for t in touches]).dot(R), noise)
+    return design(points, np.array([t.normal for t in touches]).dot(R), noise_of(touches).scaled(length, R))
 
 
 REANCHOR_TRAVEL_SHARE = 0.05

@@ -19,8 +19,8 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
-from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, PadPathLength
-from canprobe.mechanics.touch.estimate.information import InformationFilter, MeasuredContact, slow_errors
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength, slow_errors
+from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
@@ -136,18 +136,8 @@ class RecursiveEstimator:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        point, height, normal = self._gate.sigmas(sample)
-        slow, way = self._pad.step(sample, point)
-        touch = MeasuredContact(
-            sample.p_base,
-            sample.n_base,
-            sigma_point=point,
-            sigma_height=self._taller * height,
-            sigma_normal=normal,
-            coupling=self._coupling,
-            slow=slow,
-            way=way,
-        )
+        touch = self._pad.measured(sample, self._gate, self._coupling)
+        touch = touch._replace(sigma_height=self._taller * touch.sigma_height)
         moved = self._path_length.add(sample.p_base)
         self._pending.append(_Pending(touch, self._path_length.weight))
         if self._last is None or self._path_length.weight == 1.0:

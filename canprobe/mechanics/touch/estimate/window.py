@@ -8,7 +8,6 @@ both sides of the equation, draws them towards 0. They are baselines and are rep
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +16,9 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
 from canprobe.mechanics.touch.estimate.differences import Pairs, chord_pairs, solve_pairs, usable_lag
-from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, PadPathLength
-from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, fit_ml, make_touches, working_frame
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength
+from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, batch_of, fit_ml, working_frame
+from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.linear_algebra import whole
 from canprobe.mechanics.touch.tangent_frames import rotation_vectors
@@ -55,20 +54,20 @@ class WindowEstimator:
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
-        self._rows: deque[Sequence[float]] = deque(maxlen=kept)
+        self._kept: deque[tuple[ContactSample, MeasuredContact]] = deque(maxlen=kept)
         self._pad = PadPathLength(sigma_point)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._gate.passes(sample, self.dropped):
-            self._rows.append(self._row(sample))
+            self._kept.append((sample, self._pad.measured(sample, self._gate, self._coupling)))
             self._answer = None
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""
-        if self._answer is None and len(self._rows) >= self.least:
-            touches = self._touches()
+        if self._answer is None and len(self._kept) >= self.least:
+            touches = self._batch()
             if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
                 answer = self._solve(touches)
                 self._answer = replace(answer, notes=answer.notes + self._gate.notes())
@@ -76,23 +75,15 @@ class WindowEstimator:
 
     def reset(self) -> None:
         """Forget all samples."""
-        self._rows.clear()
+        self._kept.clear()
         self._gate.reset()
         self._answer = None
 
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         raise NotImplementedError
 
-    def _row(self, sample: ContactSample) -> Sequence[float]:
-        """The row that is kept of a sample: point, normal, their noise; a subclass adds what it needs."""
-        sigmas = self._gate.sigmas(sample)
-        return (*sample.p_base.tolist(), *sample.n_base.tolist(), *sigmas, *self._pad.step(sample, sigmas[0]))
-
-    def _touches(self) -> ContactBatch:
-        rows = np.array(self._rows)
-        noise = Noise(rows[:, 6], rows[:, 8], self._coupling, height=rows[:, 7])
-        slow = SlowErrors(rows[:, 9], rows[:, 10])
-        return make_touches(rows[:, :3], rows[:, 3:6], noise, self._correlation, slow)
+    def _batch(self) -> ContactBatch:
+        return batch_of([touch for _, touch in self._kept], self._correlation)
 
 
 class MlEstimator(WindowEstimator):
@@ -109,8 +100,8 @@ class MlEstimator(WindowEstimator):
             return answer
         agree = np.flatnonzero(squares <= MAX_AGREEING_RESIDUAL * float(np.median(squares)))
         for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_SAMPLES)):
-            self._rows.popleft()
-        answer = fit_ml(self._touches(), self._prior)
+            self._kept.popleft()
+        answer = fit_ml(self._batch(), self._prior)
         return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))
 
 
@@ -163,15 +154,11 @@ class Chen1996Estimator(WindowEstimator):
         super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
         self._lag = whole("lag", lag, 1, "sample")
 
-    def _row(self, sample: ContactSample) -> Sequence[float]:
-        """With the probe's pose, row by row, and the contact in its frame."""
-        return (*super()._row(sample), *sample.T_base_probe[:3].ravel().tolist(), *sample.r_probe.tolist())
-
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
-        rows = np.array(self._rows)
-        lag = usable_lag(len(rows), self._lag)
-        newer = np.arange(lag, len(rows))
-        rates = paper_rates(rows[:, 11:23].reshape(-1, 3, 4), rows[:, 23:], touches.normals, lag)
+        T, r = (np.array([getattr(s, name) for s, _ in self._kept]) for name in ("T_base_probe", "r_probe"))
+        lag = usable_lag(len(r), self._lag)
+        newer = np.arange(lag, len(r))
+        rates = paper_rates(T, r, touches.normals, lag)
         x, y = np.array(rates) @ working_frame(touches)[:3, :3]
         return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 

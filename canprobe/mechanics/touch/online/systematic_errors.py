@@ -116,7 +116,7 @@ def drag_errors(answer: SurfaceEstimate, drag: float) -> list[Floats]:
     Model: the contact seems to go `(I + M) w` over the pad where it goes w, and each entry of M (2, 2) has the standard
     deviation `drag`. So the normal seems to turn too far or not far enough, and about another axis: the centroid lags
     behind a contact that goes round, for instance, which turns the principal directions. Of `M K` the symmetrical part
-    is a curvature. The other part is none, and contradicts the places of the contacts.
+    is a curvature. The other part is not, and contradicts the places of the contacts.
     """
     P = answer.T_frame_contact[:3, :2]
     errors = []
