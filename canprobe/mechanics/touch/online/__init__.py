@@ -7,7 +7,7 @@ One `OnlineEstimator` holds the motion (`recursive` or `ml`) and the stages; a s
 has used, and refines every answer. There is one answer object: a stage changes some fields of it and leaves the rest,
 `with_solution` where the curvature changes, `regions` where its errors do.
 
-    estimator           the estimator and the interface of a stage
+    estimator           the estimator, the interface of a stage, and the path from answer to answer
     patch_fusion        the contact patch as a second sensor; before the contact moves, the patch's answer alone
     patch_curvature     what the images of a contact say about curvature, fused with what the motion has shown
     noise_level         variances by the level of the innovations

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.gate import Dropped, Estimator
+from canprobe.mechanics.types import Floats
 
 
 class AnswerStage:
@@ -24,6 +27,18 @@ class AnswerStage:
 
     def reset(self) -> None:
         """Forget everything but the settings."""
+
+
+class AnswerPath:
+    """Distances from answer to answer, for stages that work along the path."""
+
+    def __init__(self) -> None:
+        self._place: Floats | None = None
+
+    def step(self, answer: SurfaceEstimate) -> float:
+        """Distance of an answer from the one before, m; 0 for the first."""
+        before, self._place = self._place, answer.point
+        return 0.0 if before is None else float(np.linalg.norm(answer.point - before))
 
 
 class OnlineEstimator:

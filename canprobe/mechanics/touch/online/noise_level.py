@@ -19,13 +19,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.online.estimator import AnswerStage
+from canprobe.mechanics.touch.online.estimator import AnswerPath, AnswerStage
 from canprobe.mechanics.touch.online.regions import scaled
-from canprobe.mechanics.types import Floats
 
 MIN_LEVEL = 0.5
 """Least level of the variances."""
@@ -47,13 +44,12 @@ class NoiseLevel(AnswerStage):
 
     def reset(self) -> None:
         self._mean = self.level = 1.0
-        self._place: Floats | None = None
+        self._path = AnswerPath()
 
     def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
         if answer is None:
             return None
-        moved = 0.0 if self._place is None else float(np.linalg.norm(answer.point - self._place))
-        self._place = answer.point
-        self._mean += (1.0 - math.exp(-moved / self._memory)) * (answer.innovation - self._mean)
+        new = 1.0 - math.exp(-self._path.step(answer) / self._memory)
+        self._mean += new * (answer.innovation - self._mean)
         self.level = max(self._mean, MIN_LEVEL)
         return scaled(answer, math.sqrt(self.level))

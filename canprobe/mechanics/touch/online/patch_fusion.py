@@ -10,9 +10,9 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate, with_solution
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import SIGMA_LIMIT, Decision, nothing_observed
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, matrix_of, parameters_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, matrix_of, parameters_of
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted
-from canprobe.mechanics.touch.online.estimator import AnswerStage
+from canprobe.mechanics.touch.online.estimator import AnswerPath, AnswerStage
 from canprobe.mechanics.touch.online.patch_curvature import Fused, PatchCurvature
 from canprobe.mechanics.touch.online.regions import with_information
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
@@ -20,7 +20,7 @@ from canprobe.mechanics.types import Floats
 
 MIN_NAMED_SHARE = 0.1
 """Least share of the patch in the information about K at which the estimate's method names it."""
-_TO_K = 1.0 / np.outer(TO_Q, TO_Q)
+_TO_K = 1.0 / TO_Q_SQUARED
 
 
 class PatchFusion(AnswerStage):
@@ -34,7 +34,7 @@ class PatchFusion(AnswerStage):
     def __init__(self, patch: PatchCurvature, length: float) -> None:
         self.patch = patch
         self._length = length
-        self._place: Floats | None = None
+        self._path = AnswerPath()
 
     def take(self, sample: ContactSample) -> None:
         self.patch.add(sample)
@@ -45,8 +45,7 @@ class PatchFusion(AnswerStage):
         if answer.evidence is None:
             return answer
         found = self.patch.fuse(answer.T_frame_contact, answer.evidence)
-        moved = 0.0 if self._place is None else float(np.linalg.norm(answer.point - self._place))
-        self._place = answer.point
+        moved = self._path.step(answer)
         if found is None:
             return answer
         if not found.contradicted:
@@ -56,7 +55,7 @@ class PatchFusion(AnswerStage):
 
     def reset(self) -> None:
         self.patch.reset()
-        self._place = None
+        self._path = AnswerPath()
 
 
 def with_patch(motion: SurfaceEstimate, found: Fused, length: float, stiffness: float) -> SurfaceEstimate:

@@ -26,7 +26,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.online.estimator import AnswerStage
+from canprobe.mechanics.touch.online.estimator import AnswerPath, AnswerStage
 from canprobe.mechanics.touch.online.regions import with_errors
 from canprobe.mechanics.types import Floats
 
@@ -62,7 +62,7 @@ class SystematicErrors(AnswerStage):
         self._scale, self._drag, self._offset = scale, drag, offset
         self._memory = memory_m
         self._past: deque[tuple[float, Floats]] = deque()
-        self._place: Floats | None = None
+        self._path = AnswerPath()
         self._travelled = 0.0
 
     @classmethod
@@ -78,14 +78,12 @@ class SystematicErrors(AnswerStage):
 
     def reset(self) -> None:
         self._past.clear()
-        self._place = None
+        self._path = AnswerPath()
 
     def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
         if answer is None or answer.rank < 3:
             return answer
-        if self._place is not None:
-            self._travelled += float(np.linalg.norm(answer.point - self._place))
-        self._place = answer.point
+        self._travelled += self._path.step(answer)
         tensor = answer.curvature_tensor_base()
         lag = self._lag_error(tensor)
         self._past.append((self._travelled, tensor))
