@@ -7,12 +7,12 @@
 
 Reading a touch:
 
-    pad               where the taxels are, and what their counts mean
-    image/            images: force, centroid, moments, and the model of an array
+    pad                  where the taxels are, and what their counts mean
+    image/               images: force, centroid, moments, and the model of an array
     array_calibration/   the calibration of an array by touches of known objects, and its check
-    contact           from the centroid on the wrapped pad to the object's point and normal in base
-    layer_stiffness   the stiffness of the layer: from a push, and as a state of a scan
-    stops             the limits at which a touch is stopped, and why a touch at rest must not go on
+    contact              from the centroid on the wrapped pad to the object's point and normal in base
+    layer_stiffness      the stiffness of the layer: from a push, and as a state of a scan
+    stops                the limits at which a touch is stopped, and why a touch at rest must not go on
 
 Shape:
 
@@ -28,6 +28,7 @@ Motion:
     servo             a local surface that the samples correct, and the next pose of the probe
     strategies        where the contact goes next
     probe_motion      ways between poses, and the joint steps that follow them
+    explore/          where to go next, so that the map of a rectangle is sure enough everywhere
 
 True objects, which no estimator sees: `shapes` (a shape at a pose; bowl, wave, fillet, torus), `objects` (all shapes by
 name, and the quadrics), `heights` (a spline over a grid), `mesh_fit` (such a spline from a mesh).
@@ -35,7 +36,8 @@ name, and the quadrics), `heights` (a spline over a grid), `mesh_fit` (such a sp
 Invariants: SI units, base frame unless a name says otherwise. z of a contact frame is the inward normal; in its own
 contact frame a surface has c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [[c11, c12], [c12, c22]] is the curvature;
 κ > 0 is convex. Source: Chen, Rink, Zhang, "Local Object Shape From Tactile Sensing", with the corrections that the
-docstrings name. Start reading at `contact`, then `estimate/` and `online/`.
+docstrings name. The names in `__all__` are for a stranger, from an image to a contact to a shape; docs/mechanics.md
+shows the way. Start reading at `contact`, then `estimate/` and `online/`.
 """
 
 from __future__ import annotations
