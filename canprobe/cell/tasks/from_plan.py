@@ -64,7 +64,7 @@ def centroid_coupling(probe: Probe) -> float:
 
 def contact_correlation(array: Array) -> Correlation:
     """Correlation of the noise of an array's contacts along their path, and over the pad."""
-    from canprobe.mechanics.touch import Correlation
+    from canprobe.mechanics.touch import Correlation  # only where a shape is asked for
 
     length, share = HEIGHT_CORRELATION
     return Correlation(length, 0.0, share, array.calibration.noise.slow_way)
@@ -72,7 +72,7 @@ def contact_correlation(array: Array) -> Correlation:
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
     """An estimator by its name, with the settings of a scan."""
-    from canprobe.mechanics.touch import OnlineEstimator, make_estimator
+    from canprobe.mechanics.touch import OnlineEstimator, make_estimator  # only where a shape is asked for
     from canprobe.mechanics.touch.estimate.fit import METHODS
 
     assert task.shape is not None and task.scan is not None
@@ -125,7 +125,7 @@ def _image_model(task: Touch) -> ImageModel:
 
 def make_surface_map(task: Touch) -> SurfaceMap:
     """An empty map for the contacts of a task's pad."""
-    from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap
+    from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap  # only where a shape is asked for
 
     return SurfaceMap(PadLayer(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
 

@@ -46,7 +46,7 @@ class SurfaceEstimate:
         directions: (2, 3) rows: unit vectors of `kappa` in the frame of the points.
         covariance: (3, 3) covariance of (K11, K12, K22), 1/m².
         observed: (2,) whether each of `kappa` was observed.
-        rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `quadric`).
+        rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `observed`).
         combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
         information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.
         umbilic: κ1 and κ2 do not differ significantly (95 %), so that the directions are arbitrary.
