@@ -15,8 +15,8 @@ import numpy as np
 
 from canprobe.mechanics.touch.array_calibration.touches import FIRST_IMAGE_S, LAST_IMAGE_S, Dwell, Touches
 from canprobe.mechanics.touch.contact import indentation_from_force
+from canprobe.mechanics.touch.image.force_creep import ForceCreep
 from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS, ForceErrors
-from canprobe.mechanics.touch.image.force_reading import ForceCreep
 from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.types import Floats

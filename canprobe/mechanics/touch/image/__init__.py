@@ -11,6 +11,7 @@ From an image:
     pad_lag             corrects the lag of the centroid behind the contact
     moments             second moments of an image, and the traces that creep leaves in them
     force_reading       the force of each image in its order, without creep, with its standard deviation
+    force_creep         corrects the creep of the force by two relaxations
     force_errors        the errors of the force that a calibration states
 
 The array:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch import ForceReading, Patch, PatchCalibration
+from canprobe.mechanics.touch.image.force_creep import ForceCreep, decades_after
 from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors, upper_end
-from canprobe.mechanics.touch.image.force_reading import ForceCreep, decades_after
 
 ERRORS = ForceErrors(creep=0.05, creep_sigma=0.006, creep_decades=1.8, array=0.01, spread=0.0)
 CALIBRATION = PatchCalibration(force_errors=ERRORS, reference_sigma=0.005)
