@@ -23,10 +23,6 @@ _MAX_HIDDEN_DIRECTION = 0.05
 """Largest unobserved part of the normal curvature along a direction that still counts as observed."""
 _UMBILIC_CHI2 = 5.99
 """95 % point of χ² with two degrees of freedom, which the deviator of K has."""
-_ARRAY_FIELDS = (
-    *("S", "T_frame_contact", "K", "kappa", "directions", "covariance"),
-    *("observed", "combinations", "information"),
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -90,10 +86,9 @@ class SurfaceEstimate:
     contradicted: bool = False
 
     def __post_init__(self) -> None:
-        for name in _ARRAY_FIELDS:
-            getattr(self, name).setflags(write=False)
-        if self.model_root is not None:
-            self.model_root.setflags(write=False)
+        for field in self.__slots__:
+            if isinstance(value := getattr(self, field), np.ndarray):
+                value.setflags(write=False)
 
     @classmethod
     def of(cls, T_frame_contact: Floats, K: Floats, *, method: str = "own") -> SurfaceEstimate:
