@@ -22,6 +22,10 @@ _ROOMS = {
     "bus": "fieldbus.bus",
     "vcan": "fieldbus.vcan",
     "robot": "mechanics.robot",
+    "touch.patch.image": "mechanics.touch.image.patch",
+    "touch.patch": "mechanics.touch.image",
+    "mechanics.touch.patch.image": "mechanics.touch.image.patch",
+    "mechanics.touch.patch": "mechanics.touch.image",
     "touch": "mechanics.touch",
     "scene": "cell.scene",
     "planning": "cell.planning",
@@ -36,7 +40,7 @@ _ROOMS = {
     "gym": "lab.gym",
     "examples": "lab.examples",
 }
-"""Old name → new name, both below `canprobe`; what lies in a room moves with it."""
+"""Old name → new name, both below `canprobe`, a part before its room; what lies in a room moves with it."""
 _ALSO = {
     "canprobe.cell.cycle": "canprobe.cell.master.observers",
     "canprobe.protocol.tactile": "canprobe.cell.master.tactile_frame",

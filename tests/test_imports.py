@@ -256,7 +256,7 @@ def test_no_class_has_the_name_of_another():
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
-@pytest.mark.parametrize("door", ["canprobe", "canprobe.fieldbus", "canprobe.mechanics"])
+@pytest.mark.parametrize("door", ["canprobe", "canprobe.fieldbus", "canprobe.mechanics", "canprobe.mechanics.touch"])
 def test_every_public_name_of_a_door_can_be_had(door):
     module = importlib.import_module(door)
     assert [name for name in module.__all__ if not hasattr(module, name)] == []

@@ -22,8 +22,8 @@ from canprobe.lab.bridge.view.meshes import TriangleMesh
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
 from canprobe.lab.bridge.view.path_nodes import AHEAD, PATH
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 

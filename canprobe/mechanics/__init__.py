@@ -31,31 +31,33 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.chain import Chain, forward
     from canprobe.mechanics.robot.denavit_hartenberg import from_dh
     from canprobe.mechanics.robot.model import ArmModel, Joint
-    from canprobe.mechanics.touch.contact import ContactSample
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-    from canprobe.mechanics.touch.estimate.fit import fit_surface
-    from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-    from canprobe.mechanics.touch.estimate.prior import Prior
-    from canprobe.mechanics.touch.map.fit import fit_map
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-    from canprobe.mechanics.touch.objects import make_object
-    from canprobe.mechanics.touch.surface import SurfaceMatrix
+    from canprobe.mechanics.touch import (
+        ContactSample,
+        Prior,
+        SurfaceEstimate,
+        SurfaceMap,
+        SurfaceMatrix,
+        cramer_rao,
+        fit_map,
+        fit_surface,
+        make_object,
+    )
 
 _MODULES = {
     "ArmModel": "robot.model",
     "Chain": "robot.chain",
-    "ContactSample": "touch.contact",
+    "ContactSample": "touch",
     "Joint": "robot.model",
-    "Prior": "touch.estimate.prior",
-    "SurfaceEstimate": "touch.estimate.answer",
-    "SurfaceMap": "touch.map.surface_map",
-    "SurfaceMatrix": "touch.surface",
-    "cramer_rao": "touch.estimate.likelihood",
-    "fit_map": "touch.map.fit",
-    "fit_surface": "touch.estimate.fit",
+    "Prior": "touch",
+    "SurfaceEstimate": "touch",
+    "SurfaceMap": "touch",
+    "SurfaceMatrix": "touch",
+    "cramer_rao": "touch",
+    "fit_map": "touch",
+    "fit_surface": "touch",
     "forward": "robot.chain",
     "from_dh": "robot.denavit_hartenberg",
-    "make_object": "touch.objects",
+    "make_object": "touch",
 }
 
 __all__ = [

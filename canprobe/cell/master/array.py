@@ -17,10 +17,10 @@ from canprobe.fieldbus.protocol.period import PeriodFit
 from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
 from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
+from canprobe.mechanics.touch import ForceReading, Patch, PatchCalibration, compute_patch
+from canprobe.mechanics.touch.image.patch import patch_from_features
+from canprobe.mechanics.touch.image.silent_taxels import SilentTaxels
 from canprobe.mechanics.touch.pad import COUNTS_MAX
-from canprobe.mechanics.touch.patch.force_reading import ForceReading
-from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
-from canprobe.mechanics.touch.patch.silent_taxels import SilentTaxels
 from canprobe.mechanics.types import Floats
 
 DEADLINE_CYCLES = 2
@@ -374,6 +374,6 @@ def make_patch_reader(setup: Setup) -> PatchReader | None:
     """The reader of the setup's array; None without one."""
     if setup.array is None:
         return None
-    from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
+    from canprobe.mechanics.touch import make_patch_calibration
 
     return PatchReader(make_patch_calibration(setup.array.calibration, setup.array.pad))

@@ -49,7 +49,7 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
-from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch import Patch
 
 Result = TypeVar("Result")
 

@@ -14,8 +14,7 @@ from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.master.trail import TakenWay
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-    from canprobe.mechanics.touch.patch.image import Patch
+    from canprobe.mechanics.touch import Patch, SurfaceEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +116,7 @@ def check_command(command: Command, *, arm: bool) -> None:
     if command.q_target is not None and not arm:
         raise UsageError(f"controller: expected no q_target in a scene without an arm, got {command.q_target!r}")
     if command.estimate is not None:
-        from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+        from canprobe.mechanics.touch import SurfaceEstimate
 
         if not isinstance(command.estimate, SurfaceEstimate):
             raise UsageError(f"controller: expected estimate to be a SurfaceEstimate, got {command.estimate!r}")

@@ -31,7 +31,7 @@ from canprobe.fieldbus.protocol.frames import (
     unpack_heartbeat,
 )
 from canprobe.mechanics.robot.model import units_to_joints
-from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
+from canprobe.mechanics.touch import CalibrationCheck
 
 SECOND_NS = 1_000_000_000
 LATE_HEARTBEAT_S = 0.25

@@ -23,10 +23,10 @@ from canprobe.cell.planning.units import lag_s
 from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.mechanics.touch import Patch
 from canprobe.mechanics.touch.depth_witness import DepthWitness
+from canprobe.mechanics.touch.image.force_errors import upper_end
 from canprobe.mechanics.touch.pad import COUNTS_MAX
-from canprobe.mechanics.touch.patch.force_errors import upper_end
-from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 

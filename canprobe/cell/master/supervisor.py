@@ -22,7 +22,7 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.patch.image import Patch
+    from canprobe.mechanics.touch import Patch
 
 MAX_SPEED_SHARE = 1.5
 """Share of the speed limit above which a measured motion is no motion of the arm; SYNCs may be late by a period."""

@@ -131,7 +131,7 @@ def speed_over_array_problems(setup: Setup) -> Iterator[str]:
 
 def _unreadable(array: Array) -> Iterator[str]:
     """Problem where no force can be read from the array, because a contact falls between its taxels."""
-    from canprobe.mechanics.touch.patch.array_models import make_patch_calibration  # scipy, for coarse arrays only
+    from canprobe.mechanics.touch import make_patch_calibration  # scipy, for coarse arrays only
 
     try:
         make_patch_calibration(array.calibration, array.pad)

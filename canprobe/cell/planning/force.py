@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
 from canprobe.errors import at_least, at_most
-from canprobe.mechanics.touch.patch.force_creep import decades_after, late_decades_after
-from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
+from canprobe.mechanics.touch.image.force_creep import decades_after, late_decades_after
+from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
 
 _ROUNDS = 5
 

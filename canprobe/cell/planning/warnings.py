@@ -16,9 +16,9 @@ from canprobe.cell.scene.surface_files import mesh_warnings
 from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
+from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
+from canprobe.mechanics.touch.image.force_errors import UNSTATED
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
-from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
-from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 
 
 def _open_to_others(setup: Setup) -> Iterator[str]:

@@ -7,7 +7,7 @@ steps of a taxel and may be off its middle by `FOLLOWING_TAXELS`, which needs ro
 which carries some of the rim back inside, is left out.
 
 Where enough of a cut patch is inside, the cell carries it on beyond the window
-(`canprobe.mechanics.touch.patch.image`), and the force errs by a little. Else what lies outside presses unmeasured: the
+(`canprobe.mechanics.touch.image.patch`), and the force errs by a little. Else what lies outside presses unmeasured: the
 servo holds the measured force, so that the true one is as much larger as the window misses.
 
 Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.

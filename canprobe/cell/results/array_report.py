@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.mechanics.touch.patch.calibrate import ArrayFit
+from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
 
 
 def calibration_text(fit: ArrayFit) -> str:

@@ -15,8 +15,8 @@ from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, m
 from canprobe.cell.tasks.own_estimators import OwnEstimator, RenewedEstimator
 from canprobe.cell.tasks.shape import replay_samples
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.online import Estimator, Gate
+from canprobe.mechanics.touch import ContactSample, Estimator
+from canprobe.mechanics.touch.estimate.gate import Gate
 from canprobe.mechanics.types import Floats
 
 ESTIMATE_PERIOD_S = 0.1

@@ -31,7 +31,7 @@ from canprobe.cell.results.surface_panels import MapPlane, add_sheet, map_surfac
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
+from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.types import Floats
 
 Panel = Callable[[SubFigure, RunData], None]

@@ -43,8 +43,7 @@ from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-    from canprobe.mechanics.touch.patch.image import Patch
+    from canprobe.mechanics.touch import Patch, SurfaceMap
 
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,

@@ -10,11 +10,9 @@ import numpy as np
 
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
-from canprobe.mechanics.touch.estimate.online import Gate, PadWay
-from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS, ForceSigma
-from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch import ContactSample, Correlation, SurfaceMatrix
+from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
+from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.types import Floats
 
 RUN_IN_M = 0.020
@@ -189,14 +187,12 @@ def bound_of_scan(
         correlation: correlation of the noise along the path.
         coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
-    from canprobe.mechanics.touch.estimate.likelihood import make_touches, osculating_bound
+    from canprobe.mechanics.touch.estimate.likelihood import batch_of, osculating_bound
 
     points = np.array([s.p_base for s in samples])
-    normals = np.array([s.n_base for s in samples])
     gate = Gate(1.0, sigma_normal)
-    point, height, normal = np.array([gate.sigmas(s) for s in samples]).T
-    pad = PadWay(float(np.median(point)))
-    share, way = np.array([pad.step(s, sigma) for s, sigma in zip(samples, point.tolist(), strict=True)]).T
+    pad = PadPathLength(float(np.median([gate.sigmas(s)[0] for s in samples])))
+    touches = [pad.measured(s, gate, coupling) for s in samples]
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
         return None
@@ -210,10 +206,7 @@ def bound_of_scan(
         T[:3, 0] = truth["direction1"][row]
         T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
         surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa_per_m"][row])).transformed(np.linalg.inv(T))
-        recent = slice(first, last + 1)
-        noise = Noise(point[recent], normal[recent], coupling, height[recent])
-        slow = SlowErrors(share[recent], way[recent])
-        C = osculating_bound(make_touches(points[recent], normals[recent], noise, correlation, slow), surface)
+        C = osculating_bound(batch_of(touches[first : last + 1], correlation), surface)
         squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
     mean = float(np.mean(squares))
     return float(np.sqrt(mean)) if np.isfinite(mean) else None

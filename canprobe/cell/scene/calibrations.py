@@ -21,8 +21,8 @@ from canprobe.cell.scene.load import (
     with_writer,
     written_by_line,
 )
-from canprobe.mechanics.touch.patch.array_calibration import (
-    ArrayCalibration,
+from canprobe.mechanics.touch import ArrayCalibration
+from canprobe.mechanics.touch.image.calibration import (
     CentroidDelays,
     ContactNoise,
     ForceReference,
@@ -32,7 +32,7 @@ from canprobe.mechanics.touch.patch.array_calibration import (
     Residuals,
     StiffnessSources,
 )
-from canprobe.mechanics.touch.patch.force_errors import UNSTATED, ForceErrors
+from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors
 
 SCHEMA = 1
 Share = Annotated[float, Range(0, 1)]

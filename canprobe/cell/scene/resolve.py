@@ -51,10 +51,10 @@ from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.tool_calibration import ball_approaches
+from canprobe.mechanics.touch import ArrayCalibration, Pad
 from canprobe.mechanics.touch.heights import Heights
-from canprobe.mechanics.touch.pad import FLAT_RADIUS_M, Pad
-from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
-from canprobe.mechanics.touch.patch.force_errors import UNSTATED
+from canprobe.mechanics.touch.image.force_errors import UNSTATED
+from canprobe.mechanics.touch.pad import FLAT_RADIUS_M
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.stops import depth_on_plane
 from canprobe.mechanics.touch.strategies import Rectangle, make_strategy

@@ -30,8 +30,8 @@ from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
 from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.robot.tool_calibration import BallApproach
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE, ArrayCalibration
+from canprobe.mechanics.touch import ArrayCalibration, Pad
+from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Rectangle, Strategy

@@ -34,11 +34,12 @@ from canprobe.cell.tasks.roll import Press, RollRecord, RollTask
 from canprobe.errors import PlanError, UsageError
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import task_rows
+from canprobe.mechanics.touch import calibrate_array
+from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
+from canprobe.mechanics.touch.array_calibration.touches import Dwell
 from canprobe.mechanics.touch.contact import direction_to_pad
-from canprobe.mechanics.touch.patch.array_calibration import ForceReference
-from canprobe.mechanics.touch.patch.calibrate import ArrayFit, calibrate_array
-from canprobe.mechanics.touch.patch.force_errors import MAKE_SPREAD
-from canprobe.mechanics.touch.patch.image_fit import Dwell
+from canprobe.mechanics.touch.image.calibration import ForceReference
+from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD
 from canprobe.mechanics.types import Floats
 
 Ask = Callable[[str], str]

@@ -14,9 +14,8 @@ from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.mechanics.robot.tool_calibration import BallModel, BallTouch, ToolEstimate, calibrate_tool
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.layer_stiffness import PushFit
-from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import EXTRA_CLEARANCE_M, ROUND_SPEED_M_S, ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE

@@ -20,14 +20,13 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.regain import SEARCH_SPEED, Search
 from canprobe.cell.tasks.task import Exploration, TaskRecord
 from canprobe.cell.tasks.touch import RAMP_S, TouchTask
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
 from canprobe.mechanics.touch.explore.ground import UNKNOWN_M, GroundCells
 from canprobe.mechanics.touch.explore.spacing import LaneForecast
 from canprobe.mechanics.touch.explore.stretches import STEP_M
 from canprobe.mechanics.touch.map.cells import STATED_STIFFNESS_SIGMA
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
-from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import Rectangle, turn_radius

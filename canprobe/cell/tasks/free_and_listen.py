@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from canprobe.cell.master.array import PatchReader, force_columns
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.tasks.task import Task, TaskRecord
-from canprobe.mechanics.touch.patch.image import PatchCalibration
+from canprobe.mechanics.touch import PatchCalibration
 from canprobe.mechanics.touch.probe_motion import smooth_step
 from canprobe.mechanics.types import Floats
 

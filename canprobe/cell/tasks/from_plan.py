@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Controller
@@ -14,17 +14,19 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
-from canprobe.mechanics.touch.contact import ContactSample, indentation_from_force
-from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
-from canprobe.mechanics.touch.patch.moments import MomentImage
+from canprobe.mechanics.touch import (
+    CalibrationCheck,
+    ContactSample,
+    MomentImage,
+    indentation_from_force,
+    make_image_model,
+    make_patch_calibration,
+)
 from canprobe.mechanics.touch.strategies import Rectangle
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.noise import Correlation
-    from canprobe.mechanics.touch.estimate.online import Estimator
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-    from canprobe.mechanics.touch.patch.image_model import ImageModel
+    from canprobe.mechanics.touch import Correlation, Estimator, ImageModel, SurfaceMap
+    from canprobe.mechanics.touch.online.estimator import AnswerStage
 
 
 HEIGHT_CORRELATION = (2e-3, 0.2)
@@ -36,16 +38,8 @@ SIGMA_NORMAL_RAD = 0.3e-3
 """Error of a normal that does not come from its centroid: joint counts displace the probe by 11 µm, times 28 1/m."""
 SIGMA_STIFFNESS = 0.6
 """Standard deviation of the logarithm of the layer's stiffness before any touch."""
-SCALE_ERROR = 4e-3
-"""Relative error of curvature that no path averages."""
-PAD_DRAG = 0.03
-"""Error of the way of a contact over the pad, over this way (`drag_errors`), by hysteresis and creep. A probe that
-keeps its orientation measures the normal by this way alone; else the rolling share is its part in the turn of the
-normal. The value has the best log score on 15 scenes of a gantry of a development draw."""
-TOOL_SIGMA_M = 0.2e-3
-"""Standard deviation of the probe's centre along its pole, m, as a tool is known after its calibration."""
-PATCH_METHODS = ("recursive", "ml")
-"""Estimators that use the patch, and whose confidence regions follow changes; the others are as published."""
+REFINED_METHODS = ("recursive", "ml")
+"""Estimators whose answers are refined by the stages of `online`; the others are as published."""
 
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
@@ -70,7 +64,7 @@ def centroid_coupling(probe: Probe) -> float:
 
 def contact_correlation(array: Array) -> Correlation:
     """Correlation of the noise of an array's contacts along their path, and over the pad."""
-    from canprobe.mechanics.touch.estimate.noise import Correlation  # only where a shape is asked for
+    from canprobe.mechanics.touch import Correlation  # only where a shape is asked for
 
     length, share = HEIGHT_CORRELATION
     return Correlation(length, 0.0, share, array.calibration.noise.slow_way)
@@ -78,7 +72,8 @@ def contact_correlation(array: Array) -> Correlation:
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
     """An estimator by its name, with the settings of a scan."""
-    from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator  # only where a shape is asked for
+    from canprobe.mechanics.touch import OnlineEstimator, make_estimator  # only where a shape is asked for
+    from canprobe.mechanics.touch.estimate.fit import METHODS
 
     assert task.shape is not None and task.scan is not None
     memory = task.shape.memory
@@ -95,26 +90,23 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         from canprobe.cell.tasks.own_estimators import OfferedEstimator, RenewedEstimator
 
         return RenewedEstimator(lambda: OfferedEstimator(offer, settings))
-    estimator = make_estimator(method, **settings)
-    if method not in PATCH_METHODS:
-        return estimator
-    from canprobe.mechanics.touch.estimate.following import FollowingEstimator
-    from canprobe.mechanics.touch.estimate.noise_level import LevelledEstimator
+    motion = make_estimator(method, **settings)
+    if method not in REFINED_METHODS:
+        return motion
+    return OnlineEstimator(motion, *_stages(task, memory, task.scan.rolling_share))
 
-    fused = _with_patch(task, estimator, memory) if _uses_patch(task) else estimator
-    rolling = task.scan.rolling_share
-    following = FollowingEstimator(
-        LevelledEstimator(fused, memory),
-        memory,
-        scale=SCALE_ERROR,
-        drag=PAD_DRAG * rolling,
-        offset=TOOL_SIGMA_M * (1.0 - rolling),
-    )
-    if not task.shape.revisit:
-        return following
-    from canprobe.mechanics.touch.map.known_ground import RevisitingEstimator
 
-    return RevisitingEstimator(following, make_surface_map(task), memory)
+def _stages(task: Touch, memory: float, rolling_share: float) -> Iterator[AnswerStage]:
+    """The stages of a task's answers, in order."""
+    from canprobe.mechanics.touch import MapFusion, NoiseLevel, PatchCurvature, PatchFusion, SystematicErrors
+
+    assert task.shape is not None
+    if _uses_patch(task):
+        yield PatchFusion(PatchCurvature(_image_model(task), SIGMA_STIFFNESS), memory)
+    yield NoiseLevel(memory)
+    yield SystematicErrors.of_scan(memory, rolling_share)
+    if task.shape.revisit:
+        yield MapFusion(make_surface_map(task), memory)
 
 
 def _typical_sigma(task: Touch) -> float:
@@ -122,14 +114,6 @@ def _typical_sigma(task: Touch) -> float:
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
     return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
-
-
-def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
-    """The estimator with the contact patch as its second sensor."""
-    from canprobe.mechanics.touch.patch.curvature import PatchCurvature
-    from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator
-
-    return PatchedEstimator(estimator, PatchCurvature(_image_model(task), SIGMA_STIFFNESS), memory)
 
 
 def _image_model(task: Touch) -> ImageModel:
@@ -141,9 +125,7 @@ def _image_model(task: Touch) -> ImageModel:
 
 def make_surface_map(task: Touch) -> SurfaceMap:
     """An empty map for the contacts of a task's pad."""
-    from canprobe.mechanics.touch.map.local_fits import PadLayer
-    from canprobe.mechanics.touch.map.noise import PAD_NOISE
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap  # only where a shape is asked for
+    from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap  # only where a shape is asked for
 
     return SurfaceMap(PadLayer(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
 

@@ -7,9 +7,8 @@ from typing import Any, Protocol
 
 from canprobe.cell.scene.offers import Offer
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.online import Dropped
+from canprobe.mechanics.touch import ContactSample, SurfaceEstimate
+from canprobe.mechanics.touch.estimate.gate import Dropped
 
 
 class OwnEstimator(Protocol):

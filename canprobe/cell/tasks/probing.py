@@ -22,16 +22,15 @@ from canprobe.cell.scene.setup import Approach
 from canprobe.cell.tasks.probe_motion import ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.depth_witness import DepthWitness
 from canprobe.mechanics.touch.pad import FLAT_RADIUS_M
-from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S, ArcMotion, LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch import SurfaceEstimate
 
 
 class Phase(IntEnum):

@@ -15,8 +15,7 @@ from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.calibrate import PRESS_SPEED
 from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.probe_motion import LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE

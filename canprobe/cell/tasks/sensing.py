@@ -14,23 +14,25 @@ from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.mechanics.robot.chain import ending_in, forward
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.motors import position_sigma
-from canprobe.mechanics.touch.contact import (
-    HOLLOW_LIMIT_SHARE,
+from canprobe.mechanics.touch import (
     ContactSample,
+    MomentImage,
+    Patch,
+    PatchCalibration,
     Slope,
     contact_sample,
     indentation_from_force,
 )
+from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE
+from canprobe.mechanics.touch.image.calibration import ContactNoise, Lag
+from canprobe.mechanics.touch.image.moments import Moments
+from canprobe.mechanics.touch.image.pad_lag import PadLag
+from canprobe.mechanics.touch.image.silent_taxels import mended
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
-from canprobe.mechanics.touch.patch.array_calibration import ContactNoise, Lag
-from canprobe.mechanics.touch.patch.dead_taxels import mended
-from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
-from canprobe.mechanics.touch.patch.moments import MomentImage, Moments
-from canprobe.mechanics.touch.patch.pad_lag import PadLag
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch import SurfaceEstimate
 
 
 MAX_STIFFNESS_RATIO = 6.0

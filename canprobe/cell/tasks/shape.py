@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth, indentation_from_force
+from canprobe.mechanics.touch import indentation_from_force
+from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.contact import ContactSample
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-    from canprobe.mechanics.touch.estimate.online import Estimator
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+    from canprobe.mechanics.touch import ContactSample, Estimator, SurfaceEstimate, SurfaceMap
 
 
 GAP_S = 0.1
@@ -66,7 +64,7 @@ class ShapeTracker:
         travelled_m: path of the contact, m.
         restarts: how often the estimator diverged and started afresh.
         withheld: answers that could not be computed: of a matrix that is singular or not definite.
-        doubted: whether images mean another curvature than the calibration says, so that answers are `widened`.
+        doubted: whether images mean another curvature than the calibration says, so that regions are wider.
     """
 
     def __init__(self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None) -> None:
@@ -191,9 +189,9 @@ class ShapeTracker:
             self._start_afresh()
             return
         if self.doubted:
-            from canprobe.mechanics.touch.estimate.widened import widened  # only where a shape is asked for
+            from canprobe.mechanics.touch.online.regions import scaled  # only where a shape is asked for
 
-            estimate = widened(estimate)
+            estimate = scaled(estimate)
         self._found = estimate, at_s
 
     def _start_afresh(self) -> None:

@@ -18,10 +18,8 @@ from canprobe.cell.tasks.regain import REST_S, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
-from canprobe.mechanics.touch.contact import ContactSample, Slope
+from canprobe.mechanics.touch import CalibrationCheck, ContactSample, Patch, Slope
 from canprobe.mechanics.touch.layer_stiffness import PushFit
-from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
-from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, SETTLE_S, LineMotion, smooth_step
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
@@ -29,7 +27,7 @@ from canprobe.mechanics.touch.strategies import PathFollower, Rectangle
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch import SurfaceEstimate
 
 
 MAX_SLOPE_SIGMA_SHARE = 0.12

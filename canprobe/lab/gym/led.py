@@ -14,14 +14,14 @@ from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.touch import TouchTask
-from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
-from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch import ContactSample, Patch
+from canprobe.mechanics.touch.contact import direction_to_pad
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import PathFollower
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch import SurfaceEstimate
 
 
 class _Heading(PathFollower):

@@ -18,14 +18,10 @@ import numpy as np
 
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, legend, picture
 from canprobe.lab.studies.harness import Column, Row, StudyResult
+from canprobe.mechanics.touch import ArrayCalibration, ForceReading, Pad, compute_patch, make_patch_calibration
+from canprobe.mechanics.touch.array_calibration.touches import Dwell
+from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS
 from canprobe.mechanics.touch.linear_algebra import rms
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
-from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
-from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS
-from canprobe.mechanics.touch.patch.force_reading import ForceReading
-from canprobe.mechanics.touch.patch.image import compute_patch
-from canprobe.mechanics.touch.patch.image_fit import Dwell
 from canprobe.mechanics.types import Floats
 
 HOLDS, HOLD_S = 6, (8.0, 20.0, 60.0)

@@ -29,13 +29,11 @@ from canprobe.lab.studies.array_forces import GROUPS, HOLD_S, HOLDS, result_of, 
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.touch import Pad, PatchCalibration, calibrate_array, make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
+from canprobe.mechanics.touch.array_calibration.parameter_fit import curvature_errors, moment_errors
+from canprobe.mechanics.touch.array_calibration.touches import Dwell, what_is_shown
 from canprobe.mechanics.touch.linear_algebra import rms
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.calibrate import ArrayFit, calibrate_array
-from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.image_fit import Dwell, what_is_shown
-from canprobe.mechanics.touch.patch.parameter_fit import curvature_errors, moment_errors
 from canprobe.mechanics.types import Floats
 
 RADIUS_M = 0.040
@@ -302,8 +300,8 @@ def measure(seed: int) -> dict[str, Any]:
         if not shown.usable or model.trust((dwell.kappa[0], 0.0, dwell.kappa[1]), force) < 1.0:
             continue
         forces.append(force / dwell.force - 1.0)
-        curvatures.append(curvature_errors(model, [dwell], [shown], [force])[0])
-        moments.append(moment_errors(model, [dwell], [shown], [force])[0, :2])
+        curvatures.append(curvature_errors(model, [(dwell, shown)], [force])[0])
+        moments.append(moment_errors(model, [(dwell, shown)], [force])[0, :2])
     return {
         "array": seed,
         "full_scale_kpa": 1e-3 * config.full_scale_pa,

@@ -25,10 +25,7 @@ from canprobe.lab.studies.ground import Ground, make_ground
 from canprobe.lab.studies.harness import FROBENIUS, Column, Row, StudyResult
 from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.online import Estimator
+from canprobe.mechanics.touch import ContactSample, Estimator, cramer_rao, make_estimator
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 

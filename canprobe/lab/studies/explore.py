@@ -32,9 +32,8 @@ from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.shapes.scans import DEVELOPMENT, drawn, form_of, scene_of
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.travel import Travel
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+from canprobe.mechanics.touch import ContactSample, SurfaceMap
+from canprobe.mechanics.touch.estimate.path_length import PathLength
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Circle, Strategy, Weave
 from canprobe.mechanics.types import Floats
@@ -219,7 +218,7 @@ class TrueGround(NamedTuple):
 
 def errors_over_path(surface_map: SurfaceMap, samples: Sequence[ContactSample], truth: TrueGround) -> dict[str, Any]:
     """Errors after every `MARK_M` of the path of contacts, and the time at which each was walked."""
-    travel = Travel(0.2e-3)
+    travel = PathLength(0.2e-3)
     path = np.array([travel.total for sample in samples if travel.add(sample.p_base) is not None])
     seconds = np.array([sample.t_s for sample in samples]) - samples[0].t_s
     found: dict[str, list[float]] = {key: [] for key in ("path", "seconds", *LIMITS)}

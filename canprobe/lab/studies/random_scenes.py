@@ -24,9 +24,7 @@ from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.cell.scene.resolve import LAYER_STIFFNESS
 from canprobe.errors import UsageError
 from canprobe.lab.studies.arrays import RADIUS_M, REFERENCE_SIGMA, Presses, random_array
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
-from canprobe.mechanics.touch.patch.calibrate import calibrate_array
+from canprobe.mechanics.touch import ArrayCalibration, Pad, calibrate_array
 from canprobe.mechanics.types import Floats
 
 CELLS = {

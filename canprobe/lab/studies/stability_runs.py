@@ -34,8 +34,7 @@ from canprobe.lab.studies.witnessed_run import RELEASE_NS, Witness, longest_abov
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.touch.contact import Slope, indentation_from_force
-from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
+from canprobe.mechanics.touch import Slope, indentation_from_force, make_patch_calibration
 from canprobe.mechanics.types import Floats
 
 

@@ -123,11 +123,9 @@ def _weights(t: Floats) -> tuple[list[Floats], list[Floats]]:
 
 
 def _coefficients(f: Floats) -> Floats:
-    """(n + 2, …) B-spline coefficients of the cubic spline through (n, …) values, along the first axis.
-
-    With not-a-knot ends the second coefficient from each end follows from three values, and the rest from
-    ``c[i-1] + 4 c[i] + c[i+1] = 6 f[i]``, by elimination without pivots, as the diagonal dominates.
-    """
+    """(n + 2, …) B-spline coefficients of the cubic spline through (n, …) values, along the first axis."""
+    # with not-a-knot ends the second coefficient from each end follows from three values, and the rest from ``c[i-1] +
+    # 4 c[i] + c[i+1] = 6 f[i]``, by elimination without pivots, as the diagonal dominates
     n = len(f)
     c = np.zeros((n + 2, *f.shape[1:]))
     c[2] = (8.0 * f[1] - f[0] - f[2]) / 6.0

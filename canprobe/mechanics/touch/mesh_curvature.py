@@ -84,12 +84,8 @@ class VertexCurvature(NamedTuple):
 
 
 def _of_neighbours(off: Floats) -> tuple[npt.NDArray[np.bool_], Floats, float]:
-    """Curvature by the vertices (n, k, 3) round places, from each, m.
-
-    Returns:
-        (n,) at which places the vertices show it, the curvatures (m, 2) there, 1/m, and their usual deviation by what
-        the quartics leave over, 1/m.
-    """
+    """Places (n,) at which their neighbours (n, k, 3), m, show curvature; it (m, 2), 1/m; its usual deviation, 1/m."""
+    # the deviation is by what the quartics leave over
     size = np.linalg.norm(off, axis=2).max(axis=1)
     off = off / size[:, None, None]
     _, _, axes = np.linalg.svd(off - off.mean(axis=1)[:, None], full_matrices=False)  # the plane of least squares

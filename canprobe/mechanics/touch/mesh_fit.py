@@ -215,10 +215,8 @@ def _refuse_coarse(points: Floats, corners: Index, normals: Floats) -> None:
 
 
 def _samples(points: Floats, corners: Index, normals: Floats, up: npt.NDArray[np.bool_], apart: float) -> Floats:
-    """(k, 3) points of curved triangles where the vertices are farther apart than `apart`, m.
-
-    They stand in rows along the longest side: a long sliver, as CAD programs write them, has as many as its area asks.
-    """
+    """(k, 3) points of curved triangles where the vertices are farther apart than `apart`, m."""
+    # they stand in rows along the longest side: a long sliver, as CAD programs write them, has as many as its area asks
     edges = _corner_normals(points, corners, normals)[up]
     triangles = points[corners[up]]
     sides = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)  # from the corner before to each
@@ -240,10 +238,8 @@ def _samples(points: Floats, corners: Index, normals: Floats, up: npt.NDArray[np
 
 
 def _corner_normals(points: Floats, corners: Index, normals: Floats) -> Floats:
-    """(f, 3, 3) normal of the body at each corner of each facet, from the facets there that no edge parts from it.
-
-    The weights are exact on a ball.
-    """
+    """(f, 3, 3) normal of the body at each corner of each facet, from the facets there that no edge parts from it."""
+    # the weights are exact on a ball
     weighted = np.empty((len(corners), 3, 3))
     for k in range(3):
         a, b = (points[corners[:, (k + j) % 3]] - points[corners[:, k]] for j in (1, 2))
@@ -266,10 +262,8 @@ def _corner_normals(points: Floats, corners: Index, normals: Floats) -> Floats:
 
 
 def _curved(triangles: Floats, normals: Floats, along: int, across: int) -> Floats:
-    """(k, 3) points of PN triangles (f, 3, 3) with normals (f, 3, 3) at their corners.
-
-    They lie in `across` rows from the first corner to the side opposite to it, that with `along` parts.
-    """
+    """(k, 3) points of PN triangles (f, 3, 3) with normals (f, 3, 3) at their corners."""
+    # they lie in `across` rows from the first corner to the side opposite to it, that with `along` parts
     away = np.arange(across + 1) / across
     parts = np.ceil(along * away - 1e-9).astype(np.intp).clip(1)
     row = np.repeat(away, parts + 1)
@@ -328,10 +322,8 @@ def _covered(triangles: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]
 def _fitted(
     samples: Floats, weights: Floats, facing: Floats, spacing: float
 ) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
-    """The least-squares spline: heights at the grid's nodes, its middle (2,), and whether there is a surface.
-
-    `facing` (f, 3, 2) are all facets that face upwards.
-    """
+    """The least-squares spline: heights at the grid's nodes, its middle (2,), and whether there is a surface."""
+    # `facing` (f, 3, 2) are all facets that face upwards
     from scipy import ndimage, sparse  # only where a mesh is read
     from scipy.sparse.linalg import splu
 

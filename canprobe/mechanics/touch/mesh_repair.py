@@ -112,11 +112,10 @@ def _merged(points: Floats, corners: Index) -> tuple[Floats, Index, float]:
 
 
 def _oriented(corners: Index) -> tuple[Index, int, Index]:
-    """Facets that face one way, how many were turned over for that, and how many facets each edge has.
-
-    Neighbours across an edge go along it in opposite directions. Each facet stands twice in a graph, as it is and
-    turned over, and an edge connects those of two facets that agree; of a connected part most facets stay as they are.
-    """
+    """Facets that face one way, how many were turned over for that, and how many facets each edge has."""
+    # neighbours across an edge go along it in opposite directions. Each facet stands twice in a graph, as it is and
+    # turned over, and an edge connects those of two facets that agree; of a connected part most facets stay as they
+    # are.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

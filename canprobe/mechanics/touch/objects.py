@@ -148,10 +148,8 @@ class Quadric(PlacedShape):
         return self._medial_foot((x0, x1, x2), 2 if f < 0.0 else 0)
 
     def _medial_foot(self, x: Vec, free: int) -> Vec:
-        """The foot on the side of x, where two are equally near, as seen from a point of symmetry.
-
-        The multiplier stands at the end of its interval, where the coordinate ``free`` follows from f = 0 alone.
-        """
+        """The foot on the side of x, where two are equally near, as seen from a point of symmetry."""
+        # the multiplier stands at the end of its interval, where the coordinate ``free`` follows from f = 0 alone
         w, b = self._w[free], self._b[free]
         rest = sum(x[i] * (self._w[i] * x[i] + 2 * self._b[i]) for i in range(3) if i != free)
         foot = list(x)

@@ -101,10 +101,8 @@ class PoseSteps:
 
 
 def _pose_error(at: Posture, centre: list[float], pole: list[float], x_reference: Vec) -> tuple[float, ...]:
-    """Twist (6) from a probe's pose to a centre and a pole, x as near to the reference as the pole allows.
-
-    Plain floats are used, as numpy costs ten times as much on 3-vectors.
-    """
+    """Twist (6) from a probe's pose to a centre and a pole, x as near to the reference as the pole allows."""
+    # Plain floats are used, as numpy costs ten times as much on 3-vectors
     (r00, r10, r20), (r01, r11, r21), (r02, r12, r22), (t0, t1, t2) = at.x, at.y, at.z, at.flange
     p0, p1, p2 = pole
     x0, x1, x2 = x_reference

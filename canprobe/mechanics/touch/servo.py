@@ -212,11 +212,9 @@ class TactileServo:
     def _march(
         self, follower: PathFollower, foot: Sequence[float], normal: Sequence[float], distance: float
     ) -> tuple[Sequence[float], Sequence[float]]:
-        """One step along the heading, lifted from the scan plane into the tangent plane.
-
-        On a slope the step in the scan plane is shorter than the distance, so that the speed over the surface is the
-        wanted one.
-        """
+        """One step along the heading, lifted from the scan plane into the tangent plane."""
+        # on a slope the step in the scan plane is shorter than the distance, so that the speed over the surface is the
+        # wanted one
         (h0, h1, h2), (c0, c1, c2), (u0, u1, u2) = self._heading, self._across, self._up
         (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
         d0, d1, d2 = f0 - o0, f1 - o1, f2 - o2

@@ -52,12 +52,6 @@ def homogeneous(R: Floats, origin: Sequence[float] | Floats) -> Floats:
     return T
 
 
-def inverse_transform(T: Floats) -> Floats:
-    """The inverse of a rigid 4x4 transform."""
-    R = T[:3, :3].T
-    return homogeneous(R, -R @ T[:3, 3])
-
-
 def rotation_vectors(R: Floats) -> Floats:
     """The rotation vectors (n, 3) (angle times axis, rad) of rotations (n, 3, 3) below a half turn."""
     w = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)

@@ -22,7 +22,7 @@ from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
 from canprobe.mechanics.touch.depth_witness import Fall
-from canprobe.mechanics.touch.patch.force_errors import ForceSigma
+from canprobe.mechanics.touch.image.force_errors import ForceSigma
 
 LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_000)
 SCANNING = replace(LIMITS, regain=3e-3)

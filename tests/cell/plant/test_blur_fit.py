@@ -7,8 +7,8 @@ import pytest
 
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
+from canprobe.mechanics.touch.array_calibration.blur_fit import fit_blur
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.blur_fit import fit_blur
 
 PACKAGED_BLUR, CROSSTALK, WINDOW = 0.72, 0.025, (0, 0, 16, 16)
 

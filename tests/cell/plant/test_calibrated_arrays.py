@@ -16,13 +16,12 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import SceneError, UsageError
 from canprobe.lab.studies.array_forces import score_holds
 from canprobe.lab.studies.arrays import RADIUS_M, Presses, measure, random_array
+from canprobe.mechanics.touch.array_calibration.calibrate import calibrate_array
+from canprobe.mechanics.touch.image.force_errors import UNSTATED
+from canprobe.mechanics.touch.image.image_model import make_patch_calibration
+from canprobe.mechanics.touch.image.moments import MomentImage, PadMemory
+from canprobe.mechanics.touch.image.patch import compute_patch
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
-from canprobe.mechanics.touch.patch.calibrate import calibrate_array
-from canprobe.mechanics.touch.patch.creep import PadMemory
-from canprobe.mechanics.touch.patch.force_errors import UNSTATED
-from canprobe.mechanics.touch.patch.image import compute_patch
-from canprobe.mechanics.touch.patch.moments import MomentImage
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE
 from canprobe.mechanics.touch.contact import Doubt
+from canprobe.mechanics.touch.image.moments import MomentImage
+from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch, patch_from_features
+from canprobe.mechanics.touch.image.silent_taxels import mended
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.dead_taxels import mended
-from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch, patch_from_features
-from canprobe.mechanics.touch.patch.moments import MomentImage
 
 PITCH = 1.5875e-3
 EXACT = PatchCalibration(threshold_counts=0)

@@ -5,9 +5,9 @@ import pytest
 
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
+from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
+from canprobe.mechanics.touch.image.silent_taxels import LOOK_PERIOD_NS, SilentTaxels
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
-from canprobe.mechanics.touch.patch.silent_taxels import LOOK_PERIOD_NS, SilentTaxels
 
 BLUR_PITCH = 0.7
 CYLINDER = (27.8, 0.0)

@@ -1,6 +1,6 @@
 """`canprobe calibrate array`: what a touch of a known object records, and what is refused.
 
-The fit is tested on simulated touches (`tests/mechanics/touch/patch/test_array_calibration.py`): the whole command
+The fit is tested on simulated touches (`tests/cell/plant/test_calibrated_arrays.py`): the whole command
 takes a minute.
 """
 

@@ -14,8 +14,8 @@ from canprobe.cell.tasks.sensing import JointHistory, is_too_hollow
 from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.estimate.fit import fit_surface
-from canprobe.mechanics.touch.estimate.online import Gate
-from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch.estimate.gate import Gate
+from canprobe.mechanics.touch.image.patch import Patch
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 
 PERIOD = 2_500_000

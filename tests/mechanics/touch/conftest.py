@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from canprobe.mechanics.touch.contact import ContactSample, contact_on_object, pad_to_direction
-from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch import ContactSample, SurfaceMatrix
+from canprobe.mechanics.touch.contact import contact_on_object, pad_to_direction
 
 Array = NDArray[np.float64]
 STEP = 0.125e-3

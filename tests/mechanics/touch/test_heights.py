@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.touch import make_object
 
 POSE = np.eye(4)
 POSE[:3, :3] = Rotation.from_euler("xyz", (12, -25, 70), degrees=True).as_matrix()

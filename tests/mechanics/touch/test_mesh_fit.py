@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
+from canprobe.mechanics.touch import make_object
 from canprobe.mechanics.touch.mesh_fit import fit_mesh
 from canprobe.mechanics.touch.mesh_repair import repaired
-from canprobe.mechanics.touch.objects import make_object
 
 EDGE, SPACING = 5e-4, 1e-3
 BODIES = {

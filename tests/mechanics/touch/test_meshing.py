@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from canprobe.errors import ResultsError, UsageError
-from canprobe.mechanics.touch.map.fit import fit_map
+from canprobe.mechanics.touch import fit_map
 from canprobe.mechanics.touch.map.surface_map import REACH_M
 from canprobe.mechanics.touch.meshing import Feet, mesh_of
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
+from canprobe.mechanics.touch import Pad, PatchCalibration, compute_patch
 
 
 def test_a_wrapped_grid_covers_the_cap_of_its_sphere() -> None:

@@ -160,20 +160,6 @@ def test_a_correction_leaves_one_in_e_after_the_time_constant_of_its_bandwidth(s
     assert local.normal[0] == pytest.approx(1e-4 * (1 - np.exp(-1)), rel=1e-6)
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.8, -0.8])
-def test_a_straight_path_over_a_slope_turns_where_it_turns_in_the_scan_plane(slope):
-    """A step over the slope is shorter in the plane by its cosine; the contact keeps its speed over the surface."""
-    n = np.array((0.0, -np.sin(slope), np.cos(slope)))
-    local = LocalSurface(np.zeros(3), n, SurfaceGains())
-    follower = PathFollower(make_strategy("straight", 0.03, 0.0))
-    servo = TactileServo(local, follower, axes=AXES, origin=np.zeros(3), probe_radius=RADIUS_P, rolling_share=0.0)
-    contacts = np.array([servo.step(0.025, 0.0, DT).centre - RADIUS_P * n for _ in range(1400)])
-    along = contacts @ AXES[0]
-    step = 0.025 * DT
-    assert (along.max(), along.min()) == pytest.approx((0.015, -0.015), abs=2 * step)
-    assert np.linalg.norm(np.diff(contacts, axis=0), axis=1) == pytest.approx(step, rel=1e-9)
-
-
 def off_curve(contacts, strategy):
     """Greatest distance (m) of contacts from a strategy's curve in the scan plane."""
     curve = np.array([strategy.point(phase) for phase in np.linspace(0, 2 * np.pi, 4000)])
@@ -199,6 +185,8 @@ def test_a_path_over_a_slope_is_the_one_in_the_scan_plane(name, n):
     )
     contacts = np.array([servo.step(0.025, 0.0, DT).centre - RADIUS_P * n for _ in range(3000)])
     assert off_curve(contacts, strategy) < 0.15e-3
+    along = contacts @ AXES[0]
+    assert (along.max(), along.min()) == pytest.approx((0.015, -0.015), abs=0.15e-3) or name == "circle"
     assert np.linalg.norm(np.diff(contacts, axis=0), axis=1) == pytest.approx(0.025 * DT, rel=1e-9)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.touch import make_object
 from canprobe.mechanics.touch.shapes import LIP_M
 
 POSE = np.eye(4)

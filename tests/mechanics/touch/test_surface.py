@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch import SurfaceMatrix
 
 NAMES = ["plane", "cylinder", "sphere", "small sphere", "saddle", "bowl", "ellipsoid", "hyperboloid"]
 

@@ -18,7 +18,7 @@ from canprobe.lab.studies.harness import Column, Row
 from canprobe.lab.studies.shapes.contacts_file import read_columns, read_contacts
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.linear_algebra import rms
-from canprobe.mechanics.touch.map.known_ground import JOINED_NOTE
+from canprobe.mechanics.touch.online.map_fusion import JOINED_NOTE
 from canprobe.mechanics.types import Floats
 
 METHOD, EVERY, START_M = "recursive", 8, 20e-3

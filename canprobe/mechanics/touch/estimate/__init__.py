@@ -10,7 +10,7 @@ Model and assumptions:
     terms               the cubic and quartic terms beside them, their gradients, and changes of the origin
     residuals           residuals of samples and their Jacobian, from which every fit starts
     noise, prior        errors of points and normals, correlated along the path; the surface before it is touched
-    travel              how far a contact has moved beyond its noise, and how its places spread
+    path_length         how far a contact has moved beyond its noise, and how its places spread
 
 Fits of a batch:
 
@@ -21,17 +21,14 @@ Fits of a batch:
 
 Estimators, one sample after another:
 
-    online              their interface (`add`, `estimate`, `reset`), and the gate that every sample passes
-    window              over the last samples: `ml` and `chord`; `chen1996` is the paper's
+    gate                their interface (`add`, `estimate`, `reset`), the gate of every sample, and its errors behind it
+    window              over the last samples: `ml`, `chord`, and `chen1996`, the scheme of the paper
     recursive           what runs in the loop: forgets per millimetre, starts afresh where the surface changes
     information         the square-root information filter under it
     start               its first stretch, solved as a whole by single Gauss–Newton steps
     omitted_terms       the terms of `misfit`, in constant time and memory
     sandwich            the covariance of weighted and correlated rows
     change              the test for a changed surface
-    following           wider regions where the answers change along the path
-    noise_level         variances by the level of the innovations
-    widened             wider regions of an array that is not as its calibration says
 
 Answers:
 
@@ -40,5 +37,6 @@ Answers:
     answer              a solution carried to the contact frame: the estimate
     fit                 the entry: `fit_surface` for recorded points, `make_estimator` by name
 
-An answer is computed in one piece: 0.4 ms, after the cycle's commands are out. Start reading at `quadric`, then `fit`.
+An answer is computed in one piece: 0.4 ms, after the cycle's commands are out. In the loop the stages of `touch.online`
+refine it. Start reading at `quadric`, then `fit`.
 """

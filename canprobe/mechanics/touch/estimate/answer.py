@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
 from canprobe.mechanics.touch.estimate.observed import Decision, outside, tensor
-from canprobe.mechanics.touch.estimate.quadric import TO_Q, matrix_of
+from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import transport
 from canprobe.mechanics.touch.linear_algebra import checked, principal, read_only
 from canprobe.mechanics.touch.surface import SurfaceMatrix
@@ -23,10 +23,6 @@ _MAX_HIDDEN_DIRECTION = 0.05
 """Largest unobserved part of the normal curvature along a direction that still counts as observed."""
 _UMBILIC_CHI2 = 5.99
 """95 % point of χ² with two degrees of freedom, which the deviator of K has."""
-_ARRAY_FIELDS = (
-    *("S", "T_frame_contact", "K", "kappa", "directions", "covariance"),
-    *("observed", "combinations", "information"),
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -46,7 +42,7 @@ class SurfaceEstimate:
         directions: (2, 3) rows: unit vectors of `kappa` in the frame of the points.
         covariance: (3, 3) covariance of (K11, K12, K22), 1/m².
         observed: (2,) whether each of `kappa` was observed.
-        rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `quadric`).
+        rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `observed`).
         combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
         information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.
         umbilic: κ1 and κ2 do not differ significantly (95 %), so that the directions are arbitrary.
@@ -90,10 +86,9 @@ class SurfaceEstimate:
     contradicted: bool = False
 
     def __post_init__(self) -> None:
-        for name in _ARRAY_FIELDS:
-            getattr(self, name).setflags(write=False)
-        if self.model_root is not None:
-            self.model_root.setflags(write=False)
+        for field in self.__slots__:
+            if isinstance(value := getattr(self, field), np.ndarray):
+                value.setflags(write=False)
 
     @classmethod
     def of(cls, T_frame_contact: Floats, K: Floats, *, method: str = "own") -> SurfaceEstimate:
@@ -104,27 +99,18 @@ class SurfaceEstimate:
             K: (2, 2) shape operator along its x and y, 1/m; positive where the object is convex.
             method: name of the estimator.
         """
-        K = checked("K", K, (2, 2)).copy()
-        T_frame_contact = checked("T_frame_contact", T_frame_contact, (4, 4))
-        T, (kappa, local) = read_only(T_frame_contact), _principal(K)
-        return cls(
-            S=SurfaceMatrix.from_curvature(K).S.copy(),
-            T_frame_contact=T,
-            K=K,
-            kappa=kappa,
-            directions=local @ T[:3, :2].T,
-            covariance=np.full((3, 3), math.inf),
-            observed=np.array([True, True]),
-            rank=3,
-            combinations=np.eye(3),
-            information=np.zeros((3, 3)),
-            umbilic=False,
+        c = parameters_of(SurfaceMatrix.from_curvature(checked("K", K, (2, 2))).S)
+        known = Decision(np.zeros(3), np.eye(3), np.ones(3, dtype=bool))
+        return build_estimate(
+            Solution(c, np.full((3, 3), math.inf), known, has_prior=False),
+            length=1.0,
+            T_frame_contact=checked("T_frame_contact", T_frame_contact, (4, 4)),
+            problem_root=np.eye(3),
             innovation=math.nan,
             distance=math.nan,
             samples=math.nan,
             method=method,
             prior="none",
-            problem_root=np.eye(3),
         )
 
     @property
@@ -196,29 +182,24 @@ class Solution(NamedTuple):
     root: Floats | None = None
 
 
-def build_estimate(
-    solution: Solution,
-    *,
-    length: float,
-    T_frame_contact: Floats,
-    problem_root: Floats,
-    innovation: float,
-    distance: float,
-    samples: float,
-    method: str,
-    prior: str,
-    notes: tuple[str, ...] = (),
-    evidence: CurvatureInformation | None = None,
-    stiffness: float | None = None,
-    contradicted: bool = False,
-) -> SurfaceEstimate:
-    """An estimate from a solution in units of `length` (m)."""
+def build_estimate(solution: Solution, *, length: float, T_frame_contact: Floats, **facts: Any) -> SurfaceEstimate:
+    """An estimate from a solution in units of `length` (m); `facts` are the fields that no solution gives."""
+    T = read_only(T_frame_contact)
+    return SurfaceEstimate(T_frame_contact=T, **_shape(solution, T, length), **facts)
+
+
+def with_solution(answer: SurfaceEstimate, solution: Solution, **facts: Any) -> SurfaceEstimate:
+    """An estimate with another solution in its contact frame, in 1/m; `facts` are other fields that change."""
+    return replace(answer, **_shape(solution, answer.T_frame_contact, 1.0), **facts)
+
+
+def _shape(solution: Solution, T: Floats, length: float) -> dict[str, Any]:
+    """The fields of an estimate in the contact frame T (4, 4) that a solution in units of `length` (m) gives."""
     S = matrix_of(solution.c)
     S[:3, :3] /= length
     k = 2.0 * S[:2, :2]
     decision = solution.decision
     covariance = solution.covariance / length**2
-    T = read_only(T_frame_contact)
     if decision.rank == 3:
         kappa, local = _principal(k)
         observed = np.array([True, True])
@@ -227,30 +208,19 @@ def build_estimate(
         k, covariance, kappa, local, observed = _partly(k, covariance, decision, solution.has_prior, length)
         umbilic = False
     V = decision.vectors
-    return SurfaceEstimate(
-        S=S,
-        T_frame_contact=T,
-        K=k,
-        kappa=kappa,
-        directions=local.dot(T[:3, :2].T),
-        covariance=covariance,
-        observed=observed,
-        rank=decision.rank,
-        combinations=V[:, decision.passed].T.copy(),
-        information=(V * decision.information).dot(V.T) * length**2,
-        umbilic=umbilic,
-        problem_root=problem_root,
-        innovation=innovation,
-        distance=distance,
-        samples=samples,
-        method=method,
-        prior=prior,
-        notes=notes,
-        model_root=None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
-        evidence=evidence,
-        stiffness=stiffness,
-        contradicted=contradicted,
-    )
+    return {
+        "S": S,
+        "K": k,
+        "kappa": kappa,
+        "directions": local.dot(T[:3, :2].T),
+        "covariance": covariance,
+        "observed": observed,
+        "rank": decision.rank,
+        "combinations": V[:, decision.passed].T.copy(),
+        "information": (V * decision.information).dot(V.T) * length**2,
+        "umbilic": umbilic,
+        "model_root": None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
+    }
 
 
 def _principal(K: Floats) -> tuple[Floats, Floats]:
@@ -297,7 +267,7 @@ def partial_covariance(V: Floats, information: Floats, hidden: Floats) -> Floats
         information: (k,) information about each of them.
         hidden: (3,) whether an entry of K is hidden.
     """
-    C: Floats = (V / information) @ V.T / np.outer(TO_Q, TO_Q)
+    C: Floats = (V / information) @ V.T / TO_Q_SQUARED
     C[hidden] = C[:, hidden] = math.nan
     C[hidden, hidden] = math.inf
     return C
@@ -311,11 +281,9 @@ def _projector(t: Floats) -> Floats:
 
 
 def _observed_direction(decision: Decision) -> Floats:
-    """The tangent direction whose normal curvature the data know best.
-
-    With one unobserved combination it is the null direction of that combination; with two it is the main direction of
-    the observed one.
-    """
+    """The tangent direction whose normal curvature the data know best."""
+    # with one unobserved combination it is the null direction of that combination; with two it is the main direction of
+    # the observed one
     if decision.rank == 0:
         return np.array([1.0, 0.0])
     open_one = decision.rank == 2

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, working_frame
 from canprobe.mechanics.touch.estimate.observed import decide
-from canprobe.mechanics.touch.estimate.quadric import TO_Q, size_of
+from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, size_of
 from canprobe.mechanics.touch.linear_algebra import upper_root
 from canprobe.mechanics.types import Floats
 
@@ -95,7 +95,7 @@ def solve_pairs(touches: ContactBatch, data: Pairs, method: str) -> SurfaceEstim
     variance = float(touches.noise.normal_variance.mean()) + size**2 * vp
     k = variance * _propagated(data, inverse)[np.ix_(_K_OF_SIX, _K_OF_SIX)]
     flat = data.points[:, :2]
-    root_q = _root_of(k * np.outer(TO_Q, TO_Q), TO_Q[:, None] * Vt[rank:, _K_OF_SIX].T)
+    root_q = _root_of(k * TO_Q_SQUARED, TO_Q[:, None] * Vt[rank:, _K_OF_SIX].T)
     decision = decide(root_q, flat.T @ flat / (len(flat) * 2.0 * vp), size)
     return build_estimate(
         Solution(c, k, decision, has_prior=False),
@@ -121,10 +121,8 @@ def _propagated(data: Pairs, inverse: Floats) -> Floats:
 
 
 def _root_of(covariance: Floats, open_ways: Floats) -> Floats:
-    """A root (k, 3) of the inverse of a covariance that may vanish or be singular (then: nothing is known there).
-
-    Nothing is known along the columns of `open_ways` (3, m) either.
-    """
+    """A root (k, 3) of the inverse of a covariance that may vanish or be singular (then: nothing is known there)."""
+    # nothing is known along the columns of `open_ways` (3, m) either
     ways, sizes, _ = np.linalg.svd(open_ways)
     known = ways[:, np.count_nonzero(sizes > _MIN_OPEN_PART) :]
     values, vectors = np.linalg.eigh(known.T @ covariance @ known)

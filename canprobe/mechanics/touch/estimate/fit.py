@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,14 +13,13 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.chen1996 import Chen1996Estimator
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, lag_pairs, solve_pairs, usable_lag
+from canprobe.mechanics.touch.estimate.gate import Estimator
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, checked_arrays, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
-from canprobe.mechanics.touch.estimate.online import Estimator
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.recursive import RecursiveEstimator
-from canprobe.mechanics.touch.estimate.window import ChordEstimator, MlEstimator
+from canprobe.mechanics.touch.estimate.window import Chen1996Estimator, ChordEstimator, MlEstimator
 from canprobe.mechanics.touch.linear_algebra import whole
 
 METHODS = ("chen1996", "chord", "ml", "recursive")
@@ -54,29 +54,16 @@ def make_estimator(
     Raises:
         UsageError: the method is unknown, or a value is out of range.
     """
+    of_all: dict[str, Any] = {"sigma_point": sigma_point, "sigma_normal": sigma_normal, "window": window}
+    of_models: dict[str, Any] = {"prior": prior, "coupling": coupling, "correlation": correlation}
     if method == "recursive":
-        return RecursiveEstimator(
-            sigma_point=sigma_point,
-            sigma_normal=sigma_normal,
-            memory_m=memory_m,
-            window=window,
-            prior=prior,
-            correlation=correlation,
-            coupling=coupling,
-        )
+        return RecursiveEstimator(**of_all, **of_models, memory_m=memory_m)
     if method == "ml":
-        return MlEstimator(
-            sigma_point=sigma_point,
-            sigma_normal=sigma_normal,
-            window=window,
-            prior=prior,
-            coupling=coupling,
-            correlation=correlation,
-        )
+        return MlEstimator(**of_all, **of_models)
     if method == "chord":
-        return ChordEstimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
+        return ChordEstimator(**of_all)
     if method == "chen1996":
-        return Chen1996Estimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, lag=lag)
+        return Chen1996Estimator(**of_all, lag=lag)
     raise unknown_method(method)
 
 
@@ -190,11 +177,9 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
 
 
 def _memory_of(touches: ContactBatch) -> float:
-    """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow.
-
-    Why not always the whole path: the filter's unit of length, its steps and its prior are shares of the memory, and on
-    a long path over a small patch the steps would be larger than the patch.
-    """
+    """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow."""
+    # why not always the whole path: the filter's unit of length, its steps and its prior are shares of the memory, and
+    # on a long path over a small patch the steps would be larger than the patch
     off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
     square = float(np.square(turned).sum())
     radius = math.sqrt(float(np.square(off).sum()) / square) if square > 0.0 else math.inf  # exact on a sphere

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import foot
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
+from canprobe.mechanics.touch.estimate.gate import MeasuredContact, noise_of
+from canprobe.mechanics.touch.estimate.noise import Correlation, SlowErrors
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.omitted_terms import OmittedTerms
 from canprobe.mechanics.touch.estimate.prior import NUISANCE_SIGMA, Prior
@@ -28,45 +29,11 @@ from canprobe.mechanics.touch.tangent_frames import homogeneous, transported
 from canprobe.mechanics.types import Floats, Vec
 
 
-class MeasuredContact(NamedTuple):
-    """A contact as the filter takes it.
-
-    Attributes:
-        point: (3,) contact point in base, m.
-        normal: (3,) outward unit normal of the object there, in base.
-        sigma_point: standard deviation of the point along the surface, per axis, m.
-        sigma_height: standard deviation of the point along the normal, m.
-        sigma_normal: standard deviation of the normal per tangent axis, rad.
-        coupling: coupling of their errors (`Noise.coupling`), 1/m.
-        slow: share of its slow errors (`SlowErrors.share`).
-        way: way over the pad up to this contact, m.
-    """
-
-    point: Floats
-    normal: Floats
-    sigma_point: float
-    sigma_height: float
-    sigma_normal: float
-    coupling: float = 0.0
-    slow: float = 0.0
-    way: float = 0.0
-
-
-def slow_errors(touches: Sequence[MeasuredContact]) -> SlowErrors:
-    """Slow errors of contacts."""
-    share, way = np.array([(t.slow, t.way) for t in touches]).T
-    return SlowErrors(share, way)
-
-
 def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredContact]) -> Design:
     """The design (`residuals.design`) of contacts in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]).dot(R) / length
-    sigma_point, sigma_height, sigma_normal = np.array(
-        [(t.sigma_point, t.sigma_height, t.sigma_normal) for t in touches]
-    ).T
-    noise = Noise(sigma_point / length, sigma_normal, touches[0].coupling * length, sigma_height / length)
-    return design(points, np.array([t.normal for t in touches]).dot(R), noise)
+    return design(points, np.array([t.normal for t in touches]).dot(R), noise_of(touches).scaled(length, R))
 
 
 REANCHOR_TRAVEL_SHARE = 0.05
@@ -109,7 +76,7 @@ class InformationFilter:
         c: (9,) parameters (`quadric`).
         root: (9, 9) root of their information, which is `rootᵀ root`.
         inverse: (9, 9) inverse of `root`.
-        left_out: sums for the terms that a quadric leaves out, and for the covariance of the answer.
+        omitted: sums for the terms that a quadric leaves out, and for the covariance of the answer.
     """
 
     def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
@@ -117,7 +84,7 @@ class InformationFilter:
         self.root: Floats
         self.inverse: Floats
         self._prior_rows = _prior_rows(prior, length)
-        self.left_out = OmittedTerms(self._prior_rows.T @ self._prior_rows, correlation)
+        self.omitted = OmittedTerms(self._prior_rows.T @ self._prior_rows, correlation)
         self.begin(np.eye(4))
 
     def begin(self, T: Floats) -> None:
@@ -127,7 +94,7 @@ class InformationFilter:
         self._inflation = 1.0
         self._path = _Path()
         self.root, self.inverse = self._prior_rows, inverted_upper(self._prior_rows)
-        self.left_out.reset()
+        self.omitted.reset()
 
     def adopt(  # noqa: PLR0917 - what a batch solution is
         self,
@@ -155,7 +122,7 @@ class InformationFilter:
         self._path = _Path(travelled, travelled)
         self.root = upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)]))
         self.inverse = inverted_upper(self.root)
-        self.left_out.start(rows, residuals, travelled, slow)
+        self.omitted.start(rows, residuals, travelled, slow)
 
     def take(self, rows: Floats, residuals: Floats, moved: float, slow: SlowErrors | None = None) -> None:
         """Forget over a step of the path (m), then add weighted rows (n, 3, 18) and minus residuals (n, 3): one QR.
@@ -178,7 +145,7 @@ class InformationFilter:
         self.inverse = inverted_upper(self.root)
         step = self.inverse.dot(full[:9, 9])
         self.c = self.c + step
-        self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2, slow)
+        self.omitted.take(rows, residuals, step, moved, kept, share**2 - left**2, slow)
 
     def equations(self, touches: Sequence[MeasuredContact]) -> tuple[Floats, Floats]:
         """Whitened rows (n, 3, 18) and minus residuals (n, 3) of new contacts, as `take` wants them."""
@@ -214,7 +181,7 @@ class InformationFilter:
         self.c[:3] = 0.0
         back = inverted(M)
         self.root, self.inverse = self.root.dot(back), M.dot(self.inverse)
-        self.left_out.carry(back, x[0], x[1])
+        self.omitted.carry(back, x[0], x[1])
         R = self.T[:3, :3]
         self.T = homogeneous(R.dot(turned), self.T[:3, 3] + self.length * R.dot(x))
 

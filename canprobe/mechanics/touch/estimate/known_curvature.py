@@ -8,13 +8,10 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import CHI2_99
 from canprobe.mechanics.touch.estimate.observed import excited
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian
 from canprobe.mechanics.touch.linear_algebra import inverted, solved
 from canprobe.mechanics.types import Floats
-
-TO_Q_SQUARED = np.outer(TO_Q, TO_Q)
-"""A covariance of (K11, K12, K22) to that of q, entry by entry."""
 
 
 class CurvatureInformation(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +17,14 @@ from canprobe.mechanics.touch.estimate.answer import (
     build_estimate,
     partial_covariance,
 )
-from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.gate import MeasuredContact, noise_of, slow_errors
+from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import MENTIONED_PROBABILITY, correct, misfit_notes
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors, make_noise, mixed
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION, fit
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, parameters_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise
 from canprobe.mechanics.touch.linear_algebra import MAX_LENGTH, checked, instance, inverted, solved, upper_root
 from canprobe.mechanics.touch.surface import SurfaceMatrix
@@ -77,6 +79,12 @@ def make_touches(
     offset = points - points[-1]
     extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
     return ContactBatch(points, normals, noise, extent, _travelled(points), correlation, slow)
+
+
+def batch_of(touches: Sequence[MeasuredContact], correlation: Correlation | None) -> ContactBatch:
+    """A batch of contacts; the answer is at the last."""
+    points, normals = np.array([t.point for t in touches]), np.array([t.normal for t in touches])
+    return make_touches(points, normals, noise_of(touches), correlation, slow_errors(touches))
 
 
 def _travelled(points: Floats) -> float:

@@ -189,10 +189,8 @@ def correct(c: Floats, root: Floats, d: Design, independent: Floats | None, obse
 
 
 def _rows(c: Floats, d: Design, independent: Floats | None) -> tuple[Floats, Floats, Floats, Floats]:
-    """Whitened rows of the parameters (3n, 9) and of the terms (3n, 9), residuals (3n,), and what is left of Jᵀ r (9,).
-
-    Wrong samples count by the square of their weight: those that still pull at the fit would look like a misfit.
-    """
+    """Whitened rows of the parameters and of the terms (3n, 9), residuals (3n,), and what is left of Jᵀ r (9,)."""
+    # wrong samples count by the square of their weight: those that still pull at the fit would look like a misfit
     at = linearise(c, d)
     weight = robust(np.einsum("ij,ij->i", at.r, at.r))[0][:, None, None]
     joined = np.concatenate([at.jacobian(18), at.r[:, :, None]], axis=2)

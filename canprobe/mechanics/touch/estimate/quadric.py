@@ -15,6 +15,8 @@ from canprobe.mechanics.types import Floats
 
 TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
 """Factors from K11, K12, K22 to q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
+TO_Q_SQUARED = np.outer(TO_Q, TO_Q)
+"""A covariance of (K11, K12, K22) to that of q, entry by entry."""
 C_PER_Q = 0.5 / TO_Q
 """c11, c12, c22 per unit of q."""
 

@@ -19,18 +19,18 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
-from canprobe.mechanics.touch.estimate.information import InformationFilter, MeasuredContact, slow_errors
-from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength, slow_errors
+from canprobe.mechanics.touch.estimate.information import InformationFilter
+from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit
-from canprobe.mechanics.touch.estimate.online import Dropped, Gate, PadWay
+from canprobe.mechanics.touch.estimate.path_length import PathLength, Spread
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, size_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, size_of
 from canprobe.mechanics.touch.estimate.start import Start
-from canprobe.mechanics.touch.estimate.travel import Spread, Travel
 from canprobe.mechanics.touch.linear_algebra import instance, inverted, inverted_upper, lower_root, positive, upper_root
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
@@ -54,7 +54,7 @@ CHANGING_NOTE = "the surface may be changing: nothing is observed"
 
 
 class _Pending(NamedTuple):
-    """A contact that waits for the end of its step, and its weight by its place alone (`Travel`)."""
+    """A contact that waits for the end of its step, and its weight by its place alone (`PathLength`)."""
 
     touch: MeasuredContact
     weight: float
@@ -124,33 +124,23 @@ class RecursiveEstimator:
         self._gate.reset()
         self._last: MeasuredContact | None = None
         self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
-        self._travel = Travel(max(UPDATE_TRAVEL_SHARE * self._memory, 3.0 * self._gate.sigma_point))
-        self._pad = PadWay(self._gate.sigma_point)
+        self._path_length = PathLength(max(UPDATE_TRAVEL_SHARE * self._memory, 3.0 * self._gate.sigma_point))
+        self._pad = PadPathLength(self._gate.sigma_point)
         self._spread = Spread()
         self._change = ChangeTest()
         self._start: Start | None = Start(self._memory, self._prior)
-        self._settled = False
+        self._steady = False
         self._doubtful = 0.0
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        point, height, normal = self._gate.sigmas(sample)
-        slow, way = self._pad.step(sample, point)
-        touch = MeasuredContact(
-            sample.p_base,
-            sample.n_base,
-            sigma_point=point,
-            sigma_height=self._taller * height,
-            sigma_normal=normal,
-            coupling=self._coupling,
-            slow=slow,
-            way=way,
-        )
-        moved = self._travel.add(sample.p_base)
-        self._pending.append(_Pending(touch, self._travel.weight))
-        if self._last is None or self._travel.weight == 1.0:
+        touch = self._pad.measured(sample, self._gate, self._coupling)
+        touch = touch._replace(sigma_height=self._taller * touch.sigma_height)
+        moved = self._path_length.add(sample.p_base)
+        self._pending.append(_Pending(touch, self._path_length.weight))
+        if self._last is None or self._path_length.weight == 1.0:
             self._last = touch
         if moved > 0.0:
             self._step(moved)
@@ -168,12 +158,12 @@ class RecursiveEstimator:
         changing = self._change.changing
         decision = nothing_observed() if changing else decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
         # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
-        noise = state.inverse.T.dot(state.left_out.score.matrix[:9, :9]).dot(state.inverse)
+        noise = state.inverse.T.dot(state.omitted.score.matrix[:9, :9]).dot(state.inverse)
         believed = True
         if decision.rank > 0 and not self._quadric:
             observed = decision.turned(-a.turn).vectors[:, decision.passed]
             H = state.inverse.dot(state.inverse.T)
-            amended = state.left_out.amend(state.c, H, place, self._expected(), observed)
+            amended = state.omitted.amend(state.c, H, place, self._expected(), observed)
             notes += misfit_notes(amended.misfit, trusted=amended.trusted)
             believed = amended.trusted
             if believed:
@@ -196,7 +186,7 @@ class RecursiveEstimator:
             T_frame_contact=a.T_frame_contact,
             problem_root=state.root,
             innovation=self._change.innovation,
-            distance=min(self._travel.total, self._memory),
+            distance=min(self._path_length.total, self._memory),
             samples=self._spread.weight,
             method="recursive",
             prior=self._prior.name,
@@ -205,12 +195,10 @@ class RecursiveEstimator:
         )
 
     def _flat(self, a: Anchor) -> Floats:
-        """(2, 2) covariance of the samples in the tangent plane of an answer, over the variance of their noise.
-
-        It is 0 for a start that has not settled, so that nothing counts as observed.
-        """
+        """(2, 2) covariance of the samples in the tangent plane of an answer, over the variance of their noise."""
+        # it is 0 for a start that is not steady, so that nothing counts as observed
         P = a.T_frame_contact[:3, :2]
-        certain = float(self._settled) / self._gate.sigma_point**2
+        certain = float(self._steady) / self._gate.sigma_point**2
         flat: Floats = P.T.dot(self._spread.covariance * certain).dot(P)
         return flat
 
@@ -228,7 +216,7 @@ class RecursiveEstimator:
 
     def _step(self, moved: float) -> None:
         """Add the pending samples to the filter or its start; after a change of the surface, to a new start."""
-        compared = self._compared() if self._settled else None
+        compared = self._compared() if self._steady else None
         caution = self._caution if self._start is None else START_ALARM_SCALE * self._caution
         if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
             explained = self._explained(compared)
@@ -254,13 +242,11 @@ class RecursiveEstimator:
                     self._begin_again()
 
     def _begin_again(self) -> None:
-        """Forget the surface: it has changed, or the model has turned over.
-
-        On a straight path gradients that grow along it change neither the surface below it nor its normals. Where they
-        pass zero the quadric's other side is up, and its normal points the wrong way.
-        """
+        """Forget the surface: it has changed, or the model has turned over."""
+        # On a straight path gradients that grow along it change neither the surface below it nor its normals. Where
+        # they pass zero the quadric's other side is up, and its normal points the wrong way.
         self._spread.fade(0.0)
-        self._start, self._settled = Start(self._memory, self._prior), False
+        self._start, self._steady = Start(self._memory, self._prior), False
 
     def _compared(self) -> _Compared:
         rows, residuals = self._filter.equations([p.touch for p in self._pending])
@@ -271,15 +257,13 @@ class RecursiveEstimator:
         if self._quadric:
             return None
         f = self._filter
-        terms = f.left_out.explanation(f.c, f.inverse.dot(f.inverse.T), self._expected())
+        terms = f.omitted.explanation(f.c, f.inverse.dot(f.inverse.T), self._expected())
         left = self._judged(found.rows, found.residuals, found.residuals - found.rows @ terms)
         return left if self._change.usual_again(left.squares) else None
 
     def _judged(self, rows: Floats, residuals: Floats, unexplained: Floats) -> _Compared:
-        """Contacts weighted by their places and, beyond a limit of the squared innovation d², by `(limit / d²)²`.
-
-        The limit is the 99.9 % point of χ² times the running innovation: where all samples disagree, none is wrong.
-        """
+        """Contacts weighted by their places and, beyond a limit of the squared innovation d², by `(limit / d²)²`."""
+        # the limit is the 99.9 % point of χ² times the running innovation: where all samples disagree, none is wrong
         squares = self._filter.squared_innovations(rows, unexplained)
         limit = CHI2_999 * max(1.0, self._change.innovation)
         weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
@@ -289,31 +273,21 @@ class RecursiveEstimator:
         """Add a step (m) to the solution of the first stretch, and give the filter the solution so far."""
         wider = 1.0 / math.sqrt(self._weigh(moved, np.ones(len(self._pending))))
         touches = [p.touch for p in self._pending]
-        start.add(
-            [
-                t._replace(
-                    sigma_point=wider * t.sigma_point,
-                    sigma_height=wider * t.sigma_height,
-                    sigma_normal=wider * t.sigma_normal,
-                )
-                for t in touches
-            ],
-            moved,
-        )
-        self._settled = start.settled
+        start.add([touch.widened(wider) for touch in touches], moved)
+        self._steady = start.steady
         found = start.solution
         if found is None:
             self._filter.begin(homogeneous(tangent_rotation(-touches[-1].normal), touches[-1].point))
             return
-        c = found.target if start.settled else found.c
+        c = found.target if start.steady else found.c
         self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled, start.slow)
         self._doubtful = float(np.count_nonzero(found.weight < 1.0))
         if start.over:
-            self._start, self._settled = None, True
+            self._start, self._steady = None, True
 
     def _weigh(self, moved: float, weight: Floats) -> float:
         """Count a step (m) with the samples' weights (n,); returns the weight of each for their density, at most 1."""
-        thinned = min(1.0, self._full_density * moved / min(len(weight), self._travel.measured))
+        thinned = min(1.0, self._full_density * moved / min(len(weight), self._path_length.measured))
         kept = math.exp(-moved / self._memory)
         self._doubtful = kept * self._doubtful + np.count_nonzero(weight < 1.0)
         self._spread.fade(kept)

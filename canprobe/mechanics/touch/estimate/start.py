@@ -3,7 +3,7 @@
 A filter that begins linearised on a plane would be off by the tilt of a curved surface along the first stretch, and
 would keep that error. So the contacts of the first stretch are kept and solved together. The solution is never iterated
 to convergence: each call takes one step from the last answer on the data so far, which bounds the work of every call
-(the real-time iteration of model predictive control). By the end of the stretch it has settled.
+(the real-time iteration of model predictive control). By the end of the stretch it is steady.
 
 Source: Diehl, Bock and Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback
 control", 2005.
@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design, slow_errors
+from canprobe.mechanics.touch.estimate.gate import MeasuredContact, slow_errors
+from canprobe.mechanics.touch.estimate.information import batch_design
 from canprobe.mechanics.touch.estimate.noise import SlowErrors
 from canprobe.mechanics.touch.estimate.nonlinear import linear_start, robust, solve_rows
 from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD, Decision, spread_of
@@ -29,7 +30,7 @@ from canprobe.mechanics.types import Floats
 FIRST_SOLUTION_SHARE = 0.1
 """Travel, over the memory, at the first solution."""
 TAKEOVER_SHARE = 0.4
-"""Travel, over the memory, from which on the filter takes over once the solution has settled."""
+"""Travel, over the memory, from which on the filter takes over once the solution is steady."""
 LATEST_TAKEOVER_SHARE = 0.8
 """Travel, over the memory, at which it takes over even if the solution still moves."""
 MAX_CONTACTS = 128
@@ -38,8 +39,8 @@ _FRAME_CONTACTS = 5
 """Number of contacts whose median place and normal make the working frame: medians, as one may be wrong."""
 _STEP_SHARES = (1.0, 0.25)
 """Shares of a step that are tried, in this order."""
-SETTLED_STEP = 0.1
-"""Largest squared length of a step, in standard deviations, of an answer that has settled."""
+STEADY_STEP = 0.1
+"""Largest squared length of a step, in standard deviations, of a steady answer."""
 
 
 class Start:
@@ -49,7 +50,7 @@ class Start:
         T: (4, 4) working frame of the solution to base, m.
         solution: the solution so far; None before the first.
         slow: slow errors of the contacts of the solution.
-        settled: whether the last step was small, and all of K was observed or the stretch is over.
+        steady: whether the last step was small, and all of K was observed or the stretch is over.
         travelled: path so far, m.
     """
 
@@ -57,7 +58,7 @@ class Start:
         self.T = np.eye(4)
         self.solution: Solved | None = None
         self.slow: SlowErrors | None = None
-        self.settled = False
+        self.steady = False
         self.travelled = 0.0
         self._length = length
         self._prior = prior.rows(length)
@@ -68,7 +69,7 @@ class Start:
         """Whether the filter should take over."""
         share = self.travelled / self._length
         return self.solution is not None and (
-            share >= LATEST_TAKEOVER_SHARE or (share >= TAKEOVER_SHARE and self.settled)
+            share >= LATEST_TAKEOVER_SHARE or (share >= TAKEOVER_SHARE and self.steady)
         )
 
     def add(self, touches: Sequence[MeasuredContact], moved: float) -> None:
@@ -91,17 +92,17 @@ class Start:
         self._improve(d, share >= TAKEOVER_SHARE)
 
     def _improve(self, d: Design, stretch_over: bool) -> None:
-        """Take a step from the last solution or, until that has settled, from a linear one where that costs less."""
+        """Take a step from the last solution or, until that is steady, from a linear one where that costs less."""
         now = None if self.solution is None else solved_once(self.solution.target, d, self._prior)
-        if now is None or not self.settled:
+        if now is None or not self.steady:
             spread = spread_of(d.X, d.point_variance)
             plain = linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
             fresh = solved_once(plain, d, self._prior)
             now = fresh if now is None or fresh.cost < now.cost else now
         better = gauss_newton(now, d, self._prior)
         self.solution, self.slow = better, slow_errors(self._touches)
-        known = self.settled or better.decision.rank == 3 or stretch_over
-        self.settled = known and better.step < SETTLED_STEP
+        known = self.steady or better.decision.rank == 3 or stretch_over
+        self.steady = known and better.step < STEADY_STEP
 
 
 def isolation(points: Floats, variance: Floats) -> Floats:
@@ -179,6 +180,6 @@ def gauss_newton(now: Solved, d: Design, prior: tuple[Floats, Floats]) -> Solved
     """
     for share in _STEP_SHARES:
         there = solved_once(now.c + share * (now.target - now.c), d, prior)
-        if there.step <= max(now.step, SETTLED_STEP):
+        if there.step <= max(now.step, STEADY_STEP):
             return there
     return now

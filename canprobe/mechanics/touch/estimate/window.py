@@ -1,6 +1,6 @@
-"""Estimators over a window of the last samples: `ml`, and the linear one from differences, `chord`.
+"""Estimators over a window of the last samples: `ml`, and the linear ones from differences, `chord` and `chen1996`.
 
-The linear one, and `chen1996`, rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the
+The linear ones rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the
 surface: plane, sphere, circular cylinder. Elsewhere they keep a bias without any noise, and noise in the points, on
 both sides of the equation, draws them towards 0. They are baselines and are reported as they are.
 """
@@ -8,7 +8,6 @@ both sides of the equation, draws them towards 0. They are baselines and are rep
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,12 +15,13 @@ import numpy as np
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
-from canprobe.mechanics.touch.estimate.differences import chord_pairs, solve_pairs
-from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, fit_ml, make_touches
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
-from canprobe.mechanics.touch.estimate.online import Dropped, Gate, PadWay
+from canprobe.mechanics.touch.estimate.differences import Pairs, chord_pairs, solve_pairs, usable_lag
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength
+from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, batch_of, fit_ml, working_frame
+from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.linear_algebra import whole
+from canprobe.mechanics.touch.tangent_frames import rotation_vectors
 from canprobe.mechanics.types import Floats
 
 
@@ -54,20 +54,20 @@ class WindowEstimator:
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
-        self._rows: deque[Sequence[float]] = deque(maxlen=kept)
-        self._pad = PadWay(sigma_point)
+        self._kept: deque[tuple[ContactSample, MeasuredContact]] = deque(maxlen=kept)
+        self._pad = PadPathLength(sigma_point)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._gate.passes(sample, self.dropped):
-            self._rows.append(self._row(sample))
+            self._kept.append((sample, self._pad.measured(sample, self._gate, self._coupling)))
             self._answer = None
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""
-        if self._answer is None and len(self._rows) >= self.least:
-            touches = self._touches()
+        if self._answer is None and len(self._kept) >= self.least:
+            touches = self._batch()
             if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
                 answer = self._solve(touches)
                 self._answer = replace(answer, notes=answer.notes + self._gate.notes())
@@ -75,23 +75,15 @@ class WindowEstimator:
 
     def reset(self) -> None:
         """Forget all samples."""
-        self._rows.clear()
+        self._kept.clear()
         self._gate.reset()
         self._answer = None
 
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         raise NotImplementedError
 
-    def _row(self, sample: ContactSample) -> Sequence[float]:
-        """The row that is kept of a sample: point, normal, their noise; a subclass adds what it needs."""
-        sigmas = self._gate.sigmas(sample)
-        return (*sample.p_base.tolist(), *sample.n_base.tolist(), *sigmas, *self._pad.step(sample, sigmas[0]))
-
-    def _touches(self) -> ContactBatch:
-        rows = np.array(self._rows)
-        noise = Noise(rows[:, 6], rows[:, 8], self._coupling, height=rows[:, 7])
-        slow = SlowErrors(rows[:, 9], rows[:, 10])
-        return make_touches(rows[:, :3], rows[:, 3:6], noise, self._correlation, slow)
+    def _batch(self) -> ContactBatch:
+        return batch_of([touch for _, touch in self._kept], self._correlation)
 
 
 class MlEstimator(WindowEstimator):
@@ -108,8 +100,8 @@ class MlEstimator(WindowEstimator):
             return answer
         agree = np.flatnonzero(squares <= MAX_AGREEING_RESIDUAL * float(np.median(squares)))
         for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_SAMPLES)):
-            self._rows.popleft()
-        answer = fit_ml(self._touches(), self._prior)
+            self._kept.popleft()
+        answer = fit_ml(self._batch(), self._prior)
         return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))
 
 
@@ -131,3 +123,62 @@ class ChordEstimator(WindowEstimator):
 
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         return solve_pairs(touches, chord_pairs(touches), "chord")
+
+
+class Chen1996Estimator(WindowEstimator):
+    """The scheme of Chen, Rink and Zhang (1996), (24)–(35), with the rates of a robot and its pad.
+
+    From a stretch of contact, in the contact frame of its last sample: `x_i = −S y_i` (27) with `x_i = ω × n_f + S_f
+    v_f` (28), `y_i = V + v` (29), assembled to `A c = b` (30)–(34) with the boundary row. What is not in print:
+
+    - S in (27)–(28) means 2S (of both bodies): as printed, (28) drops the factor 2 on S' and κ would be wrong by it.
+    - All y_i4 are 0, so the columns of c14, c24, c34, c44 vanish: A has rank 7 at most, (35) is singular for every
+      motion. Its solution of least norm is that of the six unknowns that are left (`solve_pairs`), in the gauge
+      c14 = c24 = c44 = 0, c34 = −½.
+    - Rates are differences of samples `lag` apart.
+
+    Faults of the scheme that are reproduced: a bias of some percent where |∇f| is not constant, and noise in y that
+    draws κ towards 0.
+
+    Args:
+        sigma_point, sigma_normal, window: as for `WindowEstimator`.
+        lag: number of samples between the two of a difference. The paper has 1, with which the noise of the points is
+            larger than the motion.
+
+    Source: Chen, Rink and Zhang, "Local object shape from tactile sensing", section 4.1.2.
+    """
+
+    least = 3
+
+    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, lag: int = 10) -> None:
+        super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
+        self._lag = whole("lag", lag, 1, "sample")
+
+    def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
+        T, r = (np.array([getattr(s, name) for s, _ in self._kept]) for name in ("T_base_probe", "r_probe"))
+        lag = usable_lag(len(r), self._lag)
+        newer = np.arange(lag, len(r))
+        rates = paper_rates(T, r, touches.normals, lag)
+        x, y = np.array(rates) @ working_frame(touches)[:3, :3]
+        return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
+
+
+def paper_rates(T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int) -> tuple[Floats, Floats]:
+    """x (28) and y (29), each (n − lag, 3), times the time between samples `lag` apart; the object stands still.
+
+    `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, in base axes, all taken half-way between the samples; K_f = 1/|r_probe|.
+
+    Args:
+        T_base_probe: (n, 3 or 4, 4) poses of the probe, m.
+        r_probe: (n, 3) contact points in its frame, m.
+        n_base: (n, 3) outward unit normals of the object there.
+        lag: number of samples between the two of a difference.
+    """
+    R, r = T_base_probe[:, :3, :3], r_probe[:, :, None]
+    Ra, Rb, ra, rb = R[:-lag], R[lag:], r[:-lag], r[lag:]
+    n = 0.5 * (n_base[:-lag] + n_base[lag:])
+    turn = rotation_vectors(Rb @ Ra.transpose(0, 2, 1))
+    arm = (0.5 * (Ra @ ra + Rb @ rb))[:, :, 0]
+    slide = (0.5 * (Ra + Rb) @ (rb - ra))[:, :, 0]
+    V = T_base_probe[lag:, :3, 3] - T_base_probe[:-lag, :3, 3] + np.cross(turn, arm)
+    return slide / np.linalg.norm(rb, axis=1) - np.cross(turn, n), V + slide

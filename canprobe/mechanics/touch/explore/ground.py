@@ -142,11 +142,9 @@ class GroundCells:
         self.sigma[i] = min(math.sqrt(floor2 + variance), UNKNOWN_M)
 
     def _curvature_near(self, i: int) -> Floats:
-        """Curvature (3, 3) last observed in a cell, else in the nearest one with any, as a tensor in base, 1/m.
-
-        The depth of the layer and the scatter of the normals follow from it: about a plane, a probe on a ridge seems to
-        contradict every smooth surface.
-        """
+        """Curvature (3, 3) last observed in a cell, else in the nearest one with any, as a tensor in base, 1/m."""
+        # the depth of the layer and the scatter of the normals follow from it: about a plane, a probe on a ridge seems
+        # to contradict every smooth surface
         known = np.flatnonzero(np.isfinite(self._curvature[:, 0, 0]))
         if not len(known):
             return np.zeros((3, 3))

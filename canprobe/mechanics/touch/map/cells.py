@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, Slope
 from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD
+from canprobe.mechanics.touch.image.image_model import ImageModel
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs
 from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs, stiffness_error
@@ -32,7 +33,6 @@ from canprobe.mechanics.touch.map.stiffness import (
     log_of_images,
     log_of_slope,
 )
-from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.types import Floats
 
 ROBUST_CHI2 = 6.0

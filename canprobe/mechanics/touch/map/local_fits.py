@@ -72,11 +72,11 @@ class CommonErrors(NamedTuple):
     covariance: Floats
 
     @classmethod
-    def of(cls, told: Sequence[tuple[Floats, Floats]], sigma: Floats) -> CommonErrors:
+    def of(cls, parts: Sequence[tuple[Floats, Floats]], sigma: Floats) -> CommonErrors:
         """The errors by information (4, 4) and pull (4,) of parts of a map, with prior standard deviations (4,)."""
-        if not told:
+        if not parts:
             return cls(np.zeros(COMMON), np.zeros((COMMON, COMMON)))
-        information, pull = (sum(parts) for parts in zip(*told, strict=True))
+        information, pull = (sum(each) for each in zip(*parts, strict=True))
         covariance = np.linalg.inv(information + np.diag(sigma**-2.0))
         return cls(covariance @ pull, covariance)
 
@@ -164,8 +164,8 @@ def fit_discs(
         return of_part, _Posterior.of(G, b, fourth_of(K_ref[here] * LENGTH_M))
 
     sigma = np.array(noise.common)
-    told = [part(k)[1].about_common(discs.share[here]) for k, here in enumerate(parts)] if sigma.any() else []
-    common = CommonErrors.of(told, sigma)
+    known = [part(k)[1].about_common(discs.share[here]) for k, here in enumerate(parts)] if sigma.any() else []
+    common = CommonErrors.of(known, sigma)
     answers = [_answer(*part(k), weight[here], common, noise.used) for k, here in enumerate(parts)]
     *columns, chi2 = (np.concatenate(values) for values in zip(*answers, strict=True))
     return Quartics(*columns), common, chi2

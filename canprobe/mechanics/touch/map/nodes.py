@@ -1,7 +1,7 @@
 """Nodes: contacts averaged over a millimetre of path, in a hash grid.
 
-A node is the mean of the contacts along a millimetre of the way that the contact has really made (`Travel`: noise at
-rest makes no way). A node that falls into the voxel of an older one with the same facing is averaged with it: ground
+A node is the mean of the contacts along a millimetre of the way that the contact has really made (`PathLength`: noise
+at rest makes no way). A node that falls into the voxel of an older one with the same facing is averaged with it: ground
 that is scanned again adds weight and hardly any memory.
 
 The mean of points on an arc lies beside it, inside a convex body, by some µm over a millimetre: by half the mean of
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
-from canprobe.mechanics.touch.estimate.travel import Travel
+from canprobe.mechanics.touch.estimate.path_length import PathLength
+from canprobe.mechanics.touch.image.moments import PadMemory, overlapping
 from canprobe.mechanics.touch.map.noise import MapNoise
-from canprobe.mechanics.touch.patch.creep import PadMemory, overlapping
 from canprobe.mechanics.types import Floats
 
 NODE_M = 1e-3
@@ -28,8 +28,8 @@ BLOCK_M = 12e-3
 """Side of a block of nodes that are found together, m: the largest radius of a local fit."""
 JUMP_M = 2e-3
 """Distance from one contact to the next that is a new touch, m."""
-TRAVEL_STEPS_PER_SIGMA = 4.0
-"""Least step of `Travel`, in standard deviations of the point."""
+PATH_STEPS_PER_SIGMA = 4.0
+"""Least step of `PathLength`, in standard deviations of the point."""
 CENTRE, NORMAL, X_PAD, Y_PAD, Z_PAD, HEADING = (slice(3 * i, 3 * i + 3) for i in range(6))
 ROOT_FORCE, LATERAL2, HEIGHT2, NORMAL2, PATCH = range(18, 23)
 COUNT, PATH = 23, 24
@@ -42,7 +42,7 @@ _MEANS = slice(0, COUNT)
 
 def step_of(sigma_point: float) -> float:
     """Least step of the path of contacts with a standard deviation (m), m."""
-    return min(TRAVEL_STEPS_PER_SIGMA * sigma_point, 0.5 * NODE_M)
+    return min(PATH_STEPS_PER_SIGMA * sigma_point, 0.5 * NODE_M)
 
 
 class NodeGrid:
@@ -60,7 +60,7 @@ class NodeGrid:
         self._size = 0
         self._numbers: dict[tuple[int, ...], int] = {}
         self._blocks: dict[tuple[int, ...], list[int]] = {}
-        self._travel = Travel(self._step)
+        self._path_length = PathLength(self._step)
         self._open = np.zeros(COLUMNS)
         self._along_normals = 0.0  # sum of p·n of the open node, m
         self._begun = self._first = self._last = np.zeros(3)
@@ -78,13 +78,13 @@ class NodeGrid:
             if not fresh and math.dist(place, self._last.tolist()) > JUMP_M:
                 self._take(rows[begin:i])
                 self._close()
-                self._travel, self._begun_at = Travel(self._step), 0.0
+                self._path_length, self._begun_at = PathLength(self._step), 0.0
                 begin, fresh = i, True
             if fresh:
                 self._first = point
             self._last = point
-            self._travel.add(point)
-            if self._travel.total - self._begun_at >= NODE_M:
+            self._path_length.add(point)
+            if self._path_length.total - self._begun_at >= NODE_M:
                 self._take(rows[begin : i + 1])
                 self._close()
                 begin = i + 1
@@ -124,13 +124,13 @@ class NodeGrid:
         else:
             self._append(row)
         self._open, self._along_normals = np.zeros(COLUMNS), 0.0
-        self._begun_at = self._travel.total
+        self._begun_at = self._path_length.total
 
     def _finished(self) -> Floats:
         """The open node as a mean."""
         count = self._open[COUNT]
         row: Floats = self._open / count
-        row[COUNT], row[PATH] = count, max(self._travel.total - self._begun_at, NODE_M)
+        row[COUNT], row[PATH] = count, max(self._path_length.total - self._begun_at, NODE_M)
         self._lift(row, self._along_normals / count - float(self.points_of(row) @ row[NORMAL]))
         way = self._last - self._first
         row[HEADING] = way / max(float(np.linalg.norm(way)), 0.5 * NODE_M)

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.contact import Slope
+from canprobe.mechanics.touch.image.image_model import ImageModel
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
-from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.types import Floats
 
 SOURCE_SIGMA = 0.031

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, ContactSample, at_depth, indentation_from_force
+from canprobe.mechanics.touch.image.image_model import ImageModel
 from canprobe.mechanics.touch.linear_algebra import checked, positive, real
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.cells import Cells, LayerEvidence, solve_cells
@@ -28,7 +29,6 @@ from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, heights_and_slopes, terms
 from canprobe.mechanics.touch.map.stiffness import Stiffness
 from canprobe.mechanics.touch.meshing import CELL_M, Feet, Mesh, mesh_of
-from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
-from canprobe.mechanics.touch.estimate.noise import Correlation
+from canprobe.mechanics.touch import ContactSample, Correlation, fit_surface, make_estimator
 
 RADIUS, PROBE = 0.05, 0.04
 POINT, HEIGHT, NORMAL = 40e-6, 10e-6, 0.5e-3

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
-from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.noise import Correlation
-from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch import (
+    Correlation,
+    Prior,
+    SurfaceEstimate,
+    SurfaceMatrix,
+    cramer_rao,
+    fit_surface,
+    make_estimator,
+)
 
 TINY = {"sigma_point": 1e-9, "sigma_normal": 1e-9}
 WEIGHT = np.array([1.0, 2.0, 1.0])
@@ -44,49 +47,39 @@ def test_ml_is_exact_on_any_quadric(name, truth):
     assert np.allclose(estimate.normal, path.normals[-1], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "kappa"),
-    [
-        ("plane", (0, 0)),
-        ("sphere", (20, 20)),
-        ("cylinder", (1 / 0.036, 0)),
-        ("saddle", (20, -15)),
-        ("bowl", (-12.5,) * 2),
-    ],
-)
-def test_signs_and_order_of_principal_curvatures(name, kappa, truth):
-    path = truth.path(name, T=truth.any_pose(6))
-    p, n = path.noisy(2e-5, 1e-3, 1)
-    estimate = fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3)
-    assert estimate.kappa == pytest.approx(kappa, abs=1.5)
-    assert estimate.kappa[0] >= estimate.kappa[1]
-    assert estimate.umbilic == (name in ("plane", "sphere", "bowl"))
-    for k, d in zip(estimate.kappa, estimate.directions, strict=True):
-        assert d @ estimate.curvature_tensor_base() @ d == pytest.approx(k)
-        assert abs(d @ estimate.normal) < 1e-12
-
-
-# The table of the method comparison: ml against the bound.
+# The table of the method comparison: against the bound, RMS error and runs of 40 (16) that a 95 % region may miss.
+@pytest.mark.parametrize(("method", "seeds", "largest", "missed"), [("ml", 40, 1.25, 7), ("recursive", 16, 1.4, 3)])
 @pytest.mark.parametrize(("sigma_point", "sigma_normal"), [(2e-5, 1e-3), (5e-5, 3e-3)])
-@pytest.mark.parametrize("name", ["cylinder", "sphere", "ellipsoid", "hyperboloid", "saddle"])
-def test_ml_reaches_the_bound_and_covers(name, sigma_point, sigma_normal, truth):
+@pytest.mark.parametrize("name", ["plane", "cylinder", "sphere", "ellipsoid", "hyperboloid", "saddle"])
+def test_it_reaches_the_bound_and_covers(  # noqa: PLR0917
+    name, sigma_point, sigma_normal, method, seeds, largest, missed, truth
+):
     path = truth.path(name)
     noise = {"sigma_point": sigma_point, "sigma_normal": sigma_normal}
     bound = math.sqrt(float(WEIGHT @ np.diag(cramer_rao(path.points, path.normals, path.surface, **noise))))
     errors, inside, innovation = [], 0, []
-    for seed in range(40):
-        estimate = fit_surface(*path.noisy(sigma_point, sigma_normal, seed), **noise)
+    for seed in range(seeds):
+        points, normals = path.noisy(sigma_point, sigma_normal, seed)
+        if method == "ml":
+            estimate = fit_surface(points, normals, **noise)
+        else:
+            estimator = make_estimator(method, **noise)
+            for sample in truth.samples(points, normals):
+                estimator.add(sample)
+            estimate = estimator.estimate()
+        assert estimate.observed.all()
         error = path.error(estimate)
         errors.append(error)
         innovation.append(estimate.innovation)
         inside += error @ np.linalg.solve(estimate.covariance, error) < 7.815
     rms = math.sqrt(np.mean([frobenius(e) ** 2 for e in errors]))
-    assert 0.6 * bound < rms < 1.25 * bound
-    assert frobenius(np.mean(errors, axis=0)) < 0.5 * bound  # 40 runs leave 0.16 by chance
-    assert inside >= 33
-    assert np.mean(innovation) == pytest.approx(1.0, abs=0.06)
-    relative = bound / np.linalg.norm(path.surface.curvature_at(path.points[-1])[0])
-    assert relative < 0.05
+    assert 0.55 * bound < rms < largest * bound
+    assert inside >= seeds - missed
+    if method == "ml":
+        assert frobenius(np.mean(errors, axis=0)) < 0.5 * bound  # 40 runs leave 0.16 by chance
+        assert np.mean(innovation) == pytest.approx(1.0, abs=0.06)
+        K = path.surface.curvature_at(path.points[-1])[0]
+        assert bound < 0.05 * np.linalg.norm(K) or name == "plane"
 
 
 def test_tight_curvature_needs_the_points_noise_in_the_normals(truth):
@@ -139,17 +132,6 @@ class TestUnobserved:
             assert np.isnan(e.K[1, 1]) or angle == 0.5 * math.pi
             assert np.isinf(np.diag(e.covariance)).any()
             assert np.isfinite(e.S).all()
-
-    @pytest.mark.parametrize("noise", NOISE)
-    def test_standing_still_and_pure_spin_say_nothing(self, noise, truth):
-        path = truth.placed(truth.surface("cylinder"), np.zeros(160), np.zeros(160))
-        for seed in range(10):
-            e = fit_surface(*path.noisy(*noise, seed), sigma_point=noise[0], sigma_normal=noise[1])
-            assert e.rank == 0
-            assert not e.observed.any()
-            assert np.isnan(e.kappa).all()
-            assert np.isnan(e.K).all()
-            assert np.isinf(np.diag(e.covariance)).all()
 
     def test_a_prior_on_curvature_fills_in_but_is_named_and_not_called_observed(self, truth):
         path = truth.straight("cylinder")
@@ -210,27 +192,6 @@ def test_recursive_refuses_only_what_does_not_move(truth):
         fit_surface(*rest.noisy(2e-5, 1e-3, 0), sigma_point=2e-5, sigma_normal=1e-3, method="recursive")
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("unit", [1e3, 1e-3, 39.37])
-def test_the_unit_of_length_does_not_matter(method, unit, truth):
-    path = truth.path("ellipsoid")
-    p, n = path.noisy(2e-5, 1e-3, 2)
-    one = fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3, method=method)
-    other = fit_surface(p * unit, n, sigma_point=2e-5 * unit, sigma_normal=1e-3, method=method)
-    assert np.allclose(other.K * unit, one.K, rtol=1e-6, atol=1e-6 * np.abs(one.K).max())
-    assert np.allclose(other.covariance * unit**2, one.covariance, rtol=1e-5, atol=1e-9)
-    assert other.condition_number == pytest.approx(one.condition_number, rel=1e-5)
-
-
-@pytest.mark.parametrize("radius", [1e-3, 1.0, 100.0])
-def test_radius_from_a_millimetre_to_a_hundred_metres(radius, truth):
-    path = truth.path("sphere", size=20 * radius if radius < 0.01 else 1.0)
-    scale = radius / 0.05
-    p, n = path.points * scale, path.normals
-    e = fit_surface(p, n, sigma_point=1e-6 * radius, sigma_normal=1e-5)
-    assert e.kappa * radius == pytest.approx([1, 1], rel=1e-2)
-
-
 def test_the_answer_turns_with_the_frame(truth):
     path = truth.path("ellipsoid")
     p, n = path.noisy(2e-5, 1e-3, 3)
@@ -261,18 +222,6 @@ def test_noise_per_sample_and_as_covariance(truth):
     p[:40] += np.random.default_rng(0).normal(size=(40, 3)) * 1e-3
     weighted = fit_surface(p, n, sigma_point=bad, sigma_normal=1e-3)
     assert frobenius(path.error(weighted)) < 2.0
-
-
-def test_outliers_have_bounded_influence(truth):
-    path = truth.path("cylinder")
-    p, n = path.noisy(2e-5, 1e-3, 5)
-    clean = frobenius(path.error(fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3)))
-    rng = np.random.default_rng(6)
-    wrong = rng.choice(150, 8, replace=False)
-    p[wrong] += rng.normal(size=(8, 3)) * 2e-3
-    e = fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3)
-    assert frobenius(path.error(e)) < clean + 1.0
-    assert any("reduced weight" in note for note in e.notes)
 
 
 def test_prediction_follows_the_surface(truth):

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from canprobe.mechanics.touch import Correlation, Prior
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
+from canprobe.mechanics.touch.estimate.noise import Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, OmittedTerms
-from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
 from canprobe.mechanics.touch.estimate.sandwich import Score
 from canprobe.mechanics.touch.estimate.start import solved_once
@@ -46,7 +46,7 @@ def test_the_prior_counts_as_the_samples_of_its_path_do(path, travelled):
     started = travelled * np.exp(-path / MEMORY)
     weight, square = started + STEP * weights.sum(), started * np.exp(-path / MEMORY) + STEP * (weights @ weights)
     assert information(f) == pytest.approx(square / weight * prior(), abs=TINY)
-    assert f.left_out.score.matrix[:9, :9] == pytest.approx((square / weight) ** 2 * prior(), abs=TINY)
+    assert f.omitted.score.matrix[:9, :9] == pytest.approx((square / weight) ** 2 * prior(), abs=TINY)
 
 
 def test_after_a_long_path_it_counts_by_half():
@@ -68,7 +68,7 @@ def test_no_other_prior_leaves_less_error_on_surfaces_as_it_says(path):
 
     share = (weights @ weights) / weights.sum()
     assert information(f) == pytest.approx(A + share * P, abs=TINY)
-    assert f.left_out.score.matrix[:9, :9] == pytest.approx(B + share**2 * P, abs=TINY)
+    assert f.omitted.score.matrix[:9, :9] == pytest.approx(B + share**2 * P, abs=TINY)
     least = expected_error(np.linalg.inv(information(f)), share)
     for other in (0.25, 0.9 * share, 1.1 * share, 1.5):
         assert expected_error(np.linalg.inv(A + other * P), other) > least
@@ -144,13 +144,13 @@ def test_sums_are_carried_along_as_if_they_were_taken_in_the_last_frame():
     assert np.linalg.norm(state.T[:3, 3] - points[-1]) < 1.5e-3  # the frame has come along
     whole = at(state.T, slice(None), state.c)
     flat = whole.rows.reshape(-1, 18)
-    wanted, found = flat.T @ flat, state.left_out._information
+    wanted, found = flat.T @ flat, state.omitted._information
     size = np.sqrt(np.diag(wanted))
     # what tilts is taken for level: over 0.22 rad here, cos⁴ of which is 0.91
     assert np.abs((found - wanted) / np.outer(size, size)).max() < 0.09
     slope = flat[:, 9:].T @ -whole.r.reshape(-1)
-    assert np.abs((state.left_out._slope - slope) / size[9:]).max() < 0.5  # standard deviations
-    score = state.left_out.score.matrix[9:, 9:]
+    assert np.abs((state.omitted._slope - slope) / size[9:]).max() < 0.5  # standard deviations
+    score = state.omitted.score.matrix[9:, 9:]
     assert np.abs((score - wanted[9:, 9:]) / np.outer(size[9:], size[9:])).max() < 0.09
 
 

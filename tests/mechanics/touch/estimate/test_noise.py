@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.estimate.fit import fit_surface
-from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.noise import Correlation
-from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch import Correlation, Prior, cramer_rao, fit_surface
 
 SIGMA = {"sigma_point": 5e-5, "sigma_normal": 3e-3}
 LENGTH, SHARE, STEP = 1.5e-3, 0.9, 0.125e-3

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from canprobe.mechanics.touch import fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate import residuals
-from canprobe.mechanics.touch.estimate.chen1996 import paper_rates
 from canprobe.mechanics.touch.estimate.differences import three_rows
-from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import fit_ml, make_touches, working_frame
 from canprobe.mechanics.touch.estimate.noise import make_noise
+from canprobe.mechanics.touch.estimate.window import paper_rates
 
 R = 0.036
 SIX = [0, 1, 2, 4, 5, 7]

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, Prior, make_estimator
 from canprobe.mechanics.touch.estimate import start as first_stretch
-from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
+from canprobe.mechanics.touch.estimate.gate import MeasuredContact
+from canprobe.mechanics.touch.estimate.information import batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
-from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.start import MAX_CONTACTS, TAKEOVER_SHARE, Start, isolation
 
 MEMORY, SIGMA = 0.02, (2e-5, 1e-3)
@@ -36,7 +35,7 @@ def test_it_has_settled_where_the_full_iteration_ends(name, truth):
         found = touches(truth, name, seed)
         start = stepwise(found)
         assert start.over
-        assert start.settled
+        assert start.steady
         full = fit(batch_design(start.T, MEMORY, found), PRIOR.rows(MEMORY))
         assert full.converged
         off = full.root @ (start.solution.target - full.c)
@@ -54,7 +53,7 @@ def test_wrong_places_do_not_lead_it_astray(truth):
             found[i] = found[i]._replace(point=found[i].point + 5e-3 * rng.normal(size=3))
         clean = [t for i, t in enumerate(found) if i not in wrong]
         start = stepwise(found)
-        assert start.settled
+        assert start.steady
         assert np.count_nonzero(start.solution.weight < 0.1) == 6
         without = fit(batch_design(start.T, MEMORY, clean), PRIOR.rows(MEMORY))
         off = without.root @ (start.solution.target - without.c)

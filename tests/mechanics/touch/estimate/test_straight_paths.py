@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from canprobe.mechanics.touch.estimate.fit import fit_surface
-from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch import Prior, fit_surface
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
 TO_Q = np.array([1.0, np.sqrt(2.0), 1.0])

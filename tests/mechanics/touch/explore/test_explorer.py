@@ -5,14 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap
 from canprobe.mechanics.touch.explore.explorer import Explorer
 from canprobe.mechanics.touch.explore.ground import GroundCells
 from canprobe.mechanics.touch.explore.spacing import LaneForecast
-from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.nodes import COLUMNS
-from canprobe.mechanics.touch.map.noise import PAD_NOISE
 from canprobe.mechanics.touch.map.stiffness import Stiffness
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.strategies import Rectangle
 
 PAD = PadLayer(0.04, 1.27e8)

@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap
 from canprobe.mechanics.touch.explore.spacing import DISTANCES_M, MAX_MARGIN_M, LaneForecast
-from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.nodes import COLUMNS
-from canprobe.mechanics.touch.map.noise import PAD_NOISE
 from canprobe.mechanics.touch.map.quartic import USUAL_CHANGE
 from canprobe.mechanics.touch.map.stiffness import Stiffness
-from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
+from canprobe.mechanics.touch.map.surface_map import REACH_M
 
 PAD, DEPTH = PadLayer(0.04, 1.27e8), 0.43e-3
 FORECAST = LaneForecast(PAD.radius, DEPTH, PAD_NOISE)

@@ -7,16 +7,21 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.contact import ContactSample, Slope, indentation_from_force
+from canprobe.mechanics.touch import (
+    PAD_NOISE,
+    ContactSample,
+    ImageModel,
+    MapNoise,
+    PadLayer,
+    Slope,
+    SurfaceMap,
+    fit_map,
+    indentation_from_force,
+)
+from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.map import discs, local_fits, nodes, surface_map
-from canprobe.mechanics.touch.map.fit import fit_map
-from canprobe.mechanics.touch.map.local_fits import PadLayer
-from canprobe.mechanics.touch.map.noise import PAD_NOISE, MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND_DERIVATIVES, fourth_of, heights_and_slopes, terms
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
-from canprobe.mechanics.touch.patch.image_model import ImageModel
 
 SIGMA_POINT, SIGMA_NORMAL = 30e-6, 1e-3
 LINE = np.arange(-100, 100) * 0.125e-3
@@ -288,30 +293,28 @@ def pad_samples(radius, stiffness, true_stiffness, model):
         )
 
 
-@pytest.mark.parametrize("true_share", [0.7, 1.0, 1.4])
-def test_the_scan_shows_the_stiffness_of_its_layer(true_share):
+def of_scan(seen, true_share=1.0, larger=1.0):
+    """The map of a scan on a layer whose stiffness is a share of the stated one, and the model of its images."""
     radius = 0.04
     parameters = ImageParameters(stiffness=1.24e8, scale=1.0, blur=1.5e-3, crosstalk=0.0, memory=0.0)
     errors = MomentErrors(moment=1e-3, both=5e-4, shear=1e-3, frame_sigma=0.01)
-    model = ImageModel(parameters, radius, 1.6e-3, level=1e3, count=500.0, side=16, seen=16, errors=errors)
+    model = ImageModel(parameters, radius, 1.6e-3, level=1e3, count=500.0, side=16, seen=seen, errors=errors)
     found = SurfaceMap(PadLayer(radius, model.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
-    found.add_samples(list(pad_samples(radius, model.stiffness, true_share * model.stiffness, model)))
+    samples = pad_samples(radius, model.stiffness, true_share * model.stiffness, model)
+    found.add_samples([replace(s, moments=tuple(larger * moment for moment in s.moments)) for s in samples])
+    return found, model
+
+
+@pytest.mark.parametrize("true_share", [0.7, 1.0, 1.4])
+def test_the_scan_shows_the_stiffness_of_its_layer(true_share):
+    found, model = of_scan(16, true_share)
     at = on_sphere(PLACES, 0.05)[0]
     assert np.abs(found.distance(at)[0]).max() < 5e-6
     assert found.stiffness.value == pytest.approx(true_share * model.stiffness, rel=0.02)
 
 
 def test_images_of_a_patch_that_does_not_fit_into_the_window_say_nothing_of_the_stiffness():
-    radius = 0.04
-    parameters = ImageParameters(stiffness=1.24e8, scale=1.0, blur=1.5e-3, crosstalk=0.0, memory=0.0)
-    errors = MomentErrors(moment=1e-3, both=5e-4, shear=1e-3, frame_sigma=0.01)
-    model = ImageModel(parameters, radius, 1.6e-3, level=1e3, count=500.0, side=16, seen=4, errors=errors)
-    found = SurfaceMap(PadLayer(radius, model.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
-    larger = (
-        replace(sample, moments=tuple(1.1 * moment for moment in sample.moments))
-        for sample in pad_samples(radius, model.stiffness, model.stiffness, model)
-    )
-    found.add_samples(list(larger))
+    found, model = of_scan(4, larger=1.1)
     assert found.stiffness.value == pytest.approx(model.stiffness, rel=0.02)
     assert found.stiffness.sigma == SOURCE_SIGMA
 

@@ -1,0 +1,302 @@
+"""Calibrate an array by touches of a plane and a ball that were rolled to and fro; a rod verifies.
+
+`parameter_fit` finds the parameters of the image model, `pad_fit` the errors of centroids, `taxel_gains` the gains of
+taxels, and `push_fit` the stiffness by the arm's way into the object. Errors are held out: each fifth of the touches
+is predicted by a fit to the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.array_calibration.pad_fit import fit_noise
+from canprobe.mechanics.touch.array_calibration.parameter_fit import (
+    ParameterFit,
+    curvature_errors,
+    fit_parameters,
+    moment_errors,
+    taxel_gains,
+)
+from canprobe.mechanics.touch.array_calibration.push_fit import fit_force, stiffness_by_depth
+from canprobe.mechanics.touch.array_calibration.touches import (
+    LAST_IMAGE_S,
+    NO_ERRORS,
+    Dwell,
+    Shown,
+    Touches,
+    what_is_shown,
+)
+from canprobe.mechanics.touch.contact import indentation_from_force
+from canprobe.mechanics.touch.image.calibration import (
+    ArrayCalibration,
+    CentroidDelays,
+    ContactNoise,
+    ForceReference,
+    ImageParameters,
+    Lag,
+    MomentErrors,
+    Residuals,
+    StiffnessSources,
+)
+from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, USUAL_LIGHTNESS
+from canprobe.mechanics.touch.image.image_model import MOMENT_ERROR_POWER, make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.image.patch import PatchCalibration
+from canprobe.mechanics.touch.linear_algebra import rms
+from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.types import Floats
+
+FORM_SIGMA = 0.01
+"""Relative error of a moment on cylinders and saddles by the form of the model, which planes and balls do not show."""
+FOLDS = 5
+"""Number of parts of the touches, each of which is held out once."""
+MIN_TOUCHES = 10
+"""Least number of touches of plane and ball."""
+MAX_ERROR_LEFT_SHARE = 0.9
+"""Largest error of moments with gains of the taxels, over the error without, at which the gains are used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayFit:
+    """A calibration, with the data for its report.
+
+    Attributes:
+        calibration: the result.
+        dwells, shown: the touches that were used.
+        forces: (n,) their forces by the calibration, N.
+        errors: (n, 3) relative errors of moments of each touch by a fit that has not seen it.
+        curvature_errors: (n, 2) errors of curvatures by that fit, relative to (κ + 1/R_p).
+        scatter: (n,) scatter of the centroids of each touch, m.
+        left_out: number of touches that saturated or ran off the pad.
+        gains: (16, 16) gains of the taxels.
+        gained, plain: relative RMS error of moments with these gains, and without.
+        offset, object_offset: (2,) offset of centroids that turns with the probe, and offset that stays with the
+            object, m; NaN without turned touches.
+    """
+
+    calibration: ArrayCalibration
+    dwells: Sequence[Dwell]
+    shown: Sequence[Shown]
+    forces: Floats
+    errors: Floats
+    curvature_errors: Floats
+    scatter: Floats
+    left_out: int
+    gains: Floats
+    gained: float
+    plain: float
+    offset: Floats
+    object_offset: Floats
+
+
+def calibrate_array(
+    dwells: Sequence[Dwell],
+    *,
+    pad: Pad,
+    reference: ForceReference,
+    reference_sigma: float,
+    array: str,
+    date: str,
+    made_on: str,
+    own_gains: bool = True,
+    spread: float = MAKE_SPREAD,
+) -> ArrayFit:
+    """Calibrate an array by touches of known objects.
+
+    Args:
+        dwells: touches of plane and ball, at more than one force and place; those of a rod only verify.
+        pad: taxels of the array, and the stated pressure of a full count.
+        reference: reference of newtons. "scale" and "weights" need touches with a force; "unit" relies on the stated
+            full scale.
+        reference_sigma: relative standard deviation of the reference.
+        array, date, made_on: entries of the file.
+        own_gains: whether taxel gains are used where they help; False where the file is for all arrays of a make.
+        spread: relative standard deviation of the force between the arrays of a make; not that of one array.
+
+    Raises:
+        UsageError: there are too few touches, or none has a force where the reference is one.
+    """
+    by_force = reference in ("scale", "weights")
+    dwells = dwells if by_force else [replace(d, force=None) for d in dwells]
+    plain = PatchCalibration(pad)
+    every = [(d, what_is_shown(d, plain, LAST_IMAGE_S)) for d in dwells]
+    used = {id(d) for d, s in every if s.usable}
+    count = sum(s.usable and d.name != "rod" for d, s in every)
+    if count < MIN_TOUCHES or len({d.name for d, s in every if s.usable and d.name != "rod"}) < 2:
+        raise UsageError(
+            f"expected at least {MIN_TOUCHES} touches of a plane and a ball that neither saturate nor leave the pad,"
+            f" got {count}"
+        )
+    if by_force and not any(d.force is not None and id(d) in used for d in dwells):
+        raise UsageError(f'force reference "{reference}": expected touches with a known force, got none')
+    scale_sigma = None if by_force else max(reference_sigma, 1e-4) if reference == "unit" else 1e-4
+    seen = max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
+    blank = _blank(array, date, made_on, reference, reference_sigma, pad.full_scale_pa)
+
+    def fit(touches: Touches, own: PatchCalibration) -> tuple[ArrayCalibration, ParameterFit]:
+        sigma = reference_sigma if by_force else 1.0
+        found = fit_parameters(touches, own, scale_sigma, sigma, seen)
+        crept = [s.crept for d, s in touches if d.force is not None]
+        scale = found.parameters.scale * (float(np.mean(crept)) if crept else 1.0)
+        return replace(blank, image=replace(found.parameters, scale=scale), gains=own.gains), found
+
+    good = [(d, s) for d, s in every if s.usable]
+    fitted = [(d, s) for d, s in good if d.name != "rod"]
+    first, found = fit(fitted, plain)
+    gained, alike = _by_gains(fitted, first, plain, seen)
+    gains, dead = _gains(fitted, first, plain)
+    own = plain
+    if own_gains and gained < MAX_ERROR_LEFT_SHARE * alike:
+        own = replace(plain, gains=tuple(tuple(row) for row in np.round(gains, 4).tolist()))
+        good = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in good]
+        fitted = [(d, s) for d, s in good if d.name != "rod"]
+        first, found = fit(fitted, own)
+    errors, curvatures, force_errors = _held_out(fitted, lambda touches: fit(touches, own)[0], own, seen)
+    stiffness = found.parameters.stiffness
+    by_images = stiffness, stiffness * math.sqrt(float(found.covariance[0, 0]))
+    by_depth = stiffness_by_depth(fitted, found.forces.tolist(), pad.radius_m, by_images)
+    rods = [(d, s) for d, s in good if d.name == "rod"]
+    across = rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
+    patch = make_patch_calibration(first, pad)
+    depths = [_depths(d, s, patch, stiffness) for d, s in fitted]
+    noise, centroid, scatter = fit_noise(fitted, depths)
+    spread = 0.0 if own_gains else spread
+    calibration = replace(
+        first,
+        force=fit_force(fitted, patch, stiffness, force_errors, spread),
+        moments=_moment_errors(errors, [s for _, s in fitted]),
+        noise=noise,
+        centroid=centroid,
+        stiffness=StiffnessSources(*by_images, *by_depth),
+        residuals=Residuals(len(fitted), rms(force_errors), rms(errors[:, :2]), rms(curvatures), across),
+        dead=dead if own_gains else (),
+    )
+    offset, of_object = _offsets(good)
+    forces = np.array([_force(patch, s) for _, s in fitted])
+    return ArrayFit(
+        calibration=calibration,
+        dwells=[d for d, _ in fitted],
+        shown=[s for _, s in fitted],
+        forces=forces,
+        errors=errors,
+        curvature_errors=curvatures,
+        scatter=scatter,
+        left_out=len(every) - len(good),
+        gains=gains,
+        gained=gained,
+        plain=alike,
+        offset=offset,
+        object_offset=of_object,
+    )
+
+
+def _blank(  # noqa: PLR0917
+    array: str, date: str, made_on: str, reference: ForceReference, sigma: float, full_scale: float
+) -> ArrayCalibration:
+    nan = math.nan
+    return ArrayCalibration(
+        array,
+        date,
+        made_on,
+        reference,
+        nan if reference == "none" else sigma,
+        full_scale,
+        ImageParameters(1.0, 1.0, 1.0, 0.0, 0.0),
+        NO_ERRORS,
+        ContactNoise(nan, nan, nan, nan, nan),
+        CentroidDelays(nan, nan, Lag(0.0, 1.0)),
+        StiffnessSources(nan, nan, nan, nan, nan, nan),
+        Residuals(0, nan, nan, nan, nan),
+    )
+
+
+def _force(patch: PatchCalibration, s: Shown) -> float:
+    return patch.force_gain * s.total + patch.edge_gain * math.sqrt(s.total)
+
+
+def _depths(dwell: Dwell, s: Shown, patch: PatchCalibration, stiffness: float) -> Floats:
+    """(n,) depth of the layer in each image of a touch, m."""
+    at_1_n = indentation_from_force(1.0, stiffness, patch.radius_m, dwell.kappa)
+    depths: Floats = at_1_n * np.sqrt(patch.force_gain * s.sums + patch.edge_gain * np.sqrt(s.sums))
+    return depths
+
+
+def _checked(
+    calibration: ArrayCalibration, touches: Touches, plain: PatchCalibration, seen: int
+) -> tuple[Floats, Floats, Floats]:
+    """Errors (n, 3) of moments, (n, 2) of curvatures and (m,) of reference forces of touches by a calibration."""
+    patch = make_patch_calibration(calibration, plain.pad)
+    model = make_image_model(calibration, patch, seen=seen)
+    measured = [_force(patch, s) for _, s in touches]
+    # a reference load is read over the whole touch, and creep is part of it
+    forces = [f * s.crept / d.force - 1.0 for f, (d, s) in zip(measured, touches, strict=True) if d.force is not None]
+    return moment_errors(model, touches, measured), curvature_errors(model, touches, measured), np.array(forces)
+
+
+def _held_out(
+    touches: Touches, fit: Callable[[Touches], ArrayCalibration], plain: PatchCalibration, seen: int
+) -> tuple[Floats, Floats, Floats]:
+    """As `_checked`, each fifth of the touches by a calibration that was fitted to the others."""
+    errors, curvatures, forces = np.zeros((len(touches), 3)), np.zeros((len(touches), 2)), []
+    for fold in range(FOLDS):
+        out = list(range(fold, len(touches), FOLDS))
+        found = _checked(
+            fit([p for i, p in enumerate(touches) if i not in out]), [touches[i] for i in out], plain, seen
+        )
+        errors[out], curvatures[out] = found[:2]
+        forces.append(found[2])
+    return errors, curvatures, np.concatenate(forces)
+
+
+def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
+    """Errors of moments from touches that the fit has not seen, with `FORM_SIGMA` for shapes that were not touched."""
+    scaled = errors * (USUAL_LIGHTNESS / np.array([[s.lightness] for s in shown])) ** (0.5 * MOMENT_ERROR_POWER)
+    moment = float(np.mean(scaled[:, :2] ** 2)) + FORM_SIGMA**2
+    return MomentErrors(
+        moment=moment,
+        both=float(np.clip(np.mean(scaled[:, 0] * scaled[:, 1]), 0.0, 0.5 * moment)),
+        shear=float(np.mean(scaled[:, 2] ** 2)) + 0.25 * FORM_SIGMA**2,
+        frame_sigma=float(np.median([s.frame_sigma for s in shown])),
+    )
+
+
+def _gains(
+    touches: Touches, calibration: ArrayCalibration, plain: PatchCalibration
+) -> tuple[Floats, tuple[tuple[int, int], ...]]:
+    """(16, 16) gains of the taxels by these touches, and dead ones."""
+    patch = make_patch_calibration(calibration, plain.pad)
+    model = make_image_model(calibration, patch, seen=None)
+    forces = [_force(patch, s) for _, s in touches]
+    return taxel_gains(plain.pad, model, touches, forces)
+
+
+def _by_gains(
+    touches: Touches, calibration: ArrayCalibration, plain: PatchCalibration, seen: int
+) -> tuple[float, float]:
+    """RMS error of the moments of each half of the touches, with gains of the taxels from the other, and without."""
+    gained, alike = [], []
+    for half in (0, 1):
+        gains = _gains(touches[half::2], calibration, plain)[0]
+        own = replace(plain, gains=tuple(tuple(row) for row in gains.tolist()))
+        check = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in touches[1 - half :: 2]]
+        gained.append(_checked(calibration, check, plain, seen)[0][:, :2])
+        alike.append(_checked(calibration, touches[1 - half :: 2], plain, seen)[0][:, :2])
+    return rms(np.concatenate(gained)), rms(np.concatenate(alike))
+
+
+def _offsets(touches: Touches) -> tuple[Floats, Floats]:
+    """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m."""
+    # a gradient of the taxels' gains and an error of the tool turn with the probe; a wrong place of the object does not
+    unknown = np.full(2, math.nan)
+    mine, its = [], []
+    for name in sorted({d.name for d, _ in touches if abs(d.turn) > 0.5 and d.name != "rod"}):
+        straight = [s.off.mean(axis=0) for d, s in touches if d.name == name and d.turn == 0.0]
+        turned = [s.off.mean(axis=0) for d, s in touches if d.name == name and abs(d.turn) > 0.5]
+        if straight:
+            mine.append(0.5 * (np.mean(straight, axis=0) + np.mean(turned, axis=0)))
+            its.append(0.5 * (np.mean(straight, axis=0) - np.mean(turned, axis=0)))
+    return (np.mean(mine, axis=0), np.mean(its, axis=0)) if mine else (unknown, unknown)

@@ -1,0 +1,126 @@
+"""Errors of curvature that no path averages: the lag of an answer, the scale, the tool, and the drag of the pad.
+
+**Lag.** An answer is a mean over the memory, and a patch is one over its own size. Where curvature changes along the
+path the mean belongs to an earlier place; the terms that a quadric leaves out (`misfit`) follow most of the change, not
+all of it. The error that is left points in the direction in which the answers move, and is taken to be their movement
+over a small share of the memory. So it is zero where the answers stay, however uncertain the surface was before, and
+large for a while where they change from one curvature to another. Why not move the answer on too: the movement is
+itself an estimate, and extrapolated noise would do more harm than the lag.
+
+**Scale** is a relative error that all curvatures have in common.
+
+**Tool.** Where the probe turns with the surface, an error of its centre along the normal puts the contacts on an offset
+surface, whose curvature differs by `offset · K²`.
+
+**Drag.** Where it keeps its orientation, the contact seems to go `(I + M) w` over the pad where it goes w
+(`drag_errors`).
+
+Each is added to the covariance (`with_errors`); curvature is not changed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.online.estimator import AnswerPath, AnswerStage
+from canprobe.mechanics.touch.online.regions import with_errors
+from canprobe.mechanics.types import Floats
+
+SPAN_SHARE = 0.5
+"""Path, over the memory, over which a change of the answers is measured."""
+MIN_SPAN_SHARE = 0.05
+"""Least such path, just after a start."""
+LAG_SHARE = 0.075
+"""Path, over the memory, by which an answer lags (one standard deviation): 1.5 mm of 20 mm, half a patch. The value was
+set on scans of nine packaged scenes."""
+SCALE_ERROR = 4e-3
+"""Relative error of curvature that no path averages."""
+PAD_DRAG = 0.03
+"""Error of the way of a contact over the pad, over this way (`drag_errors`), by hysteresis and creep. A probe that
+keeps its orientation measures the normal by this way alone; else the rolling share is its part in the turn of the
+normal. The value has the best log score on 15 scenes of a gantry of a development draw."""
+TOOL_SIGMA_M = 0.2e-3
+"""Standard deviation of the probe's centre along its pole, m, as a tool is known after its calibration."""
+
+
+class SystematicErrors(AnswerStage):
+    """Adds errors that no path averages to the covariance of fully observed answers.
+
+    Args:
+        memory_m: path that the motion remembers, m.
+        scale: relative error that all curvatures have in common, one standard deviation.
+        drag: error of the way of a contact over the pad, over this way, one standard deviation (`drag_errors`).
+        offset: error of the probe's centre along the normal while the probe turns with the surface, m, one standard
+            deviation.
+    """
+
+    def __init__(self, memory_m: float, *, scale: float = 0.0, drag: float = 0.0, offset: float = 0.0) -> None:
+        self._scale, self._drag, self._offset = scale, drag, offset
+        self._memory = memory_m
+        self._past: deque[tuple[float, Floats]] = deque()
+        self._path = AnswerPath()
+        self._travelled = 0.0
+
+    @classmethod
+    def of_scan(cls, memory_m: float, rolling_share: float) -> SystematicErrors:
+        """The errors of a scan: the pad drags as far as the contact rolls, the tool errs as far as the probe turns.
+
+        Args:
+            memory_m: path that the motion remembers, m.
+            rolling_share: 0 where the probe follows the normal, 1 where it keeps its orientation.
+        """
+        drag, offset = PAD_DRAG * rolling_share, TOOL_SIGMA_M * (1.0 - rolling_share)
+        return cls(memory_m, scale=SCALE_ERROR, drag=drag, offset=offset)
+
+    def reset(self) -> None:
+        self._past.clear()
+        self._path = AnswerPath()
+
+    def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
+        if answer is None or answer.rank < 3:
+            return answer
+        self._travelled += self._path.step(answer)
+        tensor = answer.curvature_tensor_base()
+        lag = self._lag_error(tensor)
+        self._past.append((self._travelled, tensor))
+        errors = [] if lag is None else [lag]
+        if self._scale != 0.0:
+            errors.append(self._scale * tensor)
+        if self._offset != 0.0:
+            errors.append(self._offset * tensor.dot(tensor))
+        if self._drag != 0.0:
+            errors += drag_errors(answer, self._drag)
+        return with_errors(answer, *errors)
+
+    def _lag_error(self, tensor: Floats) -> Floats | None:
+        """(3, 3) change of the curvature tensor over the path by which an answer lags; None where it is not known."""
+        past = self._past
+        while len(past) > 1 and self._travelled - past[1][0] >= SPAN_SHARE * self._memory:
+            past.popleft()
+        if not past or self._travelled - past[0][0] < MIN_SPAN_SHARE * self._memory:
+            return None
+        then, before = past[0]
+        result: Floats = (tensor - before) * (LAG_SHARE * self._memory / (self._travelled - then))
+        return result
+
+
+def drag_errors(answer: SurfaceEstimate, drag: float) -> list[Floats]:
+    """Errors (3, 3) of curvature, 1/m, of a probe that keeps its orientation, each times a standard normal variate.
+
+    Model: the contact seems to go `(I + M) w` over the pad where it goes w, and each entry of M (2, 2) has the standard
+    deviation `drag`. So the normal seems to turn too far or not far enough, and about another axis: the centroid lags
+    behind a contact that goes round, for instance, which turns the principal directions. Of `M K` the symmetrical part
+    is a curvature. The other part is not, and contradicts the places of the contacts.
+    """
+    P = answer.T_frame_contact[:3, :2]
+    errors = []
+    for i in range(2):
+        for row in answer.K:
+            MK = np.zeros((2, 2))
+            MK[i] = drag * row
+            errors.append(P.dot(0.5 * (MK + MK.T)).dot(P.T))
+    return errors

@@ -1,0 +1,332 @@
+"""Motion and patch as one answer: straight paths, images that lie, and regions over many draws."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from image_models import (
+    FORCE,
+    HERE_FLOOR,
+    NORMAL,
+    RADIUS,
+    STIFFNESS,
+    base_tensor,
+    entries,
+    exact,
+    model,
+    samples,
+    tensor,
+)
+from scipy.optimize import minimize
+
+from canprobe.mechanics.touch import (
+    ContactSample,
+    OnlineEstimator,
+    PatchCurvature,
+    PatchFusion,
+    Prior,
+    Slope,
+    SystematicErrors,
+    indentation_from_force,
+    make_estimator,
+)
+from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.online.patch_curvature import MIN_FRAMES
+from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+
+
+def cylinder_touch(x, y, t, moments):
+    """A touch on the cylinder of radius 36 mm along x: height over its crown."""
+    a = y / 0.036
+    normal = np.array([0.0, math.sin(a), math.cos(a)])
+    point = 0.036 * normal + [x, 0.0, -0.036]
+    T = homogeneous(tangent_rotation(-normal), point + (RADIUS - 0.4e-3) * normal)
+    along = T[:3, :2].T @ [0.0, math.cos(a), -math.sin(a)]
+    k = np.outer(along, along) / 0.036
+    inner = np.array([0.0, 0.0, RADIUS - 0.4e-3])
+    return ContactSample(t, point, normal, T, inner, FORCE, moments=exact(entries(k)) if moments else None)
+
+
+def estimator(method="recursive", *later):
+    motion = make_estimator(method, sigma_point=3e-5, sigma_normal=2e-3, memory_m=0.02)
+    return OnlineEstimator(motion, PatchFusion(PatchCurvature(model()), 0.02), *later)
+
+
+def after_path(line, *, moments=True, method="recursive", seed=4):
+    rng = np.random.default_rng(seed)
+    one = estimator(method)
+    for i, (x, y) in enumerate(line):
+        touch = cylinder_touch(x, y, i * 5e-3, moments)
+        one.add(
+            ContactSample(
+                touch.t_s,
+                touch.p_base + 1e-5 * rng.standard_normal(3),
+                touch.n_base,
+                touch.T_base_probe,
+                touch.r_probe,
+                FORCE,
+                moments=touch.moments,
+            )
+        )
+    return one
+
+
+AXIAL = [(x, 0.0) for x in np.arange(0.0, 0.04, 1.25e-4)]
+CIRCUMFERENTIAL = [(0.0, y) for y in np.arange(-0.02, 0.02, 1.25e-4)]
+WEAVE = [(0.004 * math.sin(y / 2e-3), y) for y in np.arange(-0.02, 0.02, 0.5e-4)]
+
+
+@pytest.mark.parametrize("method", ["recursive", "ml"])
+@pytest.mark.parametrize(("line", "alone"), [(AXIAL, 0.0), (CIRCUMFERENTIAL, 1 / 0.036)])
+def test_patch_completes_a_straight_path(method, line, alone):
+    without = after_path(line, moments=False, method=method).estimate()
+    assert without.method == method
+    assert list(without.observed) == [True, False]
+    assert without.kappa[0] == pytest.approx(alone, abs=0.6)
+    both = after_path(line, method=method).estimate()
+    assert both.method == f"{method}+patch"
+    assert both.rank == 3
+    np.testing.assert_allclose(both.kappa, [1 / 0.036, 0.0], atol=0.6)
+    assert abs(both.directions[0] @ [1.0, 0.0, 0.0]) < 0.03  # the larger one lies across the axis
+    assert np.linalg.eigvalsh(both.covariance)[0] > 0.0
+    np.testing.assert_array_equal(both.T_frame_contact, without.T_frame_contact)
+
+
+def test_curvature_known_along_the_path_sharpens_that_across():
+    touches = [cylinder_touch(x, 0.0, 0.0, True) for x, _ in AXIAL[:20]]
+    patch = PatchCurvature(model())
+    for touch in touches:
+        patch.add(touch)
+    alone = patch_estimate(touches[-1], patch, 0.02)
+    both = after_path(AXIAL).estimate()
+    assert across(both) < 0.75 * across(alone)
+
+
+def test_along_a_straight_path_over_a_torus_both_are_right_or_say_so(torus_line):
+    """Diagonally over its tube. Taken for a quadric's, the motion's curvature is 1 1/m off and said to be ±0.1."""
+    held, answers = [], 0
+    for end in (-0.9, 0.9, 1.3):
+        line = torus_line(0.11, 0.04, end, 0.8, length=0.04, samples=320)
+        rng = np.random.default_rng(1)
+        one = estimator("recursive", SystematicErrors(0.02))  # as in the loop
+        for i, (point, normal) in enumerate(zip(*line.felt(2e-5, 1e-3, rng), strict=True)):
+            T = homogeneous(tangent_rotation(-normal), point + (RADIUS - 0.4e-3) * normal)
+            k = T[:3, :2].T @ line.tensor(point) @ T[:3, :2]
+            inner = np.array([0.0, 0.0, RADIUS - 0.4e-3])
+            one.add(ContactSample(5e-3 * i, point, normal, T, inner, FORCE, moments=exact(entries(k))))
+            if i < 160 or i % 10:
+                continue
+            answers += 1
+            e = one.estimate()
+            if e.rank == 3:
+                P = e.T_frame_contact[:3, :2]
+                d = (e.K - P.T @ line.tensor(e.point) @ P)[[0, 0, 1], [0, 1, 1]]
+                held.append(d @ np.linalg.solve(e.covariance, d) < 7.815)
+    assert len(held) > 0.5 * answers
+    assert np.mean(held) > 0.9
+
+
+def across(estimate):
+    """Standard deviation of the curvature across the axis, 1/m."""
+    y = estimate.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
+    weights = np.array([y[0] ** 2, 2 * y[0] * y[1], y[1] ** 2])
+    return math.sqrt(weights @ estimate.covariance @ weights)
+
+
+def test_where_the_path_shows_all_curvature_the_patch_hardly_counts():
+    alone, both = (after_path(WEAVE, moments=moments).estimate() for moments in (False, True))
+    assert alone.method == "recursive"
+    assert both.rank == 3
+    assert any(note.endswith("% of the curvature from the patch") for note in both.notes)
+    assert 0.9 * across(alone) < across(both) < across(alone)
+    assert np.linalg.norm(both.K - alone.K) < 0.5 * across(alone)
+
+
+def lies(factor):
+    """The answers along an axial path under images whose moments are too large."""
+    one = after_path(AXIAL, moments=False)
+    for i, (x, y) in enumerate(AXIAL[-80:]):
+        touch = cylinder_touch(x, y, 10.0 + i * 5e-3, True)
+        one.add(replace(touch, moments=tuple(factor * m for m in touch.moments)))
+        if i % 8 == 7:
+            yield one.estimate()
+
+
+def test_images_that_lie_widen_what_both_know_until_nothing_is_observed():
+    """The curvature along the path stays the motion's, ever less certain."""
+    before = 0.0
+    for factor in (1.0, 1.01, 1.02, 1.03):
+        answer = list(lies(factor))[1]
+        ex = answer.T_frame_contact[:3, :2].T @ [1.0, 0.0, 0.0]
+        assert 2.0 * ex @ answer.S[:2, :2] @ ex == pytest.approx(0.0, abs=0.5)
+        weights = np.array([ex[0] ** 2, 2.0 * ex[0] * ex[1], ex[1] ** 2])
+        sigma = math.sqrt(weights @ answer.covariance @ weights)
+        assert sigma > before
+        before = sigma
+    for answer in list(lies(2.0))[1:]:
+        assert "the patch contradicts the motion" in answer.notes
+        assert answer.rank == 0
+
+
+@pytest.fixture(scope="module")
+def touches():
+    """A touch whose patch is longer along x."""
+    return samples(base_tensor(np.diag([-6.0, 27.8])), NORMAL, FORCE, exact, 12)
+
+
+class TestFusion:
+    """Informations are added; nothing jumps."""
+
+    T = homogeneous(tangent_rotation(-NORMAL), np.zeros(3))
+
+    def patch(self, touches, scale=1.0):
+        found = PatchCurvature(model())
+        for touch in touches:
+            found.add(replace(touch, moments=tuple(scale * m for m in touch.moments)))
+        return found
+
+    def test_it_is_the_minimum_of_both_costs(self, touches):
+        """Against a general minimiser."""
+        patch, rng, m = self.patch(touches), np.random.default_rng(5), model()
+        A = rng.normal(size=(3, 3))
+        information = A @ A.T + 0.3 * np.eye(3)
+        motion = CurvatureInformation(np.array([-4.0, 0.8, 26.5]), information)
+        v = exact((-6.0, 0.0, 27.8))
+
+        def cost(q):
+            _, r, W = m.linearised(v, FORCE, 12, (q[0], q[1] / math.sqrt(2.0), q[2]))
+            return (q - motion.q) @ information @ (q - motion.q) + r @ W @ r
+
+        best = minimize(cost, motion.q, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9}).x
+        found = patch.fuse(self.T, motion)
+        assert found.q == pytest.approx(best, abs=0.03)  # W moves with q, which steps leave out
+        assert not found.contradicted
+        assert np.linalg.norm(found.q - motion.q) > 0.3
+        assert np.linalg.norm(found.q - [-6.0, 0.0, 27.8]) > 0.2
+
+    def test_more_of_the_motion_moves_the_answer_over_without_a_jump(self, touches):
+        patch = self.patch(touches)
+        own = patch.fuse(self.T)
+        q = own.q + np.array([1.5, -1.0, 1.0])
+        answers = [
+            patch.fuse(self.T, CurvatureInformation(q, size * np.diag([1.0, 0.5, 2.0]))).q
+            for size in np.geomspace(1e-4, 1e4, 401)
+        ]
+        assert answers[0] == pytest.approx(own.q, abs=0.01)
+        assert answers[-1] == pytest.approx(q, abs=0.01)
+        assert np.abs(np.diff(answers, axis=0)).max() < 0.05
+        assert np.all(np.diff([np.linalg.norm(a - q) for a in answers]) < 1e-3)
+
+    def test_no_jump_where_images_leave_what_the_motion_believes_and_the_calibration(self, touches):
+        motion = CurvatureInformation(np.array([-5.0, 0.0, 26.0]), np.diag([4.0, 4.0, 0.5]))
+        scales = np.linspace(0.6, 1.6, 401)
+        found = [one for s in scales if (one := self.patch(touches, s).fuse(self.T, motion))]
+        assert len(found) > 380
+        believed = [one.q for one in found if not one.contradicted]
+        assert len(believed) > 30
+        assert np.abs(np.diff(believed, axis=0)).max() < 0.4
+        assert found[-1].contradicted  # nobody believes moments that are 60 % too large
+
+    def test_estimates_along_a_path_that_begins_to_weave_do_not_jump(self):
+        """Axial, then ever wider: motion takes over from the patch within its standard deviation."""
+        x = np.arange(0.0, 0.06, 1.25e-4)
+        line = [(a, max(a - 0.03, 0.0) * 0.15 * math.sin((a - 0.03) / 1e-3)) for a in x]
+        one, K, sigma = estimator(), [], []
+        for i, (a, y) in enumerate(line):
+            one.add(cylinder_touch(a, y, i * 5e-3, True))
+            if i > 160:
+                answer = one.estimate()
+                assert answer.rank == 3
+                ey = answer.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
+                K.append(ey @ answer.K @ ey)
+                sigma.append(across(answer))
+        assert sigma[-1] < 0.65 * sigma[0]
+        assert np.abs(np.diff(K)).max() < 0.25 * max(sigma)
+        assert np.asarray(K) == pytest.approx(1 / 0.036, abs=1.0)
+
+    def test_regions_of_both_together_cover_the_truth(self):
+        """Motion and floor drawn anew 200 times: 95 % regions, and never worse than either alone."""
+        rng = np.random.default_rng(12)
+        K = tensor(27.8, 0.0, 0.0)
+        T = homogeneous(tangent_rotation(-np.array([0.0, 0.0, 1.0])), np.zeros(3))
+        P = T[:3, :2]
+        k = P.T @ base_tensor(K, np.array([0.0, 0.0, 1.0])) @ P
+        true = np.array([k[0, 0], math.sqrt(2.0) * k[0, 1], k[1, 1]])
+        information = np.array([[1.5, 0.4, 0.0], [0.4, 0.5, 0.1], [0.0, 0.1, 0.25]])
+        root, floor, inside, errors = (
+            np.linalg.inv(np.linalg.cholesky(information)).T,
+            np.linalg.cholesky(HERE_FLOOR),
+            0,
+            [],
+        )
+        for _ in range(200):
+            e1, e2, shear = floor @ rng.standard_normal(3)
+
+            def seen(k, e1=e1, e2=e2, shear=shear):
+                xx, _, yy = exact(k)
+                return xx * (1 + e1), math.sqrt(xx * yy) * shear, yy * (1 + e2)
+
+            patch = PatchCurvature(model())
+            for touch in samples(base_tensor(K, np.array([0.0, 0.0, 1.0])), np.array([0.0, 0.0, 1.0]),
+                                 FORCE, seen, 2 * MIN_FRAMES):  # fmt: skip
+                patch.add(touch)
+            motion = CurvatureInformation(true + root @ rng.standard_normal(3), information)
+            found = patch.fuse(T, motion)
+            off = found.q - true
+            inside += off @ (information + found.patch) @ off < 7.815
+            errors.append([off, motion.q - true, patch.fuse(T).q - true])
+        assert 0.915 <= inside / 200 <= 0.985
+        both, motion_alone, patch_alone = np.sqrt(np.mean(np.square(errors), axis=0))
+        assert np.all(both < 1.02 * motion_alone)
+        assert np.all(both < 1.02 * patch_alone)
+
+
+def test_a_standing_contact_is_answered_by_the_patch_alone_and_a_reset_forgets_both():
+    one = estimator()
+    for i in range(20):
+        one.add(cylinder_touch(0.0, 0.0, i * 5e-3, True))
+    answer = one.estimate()
+    assert answer.method == "patch"
+    np.testing.assert_allclose(answer.kappa, [27.8, 0.0], atol=0.05)
+    one.reset()
+    assert one.estimate() is None
+
+
+def test_a_sample_that_the_motion_drops_is_not_taken_from_the_patch_either():
+    motion, patch = make_estimator("recursive", sigma_point=3e-5, sigma_normal=2e-3), PatchCurvature(model())
+    one = OnlineEstimator(motion, PatchFusion(patch, 0.02))
+    one.add(cylinder_touch(0.0, 0.0, 1.0, True))
+    one.add(cylinder_touch(0.0, 0.0, 1.0, True))
+    assert one.dropped.repeated == 1
+    assert patch.frames == 1
+
+
+def test_a_prior_on_curvature_counts_once_and_the_patch_still_observes():
+    motion = make_estimator("ml", sigma_point=3e-5, sigma_normal=2e-3, prior=Prior.flat(0.02, 10.0))
+    one = OnlineEstimator(motion, PatchFusion(PatchCurvature(model()), 0.02))
+    for i, (x, y) in enumerate(AXIAL[:160]):
+        one.add(cylinder_touch(x, y, i * 5e-3, True))
+    before, both = motion.estimate(), one.estimate()
+    assert before.rank < 3
+    assert both.rank == 3
+    assert both.prior == before.prior
+    # the prior pulls 27.8 towards 0 by the ratio of its information to that of the patch and its own
+    pull = both.covariance.trace() / 10.0**2
+    assert 0.0 < pull < 0.03
+    assert both.kappa[0] == pytest.approx((1 / 0.036) * (1.0 - pull), abs=0.25)
+
+
+def test_stiffness_follows_from_the_images_where_the_motion_knows_curvature():
+    """The slope of the touch is 10 % off. Along a weave k gets better, and it does not jump from answer to answer."""
+    slope = Slope(1.1 / indentation_from_force(1.0, STIFFNESS, RADIUS, (27.8, 0.0)), 30.0)
+    motion = make_estimator("recursive", sigma_point=3e-5, sigma_normal=2e-3, memory_m=0.02)
+    one, found = OnlineEstimator(motion, PatchFusion(PatchCurvature(model(), 0.6), 0.02)), []
+    for i, (x, y) in enumerate(WEAVE + WEAVE[::-1]):
+        one.add(replace(cylinder_touch(x, y, i * 5e-3, True), slope=slope))
+        if i % 20 == 19:
+            found.append(math.log(one.estimate().stiffness / STIFFNESS))
+    assert found[0] > 0.08
+    assert abs(found[-1]) < 0.4 * found[0]
+    assert np.abs(np.diff(found)).max() < 0.02
