@@ -33,10 +33,16 @@ examples:
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
 STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
-    "draw": ("arrays", "calibrations", "explore", "link", "regions", "shapes"),
+    "draw": ("arrays", "calibrations", "link", "regions", "surfaces"),
     "against": ("regions",),
 }
 """Studies that have an option, by the option's name."""
+RENAMED: Mapping[str, str] = {
+    "explore": "surfaces",
+    "shapes": "surfaces",
+    "soak": "realtime --soak",
+}
+"""Former study → what is typed now."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -55,7 +61,7 @@ def add_arguments(parser: Parser) -> None:
         "--draw",
         metavar="N",
         type=whole(0, 9999),
-        help="arrays, calibrations, explore, link, regions, shapes: number that all cases follow from; others than"
+        help="arrays, calibrations, link, regions, surfaces: number that all cases follow from; others than"
         " those of the published figures",
     )
     parser.add_argument(
@@ -92,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     _refuse_wrong(args, STUDIES)
     if args.seed is not None:
         return _replay(args)
-    from canprobe.lab.studies.result_files import as_document, text_of, write_study
+    from canprobe.lab.studies.result import as_document, text_of, write_study
     from canprobe.lab.studies.sweep import open_sweep
 
     out = args.out or Path("runs") / f"study-{args.name}"
@@ -123,8 +129,8 @@ def _chosen(args: argparse.Namespace) -> dict[str, Any]:
 
 def _refuse_wrong(args: argparse.Namespace, studies: Mapping[str, str]) -> None:
     """Complain about an unknown study, and about options that it does not have."""
-    if args.name == "soak":
-        args.complain("study soak is now an option of study realtime: canprobe study realtime --soak")
+    if args.name in RENAMED:
+        args.complain(f"study {args.name} is now a part of another one: canprobe study {RENAMED[args.name]}")
     if args.name not in studies:
         known = ", ".join(studies)
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, studies)}" if args.name else "expected NAME"

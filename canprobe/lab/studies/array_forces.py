@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, legend, picture
-from canprobe.lab.studies.harness import Column, Row, StudyResult
+from canprobe.lab.studies.result import Column, Row, StudyResult
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration

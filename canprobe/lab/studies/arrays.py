@@ -26,8 +26,7 @@ from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.results.picture import BLUE, INK, picture
 from canprobe.lab.studies.array_forces import GROUPS, HOLD_S, HOLDS, result_of, score_holds
-from canprobe.lab.studies.harness import Column, Row, StudyResult
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.pad import Pad

@@ -22,8 +22,15 @@ from canprobe.lab.studies.bound_cases import REGION, BoundCase, all_cases, crite
 from canprobe.lab.studies.bound_figure import draw_bound
 from canprobe.lab.studies.bound_scores import METHODS, Answer, answer_of, findings, length, score, verdict
 from canprobe.lab.studies.cell_store import as_json
-from canprobe.lab.studies.harness import FROBENIUS, Column, Row, StudyResult
-from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
+from canprobe.lab.studies.result import (
+    FROBENIUS,
+    SIGMA_COLUMNS,
+    Column,
+    Row,
+    StudyResult,
+    measuring_facts,
+    sigma_values,
+)
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, picture
-from canprobe.lab.studies.harness import Row
+from canprobe.lab.studies.result import Row
 
 RATIOS, COVERAGES = (0.0, 2.0), (0.85, 1.0)
 """Scales of the picture; a case beyond is drawn at the edge."""

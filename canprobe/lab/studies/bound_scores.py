@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.lab.studies.ground import Ground
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Row
+from canprobe.lab.studies.result import CHI2_95_OF_3, FROBENIUS, Row
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.types import Floats
 

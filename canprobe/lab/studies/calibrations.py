@@ -22,11 +22,10 @@ import numpy as np
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, legend, picture
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.resolve import EMULATED_ARRAY
-from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, StudyResult
 from canprobe.lab.studies.random_scenes import FOREIGN, KINDS, SceneSeed, own_array
 from canprobe.lab.studies.region_scores import ScoredScan, measure
 from canprobe.lab.studies.regions import MODEL
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.pad import Pad
 

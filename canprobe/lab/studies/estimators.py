@@ -22,8 +22,15 @@ from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
 from canprobe.lab.studies.ground import Ground, make_ground
-from canprobe.lab.studies.harness import FROBENIUS, Column, Row, StudyResult
-from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
+from canprobe.lab.studies.result import (
+    FROBENIUS,
+    SIGMA_COLUMNS,
+    Column,
+    Row,
+    StudyResult,
+    measuring_facts,
+    sigma_values,
+)
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.fit import make_estimator

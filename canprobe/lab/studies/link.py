@@ -25,10 +25,9 @@ from canprobe.cell.session.session import Session
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.tools.link.verdict import FIT_SHARE, UNFIT_SHARE, Fitness
 from canprobe.lab.studies import link_rates
-from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.link_rates import draw_rates, measure_machine
 from canprobe.lab.studies.link_setups import construct, describe, draw_setup, scene_of
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 CHECK_S, MINUTE_S = 10.0, 60.0

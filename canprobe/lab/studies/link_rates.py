@@ -28,10 +28,10 @@ from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.tapped import TappedPort
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
-from canprobe.lab.studies.harness import Column, Row
 from canprobe.lab.studies.link_setups import LateClock
 from canprobe.lab.studies.no_bus import on_any_bitrate
 from canprobe.lab.studies.realtime_cases import patient
+from canprobe.lab.studies.result import Column, Row
 
 CHECKED_HZ, CHECK_S, MINUTE_S, QUICK_MINUTE_S = 400, 10.0, 60.0, 10.0
 RATES_HZ = (100, 200, 400, 800, 1000)

@@ -19,7 +19,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.protocol.sync import SyncCounter
 from canprobe.lab.studies.cycle_times import CycleTimes, processor_share, woken
-from canprobe.lab.studies.harness import CHANNEL
+from canprobe.lab.studies.result import CHANNEL
 
 _ENABLING = (6, 7, 15)
 _CYCLES_A_STEP = 20

@@ -23,7 +23,6 @@ from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
 from canprobe.lab.studies.cycle_times import CycleTimes, Times
-from canprobe.lab.studies.harness import CHANNEL, Column, Row, Say, StudyResult
 from canprobe.lab.studies.realtime_cases import (
     PATIENCE,
     Measured,
@@ -32,7 +31,7 @@ from canprobe.lab.studies.realtime_cases import (
     measure_plain,
     measure_scan,
 )
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Column, Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)

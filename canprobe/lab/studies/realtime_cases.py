@@ -27,9 +27,9 @@ from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.lab.studies.cycle_times import CycleTimes, answer_latencies, processor_share, woken
-from canprobe.lab.studies.harness import CHANNEL
 from canprobe.lab.studies.no_bus import on_any_bitrate
 from canprobe.lab.studies.plain_canopen import run_plain
+from canprobe.lab.studies.result import CHANNEL
 
 RATE_HZ = 400.0
 MISSED_SYNCS, LATE_PERCENT = 250, 100

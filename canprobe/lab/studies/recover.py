@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cell.results.picture import BLUE, picture
-from canprobe.lab.studies.harness import Column, Row, Say, StudyResult
 from canprobe.lab.studies.recover_cases import SCENES, draw_case, shrink
 from canprobe.lab.studies.recover_runs import run_case
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import Column, Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS, QUICK_RUNS, SEEDS_A_CELL = 1000, 8, 20

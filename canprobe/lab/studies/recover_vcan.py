@@ -28,12 +28,11 @@ from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.lab.studies.faults_vcan import link
-from canprobe.lab.studies.harness import CHANNEL, StudyResult
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
 from canprobe.lab.studies.recover_cases import END_S, REPLUG, SCENES, STALL, RecoverCase, draw_case
 from canprobe.lab.studies.recover_runs import RecoverScore, WatchedDrives, forces_of
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import CHANNEL, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS, QUICK_RUNS = 50, 2

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import AMBER, BLUE, INK, ORANGE, SHADE, legend, log_scale, parts, picture
-from canprobe.lab.studies.harness import Row
 from canprobe.lab.studies.region_scores import ScoredScan
+from canprobe.lab.studies.result import Row
 
 SHARES = (
     (0.8, 1.01, BLUE, "o", "80 % of the scene's regions or more hold the truth"),

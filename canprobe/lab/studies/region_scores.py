@@ -23,8 +23,8 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import PlanError, SafetyStop
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS
 from canprobe.lab.studies.random_scenes import DrawnScene, SceneSeed, random_scene
+from canprobe.lab.studies.result import CHI2_95_OF_3, FROBENIUS
 from canprobe.mechanics.types import Floats
 
 BEHIND_JUMP_M = 1.5e-3

@@ -29,11 +29,10 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.files import whole_file
-from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, Say, StudyResult
 from canprobe.lab.studies.random_scenes import FOREIGN, KINDS, SceneSeed
 from canprobe.lab.studies.region_figure import draw_regions
 from canprobe.lab.studies.region_scores import ScoredScan, measure
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.types import Floats
 

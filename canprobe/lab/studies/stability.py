@@ -25,9 +25,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, SKY, legend, log_scale, parts, picture
-from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.stability_extremes import run_extremes
 from canprobe.lab.studies.stability_runs import HUNTING_SPREAD, LoopCase, bent_touch, carry_out, loop_of
 from canprobe.lab.studies.sweep import Sweep

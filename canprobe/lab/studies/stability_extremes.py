@@ -30,10 +30,9 @@ from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.errors import PlanError
 from canprobe.fieldbus.protocol.frames import SYNC_ID
-from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, StudyResult
 from canprobe.lab.studies.random_scenes import CELLS
 from canprobe.lab.studies.region_scores import scores_of
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.stability_runs import LateNode, bent_touch, refused_row, run_touch, scene_of
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.workprec_cell import SENSOR_HZ

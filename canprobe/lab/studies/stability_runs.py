@@ -28,8 +28,8 @@ from canprobe.errors import PlanError, SafetyStop
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.node.wrapped import WrappedNode
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.lab.studies.harness import Row
 from canprobe.lab.studies.linear_loop import ForceLoop
+from canprobe.lab.studies.result import Row
 from canprobe.lab.studies.witnessed_run import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import inverse_near

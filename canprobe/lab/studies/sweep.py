@@ -44,7 +44,7 @@ from canprobe.cell.session.terminal import Progress
 from canprobe.errors import StudyError
 from canprobe.lab.studies.cell_store import CellStore, as_json, cell_key, model_digest
 from canprobe.lab.studies.executors import Opener, dask_executor, process_pool
-from canprobe.lab.studies.harness import Say, StudyResult
+from canprobe.lab.studies.result import Say, StudyResult
 
 
 class Sweep:
@@ -186,8 +186,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "arrays": "how well forty touches calibrate an unknown emulated array",
         "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
         "calibrations": "whether the cell notices that its array has the calibration of another one",
-        "shapes": "surfaces of unknown shapes by the map, every estimator, local fits and Gaussian processes",
-        "explore": "path that exploration needs for an error, against weaves, rasters and a circle, on unknown shapes",
+        "surfaces": "unknown shapes by the map, quadrics, splines and Gaussian processes; the path of exploration",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "link": "whether a check of the link says what the next minute of the cell shows",

@@ -34,8 +34,7 @@ from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, 
 from canprobe.cell.scene.arms import Bodies, arm_model
 from canprobe.cell.scene.load import read_cell
 from canprobe.cell.scene.setup import Dynamics
-from canprobe.lab.studies.harness import Column, Row, StudyResult
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.workprec_cell import run_cell
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset

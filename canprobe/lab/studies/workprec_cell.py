@@ -30,9 +30,8 @@ from canprobe.cell.scene.model import PlantSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import PlanError, SafetyStop
-from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.no_bus import on_any_bitrate
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.workprec_cell_choice import (
     ENOUGH,

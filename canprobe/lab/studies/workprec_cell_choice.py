@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from canprobe.cell.scene.load import load_scene
-from canprobe.lab.studies.harness import Row
+from canprobe.lab.studies.result import Row
 
 FIDELITIES = ("ideal", "dynamic")
 ENOUGH = {"curvature_percent": 2.0, "normal_deg": 0.2, "force_percent": 6.0}

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from canprobe.cell.results.picture import FAINT, INK, METHOD_COLOURS, legend, log_scale, picture
-from canprobe.lab.studies.harness import Row
+from canprobe.lab.studies.result import Row
 from canprobe.lab.studies.workprec_cell_choice import CLASSICAL, FASTER, FD, FIDELITIES, default_of, good
 
 MARKS = {"features": "^", "window": "o", "image": "s"}

@@ -19,8 +19,7 @@ from canprobe.lab.studies.estimators import (
     on_the_move,
     settings,
 )
-from canprobe.lab.studies.harness import Column, StudyResult
-from canprobe.lab.studies.result_files import as_document, table_lines, write_study
+from canprobe.lab.studies.result import Column, StudyResult, as_document, table_lines, write_study
 from canprobe.lab.studies.sweep import STUDIES
 from canprobe.mechanics.touch.estimate.fit import METHODS
 
@@ -97,6 +96,7 @@ def test_list(capsys):
         (["study", "bond"], "did you mean bound?"),
         (["study"], "expected NAME"),
         (["study", "soak"], "canprobe study realtime --soak"),
+        (["study", "shapes"], "canprobe study surfaces"),
         (["study", "bound", "--soak"], "only realtime has"),
     ],
 )

@@ -14,7 +14,7 @@ from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.scene.load import load_scene
 from canprobe.lab.studies import stability
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
-from canprobe.lab.studies.result_files import write_study
+from canprobe.lab.studies.result import write_study
 from canprobe.lab.studies.stability_extremes import EXTREMES, ExtremeCase, extreme_scene, judged, sync_delay_ns
 from canprobe.lab.studies.stability_runs import LoopCase, layer_stiffness, loop_of, scene_of, touch_in_posture, upright
 from canprobe.lab.studies.witnessed_run import longest_above

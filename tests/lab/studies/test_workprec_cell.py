@@ -8,7 +8,7 @@ import pytest
 
 from canprobe.cell.tasks.probing import Phase
 from canprobe.lab.studies import workprec_cell
-from canprobe.lab.studies.result_files import as_document, text_of, write_study
+from canprobe.lab.studies.result import as_document, text_of, write_study
 from canprobe.lab.studies.workprec_cell import (
     MEASURES,
     BusSetting,
