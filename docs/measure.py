@@ -49,6 +49,7 @@ ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --p
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
 LONG = ("faults", "soak", "growth", "held", "canopen_node")
 FORMS = {
+    "bound": "estimators",
     "exploration": "surfaces",
     "soak": "realtime --soak",
     "recover_vcan": "recover --vcan",

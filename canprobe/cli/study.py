@@ -23,7 +23,7 @@ EXAMPLE = """\
 examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
-  canprobe study bound --dask tcp://10.0.0.1:8786
+  canprobe study regions --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
   canprobe study recover --seed 17
   canprobe study regions --draw 2 --against earlier/regions.json
@@ -38,6 +38,7 @@ STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
 }
 """Studies that have an option, by the option's name."""
 RENAMED: Mapping[str, str] = {
+    "bound": "estimators",
     "explore": "surfaces",
     "shapes": "surfaces",
     "soak": "realtime --soak",

@@ -10,8 +10,7 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
     result      the result of a study: columns, rows, findings, picture; its files; facts and intervals
     many        many runs of one scene, for `canprobe.run_many`; no study
 
-    estimators  error against run time, on `ground`
-    bound       error and coverage over the Cramér–Rao bound; `bound_cases`, `bound_scores`, `bound_figure`
+    estimators  error against run time, on `ground`; `bound`: error and coverage over the Cramér–Rao bound
     regions     coverage with the whole sensor on `random_scenes`; `region_scores`, `region_figure`
     arrays      calibrations of unseen arrays, and with `array_forces` their force
     calibrations  scans that notice a calibration of another array

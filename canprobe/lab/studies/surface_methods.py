@@ -59,7 +59,7 @@ class HeightAnswer(NamedTuple):
 
 
 class PlaneContacts(NamedTuple):
-    """PlaneContacts over their mean plane, in mm: places (n, 2), heights, slopes (n, 2), and σ of heights and slopes."""
+    """Contacts over their mean plane, in mm: places (n, 2), heights, slopes (n, 2), and σ of heights and slopes."""
 
     xy: Floats
     z: Floats
@@ -71,7 +71,7 @@ class PlaneContacts(NamedTuple):
 Heights = Callable[[Floats], HeightAnswer]
 """Places (n, 2), mm, to heights."""
 Fit = Callable[[PlaneContacts, float], Heights]
-"""PlaneContacts and a setting of the method to heights."""
+"""Contacts and a setting of the method to heights."""
 
 
 def map_of(samples: Sequence[ContactSample], task: Touch) -> SurfaceMap:

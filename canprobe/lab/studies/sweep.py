@@ -181,8 +181,7 @@ def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
 
 STUDIES: Mapping[str, str] = MappingProxyType(
     {
-        "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
-        "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
+        "estimators": "error of the shape estimators against their run time, and over the Cramér–Rao bound",
         "arrays": "how well forty touches calibrate an unknown emulated array",
         "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
         "calibrations": "whether the cell notices that its array has the calibration of another one",

@@ -19,6 +19,7 @@ from canprobe.lab.studies.estimators import (
     on_the_move,
     settings,
 )
+from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.result import Column, StudyResult, as_document, table_lines, write_study
 from canprobe.lab.studies.sweep import STUDIES
 from canprobe.mechanics.touch.estimate.fit import METHODS
@@ -51,7 +52,13 @@ def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert {r["method"] for r in document["rows"]} == set(METHODS)
     assert all(r["bound_percent"] > 0 and r["sample_us"] > 0 for r in document["rows"])
     assert {"commit", "machine", "model", "seeds"} <= set(document["facts"])
-    assert (tmp_path / "estimators.png").stat().st_size > 10_000
+    (bound,) = document["more"]
+    assert {r["surface"] for r in bound["rows"]} == set(SURFACES)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {
+        "cells.jsonl",
+        *(f"{n}.{e}" for n in ("estimators", "bound") for e in ("csv", "txt", "json", "png")),
+    }
 
 
 def test_ratios_are_to_the_paper_in_the_same_run():
@@ -93,11 +100,12 @@ def test_list(capsys):
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["study", "bond"], "did you mean bound?"),
+        (["study", "region"], "did you mean regions?"),
         (["study"], "expected NAME"),
         (["study", "soak"], "canprobe study realtime --soak"),
         (["study", "shapes"], "canprobe study surfaces"),
-        (["study", "bound", "--soak"], "only realtime has"),
+        (["study", "bound"], "canprobe study estimators"),
+        (["study", "regions", "--soak"], "only realtime has"),
     ],
 )
 def test_a_wrong_name_is_told(argv, said, capsys):

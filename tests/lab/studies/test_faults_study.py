@@ -91,7 +91,7 @@ def test_one_run_is_told_by_its_number(capsys):
     told = capsys.readouterr()
     outcome = json.loads(told.out)
     assert outcome["number"] == 0 and outcome["fault"] in told.err
-    assert main(["study", "bound", "--seed", "3"]) == 2
+    assert main(["study", "estimators", "--seed", "3"]) == 2
 
 
 def deaf_to_findings(monkeypatch):
@@ -274,6 +274,6 @@ def test_without_the_right_to_set_the_interface_the_study_says_so_before_anythin
 
 
 def test_vcan_belongs_to_faults_and_knows_no_seed(capsys):
-    assert main(["study", "bound", "--vcan"]) == 2
+    assert main(["study", "estimators", "--vcan"]) == 2
     assert main(["study", "faults", "--vcan", "--seed", "3"]) == 2
     assert "--vcan" in capsys.readouterr().err

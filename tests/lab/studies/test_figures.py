@@ -21,8 +21,7 @@ from canprobe.cell.results.surface_figure import draw_surface
 from canprobe.lab.studies import estimators, fault_cases, stability, workprec
 from canprobe.lab.studies import faults as faults_study
 from canprobe.lab.studies import stability as stability_figure
-from canprobe.lab.studies.bound_cases import NOISES, SIZES_M
-from canprobe.lab.studies.bound_figure import draw_bound
+from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
 from canprobe.lab.studies.cycle_times import CycleTimes
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.faults_vcan import draw_ends
