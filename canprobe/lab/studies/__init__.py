@@ -15,7 +15,7 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
     arrays      calibrations of unseen arrays, and with `array_forces` their force
     calibrations  scans that notice a calibration of another array
     surfaces    whole surfaces of `drawn_shapes` beside those of `surface_methods`, and the paths of `exploration`
-    workprec    plant and, in `workprec_cell` (`_choice`, `_figure`), the whole cell on `no_bus`
+    workprec    plant and, in `workprec_cell`, the whole cell on `no_bus`
     stability   `stability_runs`, `stability_extremes`, `linear_loop`
     faults      `fault_cases`, `fault_runs`, `witnessed_run`; `faults_vcan`
     recover     `recover_cases`, `recover_runs`; `recover_vcan`
