@@ -50,6 +50,7 @@ BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
 LONG = ("faults", "soak", "growth", "held", "canopen_node")
 FORMS = {
     "bound": "estimators",
+    "calibrations": "calibration",
     "exploration": "surfaces",
     "soak": "realtime --soak",
     "recover_vcan": "recover --vcan",

@@ -27,18 +27,20 @@ examples:
   canprobe study faults --seed 4711
   canprobe study recover --seed 17
   canprobe study regions --draw 2 --against earlier/regions.json
-  canprobe study arrays --draw 2
+  canprobe study calibration --draw 2
   canprobe vcan -- canprobe study faults --vcan
   canprobe vcan -- canprobe study recover --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
 STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
-    "draw": ("arrays", "calibrations", "link", "regions", "surfaces"),
+    "draw": ("calibration", "link", "regions", "surfaces"),
     "against": ("regions",),
 }
 """Studies that have an option, by the option's name."""
 RENAMED: Mapping[str, str] = {
+    "arrays": "calibration",
     "bound": "estimators",
+    "calibrations": "calibration",
     "explore": "surfaces",
     "shapes": "surfaces",
     "soak": "realtime --soak",
@@ -62,7 +64,7 @@ def add_arguments(parser: Parser) -> None:
         "--draw",
         metavar="N",
         type=whole(0, 9999),
-        help="arrays, calibrations, link, regions, surfaces: number that all cases follow from; others than"
+        help="calibration, link, regions, surfaces: number that all cases follow from; others than"
         " those of the published figures",
     )
     parser.add_argument(

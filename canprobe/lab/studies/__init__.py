@@ -8,12 +8,12 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
     executors   where cells are computed: processes of this machine, or a Dask cluster
     cell_store  finished cells on disk, with a digest of the code behind them
     result      the result of a study: columns, rows, findings, picture; its files; facts and intervals
+    figure      a figure that many studies have
     many        many runs of one scene, for `canprobe.run_many`; no study
 
     estimators  error against run time, on `ground`; `bound`: error and coverage over the Cramér–Rao bound
-    regions     coverage with the whole sensor on `random_scenes`; `region_scores`, `region_figure`
-    arrays      calibrations of unseen arrays, and with `array_forces` their force
-    calibrations  scans that notice a calibration of another array
+    regions     coverage with the whole sensor on `random_scenes`; `region_scores`
+    calibration  of unseen arrays by `array_presses`, their force, and foreign calibrations
     surfaces    whole surfaces of `drawn_shapes` beside those of `surface_methods`, and the paths of `exploration`
     workprec    plant and, in `workprec_cell`, the whole cell on `no_bus`
     stability   `stability_runs`, `stability_extremes`, `linear_loop`

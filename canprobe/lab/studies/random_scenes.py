@@ -23,11 +23,8 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.cell.scene.resolve import LAYER_STIFFNESS
 from canprobe.errors import UsageError
-from canprobe.lab.studies.arrays import RADIUS_M, REFERENCE_SIGMA, Presses, random_array
+from canprobe.lab.studies.array_presses import RADIUS_M, Presses, calibrated, pad_of, random_array
 from canprobe.lab.studies.drawn_shapes import centred, heights_file, waves_mm
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
-from canprobe.mechanics.touch.patch.calibrate import calibrate_array
 from canprobe.mechanics.types import Floats
 
 CELLS = {
@@ -98,30 +95,11 @@ def own_array(seed: int) -> tuple[TaxelConfig, float, np.random.Generator]:
     return replace(config, gain_error=rng.uniform(0.02, 0.08)), stiffness, rng
 
 
-def calibration_of(seed: int) -> ArrayCalibration:
-    """The calibration that touches of a random array give."""
-    config, stiffness, rng = own_array(seed)
-    fit = calibrate_array(
-        list(Presses(config, stiffness, rng).protocol()),
-        pad=_pad(config),
-        reference="scale",
-        reference_sigma=REFERENCE_SIGMA,
-        array=f"emulated, seed {seed}",
-        date="",
-        made_on="study regions",
-    )
-    return fit.calibration
-
-
-def _pad(config: TaxelConfig) -> Pad:
-    return Pad(full_scale_pa=config.full_scale_pa, mount_radius_m=RADIUS_M)
-
-
 def _emulated(seed: int) -> TaxelArray:
     """The random array as its calibration touches it, with noise of its own."""
     config, stiffness, gains = own_array(seed)
     arrays = [
-        TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness, pad=_pad(config))
+        TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness, pad=pad_of(config))
         for rng in (gains, np.random.default_rng([39, seed]))
     ]
     arrays[1].take_gains(arrays[0])
@@ -177,7 +155,8 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
         array, sensor = _emulated(seed), replace(sensor, full_scale_kpa=1e-3 * config.full_scale_pa)
     if group == "calibrated":
         file = folder / "calibration.toml"
-        file.write_text(dump_calibration(calibration_of(seed)), encoding="utf-8")
+        fit = calibrated(Presses(*own_array(seed)), f"emulated, seed {seed}")
+        file.write_text(dump_calibration(fit.calibration), encoding="utf-8")
         sensor = replace(sensor, calibration=str(file))
     scene = replace(
         base,

@@ -182,9 +182,8 @@ def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
 STUDIES: Mapping[str, str] = MappingProxyType(
     {
         "estimators": "error of the shape estimators against their run time, and over the Cramér–Rao bound",
-        "arrays": "how well forty touches calibrate an unknown emulated array",
         "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
-        "calibrations": "whether the cell notices that its array has the calibration of another one",
+        "calibration": "how well forty touches calibrate an array, and whether a foreign calibration is noticed",
         "surfaces": "unknown shapes by the map, quadrics, splines and Gaussian processes; the path of exploration",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",

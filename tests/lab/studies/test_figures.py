@@ -30,9 +30,8 @@ from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
 from canprobe.lab.studies.realtime_cases import Measured
 from canprobe.lab.studies.realtime_soak import draw_soak
-from canprobe.lab.studies.region_figure import draw_regions
 from canprobe.lab.studies.region_scores import ScoredScan
-from canprobe.lab.studies.regions import rows_of
+from canprobe.lab.studies.regions import draw_regions, rows_of
 from canprobe.lab.studies.stability_extremes import END_MARKS, EXTREMES, ExtremeCase, draw_extremes, value_in_words
 from canprobe.lab.studies.workprec import draw_workprec
 from canprobe.lab.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell, over_seeds
