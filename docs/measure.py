@@ -52,8 +52,10 @@ FORMS = {
     "bound": "estimators",
     "calibrations": "calibration",
     "exploration": "surfaces",
+    "link": "realtime --link",
     "soak": "realtime --soak",
-    "recover_vcan": "recover --vcan",
+    "recover": "faults --recover",
+    "recover_vcan": "faults --recover --vcan",
     "faults_vcan": "faults --vcan",
 }
 """Other forms of a study, and further tables of one that have their own place on a page, as they are typed."""

@@ -18,7 +18,6 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
     workprec    plant and, in `workprec_cell`, the whole cell on `no_bus`
     stability   `stability_runs`, `stability_extremes`, `linear_loop`
     faults      `fault_cases`, `fault_runs`, `witnessed_run`; `faults_vcan`
-    recover     `recover_cases`, `recover_runs`; `recover_vcan`
-    link        `link_setups`, `link_rates`
-    realtime    `realtime_cases`, `cycle_times`, `plain_canopen`; `realtime_soak`
+    faults --recover  `recover`, `recover_cases`, `recover_runs`; `recover_vcan`
+    realtime    `realtime_cases`, `cycle_times`, `plain_canopen`; `realtime_soak`; `realtime_link` on `link_setups`
 """

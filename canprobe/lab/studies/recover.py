@@ -1,12 +1,12 @@
-"""Study `recover`: a thousand cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
+"""Study `faults --recover`: cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
 
 What is lost, when, for how long, alone or in pairs, follows from a seed, while the arm holds, moves, presses or scans
 (`recover_cases`). A run fails where a drive is enabled with a target more than one count beside its position, where the
 force exceeds the limit at another time than between loss and stop (study `faults` judges that time), where the cell
 does not come back or takes more than a second from the boot-up of the last node to the hold, or where its log lacks a
 cycle. Behind a loss without a boot-up the cell may take as long again as its nodes may take to stop. A stop that
-somebody has to look at, such as a probe that is left pressing, is counted by itself. `canprobe study recover --seed N`
-carries out one run again; a failure is shrunk to the fewest losses that still fail.
+somebody has to look at, such as a probe that is left pressing, is counted by itself. `canprobe study faults --recover
+--seed N` carries out one run again; a failure is shrunk to the fewest losses that still fail.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def replay(seed: int, say: Say) -> dict[str, Any]:
     for failure in outcome["failures"]:
         say(f"FAILURE: {failure}")
     if outcome["failures"]:
-        say(f"shrunk: {shrink(case, run_case)} (canprobe study recover --seed {seed})")
+        say(f"shrunk: {shrink(case, run_case)} (canprobe study faults --recover --seed {seed})")
     return outcome
 
 
@@ -108,8 +108,8 @@ def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
         f" last return to the hold: {most['late_s']:.2f} s; {most['rows_lost']} cycles without a row in the log.",
     ]
     for run in failed[:20]:
-        why = "; ".join(run["failures"])
-        lines.append(f"seed {run['seed']}: {run['shrunk']}: {why} (canprobe study recover --seed {run['seed']})")
+        seed, why = run["seed"], "; ".join(run["failures"])
+        lines.append(f"seed {seed}: {run['shrunk']}: {why} (canprobe study faults --recover --seed {seed})")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Cases of study `recover`: what a cell loses, when and for how long, while it works; each follows from a seed.
+"""Cases of study `faults --recover`: what a cell loses while it works, when and for how long, from a seed.
 
 What is lost: power of a node or of all nodes, the link of a node (bus-off), its SYNC or its heartbeats, its state by
 itself, the interface of the master, or the master's own time; one of them or a pair, while the arm holds, moves,

@@ -1,4 +1,4 @@
-"""Runs of study `recover`: a cell in lockstep that loses nodes or its bus (`recover_cases`), and what comes of it.
+"""Runs of study `faults --recover`: a cell in lockstep that loses nodes or its bus, and what comes of it.
 
 The score looks at the emulated nodes and the plant, not at what the master believes.
 """

@@ -1,8 +1,9 @@
-"""Study `recover` on a real vcan0: the cases of `recover_cases`, with nodes in their own process.
+"""Study `faults --recover` on a real vcan0: the cases of `recover_cases`, with nodes in their own process.
 
-`canprobe vcan -- canprobe study recover --vcan`. Faults are thrown as `canprobe inject` throws them, the interface is
-taken down and up by `ip`, and the master stands still in its controller. The score is that of the study in lockstep;
-first targets, boot-ups and SYNCs are read from the bus log, forces from the plant. Real time is not repeated by a seed.
+`canprobe vcan -- canprobe study faults --recover --vcan`. Faults are thrown as `canprobe inject` throws them, the
+interface is taken down and up by `ip`, and the master stands still in its controller. The score is that of the study in
+lockstep; first targets, boot-ups and SYNCs are read from the bus log, forces from the plant. Real time is not repeated
+by a seed.
 """
 
 from __future__ import annotations

@@ -187,25 +187,34 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "surfaces": "unknown shapes by the map, quadrics, splines and Gaussian processes; the path of exploration",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
-        "link": "whether a check of the link says what the next minute of the cell shows",
-        "recover": "whether a cell comes back from power cycles, resets, cuts and unplugged interfaces, drawn by seed",
-        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
         "faults": "the true force with every kind of fault, in each task and phase, and with files that are wrong",
+        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
     }
 )
 """Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""
+FORMS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "faults --vcan": ("faults_vcan", "on a real vcan0: processes are killed, the link is taken down"),
+        "faults --recover": ("recover", "whether a cell comes back from what it loses by chance: power, links, time"),
+        "faults --recover --vcan": ("recover_vcan", "the same on a real vcan0"),
+        "realtime --link": ("realtime_link", "whether a check of the link says what the next minute of the cell shows"),
+        "realtime --soak": ("realtime_soak", "memory, clocks and counters of a cell that is held for half an hour"),
+    }
+)
+"""Other forms of a study, as they are typed: module, and measured quantity."""
 
 
-def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "", **chosen: Any) -> StudyResult:
+def run_study(typed: str, *, quick: bool, sweep: Sweep, **chosen: Any) -> StudyResult:
     """Run a study.
 
     Args:
-        name: one of `STUDIES`.
+        typed: one of `STUDIES` or `FORMS`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
-        form: variant of it: ``vcan`` of `faults` and `recover`, on a real vcan0; ``soak`` of `realtime`, half an hour.
         chosen: arguments of this study only.
     """
-    module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")
-    result: StudyResult = module.run(quick=quick, sweep=sweep, **chosen)
+    name, _ = FORMS.get(typed, (typed, ""))
+    result: StudyResult = importlib.import_module(f"canprobe.lab.studies.{name}").run(
+        quick=quick, sweep=sweep, **chosen
+    )
     return result

@@ -21,7 +21,7 @@ from canprobe.lab.studies.estimators import (
 )
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.result import Column, StudyResult, as_document, table_lines, write_study
-from canprobe.lab.studies.sweep import STUDIES
+from canprobe.lab.studies.sweep import FORMS, STUDIES
 from canprobe.mechanics.touch.estimate.fit import METHODS
 
 FEW = [EstimatorSetting("chen1996", 160, 10), EstimatorSetting("ml", 160), EstimatorSetting("recursive", 160)]
@@ -92,9 +92,10 @@ def test_what_does_not_apply_is_null_and_a_dash(tmp_path):
 def test_list(capsys):
     assert main(["study", "--list"]) == 0
     out = capsys.readouterr().out
-    assert all(name in out for name in STUDIES)
+    assert all(name in out for name in (*STUDIES, *FORMS))
     assert main(["study", "--list", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == dict(STUDIES)
+    described = json.loads(capsys.readouterr().out)
+    assert described == {**STUDIES, **{typed: words for typed, (_, words) in FORMS.items()}}
 
 
 @pytest.mark.parametrize(
@@ -105,7 +106,10 @@ def test_list(capsys):
         (["study", "soak"], "canprobe study realtime --soak"),
         (["study", "shapes"], "canprobe study surfaces"),
         (["study", "bound"], "canprobe study estimators"),
-        (["study", "regions", "--soak"], "only realtime has"),
+        (["study", "regions", "--soak"], "expected one of faults --vcan"),
+        (["study", "faults", "--link"], "realtime --link"),
+        (["study", "recover"], "canprobe study faults --recover"),
+        (["study", "link"], "canprobe study realtime --link"),
     ],
 )
 def test_a_wrong_name_is_told(argv, said, capsys):

@@ -1,4 +1,4 @@
-"""Cells that lose something by chance come back; the runs of the study `recover`, twenty of its seeds."""
+"""Cells that lose something by chance come back; the runs of `study faults --recover`, twenty of its seeds."""
 
 from __future__ import annotations
 
@@ -46,6 +46,6 @@ def test_a_failure_is_shrunk_to_the_loss_that_makes_it():
 
 
 def test_one_seed_is_repeated_from_the_command_line(capsys):
-    assert main(["study", "recover", "--seed", "6", "-v"]) == 0
+    assert main(["study", "faults", "--recover", "--seed", "6", "-v"]) == 0
     said = capsys.readouterr().err
     assert "seed 6: hold: reboot of node 1" in said and "the cell is back after" in said

@@ -159,7 +159,7 @@ def test_times_are_taken_one_by_one_and_belong_to_a_machine(demo, tmp_path, monk
     store.close()
 
 
-@pytest.mark.parametrize("study", sweep.STUDIES)
+@pytest.mark.parametrize("study", [*sweep.STUDIES, *(module for module, _ in sweep.FORMS.values())])
 def test_the_code_that_a_study_names_is_there(study):
     model_digest(getattr(importlib.import_module(f"canprobe.lab.studies.{study}"), "MODEL", ()))
 
