@@ -15,7 +15,7 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
     regions     coverage with the whole sensor on `random_scenes`; `region_scores`
     calibration  of unseen arrays by `array_presses`, their force, and foreign calibrations
     surfaces    whole surfaces of `drawn_shapes` beside those of `surface_methods`, and the paths of `exploration`
-    workprec    plant and, in `workprec_cell`, the whole cell on `no_bus`
+    workprec    error of the dynamic plant against its run time
     stability   `stability_runs`, `stability_extremes`, `linear_loop`
     faults      `fault_cases`, `fault_runs`, `witnessed_run`; `faults_vcan`
     faults --recover  `recover`, `recover_cases`, `recover_runs`; `recover_vcan`

@@ -35,7 +35,6 @@ from canprobe.lab.studies.region_scores import scores_of
 from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.stability_runs import LateNode, bent_touch, refused_row, run_touch, scene_of
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.workprec_cell import SENSOR_HZ
 
 EXTREMES: Mapping[str, tuple[tuple[float, ...], str]] = {
     "dead rows": ((1, 2, 4, 8), "{:g}"),
@@ -48,6 +47,8 @@ EXTREMES: Mapping[str, tuple[tuple[float, ...], str]] = {
     "jitter of the period": ((5, 20, 50), "{:g} %"),
 }
 """Thing → its values, and the form of one in words."""
+SENSOR_HZ = {500.0: 250.0}
+"""Rate of the tactile frames where 200 Hz does not divide the servo's."""
 PROBE_MM = 40.0
 """Radius of the default probe."""
 HOLD_S, SCAN_S = 1.0, 2.0

@@ -6,8 +6,6 @@ evaluate them in every call. Cost is processor time per cycle, the best of sever
 RMS over the ends of the cycles: force relative to the reference's RMS force, position of the probe's centre, pressure
 of a taxel in counts of 1/255 of the full scale. Each method and step must also come to rest against a contact of
 10 MN/m, the stiffest here: explicit steps that are too long rattle there.
-
-`workprec_cell` measures the whole cell, of which the plant is a part.
 """
 
 from __future__ import annotations
@@ -37,7 +35,6 @@ from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import UsageError
 from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.workprec_cell import run_cell
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.dynamics import dynamics_problem
 from canprobe.mechanics.robot.inverse import inverse_near
@@ -112,7 +109,7 @@ def cases(quick: bool) -> list[IntegrationCase]:
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Integrate all cases, one at a time, and the references beside each other; then scan with the whole cell.
+    """Integrate all cases, one at a time, and the references beside each other.
 
     Raises:
         UsageError: MuJoCo is missing.
@@ -138,8 +135,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         row |= dict.fromkeys(ENOUGH) if states is None else errors(truths[k], observed(k, np.array(states)))
         rows.append(row | {"verdict": verdict(row)})
     facts, draw = measuring_facts(quick, 0, MODEL), partial(draw_workprec, rows, floors)
-    more = (run_cell(quick=quick, sweep=sweep),)
-    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw, more)
+    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw)
 
 
 @cache

@@ -34,7 +34,6 @@ from canprobe.lab.studies.region_scores import ScoredScan
 from canprobe.lab.studies.regions import draw_regions, rows_of
 from canprobe.lab.studies.stability_extremes import END_MARKS, EXTREMES, ExtremeCase, draw_extremes, value_in_words
 from canprobe.lab.studies.workprec import draw_workprec
-from canprobe.lab.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell, over_seeds
 
 COLUMN_PX, WIDEST_PX, LEAST_TYPE_PX, LEAST_BAR_PX = 800, 1400, 9.0, 4.0
 FILLED, TILES = 0.3, 3
@@ -110,20 +109,6 @@ def plant(path, stiffnesses=workprec.STIFFNESSES, steps=workprec.STEPS_US):
         for held in (True, False)
     ]  # fmt: skip
     draw_workprec(rows, floors, path)
-
-
-def whole_cell(path):
-    rows = [
-        {"rate_hz": rate, "mode": mode, "bus": one_of((*REAL, FASTER), i), "fidelity": fidelity, "stiff": "holds",
-         "reason": "", "method": one_of(("chord", "ml", "recursive"), i)}
-        | over_seeds([
-            {"ended": "done", "cost_ms_per_s": 40 + 0.5 * rate + 20 * i, "curvature_percent": (2 - 0.2 * i) * share,
-             "bound_percent": 0.8, "normal_deg": (0.09 - 0.01 * i) * share, "force_percent": (5.8 - 0.3 * i) * share}
-            for share in (0.9, 1.1)])
-        for fidelity in FIDELITIES
-        for i, (rate, mode) in enumerate(itertools.product(RATES_HZ, MODES[:1]))
-    ]  # fmt: skip
-    draw_cell(rows, path)
 
 
 def faults(count):
@@ -217,7 +202,6 @@ PICTURES = {
     "regions": regions,
     "workprec": plant,
     "workprec, quick": functools.partial(plant, stiffnesses=workprec.STIFFNESSES[:2], steps=workprec.STEPS_US[1:3]),
-    "workprec, cell": whole_cell,
     "faults": faults(1020),
     "faults, quick": faults(8),
     "faults, files": wrong_files,

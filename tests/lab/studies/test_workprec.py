@@ -1,17 +1,13 @@
-"""Study `workprec`: the plant's integrators, the whole cell's refusals and scans, and the words of both."""
+"""Study `workprec`: the plant's integrators against the reference, and the words of the study."""
 
-import json
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from canprobe.cell.plant.dynamic_arm import Stepping
-from canprobe.cell.tasks.probing import Phase
 from canprobe.cli import main
-from canprobe.lab.studies import workprec, workprec_cell
-from canprobe.lab.studies.result import as_document, text_of, write_study
+from canprobe.lab.studies import workprec
 from canprobe.lab.studies.workprec import (
     ENOUGH,
     IntegrationCase,
@@ -26,16 +22,6 @@ from canprobe.lab.studies.workprec import (
     stands,
     trial,
     verdict,
-)
-from canprobe.lab.studies.workprec_cell import (
-    MEASURES,
-    BusSetting,
-    CellCase,
-    default_of,
-    good,
-    measure,
-    over_seeds,
-    run_cell,
 )
 
 CYCLES = 3
@@ -116,99 +102,3 @@ def test_without_mujoco_it_is_refused_at_once(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("importlib.util.find_spec", lambda name, package=None: None)
     assert main(["study", "workprec", "--quick", "--out", str(tmp_path)]) == 2
     assert "needs the package mujoco" in capsys.readouterr().err
-
-
-class Here:
-    """A sweep without processes; answers pass through JSON as in a real one."""
-
-    def map(self, function, cells, *, model=()):
-        return [json.loads(json.dumps(function(cell))) for cell in cells]
-
-    time = map
-
-    def say(self, words):
-        pass
-
-
-@pytest.mark.slow(reason="a whole study in its quick form")
-def test_the_quick_cell_has_scans_and_the_plans_refusals(tmp_path):
-    quick = run_cell(quick=True, sweep=Here())
-    done = [r for r in quick.rows if r["ended"] == "done"]
-    assert {r["fidelity"] for r in done} == {"ideal", "dynamic"}
-    for found in done:
-        assert found["cost_ms_per_s"] > 10.0
-        assert 0.0 < found["force_percent"] < 30.0
-        assert 0.0 < found["curvature_percent"] < 30.0
-    refused = [r for r in quick.rows if r["ended"] == "refused"]
-    assert [(r["rate_hz"], r["bus"]) for r in refused] == [(500.0, "classical"), (500.0, "FD")]
-    assert all("can0" in r["reason"] for r in refused)
-    assert len(done) + len(refused) + sum(r["ended"] == "stopped" for r in quick.rows) == len(quick.rows) == 6
-    assert {(r["rate_hz"], r["bus"]) for r in done} == {(200.0, "classical"), (500.0, "8 Mbit/s")}
-    assert {(r["rate_hz"], r["stiff"]) for r in done if r["rate_hz"] > 200.0} == {(500.0, "holds")}
-    names = [path.name for path in write_study(quick, tmp_path)]
-    assert names == [f"workprec_cell.{end}" for end in ("csv", "txt", "json", "png")]
-    assert (tmp_path / "workprec_cell.png").stat().st_size > 10_000
-    assert "study workprec_cell" in text_of(quick) and len(as_document(quick)["rows"]) == 6
-
-
-def test_a_scan_that_is_stopped_is_a_row_with_its_reason(monkeypatch):
-    def stopped(*_, **__):
-        raise workprec_cell.SafetyStop("measured force 9 N above the limit of 5 N")
-
-    monkeypatch.setattr(workprec_cell, "run_scene", stopped)
-    answer = measure(CellCase(BusSetting(100.0, "features", "classical"), "chord", "ideal", 1.0, 1))
-    assert answer == {"ended": "stopped", "reason": "measured force 9 N above the limit of 5 N"}
-
-
-def test_the_cost_is_that_of_the_scan_alone(monkeypatch):
-    """Ten cycles of 10 ms, the scan from the third to the eighth: 5 s of work in 0.05 s."""
-
-    def run(scene, *, observers, **_):
-        for _ in range(10):
-            observers[0](SimpleNamespace(measurement=object()))
-        observers[0](SimpleNamespace(measurement=None))
-        phase = [Phase.APPROACH] * 3 + [Phase.SCAN] * 6 + [Phase.RETREAT]
-        log = {"phase": np.array(phase), "t_s": 0.01 * np.arange(10)}
-        shape = {"kappa_rms_error_percent": 3.0, "normal_rms_deg": 0.1, "cramer_rao_ratio": 1.5}
-        summary = {"shape": shape, "contact": {"force_rms_error_n": 0.1, "force_target_n": 2.0}}
-        return SimpleNamespace(log=log, summary=summary)
-
-    clock = iter(range(100))
-    monkeypatch.setattr(workprec_cell, "run_scene", run)
-    monkeypatch.setattr(workprec_cell, "process_time", lambda: float(next(clock)))
-    answer = measure(CellCase(BusSetting(100.0, "features", "classical"), "recursive", "ideal", 1.0, 1))
-    assert answer["cost_ms_per_s"] == pytest.approx(1e3 * 5.0 / 0.05)
-    assert answer["force_percent"] == pytest.approx(5.0)
-    assert answer["bound_percent"] == pytest.approx(2.0)
-
-
-def test_a_row_has_the_spread_of_its_seeds():
-    scans = [{"ended": "done", "reason": "", "cost_ms_per_s": 100.0 + i, "bound_percent": 1.0, "normal_deg": 0.1,
-              "curvature_percent": 2.0 + i, "force_percent": 4.0} for i in range(3)]  # fmt: skip
-    one = over_seeds(scans)
-    assert (one["cost_ms_per_s"], one["curvature_percent"]) == (100.0, 3.0)
-    assert (one["curvature_percent_low"], one["curvature_percent_high"]) == (2.0, 4.0)
-    stopped = over_seeds([*scans, {"ended": "stopped", "reason": "too much"}])
-    assert stopped["force_percent"] is None
-    assert stopped["reason"] == "1 of 4 seeds stopped: too much"
-
-
-def cell_row(method, cost, errors, *, rate=400.0, bus="classical", fidelity="ideal", stiff="holds"):
-    named = {"rate_hz": rate, "mode": "window", "bus": bus, "method": method, "fidelity": fidelity, "stiff": stiff}
-    return named | {"cost_ms_per_s": cost, "ended": "done", "reason": "", **dict(zip(MEASURES, errors, strict=True))}
-
-
-def test_the_knee_of_the_cell_is_the_cheapest_whose_errors_are_all_small_enough():
-    best, knee = cell_row("ml", 900.0, (1.0, 0.1, 2.0)), cell_row("recursive", 300.0, (1.9, 0.19, 5.9))
-    rows = [best, knee, cell_row("chord", 100.0, (1.2, 0.1, 6.1)), cell_row("chord", 50.0, (None, None, 2.0))]
-    rows.append(cell_row("chord", 10.0, (0.1, 0.01, 0.2), fidelity="dynamic"))
-    rows.append(cell_row("chord", 20.0, (1.0, 0.1, 2.0), rate=200.0, stiff="stopped"))
-    rows.append(cell_row("chord", 20.0, (1.0, 0.1, 2.0), rate=1000.0, bus="8 Mbit/s"))
-    assert good(rows, "ideal") == [knee, best]
-    assert default_of(rows, "ideal") is knee
-    said = "\n".join(workprec_cell.findings(rows))
-    assert "40 kN/m: 400 Hz, window, classical, recursive: 300 ms a second for 1.9 %" in said
-    assert "400 Hz 300 ms a second, force 5.9 %, curvature 1.9 %, 40 kN/m: holds" in said
-    assert "It is the default." in said
-    stopped = cell_row("chord", None, (None, None, None)) | {"ended": "stopped", "reason": "too much"}
-    assert "1 scans were stopped for safety, 0 settings refused" in workprec_cell.findings([stopped])[-1]
