@@ -30,8 +30,7 @@ from canprobe.errors import CanprobeError
 from canprobe.fieldbus.tools.link.verdict import FIT_SHARE, UNFIT_SHARE, Fitness
 from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.link_setups import MACHINE_HZ, construct, draw_machine, draw_setup, scene_of
-from canprobe.lab.studies.no_bus import on_any_bitrate
-from canprobe.lab.studies.realtime_cases import patient
+from canprobe.lab.studies.realtime_cases import on_any_bitrate, patient
 from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 

@@ -188,7 +188,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "workprec": "error of the dynamic plant against its run time, by an explicit and an implicit integrator",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "faults": "the true force with every kind of fault, in each task and phase, and with files that are wrong",
-        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "realtime": "how well the cycle keeps time on a real vcan0; needs that interface",
     }
 )
 """Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""

@@ -22,13 +22,12 @@ from canprobe.lab.studies import estimators, fault_cases, stability, workprec
 from canprobe.lab.studies import faults as faults_study
 from canprobe.lab.studies import stability as stability_figure
 from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
-from canprobe.lab.studies.cycle_times import CycleTimes
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.faults_vcan import draw_ends
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
-from canprobe.lab.studies.realtime_cases import Measured
+from canprobe.lab.studies.realtime_cases import CycleTimes, Measured
 from canprobe.lab.studies.realtime_soak import draw_soak
 from canprobe.lab.studies.region_scores import ScoredScan
 from canprobe.lab.studies.regions import draw_regions, rows_of
@@ -163,9 +162,7 @@ def realtime(path):
         some = some.astype(int)
         return CycleTimes(2_500_000, late.astype(int), 4000 / rate, some, 2 * some, 3 * some)
 
-    cases = [
-        Measured(case, "window", 400.0, times(400.0)) for case in ("whole controller", "plain canopen", "bare clock")
-    ]
+    cases = [Measured(case, "window", 400.0, times(400.0)) for case in ("whole controller", "bare clock")]
     held = [Measured("hold", mode, rate, times(rate - 30 * i)) for i, mode in enumerate(("features", "window", "image"))
             for rate in (200.0, 400.0, 1000.0)]  # fmt: skip
     draw_realtime([*cases, *held], path)
