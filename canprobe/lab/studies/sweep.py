@@ -186,7 +186,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "calibration": "how well forty touches calibrate an array, and whether a foreign calibration is noticed",
         "surfaces": "unknown shapes by the map, quadrics, splines and Gaussian processes; the path of exploration",
         "workprec": "error of the dynamic plant against its run time, by an explicit and an implicit integrator",
-        "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
+        "stability": "where the force loop settles, predicted and carried out, and how extreme cases end",
         "faults": "the true force with every kind of fault, in each task and phase, and with files that are wrong",
         "realtime": "how well the cycle keeps time on a real vcan0; needs that interface",
     }

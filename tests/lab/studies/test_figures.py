@@ -20,7 +20,6 @@ from canprobe.cell.results.plan_figure import draw_plan
 from canprobe.cell.results.surface_figure import draw_surface
 from canprobe.lab.studies import estimators, fault_cases, stability, workprec
 from canprobe.lab.studies import faults as faults_study
-from canprobe.lab.studies import stability as stability_figure
 from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.faults_vcan import draw_ends
@@ -137,12 +136,14 @@ def ends(path):
 
 
 def map_of_touches(path):
-    """Every table beside the map, and of the map four buses with a few contacts."""
+    """Four buses with a few contacts."""
     cases = [case for case in stability.cases(False) if case.rate_hz != 200.0 and case.late_ms != 6.0]
-    chosen = [case for case in cases if case.view not in stability_figure.VIEWS or case.contact_n_m in (1e3, 1e5)]
     names = ("stable", "stopped", "approach", "refused")
-    rows = [stability.row_of(case, {"ended": one_of(names, i), "reason": REASON}) for i, case in enumerate(chosen)]
-    stability_figure.draw_stability(rows, path)
+    rows = [
+        stability.row_of(case, {"ended": one_of(names, i), "reason": REASON})
+        for i, case in enumerate(case for case in cases if case.contact_n_m in (1e3, 1e5))
+    ]
+    stability.draw_stability(rows, path)
 
 
 def extremes(path):
