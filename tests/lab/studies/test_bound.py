@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.lab.studies.bound import BoundCase, all_cases, findings, rows_of
+from canprobe.lab.studies.bound import METHODS, BoundCase, all_cases, findings, rows_of, verdict
 from canprobe.lab.studies.cell_store import CellStore
 from canprobe.lab.studies.ground import PATHS, SURFACES, make_ground
 from canprobe.lab.studies.sweep import Sweep
@@ -89,9 +89,14 @@ def test_outside_the_region_ml_is_honest(rows):
         assert row["coverage"] >= 0.82, row
 
 
-def test_the_table_says_what_is_wrong(rows):
-    bad = dict(rows[0], ratio=3.0, coverage=0.5, inside=True, verdict="error, overconfident")
-    said = findings([*rows, bad])
+def test_the_table_says_what_is_wrong():
+    good = {"surface": "cylinder", "path": "weave", "size_mm": 40.0, "sigma_point_um": 20.0, "observed": 1.0}
+    good |= {"inside": True, "ratio": 1.0, "bias": 0.0, "coverage": 0.95}
+    rows = [good | {"method": method} for method in METHODS]
+    rows.append(rows[0] | {"ratio": 3.0, "coverage": 0.5})
+    rows = [row | {"verdict": verdict(row, 200)} for row in rows]
+    assert [row["verdict"] for row in rows] == ["good", "good", "error, overconfident"]
+    said = findings(rows)
     assert any("out of line: cylinder" in line and "overconfident" in line for line in said)
 
 

@@ -212,7 +212,7 @@ PICTURES = {
 }
 
 
-SHOWN = ("plane, stopped", "free", "plan", "bound", "faults", "soak")
+SHOWN = ("plane, stopped", "plan", "bound", "faults, quick", "soak")
 OTHERS = pytest.mark.slow(reason="one more picture; the default draws one of each kind")
 
 

@@ -10,6 +10,7 @@ from canprobe.mechanics.touch.estimate import misfit
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.prior import Prior
 
+FILTER = pytest.mark.slow(reason="the filter over many seeds; the default has the batch")
 CUBIC = np.array([9.0, -14.0, 6.0, 11.0])
 """Of x³, x²y, xy², y³, 1/m²: curvature changes by 2 1/m over the path."""
 K_TRUE = np.array([[30.0, 6.0], [6.0, -12.0]])
@@ -70,7 +71,7 @@ def test_a_misfit_that_shows_is_corrected(method, scale, share_left):
         ("ml", 1.0, 0.5, 0.45),
         ("ml", 3.0, 0.90, 0.05),
         ("ml", 8.0, 0.90, 0.05),
-        ("recursive", 3.0, 0.90, 0.1),
+        pytest.param("recursive", 3.0, 0.90, 0.1, marks=FILTER),
     ],
 )
 def test_regions_hold_the_truth_whether_it_shows_or_hides(method, scale, least, plain_most):
@@ -124,7 +125,7 @@ def test_on_a_plane_a_region_does_not_grow_with_its_own_error():
     a = np.linspace(0.0, 2.0 * np.pi, 160)
     places = 0.8e-3 * np.stack([np.sin(a), 1.0 - np.cos(a), np.zeros_like(a)], axis=1)
     inside = []
-    for seed in range(200):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         points = places + 20e-6 * rng.normal(size=places.shape)
         normals = np.array([0.0, 0.0, -1.0]) + 1e-3 * rng.normal(size=places.shape)
@@ -148,7 +149,7 @@ def held(method, seeds, sigma_point=1e-4, sigma_normal=5e-3):
     return np.mean(inside)
 
 
-@pytest.mark.parametrize(("method", "seeds"), [("ml", 40), ("recursive", 30)])
+@pytest.mark.parametrize(("method", "seeds"), [("ml", 40), pytest.param("recursive", 30, marks=FILTER)])
 def test_where_noise_is_a_share_of_the_radius_a_hidden_misfit_is_reckoned_with(method, seeds, monkeypatch):
     """Without caution every second region misses."""
     assert held(method, seeds) >= 0.9

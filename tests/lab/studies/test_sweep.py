@@ -221,7 +221,12 @@ def test_only_one_study_writes_into_a_folder(tmp_path):
     CellStore(tmp_path).close()
 
 
-@pytest.mark.parametrize(("fate", "status"), [("SIGKILL", -9), ("SIGINT", 130), ("SIGTERM", 143)])
+OTHER_SIGNAL = pytest.mark.slow(reason="a third way to end a sweep")
+
+
+@pytest.mark.parametrize(
+    ("fate", "status"), [("SIGKILL", -9), ("SIGINT", 130), pytest.param("SIGTERM", 143, marks=OTHER_SIGNAL)]
+)
 def test_an_ended_sweep_goes_on_where_it_was(demo, tmp_path, fate, status):
     ended = run_demo(tmp_path, fate)
     assert ended.returncode == status, ended.stderr
