@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from heapq import heappop, heappush
 from random import Random
 
@@ -192,15 +192,6 @@ class StandingClock:
         self.clock.sleep_until_ns(self.end_ns if self.begin_ns <= t_ns else t_ns)
 
 
-@dataclass(slots=True, eq=False)
-class _Transit:
-    """Frames on their way to the reader: (time of arrival, number, frame)."""
-
-    heap: list[tuple[int, int, Frame]] = field(default_factory=list)
-    number: int = 0
-    last_ns: int = 0
-
-
 class DisturbedPort(PlainPort):
     """A port that delays, scatters and loses frames, with a short transmit queue, a late clock or a slow master.
 
@@ -220,8 +211,8 @@ class DisturbedPort(PlainPort):
         clocks = {"machine": LateClock, "still": StandingClock}
         if setup.kind in clocks:
             self.clock = clocks[setup.kind](port.clock, rng, setup.share, setup.size * self._period_ns)
-        self._transit = _Transit()
-        self._sent_ns = self._lost_until_ns = 0
+        self._arriving: list[tuple[int, int, Frame]] = []  # a heap: time of arrival, number, frame
+        self._number = self._last_ns = self._sent_ns = self._lost_until_ns = 0
 
     @property
     def counters(self) -> PortCounters:
@@ -255,7 +246,7 @@ class DisturbedPort(PlainPort):
     def drain(self) -> list[TimedFrame]:
         """Return the frames that have arrived."""
         self._take()
-        heap, arrived = self._transit.heap, list[TimedFrame]()
+        heap, arrived = self._arriving, list[TimedFrame]()
         now_ns = self.clock.now_ns()
         while heap and heap[0][0] <= now_ns:
             ready_ns, _, (can_id, data) = heappop(heap)
@@ -266,7 +257,7 @@ class DisturbedPort(PlainPort):
         """Wait for a frame, until `until_ns` at the latest."""
         while True:
             self._take()
-            heap, now_ns = self._transit.heap, self.clock.now_ns()
+            heap, now_ns = self._arriving, self.clock.now_ns()
             if now_ns >= until_ns or (heap and heap[0][0] <= now_ns):
                 return
             self._port.wait(min(until_ns, heap[0][0]) if heap else until_ns)
@@ -283,13 +274,13 @@ class DisturbedPort(PlainPort):
         return True
 
     def _take(self) -> None:
-        transit, kind = self._transit, self._setup.kind
+        kind = self._setup.kind
         for can_id, data, t_ns in self._port.drain():
             if self._is_lost():
                 continue
             delay_ns = self._setup.size * self._period_ns if kind in ("delay", "jitter") else 0.0
             if kind == "jitter":
                 delay_ns = self._rng.expovariate(1.0 / delay_ns)
-            transit.last_ns = max(transit.last_ns, t_ns + round(delay_ns))  # an adapter keeps the order
-            transit.number += 1
-            heappush(transit.heap, (transit.last_ns, transit.number, (can_id, data)))
+            self._last_ns = max(self._last_ns, t_ns + round(delay_ns))  # an adapter keeps the order
+            self._number += 1
+            heappush(self._arriving, (self._last_ns, self._number, (can_id, data)))

@@ -14,7 +14,6 @@ from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.master.trail import TakenWay
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.scene.load import load_scene
@@ -83,45 +82,20 @@ class WatchedDrives(Participant):
         return []
 
 
-class Work(Controller):
-    """The work of a case: it ends with its own loss, or is held and goes on.
+def ending(task: Controller, is_over: Callable[[Measurement], bool]) -> Controller:
+    """The task, which is done when the case is over.
 
-    Args:
-        task: the task.
-        is_over: called with each measurement; whether the case is over.
+    Its step is replaced, as a wrapper would have to pass on all that a cell may ask of a task that is held.
     """
+    step = task.step
 
-    def __init__(self, task: Controller, is_over: Callable[[Measurement], bool]) -> None:
-        self._task, self._is_over = task, is_over
-        self.can_go_on = task.can_go_on
-
-    def step(self, measurement: Measurement) -> Command:
-        """One cycle of the task."""
-        over = self._is_over(measurement)
-        command = self._task.step(measurement)
+    def step_until_over(measurement: Measurement) -> Command:
+        over = is_over(measurement)
+        command = step(measurement)
         return replace(command, done=True) if over else command
 
-    def update(self) -> None:
-        """Let the task work."""
-        self._task.update()
-
-    def go_on(self, measurement: Measurement) -> None:
-        """Let the task go on."""
-        self._task.go_on(measurement)
-
-    @property
-    def lets_go(self) -> bool:  # type: ignore[override]
-        """Whether the task lets go."""
-        return self._task.lets_go
-
-    @property
-    def trail(self) -> TakenWay | None:
-        """The way by which the task's probe has come."""
-        return self._task.trail
-
-    def retreat(self, reason: str) -> None:
-        """Let the task let go."""
-        self._task.retreat(reason)
+    task.step = step_until_over  # type: ignore[method-assign]
+    return task
 
 
 class RecoverScore:
@@ -179,7 +153,7 @@ class RecoverScore:
         task = HoldTask() if self.case.work == "hold" else make_task(self.plan)
         for controller in (task, *(HoldTask() for _ in range(len(self.case.outages) + 1))):
             try:
-                session.run(Work(controller, is_over), after_cycle)
+                session.run(ending(controller, is_over), after_cycle)
                 if is_over(Measurement(0, 0)):
                     break
             except CanprobeError as error:
