@@ -142,7 +142,7 @@ def measure(cell: tuple[BoundCase, str, int, int]) -> list[Answer]:
     ground, fit, own = case.ground, _fitter(case), zlib.crc32(as_json(case).encode())
     answers: list[Answer] = []
     for seed in range(first, first + count):
-        points, normals = ground.felt(case.sigma_point, case.sigma_normal, np.random.default_rng([own, seed]))
+        points, normals = ground.measured(case.sigma_point, case.sigma_normal, np.random.default_rng([own, seed]))
         estimate = fit(points, normals, method=method)
         if estimate.rank < 3:
             answers.append(None)

@@ -137,7 +137,7 @@ def measure_errors(cell: tuple[Place, Noise, bool, int]) -> list[Floats | None]:
     """Error (3,) of K of each setting, of one seed; None where not all of K was observed."""
     (name, size), noise, quick, seed = cell
     ground = on_the_move(name, size)
-    samples = contacts(*ground.felt(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
+    samples = contacts(*ground.measured(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
     errors: list[Floats | None] = []
     for setting in settings(quick):
         estimator = setting.make(*noise)
@@ -154,12 +154,12 @@ def measure_costs(cell: tuple[Noise, bool, int]) -> list[list[tuple[float, float
     noise, quick, turns = cell
     ground = on_the_move(*GROUNDS[0])
     estimators = [s.make(*noise) for s in settings(quick)]
-    samples = contacts(*ground.felt(*noise, np.random.default_rng(99)))
+    samples = contacts(*ground.measured(*noise, np.random.default_rng(99)))
     for estimator in estimators:
         for sample in samples:
             estimator.add(sample)
     times: list[list[tuple[float, float]]] = [[] for _ in estimators]
-    points, normals = ground.felt(*noise, np.random.default_rng(100))  # the path again, back from its end
+    points, normals = ground.measured(*noise, np.random.default_rng(100))  # the path again, back from its end
     back = -2 - np.arange(SHARE * (turns + 1)) % (SAMPLES - 2)
     more = contacts(points[back], normals[back], first=SAMPLES)
     gc.collect()

@@ -15,7 +15,7 @@ import numpy as np
 from canprobe.cell.results.picture import BLUE, GREEN, GREY, INK, ORANGE, PINK, SKY, legend, log_scale, picture
 from canprobe.lab.studies.drawn_shapes import LENGTH_MM, WIDTH_MM, TrueGround
 from canprobe.lab.studies.result import Column, Row, drawn_anew, interval_of
-from canprobe.lab.studies.surface_methods import see_map
+from canprobe.lab.studies.surface_methods import evaluate_map
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.map.surface_map import SurfaceMap
@@ -108,7 +108,7 @@ def errors_over_path(surface_map: SurfaceMap, samples: Sequence[ContactSample], 
         until = int(np.searchsorted(path, mark, side="right"))
         surface_map.add_samples(samples[taken:until])
         taken = until
-        errors = truth.errors(see_map(surface_map, truth.points))
+        errors = truth.errors(evaluate_map(surface_map, truth.points))
         values = (path[until - 1], seconds[until - 1], *(error.mean() for error in errors))
         for column, value in zip(found.values(), values, strict=True):
             column.append(float(value))

@@ -1,8 +1,8 @@
 """Study `stability`: where the force loop settles, predicted and carried out; and how extreme cases end.
 
 The map goes over contact stiffness × force gain (`servo.surface_height_hz`) for pairs of servo rate and bus delay. Two
-servos run on it: one that uses the stated stiffness, as the linear loop of `stability_runs` does ("told"), and the real
-one, which estimates it ("felt"). Prediction: the largest eigenvalue over one period of the sensor; and the stiffness at
+servos run on it: one that uses the stated stiffness, as the linear loop of `stability_runs` does, and the real one,
+which estimates it. Prediction: the largest eigenvalue over one period of the sensor; and the stiffness at
 which the approach exceeds the force limit before the first sample of the touch is received. A second table has
 extreme cases (`stability_extremes`).
 
@@ -35,6 +35,7 @@ STIFFNESSES = (1e2, 1e3, 1e4, 2e4, 4e4, 6e4, 1e5, 1e6, 1e7)
 GAINS_HZ = (2.0, 8.0, 25.0)
 BUSES = ((400.0, 0.0), (400.0, 6.0), (400.0, 20.0), (200.0, 0.0), (100.0, 0.0), (1000.0, 0.0))
 """Servo rate (Hz) and delay (ms)."""
+SERVOS = {"stated": "servo with the stated stiffness", "estimated": "servo that estimates the stiffness"}
 WIDE_PERCENT = 20.0
 SOUND_ENDS = ("stable", "stopped", "approach", "refused")
 MODEL = ("fieldbus", "mechanics", "cell", "lab/studies/stability_runs.py", "lab/studies/linear_loop.py")
@@ -58,15 +59,15 @@ def cases(quick: bool) -> list[LoopCase]:
     """All cells; quick: a case for each way to end."""
     if quick:
         return [
-            LoopCase(1e4, rate_hz=200.0, feels=False, hold_s=0.1),
-            LoopCase(1e7, feels=False),
+            LoopCase(1e4, "stated", rate_hz=200.0, hold_s=0.1),
+            LoopCase(1e7, "stated"),
             LoopCase(1e4, late_ms=20.0),
             LoopCase(1e4, rate_hz=1000.0),
         ]
-    grid = product(BUSES, GAINS_HZ, STIFFNESSES, (True, False))
+    grid = product(BUSES, GAINS_HZ, STIFFNESSES, reversed(SERVOS))
     return [
-        LoopCase(k, rate_hz=rate, late_ms=late, height_hz=gain, feels=feels)
-        for (rate, late), gain, k, feels in grid
+        LoopCase(k, servo, rate, late, gain)
+        for (rate, late), gain, k, servo in grid
         if rate <= 400.0 or (gain == 8.0 and k == 1e4)
     ]
 
@@ -83,8 +84,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def row_of(case: LoopCase, answer: Row) -> Row:
     """The row of a cell: case, prediction, answer."""
-    servo = "felt" if case.feels else "told"
-    row = {"servo": servo, **asdict(case), "eigenvalue": spectral_radius(loop_of(case)), **answer}
+    row = {**asdict(case), "eigenvalue": spectral_radius(loop_of(case)), **answer}
     over = row["ended"] == "stopped" and "above the limit" in row["reason"]
     return row | {"ended": "approach"} if over and row["contact_n_m"] > approach_limit(row) else row
 
@@ -105,11 +105,11 @@ def findings(rows: Sequence[Row]) -> list[str]:
     ends = Counter(str(row["ended"]) for row in rows)
     counted = ", ".join(f"{number} {END_MARKS[end][2]}" for end, number in ends.most_common())
     said = [f"{len(rows)} touches: {counted}."]
-    told = [r for r in rows if r["servo"] == "told" and r["ended"] != "refused" and r["contact_n_m"] >= 1e3]
-    if told:
-        settles = [r for r in told if r["eigenvalue"] < 1.0]
+    stated = [r for r in rows if r["servo"] == "stated" and r["ended"] != "refused" and r["contact_n_m"] >= 1e3]
+    if stated:
+        settles = [r for r in stated if r["eigenvalue"] < 1.0]
         right = sum(r["ended"] == "stable" for r in settles)
-        not_settling = [r for r in told if r["eigenvalue"] >= 1.0]
+        not_settling = [r for r in stated if r["eigenvalue"] >= 1.0]
         unheard = sum("no tactile frame" in r["reason"] for r in settles)
         over = sum("above the limit" in r["reason"] for r in settles)
         wrong = sum(r["ended"] != "stable" for r in not_settling)
@@ -120,8 +120,8 @@ def findings(rows: Sequence[Row]) -> list[str]:
             f"force limit at the touch itself; of {len(not_settling)} outside {wrong} are not stable; {early} of "
             "these are beyond the limit of the approach, and say nothing about the loop."
         )
-    felt = [r for r in rows if r["servo"] == "felt" and r["ended"] != "refused"]
-    for name, group in (("stated", told), ("estimated", felt)):
+    estimated = [r for r in rows if r["servo"] == "estimated" and r["ended"] != "refused"]
+    for name, group in (("stated", stated), ("estimated", estimated)):
         stable = [r["contact_n_m"] for r in group if r["ended"] == "stable"]
         if stable:
             span = f"{min(stable):.0e} to {max(stable):.0e} N/m"
@@ -162,7 +162,6 @@ END_MARKS = {
     "failed": (ORANGE, "v", "failed"),
 }
 """Colour, marker and words for each end of a touch."""
-SERVOS = {"told": "servo with the stated stiffness", "felt": "servo that estimates the stiffness"}
 PANELS_IN_A_ROW = 3
 
 
@@ -179,7 +178,7 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
         stiffness = np.geomspace(70.0, 1.5e7, 40)
         for part, (servo, words) in zip(parts(figure, len(SERVOS), 1), SERVOS.items(), strict=True):
             part.suptitle(words, x=0.01, ha="left", fontsize="medium", fontweight="bold")
-            ratios = [loop_of(LoopCase(float(k), feels=servo == "felt")).depth_ratio for k in stiffness]
+            ratios = [loop_of(LoopCase(float(k), servo)).depth_ratio for k in stiffness]
             grid = part.subplots(lines, min(PANELS_IN_A_ROW, len(buses)), squeeze=False, sharex=True, sharey=True)
             for axes in grid.flat[len(buses) :]:
                 axes.set_visible(False)

@@ -104,18 +104,18 @@ class LoopCase:
 
     Attributes:
         contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
+        servo: whether it uses the "stated" stiffness of the default pad, or one "estimated" from the touch.
         rate_hz: rate of the servo.
         late_ms: delay of targets and tactile frames.
         height_hz: force gain.
-        feels: whether the servo estimates the stiffness from the touch; else it uses that of the default pad.
         hold_s: duration of the press.
     """
 
     contact_n_m: float
+    servo: str = "estimated"
     rate_hz: float = 400.0
     late_ms: float = 0.0
     height_hz: float = 8.0
-    feels: bool = True
     hold_s: float = 0.4
 
 
@@ -160,7 +160,7 @@ def loop_of(case: LoopCase) -> ForceLoop:
     """The linear loop of a case, with the servo's final stiffness."""
     slope = 1.0 / float(indentation_from_force(1.0, layer_stiffness(case.contact_n_m), PROBE_M, KAPPA))
     sensing = stated_sensing(scene_of(case), ContactSensing)
-    if case.feels:
+    if case.servo == "estimated":
         sensing.set_slope(Slope(slope, 0.0))
     return ForceLoop(
         depth_ratio=slope * sensing.depth(1.0),
@@ -193,7 +193,7 @@ def carry_out(case: LoopCase) -> Row:
         return refused_row(refusal)
     task = make_task(session.plan)
     assert isinstance(task, TouchTask)
-    if not case.feels:
+    if case.servo == "stated":
         task.sensing = stated_sensing(session.plan.scene)
     if case.late_ms > 0.0:
         assert session.scene.sensor is not None

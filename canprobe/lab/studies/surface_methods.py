@@ -81,16 +81,16 @@ def map_of(samples: Sequence[ContactSample], task: Touch) -> SurfaceMap:
     return found
 
 
-def see_map(found: SurfaceMap, points: Floats) -> FoundSurface:
-    """A map as seen from points (n, 3), m."""
+def evaluate_map(found: SurfaceMap, points: Floats) -> FoundSurface:
+    """A map at points (n, 3), m, near it."""
     feet = found.closest(points)
     return FoundSurface(feet.height, feet.normal, found.curvature(points).tensor, feet.sigma)
 
 
-def see_heights(
+def evaluate_heights(
     fit: Fit, setting: float, samples: Sequence[ContactSample], task: Touch, points: Floats
 ) -> FoundSurface:
-    """A surface of heights over the contacts' mean plane as seen from points (n, 3), m."""
+    """Heights over the mean plane of contacts, as a surface at points (n, 3), m, near it."""
     p, n = (np.array([getattr(sample, name) for sample in samples]) for name in ("p_base", "n_base"))
     middle, R = p.mean(axis=0), tangent_rotation(n.mean(axis=0) / np.linalg.norm(n.mean(axis=0)))
     local, up = 1e3 * (p - middle) @ R, n @ R

@@ -40,7 +40,7 @@ from canprobe.errors import PlanError, SafetyStop, StudyError
 from canprobe.lab.studies import exploration
 from canprobe.lab.studies.drawn_shapes import DrawnShape, TrueGround, drawn, scene_of
 from canprobe.lab.studies.result import Column, Row, StudyResult, mean_and_interval, measuring_facts
-from canprobe.lab.studies.surface_methods import METHODS, FoundSurface, map_of, see_heights, see_map
+from canprobe.lab.studies.surface_methods import METHODS, FoundSurface, evaluate_heights, evaluate_map, map_of
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.contact import ContactSample
 
@@ -142,10 +142,10 @@ def measure(case: SurfaceCase) -> dict[str, Any]:
 def compare_methods(samples: Sequence[ContactSample], task: Touch, truth: TrueGround) -> list[dict[str, Any]]:
     """Scores of every method and setting on the same contacts, the map's first."""
     ways: list[tuple[str, float, str, Callable[[], FoundSurface]]] = [
-        ("map", 100.0, "% of contacts", lambda: see_map(map_of(samples, task), truth.points))
+        ("map", 100.0, "% of contacts", lambda: evaluate_map(map_of(samples, task), truth.points))
     ]
     ways += [
-        (name, setting, unit, partial(see_heights, fit, setting, samples, task, truth.points))
+        (name, setting, unit, partial(evaluate_heights, fit, setting, samples, task, truth.points))
         for name, (fit, settings, unit) in METHODS.items()
         for setting in settings
     ]

@@ -141,7 +141,7 @@ def held(method, seeds, sigma_point=1e-4, sigma_normal=5e-3):
     ground = make_ground("torus", 0.005, "weave", 0.0075, 160)
     inside = []
     for seed in range(seeds):
-        points, normals = ground.felt(sigma_point, sigma_normal, np.random.default_rng(seed))
+        points, normals = ground.measured(sigma_point, sigma_normal, np.random.default_rng(seed))
         estimate = fit_surface(points, normals, sigma_point=sigma_point, sigma_normal=sigma_normal, method=method)
         e = ground.error(estimate.T_frame_contact, estimate.K)
         inside.append(e @ np.linalg.solve(estimate.covariance, e) < 7.815)
@@ -162,7 +162,7 @@ def test_caution_begins_at_its_limit_and_is_no_evidence(monkeypatch):
     ground = make_ground("cylinder", 0.005, "circle", 0.005, 160)
     variances, notes = [], []
     for sigma_point, sigma_normal in ((20e-6, 1e-3), (1e-4, 5e-3)):
-        points, normals = ground.felt(sigma_point, sigma_normal, np.random.default_rng(1))
+        points, normals = ground.measured(sigma_point, sigma_normal, np.random.default_rng(1))
         for limit in (5e-3, 1.0):
             monkeypatch.setattr(misfit, "BLUR_LIMIT_RAD", limit)
             e = fit_surface(points, normals, sigma_point=sigma_point, sigma_normal=sigma_normal)
@@ -176,7 +176,7 @@ def test_caution_begins_at_its_limit_and_is_no_evidence(monkeypatch):
 def on_torus(n, seed):
     """A weave along a torus (tube 40 mm, ring 100 mm) with the noise of the loop: contacts and its K."""
     ground = make_ground("torus", 0.04, "weave", 0.06, n, waves=5)
-    return ground, ground.felt(50e-6, 2e-3, np.random.default_rng(seed))
+    return ground, ground.measured(50e-6, 2e-3, np.random.default_rng(seed))
 
 
 def test_on_a_torus_the_filter_says_how_far_it_is_off():
@@ -203,7 +203,7 @@ def test_a_torus_felt_finely_is_no_change_of_the_surface(path):
     ground = make_ground("torus", 0.04, path, 0.02, 160)
     found = []
     for seed in range(8):
-        points, normals = ground.felt(5e-6, 2e-4, np.random.default_rng(seed))
+        points, normals = ground.measured(5e-6, 2e-4, np.random.default_rng(seed))
         e = fit_surface(points, normals, sigma_point=5e-6, sigma_normal=2e-4, method="recursive")
         assert e.rank == 3
         assert not [note for note in e.notes if "changed" in note]

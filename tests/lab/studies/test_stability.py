@@ -101,9 +101,9 @@ def test_the_layer_has_the_stiffness_of_the_case():
 
 
 def test_feeling_takes_the_wrong_stiffness_out_of_the_loop_within_its_bound():
-    told, felt = (loop_of(LoopCase(5e4, feels=feels)).depth_ratio for feels in (False, True))
-    assert felt == pytest.approx(1.0)
-    assert told > 4.0
+    stated, estimated = (loop_of(LoopCase(5e4, servo)).depth_ratio for servo in stability.SERVOS)
+    assert estimated == pytest.approx(1.0)
+    assert stated > 4.0
     assert loop_of(LoopCase(1e6)).depth_ratio > 10.0
 
 
@@ -139,7 +139,9 @@ def test_time_above_a_limit():
 
 def test_cells_of_both_servos_and_every_bus():
     whole = stability.cases(False)
-    assert {(c.rate_hz, c.late_ms, c.feels) for c in whole} == {(*b, f) for b in stability.BUSES for f in (True, False)}
+    assert {(c.rate_hz, c.late_ms, c.servo) for c in whole} == {
+        (*b, s) for b in stability.BUSES for s in stability.SERVOS
+    }
     assert {c.contact_n_m for c in whole} >= {1e2, 1e7}
 
 
@@ -180,11 +182,11 @@ def test_quick_touches_end_as_they_may_and_are_drawn(tmp_path):
 
 def test_findings_name_every_touch_that_ends_otherwise(tmp_path):
     force = {"force_max_n": 3.0, "above_ms": 10.0, "allowed_ms": 115.0, "error_percent": 4.0, "spread_percent": 3.0}
-    good = stability.row_of(LoopCase(1e4, feels=False), {"ended": "stable", "reason": "", **force})
+    good = stability.row_of(LoopCase(1e4, "stated"), {"ended": "stable", "reason": "", **force})
     assert "Every touch is stable" in stability.findings([good])[-1]
-    bad = stability.row_of(LoopCase(1e6, feels=False), {"ended": "failed", "reason": "hang", **force})
+    bad = stability.row_of(LoopCase(1e6, "stated"), {"ended": "failed", "reason": "hang", **force})
     said = "\n".join(stability.findings([good, bad]))
-    assert "told, 1e+06 N/m" in said
+    assert "stated, 1e+06 N/m" in said
     assert "failed, hang" in said
     assert "of 1 outside 1 are not stable" in said
     assert good["eigenvalue"] < 1.0 < bad["eigenvalue"]

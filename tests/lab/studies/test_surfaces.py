@@ -12,7 +12,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
 from canprobe.lab.studies import exploration, surfaces
 from canprobe.lab.studies.drawn_shapes import KINDS, DrawnShape, TrueGround, drawn, form_heights_mm, object_of, scene_of
-from canprobe.lab.studies.surface_methods import METHODS, FoundSurface, see_heights
+from canprobe.lab.studies.surface_methods import METHODS, FoundSurface, evaluate_heights
 from canprobe.lab.studies.surfaces import COLUMNS, SurfaceCase, findings, measure, rows_of, score
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.objects import Sphere
@@ -48,7 +48,7 @@ def on_ball(noise=0.0, seed=0):
 
 def seen(name, setting, samples, points):
     fit, *_ = METHODS[name]
-    return see_heights(fit, setting, samples, resolve(load_scene("cylinder")).task, points)
+    return evaluate_heights(fit, setting, samples, resolve(load_scene("cylinder")).task, points)
 
 
 @pytest.mark.parametrize(("name", "setting"), [("quadrics", 3.0), ("spline", 0.0), ("process", 400)])
