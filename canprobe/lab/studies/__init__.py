@@ -18,6 +18,6 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
     workprec    error of the dynamic plant against its run time
     stability   `stability_runs`, `stability_extremes`, `linear_loop`
     faults      `fault_cases`, `fault_runs`, `witnessed_run`; `faults_vcan`
-    faults --recover  `recover`, `recover_cases`, `recover_runs`; `recover_vcan`
+    faults --recover  `recover`, `recover_score`; `recover_vcan`
     realtime    `realtime_cases`; `realtime_soak`; `realtime_link` on `link_setups`
 """

@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 
 from canprobe.cli import main
-from canprobe.lab.studies.recover import findings, table_rows
-from canprobe.lab.studies.recover_cases import Outage, RecoverCase, draw_case, shrink
-from canprobe.lab.studies.recover_runs import run_case
+from canprobe.lab.studies.recover import findings, run_case, table_rows
+from canprobe.lab.studies.recover_score import Outage, RecoverCase, draw_case, shrink
 
 MORE = pytest.mark.slow(reason="more seeds of a study")
 
