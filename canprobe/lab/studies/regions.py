@@ -17,7 +17,6 @@ rules, prediction, and estimation", 2007.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +29,6 @@ from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import AMBER, BLUE, INK, ORANGE, SHADE, legend, log_scale, parts, picture
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.files import whole_file
 from canprobe.lab.studies.random_scenes import FOREIGN, KINDS, SceneSeed
 from canprobe.lab.studies.region_scores import ScoredScan, held_share, measure
 from canprobe.lab.studies.result import (
@@ -42,10 +40,12 @@ from canprobe.lab.studies.result import (
     drawn_anew,
     interval_of,
     measuring_facts,
+    shown,
+    write_csv,
 )
 from canprobe.lab.studies.sweep import Sweep
 
-TEST_DRAW, DEVELOPMENT_DRAW = 1, 2
+TEST_DRAW = 1
 SCENES, QUICK_SCENES = 60, 3
 """Scenes wanted of a kind that yield an estimate, K observed or not."""
 DRAWS_PER_SCENE = 4
@@ -110,7 +110,7 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW, against: Path | Non
     earlier = None if against is None else earlier_rows(against)
     wanted = QUICK_SCENES if quick else SCENES
     scans = scan_all(sweep, draw, KINDS, wanted)
-    write_scenes(sweep.folder / "regions_scenes.csv", scans)
+    write_csv(sweep.folder / "regions_scenes.csv", [scene_row(scan) for scan in scans])
     rows = rows_of(scans)
     said = findings(rows, scans)
     if earlier is not None:
@@ -257,24 +257,18 @@ def compared(rows: Sequence[Row], earlier: Mapping[str, Row]) -> list[str]:
     said = ["Now / in the earlier run:"]
     for row in rows:
         if row["group"] == "kind" and (before := earlier.get(row["of"])) is not None:
-            pairs = [f"{words} {_shown(row[key], form)} / {_shown(before[key], form)}" for key, words, form in COMPARED]
+            pairs = [f"{words} {shown(row[key], form)} / {shown(before[key], form)}" for key, words, form in COMPARED]
             said.append(f"  {row['of']}: {', '.join(pairs)}")
     return said
 
 
-def _shown(value: float | None, form: str) -> str:
-    return "–" if value is None or math.isnan(value) else format(value, form)
-
-
-def write_scenes(path: Path, scans: Sequence[ScoredScan]) -> None:
-    """Write a CSV file with a line for each scene, its seed first."""
-    facts = [name for name in ScoredScan._fields if name not in ("scores", "behind")]
-    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        lines = csv.writer(file)
-        lines.writerow([*facts, "answers", "share", "error_per_m", "stated_per_m"])
-        for scan in scans:
-            found = [scan.share, scan.error_per_m, scan.stated_per_m] if len(scan.scores) else ["", "", ""]
-            lines.writerow([*(getattr(scan, name) for name in facts), len(scan.scores), *found])
+def scene_row(scan: ScoredScan) -> Row:
+    """The facts of a scene, its seed first, and its scores."""
+    facts = {name: value for name, value in scan._asdict().items() if name not in ("scores", "behind")}
+    scores = ("share", "error_per_m", "stated_per_m")
+    return {**facts, "answers": len(scan.scores)} | {
+        name: getattr(scan, name) if len(scan.scores) else None for name in scores
+    }
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
@@ -294,10 +288,7 @@ def replay(seed: int, say: Say) -> dict[str, Any]:
     if scan.share < LOW_COVERAGE:
         failures.append(f"{100 * scan.share:.0f} % of the regions hold the truth")
         say(f"  FAILURE: {failures[0]}")
-    facts = {name: value for name, value in scan._asdict().items() if name not in ("scores", "behind")}
-    return {**facts, "answers": len(scan.scores), "share": None if math.isnan(scan.share) else scan.share} | {
-        "failures": failures
-    }
+    return {**scene_row(scan), "failures": failures}
 
 
 SHARES = (

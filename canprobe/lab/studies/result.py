@@ -136,7 +136,7 @@ def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
 def table_lines(result: StudyResult) -> list[str]:
     """The table, a line for each row, numbers flush right."""
     cells = [[c.heading for c in result.columns]]
-    cells += [[_shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
+    cells += [[shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     words = [bool(result.rows) and isinstance(result.rows[0].get(c.key), str) for c in result.columns]
     return [
@@ -177,10 +177,7 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     """
     make_folder(out)
     paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
-    keys = list(dict.fromkeys(key for row in result.rows for key in row))
-    with whole_file(paths[0]) as part, part.open("w", newline="", encoding="utf-8") as file:
-        lines = [["" if (v := _plain(row.get(key))) is None else v for key in keys] for row in result.rows]
-        csv.writer(file).writerows([keys, *lines])
+    write_csv(paths[0], result.rows)
     write_text(paths[1], text_of(result))
     document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
     write_text(paths[2], document + "\n")
@@ -190,7 +187,16 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     return [*paths, *(path for more in result.more for path in write_study(more, out))]
 
 
-def _shown(value: Any, form: str) -> str:
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows with a column for each of their keys; what does not apply is empty."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        lines = [["" if (v := _plain(row.get(key))) is None else v for key in keys] for row in rows]
+        csv.writer(file).writerows([keys, *lines])
+
+
+def shown(value: Any, form: str) -> str:
+    """A value as a table shows it; a dash for what does not apply."""
     value = _plain(value)
     if value is None:
         return "–"
