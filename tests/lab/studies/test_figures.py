@@ -18,11 +18,12 @@ import canprobe
 from canprobe.cell.results.figures import draw_run
 from canprobe.cell.results.plan_figure import draw_plan
 from canprobe.cell.results.surface_figure import draw_surface
-from canprobe.lab.studies import estimators, fault_cases, stability, workprec
+from canprobe.lab.studies import estimators, exploration, fault_cases, stability, workprec
 from canprobe.lab.studies import faults as faults_study
 from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.faults_vcan import draw_ends
+from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
@@ -31,6 +32,8 @@ from canprobe.lab.studies.realtime_soak import draw_soak
 from canprobe.lab.studies.region_scores import ScoredScan
 from canprobe.lab.studies.regions import draw_regions, rows_of
 from canprobe.lab.studies.stability_extremes import END_MARKS, EXTREMES, ExtremeCase, draw_extremes, value_in_words
+from canprobe.lab.studies.surface_methods import METHODS
+from canprobe.lab.studies.surfaces import draw_surfaces
 from canprobe.lab.studies.workprec import draw_workprec
 
 COLUMN_PX, WIDEST_PX, LEAST_TYPE_PX, LEAST_BAR_PX = 800, 1400, 9.0, 4.0
@@ -175,6 +178,42 @@ def soak(path):
     draw_soak(samples, path)
 
 
+def predicted(path):
+    rows = [
+        {
+            "kind": one_of(("machine", "still", "slow"), i),
+            "seen": 0.02 * 1.3**i,
+            "told": 0.02 * 1.3**i * (1 + i % 4 / 5),
+        }
+        for i in range(30)
+    ]
+    lines = ((1.0, "as predicted"),)
+    draw_points(
+        rows, ("seen", "seen, %"), ("told", "predicted, %"), path, title="Overruns", by="kind", log=True, lines=lines
+    )
+
+
+def surfaces_of_methods(path):
+    rng, rows = np.random.default_rng(0), []
+    for name, settings in (("map", (1,)), *((name, settings) for name, (_, settings, _) in METHODS.items())):
+        for k, _ in enumerate(settings):
+            scores = dict(
+                zip(("height_um", "normal_mrad", "curvature_per_m", "nll"), rng.uniform(1, 40, 4), strict=True)
+            )
+            rows.append({"method": name, "cpu_s": 0.02 * 2**k * rng.uniform(1, 2), **scores})
+    draw_surfaces(rows, path)
+
+
+def paths(path):
+    marks = np.arange(1, 51) * exploration.MARK_M
+    each = {
+        name: [{"path": marks.tolist(), **{key: (limit * (0.3 + i / 9 + 0.02 / marks)).tolist()
+                                           for key, limit in exploration.LIMITS.items()}}]
+        for i, name in enumerate(exploration.STRATEGIES)
+    }  # fmt: skip
+    exploration.draw(each, path)
+
+
 def bridge_bars(path):
     names = ("none", "mcap", "foxglove", "ros2", "view", "mcap + foxglove + ros2")
     rows = [{"bridge": name, "watched": "–", "added_p50_us": 40 + 9 * i, "added_p99_us": 150 + 200 * i}
@@ -206,6 +245,9 @@ PICTURES = {
     "faults, vcan": ends,
     "stability": map_of_touches,
     "stability, extremes": extremes,
+    "predicted": predicted,
+    "surfaces": surfaces_of_methods,
+    "exploration": paths,
     "realtime": realtime,
     "soak": soak,
     "bridges": bridge_bars,
