@@ -1,11 +1,11 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
-`growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `exploration` (the study `explore`, as a
-scene has its name), `pictures`, or one of `PRINTED`, what a page shows of a command that the tests repeat. Without
-names everything is measured but what takes more than half an hour (`LONG`). Measure on a machine that does nothing
-else: computing time is among the figures. Every entry has its own command, date, commit and machine, so that one can
-be measured anew without the others. Then `python docs/generate.py` writes the pages.
+`growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `pictures`, one of `FORMS`, or one of
+`PRINTED`, what a page shows of a command that the tests repeat. Without names everything is measured but what takes
+more than half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every
+entry has its own command, date, commit and machine, so that one can be measured anew without the others; an entry whose
+study is gone stays with its commit. Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from canprobe.cell.results.expected import figures_of
 from canprobe.cell.results.figures import draw_run
 from canprobe.cell.results.surface_figure import draw_surface
 from canprobe.cell.scene.load import packaged_scenes
-from canprobe.lab.studies.result_files import processor
+from canprobe.lab.studies.result import processor
 from canprobe.lab.studies.sweep import STUDIES
 
 DOCS = Path(__file__).resolve().parent
@@ -48,8 +48,18 @@ IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
 LONG = ("faults", "soak", "growth", "held", "canopen_node")
-FORMS = {"soak": "realtime --soak", "recover_vcan": "recover --vcan", "faults_vcan": "faults --vcan"}
-"""Studies of another form, as they are typed."""
+FORMS = {
+    "bound": "estimators",
+    "calibrations": "calibration",
+    "exploration": "surfaces",
+    "link": "realtime --link",
+    "soak": "realtime --soak",
+    "recover": "faults --recover",
+    "recover_vcan": "faults --recover --vcan",
+    "faults_vcan": "faults --vcan",
+}
+"""Other forms of a study, and further tables of one that have their own place on a page, as they are typed."""
+ON_VCAN0_ONLY = ("realtime", "soak", "recover_vcan", "faults_vcan")
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
 """Of a picture in the documentation."""
@@ -76,7 +86,7 @@ TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] =
             "worst scene": "{worst}",
         },
     ),
-    "explore": (
+    "exploration": (
         lambda rows: rows,
         {
             "strategy": "{strategy}",
@@ -105,17 +115,17 @@ TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] =
             "failures": "{failures}",
         },
     ),
-    "shapes": (
+    "surfaces": (
         lambda rows: [
             min((row for row in rows if row["method"] == name), key=lambda row: row["curvature_per_m"])
             for name in dict.fromkeys(row["method"] for row in rows)
         ],
         {
-            "method, at its best budget": "{method}, {budget:g} {unit}",
-            "accuracy, completeness, µm": "{accuracy_um:.0f}, {completeness_um:.0f}",
-            "F at 0.05 mm": "{f_0_05mm:.3f}",
+            "method, at its best setting": "{method}, {setting:g} {unit}",
+            "ground known": "{known:.0%}",
+            "height, µm": "{height_um:.1f}",
             "normals, mrad": "{normal_mrad:.1f}",
-            "curvature, 1/m": "{curvature_per_m:.1f}",
+            "curvature, 1/m": "{curvature_per_m:.2f}",
             "bands that hold the truth": "{coverage:.0%}",
             "time, s": "{cpu_s:.2f}",
         },
@@ -225,9 +235,9 @@ def _scan_figures(summary: Row) -> dict[str, float]:
 def study(name: str) -> Entry:
     """Findings and table of a study; its pictures, where the pages show them, are drawn anew."""
     command = f"canprobe study {FORMS.get(name, name)}"
-    if name in ("realtime", *FORMS):
+    if name in ON_VCAN0_ONLY:
         command = IN_GUEST + command
-    out = RUNS / name
+    out = RUNS / FORMS.get(name, name).replace(" --", "-")
     printed(f"{command} --out {out}")
     entry = {"command": command} | _found(name, json.loads((out / f"{name}.json").read_text(encoding="utf-8")))
     for picture in out.glob("*.png"):
@@ -238,7 +248,8 @@ def study(name: str) -> Entry:
 
 def _found(name: str, result: Row) -> Entry:
     """Findings and table of a study's document."""
-    entry: Entry = {"findings": [line for part in (result, *result.get("more", ())) for line in part["findings"]]}
+    parts = (result, *(part for part in result.get("more", ()) if part["study"] not in FORMS))
+    entry: Entry = {"findings": [line for part in parts for line in part["findings"]]}
     if name in TABLES:
         chosen, columns = TABLES[name]
         rows = ([_cell(form, row) for form in columns.values()] for row in chosen(result["rows"]))
@@ -392,7 +403,6 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "gym": gym,
     "learning": learning,
     "bridges": bridges,
-    "exploration": partial(study, "explore"),
     "pictures": pictures,
     **{name: partial(shown, name) for name in PRINTED},
 }

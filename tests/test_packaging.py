@@ -62,7 +62,7 @@ def test_the_line_that_installs_an_extra_is_for_where_canprobe_came_from(origin,
 
 def test_a_package_that_a_command_misses_is_told_with_that_line(tmp_path):
     script = "import sys; sys.modules['matplotlib'] = None; from canprobe.cli import main; sys.exit(main(sys.argv[1:]))"
-    words = ("study", "bound", "--quick", "--out", str(tmp_path / "out"))
+    words = ("study", "estimators", "--quick", "--out", str(tmp_path / "out"))
     done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("canprobe: study: needs matplotlib; type: ") and "[study]" in done.stderr

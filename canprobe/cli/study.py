@@ -7,7 +7,7 @@ crash. Cells whose code has changed since are computed again.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +23,34 @@ EXAMPLE = """\
 examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
-  canprobe study bound --dask tcp://10.0.0.1:8786
+  canprobe study regions --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
-  canprobe study recover --seed 17
+  canprobe study faults --recover --seed 17
   canprobe study regions --draw 2 --against earlier/regions.json
-  canprobe study arrays --draw 2
+  canprobe study calibration --draw 2
   canprobe vcan -- canprobe study faults --vcan
-  canprobe vcan -- canprobe study recover --vcan
+  canprobe vcan -- canprobe study faults --recover --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
 STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
-    "draw": ("arrays", "calibrations", "explore", "link", "regions", "shapes"),
+    "draw": ("calibration", "realtime --link", "regions", "surfaces"),
     "against": ("regions",),
+    "seed": ("faults", "faults --recover", "regions"),
 }
-"""Studies that have an option, by the option's name."""
+"""Studies, as they are typed, that have an option, by the option's name."""
+FORM_OPTIONS = ("recover", "link", "soak", "vcan")
+"""Options that name another form of a study, in the order in which they are typed."""
+RENAMED: Mapping[str, str] = {
+    "arrays": "calibration",
+    "bound": "estimators",
+    "calibrations": "calibration",
+    "explore": "surfaces",
+    "link": "realtime --link",
+    "recover": "faults --recover",
+    "shapes": "surfaces",
+    "soak": "realtime --soak",
+}
+"""Former study → what is typed now."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -49,22 +63,32 @@ def add_arguments(parser: Parser) -> None:
         "--seed",
         metavar="N",
         type=whole(0, 2**63 - 1),
-        help="faults, recover, regions: run only the case of this seed, and report each step",
+        help="faults, regions: run only the case of this seed, and report each step",
     )
     parser.add_argument(
         "--draw",
         metavar="N",
         type=whole(0, 9999),
-        help="arrays, calibrations, explore, link, regions, shapes: number that all cases follow from; others than"
-        " those of the published figures",
+        help="calibration, realtime --link, regions, surfaces: number that all cases follow from; others than those of"
+        " the published figures",
     )
     parser.add_argument(
         "--against", metavar="FILE", type=Path, help="regions: regions.json of an earlier run, to compare with"
     )
     parser.add_argument(
+        "--recover",
+        action="store_true",
+        help="faults: whether a cell comes back from what it loses by chance: power, links, its master's time",
+    )
+    parser.add_argument(
         "--vcan",
         action="store_true",
-        help="faults, recover: on a real vcan0; processes are killed (faults), and the link is taken down",
+        help="faults: on a real vcan0; processes are killed, and the link is taken down",
+    )
+    parser.add_argument(
+        "--link",
+        action="store_true",
+        help="realtime: whether a check of a link says what the next minute shows, in virtual time",
     )
     parser.add_argument(
         "--soak",
@@ -81,26 +105,27 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run a study, print its table, write its files."""
-    from canprobe.lab.studies.sweep import STUDIES, run_study
+    from canprobe.lab.studies.sweep import FORMS, STUDIES, run_study
 
     if args.list:
+        described = {**STUDIES, **{typed: words for typed, (_, words) in FORMS.items()}}
         if args.json:
-            print_json(dict(STUDIES))
+            print_json(described)
         else:
-            print_table(list(STUDIES.items()))
+            print_table(list(described.items()))
         return 0
-    _refuse_wrong(args, STUDIES)
+    typed = " ".join([args.name or "", *(f"--{form}" for form in FORM_OPTIONS if getattr(args, form))])
+    _refuse_wrong(args, typed, STUDIES, FORMS)
     if args.seed is not None:
-        return _replay(args)
-    from canprobe.lab.studies.result_files import as_document, text_of, write_study
+        return _replay(args, typed)
+    from canprobe.lab.studies.result import as_document, text_of, write_study
     from canprobe.lab.studies.sweep import open_sweep
 
-    out = args.out or Path("runs") / f"study-{args.name}"
-    form = "vcan" if args.vcan else "soak" if args.soak else ""
+    out = args.out or Path("runs") / f"study-{typed.replace(' --', '-')}"
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
     try:
         with open_sweep(out, say=args.report.say, progress=args.report.bar(".0f cells"), **options) as sweep:
-            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form, **_chosen(args))
+            result = run_study(typed, quick=args.quick, sweep=sweep, **_chosen(args))
     except KeyboardInterrupt:
         args.report.complain(
             f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest"
@@ -121,37 +146,33 @@ def _chosen(args: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(args, name) for name in STUDIES_WITH if getattr(args, name) is not None}
 
 
-def _refuse_wrong(args: argparse.Namespace, studies: Mapping[str, str]) -> None:
+def _refuse_wrong(args: argparse.Namespace, typed: str, studies: Mapping[str, str], forms: Collection[str]) -> None:
     """Complain about an unknown study, and about options that it does not have."""
-    if args.name == "soak":
-        args.complain("study soak is now an option of study realtime: canprobe study realtime --soak")
+    if args.name in RENAMED:
+        args.complain(f"study {args.name} is now a part of another one: canprobe study {RENAMED[args.name]}")
     if args.name not in studies:
         known = ", ".join(studies)
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, studies)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
-    if args.vcan and args.name not in ("faults", "recover"):
-        args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults and recover do")
+    if typed not in studies and typed not in forms:
+        args.complain(f"study {typed}: there is no such form; expected one of {', '.join(forms)}")
     if args.vcan and args.seed is not None:
         args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
-    if args.soak and args.name != "realtime":
-        args.complain(f"--soak: study {args.name} has no such form; only realtime has")
     for option in _chosen(args):
-        if args.name not in STUDIES_WITH[option]:
-            args.complain(f"--{option}: study {args.name}: only {', '.join(STUDIES_WITH[option])} has it")
-        if args.seed is not None:
-            args.complain(f"--{option}: study {args.name}: a seed names its draw")
+        if typed not in STUDIES_WITH[option]:
+            args.complain(f"--{option}: study {typed}: only {', '.join(STUDIES_WITH[option])} has it")
+        if args.seed is not None and option != "seed":
+            args.complain(f"--{option}: study {typed}: a seed names its draw")
 
 
-def _replay(args: argparse.Namespace) -> int:
+def _replay(args: argparse.Namespace, typed: str) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
-    if args.name == "faults":
+    if typed == "faults":
         from canprobe.lab.studies.faults import replay
-    elif args.name == "recover":
-        from canprobe.lab.studies.recover import replay
-    elif args.name == "regions":
+    elif typed == "regions":
         from canprobe.lab.studies.regions import replay
     else:
-        args.complain(f"--seed: expected study faults, recover or regions, got {args.name}")
+        from canprobe.lab.studies.recover import replay
     outcome = replay(args.seed, args.report.say)
     if args.json:
         print_json(outcome)

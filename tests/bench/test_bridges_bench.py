@@ -7,7 +7,7 @@ import mcap
 import pytest
 from bridges_bench import size_of
 
-from canprobe.lab.studies.result_files import text_of
+from canprobe.lab.studies.result import text_of
 
 
 @pytest.mark.slow(reason="a measurement of bridges")

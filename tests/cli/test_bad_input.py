@@ -220,7 +220,7 @@ def test_a_folder_that_cannot_be_made(tmp_path):
         ("view", "listen", "--bus", "direct", "--html", "x.html", "--out", "file/x"),
         ("init", "file/x"),
         ("init", "file"),
-        ("study", "bound", "--quick", "--out", "file/x"),
+        ("study", "estimators", "--quick", "--out", "file/x"),
         ("emulate", "press", "--bus", "virtual", "--channel", "x", "--truth", "file/x.npz"),
         ("emulate", "press", "--bus", "virtual", "--channel", "x", "--truth", "folder"),
         ("emulate", "press", "--bus", "virtual", "--channel", "x", "--store", "file"),

@@ -18,8 +18,7 @@ from canprobe.cli import main
 from canprobe.errors import ResultsError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.lab.studies.cell_store import CellStore
-from canprobe.lab.studies.harness import Column, StudyResult
-from canprobe.lab.studies.result_files import write_study
+from canprobe.lab.studies.result import Column, StudyResult, write_study
 
 ROOM = 2000
 

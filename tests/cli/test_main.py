@@ -200,7 +200,7 @@ def test_what_a_signal_ends_has_its_status(name, number, monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("cell.recorded.reestimate.replay", ("replay", "log")), ("lab.studies.sweep.run_study", ("study", "bound"))],
+    [("cell.recorded.reestimate.replay", ("replay", "log")), ("lab.studies.sweep.run_study", ("study", "estimators"))],
 )
 def test_sigterm_ends_what_computes(name, words, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)

@@ -34,8 +34,7 @@ from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
-from canprobe.lab.studies.harness import Column, Row, StudyResult
-from canprobe.lab.studies.result_files import as_document, measuring_facts, text_of
+from canprobe.lab.studies.result import Column, Row, StudyResult, as_document, measuring_facts, text_of
 
 # What packages take on disk, with everything that they need and canprobe itself does not.
 

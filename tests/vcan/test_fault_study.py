@@ -37,7 +37,7 @@ def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
 def test_cells_come_back_on_a_real_bus(tmp_path, capsys):
     """Quick: a node without power and one without heartbeats; jumps are read from the bus log."""
     type_as_root("ip", "link", "set", "vcan0", "up")
-    assert main(["study", "recover", "--vcan", "--quick", "--json", "--out", str(tmp_path)]) == 0
+    assert main(["study", "faults", "--recover", "--vcan", "--quick", "--json", "--out", str(tmp_path)]) == 0
     every = json.loads(capsys.readouterr().out)["rows"][-1]
     assert every["runs"] == 2 and every["lost"] == every["back"] >= 2
     assert every["failures"] == every["refused"] == 0 and every["jump_counts"] <= 1

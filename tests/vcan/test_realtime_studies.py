@@ -19,7 +19,6 @@ def test_the_quick_study_measures_every_case(tmp_path, capsys):
     rows = document["rows"]
     assert [(row["case"], row["sensor"], row["rate_hz"]) for row in rows] == [
         ("whole controller", "window", 400.0),
-        ("plain canopen", "window", 400.0),
         ("bare clock", "none", 400.0),
         *(("hold", mode, 400.0) for mode in ("features", "window", "image")),
     ]

@@ -1,4 +1,4 @@
-"""Study `estimators`: error against run time for every estimator, window, lag and noise.
+"""Study `estimators`: error against run time for every estimator, window, lag and noise; and, in `bound`, the bound.
 
 A probe moves along a weave at 25 mm/s, 200 tactile frames a second; after 60 mm the answer is scored at the last
 contact. Costs are measured apart from errors: all estimators take turns at eight frames and an answer (40 ms of the
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,9 +21,18 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
+from canprobe.lab.studies.bound import run_bound
 from canprobe.lab.studies.ground import Ground, make_ground
-from canprobe.lab.studies.harness import FROBENIUS, Column, Row, StudyResult
-from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
+from canprobe.lab.studies.result import (
+    FROBENIUS,
+    SIGMA_COLUMNS,
+    Column,
+    Row,
+    StudyResult,
+    mean_and_interval,
+    measuring_facts,
+    sigma_values,
+)
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch import ContactSample, Estimator, cramer_rao, make_estimator
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
@@ -37,7 +46,6 @@ NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (50e-6, 3e-3))
 GROUNDS = (("ellipsoid", 0.05), ("cylinder", 0.036))
 WAVES = 5
 """Waves of the weave on the whole path: one on 12 mm of it."""
-BOOTSTRAPS = 1000
 Noise = tuple[float, float]
 Place = tuple[str, float]
 REFERENCE = ("chen1996", 160, 10)
@@ -89,7 +97,7 @@ def settings(quick: bool = False) -> list[EstimatorSetting]:
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Measure costs, then errors."""
+    """Measure costs, then errors, then errors over the bound."""
     seeds, turns = (3, 4) if quick else (24, 20)
     grounds = GROUNDS[:1] if quick else GROUNDS
     sweep.say(f"costs of {len(settings(quick))} settings at {len(NOISES)} noises, one after another")
@@ -104,7 +112,8 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
             found = zip(settings(quick), times, zip(*by_seed, strict=True), strict=True)
             rows += [_row(name, ground, noise, *one) for one in found]
     facts = measuring_facts(quick, seeds, MODEL) | {"turns": turns}
-    return StudyResult("estimators", COLUMNS, rows, findings(rows), facts, partial(draw_estimators, rows))
+    said, more = findings(rows), (run_bound(quick=quick, sweep=sweep),)
+    return StudyResult("estimators", COLUMNS, rows, said, facts, partial(draw_estimators, rows), more)
 
 
 def on_the_move(surface: str, size: float) -> Ground:
@@ -125,7 +134,7 @@ def measure_errors(cell: tuple[Place, Noise, bool, int]) -> list[Floats | None]:
     """Error (3,) of K of each setting, of one seed; None where not all of K was observed."""
     (name, size), noise, quick, seed = cell
     ground = on_the_move(name, size)
-    samples = contacts(*ground.felt(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
+    samples = contacts(*ground.measured(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
     errors: list[Floats | None] = []
     for setting in settings(quick):
         estimator = setting.make(*noise)
@@ -142,12 +151,12 @@ def measure_costs(cell: tuple[Noise, bool, int]) -> list[list[tuple[float, float
     noise, quick, turns = cell
     ground = on_the_move(*GROUNDS[0])
     estimators = [s.make(*noise) for s in settings(quick)]
-    samples = contacts(*ground.felt(*noise, np.random.default_rng(99)))
+    samples = contacts(*ground.measured(*noise, np.random.default_rng(99)))
     for estimator in estimators:
         for sample in samples:
             estimator.add(sample)
     times: list[list[tuple[float, float]]] = [[] for _ in estimators]
-    points, normals = ground.felt(*noise, np.random.default_rng(100))  # the path again, back from its end
+    points, normals = ground.measured(*noise, np.random.default_rng(100))  # the path again, back from its end
     back = -2 - np.arange(SHARE * (turns + 1)) % (SAMPLES - 2)
     more = contacts(points[back], normals[back], first=SAMPLES)
     gc.collect()
@@ -186,7 +195,7 @@ def _row(  # noqa: PLR0917 - one row of a table
         ground.points[last], ground.normals[last], ground.surface, sigma_point=noise[0], sigma_normal=noise[1]
     )
     squares = np.array([np.square(e) @ FROBENIUS for e in errors if e is not None])
-    rms, low, high = (100.0 * value / size for value in _rms_and_spread(squares))
+    error = {key: 100.0 * math.sqrt(value) / size for key, value in mean_and_interval("error", squares).items()}
     add, answer = (median(column) for column in zip(*times, strict=True))
     per_sample = [t[0] + t[1] / SHARE for t in times]
     return {
@@ -195,9 +204,7 @@ def _row(  # noqa: PLR0917 - one row of a table
         "window_samples": setting.window,
         "lag_samples": setting.lag,
         **sigma_values(*noise),
-        "error_percent": rms,
-        "error_low_percent": low,
-        "error_high_percent": high,
+        **{f"{key}_percent": value for key, value in error.items()},
         "bound_percent": 100.0 * math.sqrt(float(FROBENIUS @ np.diag(C))) / size,
         "observed": len(squares) / len(errors),
         "add_us": add,
@@ -206,15 +213,6 @@ def _row(  # noqa: PLR0917 - one row of a table
         "spread_us": float(np.subtract(*np.percentile(per_sample, [75, 25]))),
         "in_budget": add + answer <= FRAME_US,
     }
-
-
-def _rms_and_spread(squares: Floats) -> tuple[float, float, float]:
-    """Root of the mean square, and the interval of it in 95 % of the draws of seeds anew (bootstrap)."""
-    if not len(squares):
-        return math.nan, math.nan, math.nan
-    drawn = np.random.default_rng(0).choice(squares, size=(BOOTSTRAPS, len(squares))).mean(axis=1)
-    low, high = np.sqrt(np.quantile(drawn, [0.025, 0.975])).tolist()
-    return math.sqrt(float(squares.mean())), low, high
 
 
 def findings(rows: Sequence[Row]) -> list[str]:
@@ -240,6 +238,7 @@ def findings(rows: Sequence[Row]) -> list[str]:
 
 
 BUDGET_MS = 5.0
+LAG_STYLES: Mapping[int | None, str] = {1: ":", 5: "-.", 10: "--", 20: "-"}
 
 
 def draw_estimators(rows: Sequence[Row], path: Path) -> None:
@@ -267,21 +266,18 @@ def draw_estimators(rows: Sequence[Row], path: Path) -> None:
 
 
 def _draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
-    ends: list[tuple[float, float, str]] = []
     for method, lag in dict.fromkeys((r["method"], r["lag_samples"]) for r in rows):
         line = [r for r in rows if r["method"] == method and r["lag_samples"] == lag]
+        colour = METHOD_COLOURS[method]
         x = [(r["add_us"] + r["answer_us"]) * 1e-3 for r in line]
         y = [r["error_percent"] for r in line]
-        axes.plot(x, y, color=METHOD_COLOURS[method], alpha=0.8)
-        sizes = [12.0 * r["window_samples"] / 40 for r in line]
+        label = method if lag is None else f"{method}, lag {lag}"
+        axes.plot(x, y, LAG_STYLES.get(lag, "-"), color=colour, alpha=0.8, label=label)
         bars = [
             [r["error_percent"] - r["error_low_percent"], r["error_high_percent"] - r["error_percent"]] for r in line
         ]
-        axes.errorbar(x, y, yerr=np.array(bars).T, fmt="none", ecolor=METHOD_COLOURS[method], elinewidth=0.9)
-        axes.scatter(x, y, s=sizes, color=METHOD_COLOURS[method], label=method, zorder=3, linewidths=0)
-        if lag is not None and x and math.isfinite(y[-1]):
-            ends.append((y[-1], x[-1], str(lag)))
-    _name_lags(axes, sorted(ends))
+        axes.errorbar(x, y, yerr=np.array(bars).T, fmt="none", ecolor=colour, elinewidth=0.9)
+        axes.scatter(x, y, s=[12.0 * r["window_samples"] / 40 for r in line], color=colour, zorder=3, linewidths=0)
     for r in rows:
         if r["method"] == "ml":
             _draw_bound(axes, r["bound_percent"], str(r["window_samples"]))
@@ -290,21 +286,6 @@ def _draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
     axes.axvline(BUDGET_MS, color=INK, label="budget of a tactile frame, 5 ms")
     log_scale(axes, "xy")
     axes.set_xlim(0.2, 200.0)
-
-
-def _name_lags(axes: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
-    """A name at the end of each line; one for those that end together."""
-    together: list[list[tuple[float, float, str]]] = []
-    for end in ends:
-        if together and end[0] < 1.25 * together[-1][-1][0]:
-            together[-1].append(end)
-        else:
-            together.append([end])
-    for lines in together:
-        y = math.sqrt(lines[0][0] * lines[-1][0])
-        text = "lag " + ", ".join(sorted((lag for *_, lag in lines), key=int))
-        at = (max(x for _, x, _ in lines), y)
-        axes.annotate(text, at, textcoords="offset points", xytext=(7, -2), fontsize="small")
 
 
 def _draw_bound(axes: Axes, percent: float, text: str) -> None:

@@ -21,8 +21,7 @@ import numpy as np
 from canprobe.cell.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, legend, log_scale, parts, picture
 from canprobe.lab.studies.fault_cases import CASES, KINDS, REPEATS, TASKS, FaultCase, WrongFile, wrong_files
 from canprobe.lab.studies.fault_runs import FORCE_SHARE, PRESSED_N, USUAL_SHARE, run_case, run_wrong_file
-from canprobe.lab.studies.harness import Column, Row, Say, StudyResult
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import Column, Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 NUMBERS_A_CELL = 17

@@ -52,10 +52,9 @@ from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.faults import draw_forces
-from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
-from canprobe.lab.studies.recover_runs import forces_of
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.recover_score import forces_of
+from canprobe.lab.studies.result import CHANNEL, Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
 

@@ -50,7 +50,7 @@ class Ground:
         """Shape operator at the last point (2, 2), in its contact frame, 1/m."""
         return self.surface.curvature_at(np.zeros(3))[0]
 
-    def felt(self, sigma_point: float, sigma_normal: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    def measured(self, sigma_point: float, sigma_normal: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Points and unit normals with independent noise: m per axis, rad per tangent axis."""
         points = self.points + sigma_point * rng.normal(size=self.points.shape)
         normals = self.normals + sigma_normal * rng.normal(size=self.normals.shape)

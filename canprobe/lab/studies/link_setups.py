@@ -1,5 +1,5 @@
 """Links that are constructed: a bus in virtual time whose port delays, scatters, loses or queues, whose machine wakes
-late, whose bus others use, or whose nodes answer late.
+late, stands still or is slow, whose bus others use, or whose nodes answer late.
 
 Each is drawn from a seed: kind, rate of the cycle, and how bad, from not felt to hopeless.
 """
@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from heapq import heappop, heappush
 from random import Random
-from typing import Any
 
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
@@ -19,7 +18,7 @@ from canprobe.cell.session.session import Session
 from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCounters, TimedFrame
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 
 FRAME_NS = 130_000
 """Time of a frame of eight bytes at 1 Mbit/s."""
@@ -37,6 +36,10 @@ RANGES = {
 }
 """How bad a set-up may be: delays, scatter and sleeps in periods of the cycle; loss and load as shares."""
 KINDS = ("clean", *RANGES)
+MACHINES = {"machine": (0.2, 3.2), "still": (0.2, 3.2), "slow": (0.08, 0.8)}
+"""Machines whose overruns at other rates are predicted: single wake-ups are late, all stands still now and then because
+another process has the processor, or the work of a cycle takes long; sizes in periods of `MACHINE_HZ`."""
+MACHINE_HZ = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +49,9 @@ class SetUp:
     Attributes:
         seed: seed that all of it follows from.
         kind: what is wrong with it; also the cause that a check should name.
-        rate_hz: rate of the cycle.
-        size: how bad it is, as in `RANGES`.
-        share: share of the sleeps that end late, of a late machine.
+        rate_hz: rate of the cycle whose periods `size` counts.
+        size: how bad it is, as in `RANGES` or `MACHINES`.
+        share: of a late machine the share of the sleeps that end late; of one that stands still how often in a second.
         room: frames that its transmit queue holds; of a lossy link one more than the periods that a loss lasts.
         node_id: the node that answers late.
     """
@@ -70,6 +73,15 @@ def draw_setup(seed: int) -> SetUp:
     size = math.exp(rng.uniform(math.log(low), math.log(high)))
     share = math.exp(rng.uniform(math.log(1e-3), math.log(0.3)))
     return SetUp(seed, kind, rng.choice(RATES_HZ), size, share, rng.randint(1, 8), rng.randint(1, 6))
+
+
+def draw_machine(seed: int) -> SetUp:
+    """The machine of a seed; the kinds take turns."""
+    rng, kind = Random(seed), tuple(MACHINES)[seed % len(MACHINES)]
+    low, high = MACHINES[kind]
+    size = math.exp(rng.uniform(math.log(low), math.log(high)))
+    share, per_s = math.exp(rng.uniform(-4.0, -1.5)), math.exp(rng.uniform(2.0, 4.0))
+    return SetUp(seed, kind, MACHINE_HZ, size, per_s if kind == "still" else share, 1, 0)
 
 
 def scene_of(setup: SetUp) -> Scene:
@@ -147,17 +159,41 @@ class LateClock:
                 self.clock.sleep_until_ns(t_ns + round(self.rng.expovariate(1.0 / self.mean_ns)))
 
 
-@dataclass(slots=True, eq=False)
-class _Transit:
-    """Frames on their way to the reader: (time of arrival, number, frame)."""
+@dataclass(slots=True)
+class StandingClock:
+    """A clock on a machine that stands still for some times: a sleep that ends in one ends behind it.
 
-    heap: list[tuple[int, int, Frame]] = field(default_factory=list)
-    number: int = 0
-    last_ns: int = 0
+    Attributes:
+        clock: the clock behind it.
+        rng: generator of the times.
+        per_s: standstills in a second.
+        mean_ns: their mean length.
+        begin_ns, end_ns: the last standstill.
+    """
+
+    clock: Clock
+    rng: Random
+    per_s: float
+    mean_ns: float
+    begin_ns: int = 0
+    end_ns: int = 0
+
+    def now_ns(self) -> int:
+        """Present time, ns."""
+        return self.clock.now_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep; a standstill goes on."""
+        if t_ns <= self.clock.now_ns():
+            return
+        while self.end_ns < t_ns:
+            self.begin_ns = self.end_ns + round(self.rng.expovariate(self.per_s * 1e-9))
+            self.end_ns = self.begin_ns + round(self.rng.expovariate(1.0 / self.mean_ns))
+        self.clock.sleep_until_ns(self.end_ns if self.begin_ns <= t_ns else t_ns)
 
 
 class DisturbedPort(PlainPort):
-    """A port that delays, scatters and loses frames, with a short transmit queue or a late clock.
+    """A port that delays, scatters and loses frames, with a short transmit queue, a late clock or a slow master.
 
     Args:
         port: port of the virtual bus.
@@ -171,11 +207,12 @@ class DisturbedPort(PlainPort):
         self._port, self._setup, self._rng = port, setup, rng
         self._period_ns = round(1e9 / setup.rate_hz)
         self.channel = port.channel
-        late = setup.kind == "machine"
-        mean_ns = setup.size * self._period_ns if late else 1.0
-        self.clock: Clock = LateClock(port.clock, rng, setup.share if late else 0.0, mean_ns)
-        self._transit = _Transit()
-        self._sent_ns = self._lost_until_ns = 0
+        self.clock: Clock = port.clock
+        clocks = {"machine": LateClock, "still": StandingClock}
+        if setup.kind in clocks:
+            self.clock = clocks[setup.kind](port.clock, rng, setup.share, setup.size * self._period_ns)
+        self._arriving: list[tuple[int, int, Frame]] = []  # a heap: time of arrival, number, frame
+        self._number = self._last_ns = self._sent_ns = self._lost_until_ns = 0
 
     @property
     def counters(self) -> PortCounters:
@@ -196,6 +233,8 @@ class DisturbedPort(PlainPort):
         kept = [frame for frame in frames if not self._is_lost()]
         if self._setup.kind != "queue":
             self._port.send_batch(kept, t_ns)
+            if self._setup.kind == "slow" and len(frames) > 1 and all(can_id != SYNC_ID for can_id, _ in frames):
+                self.clock.sleep_until_ns(self.clock.now_ns() + round(self._setup.size * self._period_ns))
             return
         for frame in kept:
             while self._sent_ns - self.clock.now_ns() > self._setup.room * FRAME_NS:
@@ -207,7 +246,7 @@ class DisturbedPort(PlainPort):
     def drain(self) -> list[TimedFrame]:
         """Return the frames that have arrived."""
         self._take()
-        heap, arrived = self._transit.heap, list[TimedFrame]()
+        heap, arrived = self._arriving, list[TimedFrame]()
         now_ns = self.clock.now_ns()
         while heap and heap[0][0] <= now_ns:
             ready_ns, _, (can_id, data) = heappop(heap)
@@ -218,7 +257,7 @@ class DisturbedPort(PlainPort):
         """Wait for a frame, until `until_ns` at the latest."""
         while True:
             self._take()
-            heap, now_ns = self._transit.heap, self.clock.now_ns()
+            heap, now_ns = self._arriving, self.clock.now_ns()
             if now_ns >= until_ns or (heap and heap[0][0] <= now_ns):
                 return
             self._port.wait(min(until_ns, heap[0][0]) if heap else until_ns)
@@ -235,18 +274,13 @@ class DisturbedPort(PlainPort):
         return True
 
     def _take(self) -> None:
-        transit, kind = self._transit, self._setup.kind
+        kind = self._setup.kind
         for can_id, data, t_ns in self._port.drain():
             if self._is_lost():
                 continue
             delay_ns = self._setup.size * self._period_ns if kind in ("delay", "jitter") else 0.0
             if kind == "jitter":
                 delay_ns = self._rng.expovariate(1.0 / delay_ns)
-            transit.last_ns = max(transit.last_ns, t_ns + round(delay_ns))  # an adapter keeps the order
-            transit.number += 1
-            heappush(transit.heap, (transit.last_ns, transit.number, (can_id, data)))
-
-
-def describe(setup: SetUp) -> dict[str, Any]:
-    """The set-up as columns of a table."""
-    return {"seed": setup.seed, "kind": setup.kind, "rate_hz": setup.rate_hz, "size": setup.size}
+            self._last_ns = max(self._last_ns, t_ns + round(delay_ns))  # an adapter keeps the order
+            self._number += 1
+            heappush(self._arriving, (self._last_ns, self._number, (can_id, data)))

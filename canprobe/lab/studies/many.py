@@ -32,7 +32,7 @@ from canprobe.cell.session.terminal import StepReport
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
 from canprobe.fieldbus.bus.files import make_folder, whole_file
 from canprobe.lab.studies.cell_store import model_digest
-from canprobe.lab.studies.harness import Row
+from canprobe.lab.studies.result import Row
 from canprobe.lab.studies.sweep import error_text, open_sweep
 from canprobe.mechanics.types import Floats
 

@@ -23,8 +23,8 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.cell.scene.resolve import LAYER_STIFFNESS
 from canprobe.errors import UsageError
-from canprobe.lab.studies.arrays import RADIUS_M, REFERENCE_SIGMA, Presses, random_array
-from canprobe.mechanics.touch import ArrayCalibration, Pad, calibrate_array
+from canprobe.lab.studies.array_presses import RADIUS_M, Presses, calibrated, pad_of, random_array
+from canprobe.lab.studies.drawn_shapes import centred, heights_file, waves_mm
 from canprobe.mechanics.types import Floats
 
 CELLS = {
@@ -44,8 +44,6 @@ TOOL_ERROR_MM = 0.4
 """Largest error of the centre of the probe along an axis, in half of the scenes."""
 MOST_CURVED_PER_M = 15.0
 """Largest curvature of a hollow of a wave or of heights: two thirds of what the probe fits into."""
-SPACING_MM, SIDE_MM = 0.5, 64.0
-"""Spacing and side of a grid of heights."""
 
 
 class SceneSeed(NamedTuple):
@@ -97,30 +95,11 @@ def own_array(seed: int) -> tuple[TaxelConfig, float, np.random.Generator]:
     return replace(config, gain_error=rng.uniform(0.02, 0.08)), stiffness, rng
 
 
-def calibration_of(seed: int) -> ArrayCalibration:
-    """The calibration that touches of a random array give."""
-    config, stiffness, rng = own_array(seed)
-    fit = calibrate_array(
-        list(Presses(config, stiffness, rng).protocol()),
-        pad=_pad(config),
-        reference="scale",
-        reference_sigma=REFERENCE_SIGMA,
-        array=f"emulated, seed {seed}",
-        date="",
-        made_on="study regions",
-    )
-    return fit.calibration
-
-
-def _pad(config: TaxelConfig) -> Pad:
-    return Pad(full_scale_pa=config.full_scale_pa, mount_radius_m=RADIUS_M)
-
-
 def _emulated(seed: int) -> TaxelArray:
     """The random array as its calibration touches it, with noise of its own."""
     config, stiffness, gains = own_array(seed)
     arrays = [
-        TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness, pad=_pad(config))
+        TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness, pad=pad_of(config))
         for rng in (gains, np.random.default_rng([39, seed]))
     ]
     arrays[1].take_gains(arrays[0])
@@ -148,8 +127,7 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
     assert base.sensor is not None and base.shape is not None
     keys = _OBJECTS[kind](rng)
     if "heights" in keys:
-        np.savez(folder / "heights.npz", heights=keys.pop("heights"), spacing=SPACING_MM)
-        keys = {"kind": "heights", "file": str(folder / "heights.npz"), **keys}
+        keys |= heights_file(folder, keys.pop("heights"))
     strategy = str(rng.choice(["weave", "straight", "circle"], p=[0.5, 0.3, 0.2]))
     sides = 1.0 if strategy == "circle" else 2.0  # a circle begins at the touch, other paths lead to both sides of it
     longest = max(8.0, min(40.0, sides * keys.pop("sharpest_mm") * math.sin(math.radians(tilt_deg))))
@@ -177,7 +155,8 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
         array, sensor = _emulated(seed), replace(sensor, full_scale_kpa=1e-3 * config.full_scale_pa)
     if group == "calibrated":
         file = folder / "calibration.toml"
-        file.write_text(dump_calibration(calibration_of(seed)), encoding="utf-8")
+        fit = calibrated(Presses(*own_array(seed)), f"emulated, seed {seed}")
+        file.write_text(dump_calibration(fit.calibration), encoding="utf-8")
         sensor = replace(sensor, calibration=str(file))
     scene = replace(
         base,
@@ -239,18 +218,9 @@ def heights_mm(rng: np.random.Generator, shortest_mm: float, longest_mm: float) 
         rng: generator of directions, lengths and phases.
         shortest_mm, longest_mm: bounds of the wavelengths; curvature changes within a quarter of one.
     """
-    side = np.arange(-SIDE_MM / 2, SIDE_MM / 2 + 0.1, SPACING_MM)
-    x, y = np.meshgrid(side, side, indexing="ij")
-    z = np.zeros_like(x)
-    for wavelength, heading, phase in rng.uniform(
-        (shortest_mm, 0.0, 0.0), (longest_mm, 2 * np.pi, 2 * np.pi), (6, 3)
-    ).tolist():
-        k = 2.0 * math.pi / wavelength
-        z += np.cos(k * (math.cos(heading) * x + math.sin(heading) * y) + phase) / k**2
-    z *= 1e-3 * MOST_CURVED_PER_M / 3.0  # the six curvatures add up to their largest value nearly nowhere
-    z -= (x**2 + y**2) / (2.0 * 90.0)
-    heights: Floats = z - z[len(side) // 2, len(side) // 2]
-    return heights
+    x, y, waves = waves_mm(rng, shortest_mm, longest_mm)
+    # the six curvatures add up to their largest value nearly nowhere
+    return centred(1e-3 * MOST_CURVED_PER_M / 3.0 * waves - (x**2 + y**2) / (2.0 * 90.0))
 
 
 def _heights(shortest_mm: float, longest_mm: float) -> Callable[[np.random.Generator], dict[str, Any]]:

@@ -1,8 +1,7 @@
 """Study `realtime`: how well the cycle keeps time on a real SocketCAN interface, emulated nodes in a child process.
 
-Four measurements: the whole controller at 400 Hz for minutes; the same cycle with plain canopen-python; a loop that
-does nothing, for the lateness of the machine; and the highest rate that is held, for each mode of the sensor, with a
-controller that only holds the joints.
+Three measurements: the whole controller at 400 Hz for minutes; a loop that does nothing, for the lateness of the
+machine; and the highest rate that is held, for each mode of the sensor, with a controller that only holds the joints.
 Needs a `vcan0`; `canprobe vcan --realtime -- canprobe study realtime` runs it where the kernel has none.
 """
 
@@ -22,17 +21,16 @@ from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, 
 from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
-from canprobe.lab.studies.cycle_times import CycleTimes, Times
-from canprobe.lab.studies.harness import CHANNEL, Column, Row, Say, StudyResult
 from canprobe.lab.studies.realtime_cases import (
     PATIENCE,
+    CycleTimes,
     Measured,
+    Times,
     measure_bare,
     measure_hold,
-    measure_plain,
     measure_scan,
 )
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Column, Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
@@ -70,8 +68,6 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     scan_s, bare_s, hold_s = (4.0, 1.0, 1.0) if quick else (300.0, 100.0, 10.0)
     say(f"the whole controller at 400 Hz, {scan_s:g} s")
     measured.append(measure_scan(scan_s))
-    say(f"plain canopen-python at 400 Hz, {hold_s:g} s")
-    measured.append(measure_plain(hold_s))
     say(f"a loop at 400 Hz that does nothing, {bare_s:g} s")
     measured.append(measure_bare(bare_s))
     for mode in MODES:
@@ -137,12 +133,10 @@ def per_10000(times: CycleTimes) -> float:
 
 def findings(measured: list[Measured]) -> list[str]:
     """The figures beside the goals."""
-    scan, plain, bare = measured[:3]
+    scan, bare = measured[:2]
     lines = [
         f"whole controller at {scan.rate_hz:g} Hz for {scan.times.seconds:.0f} s: {per_10000(scan.times):.1f} overruns"
         f" in 10 000 cycles (goal 1), {scan.times.rate_hz:.1f} cycles a second held",
-        f"plain canopen-python at {plain.rate_hz:g} Hz: {per_10000(plain.times):.0f} overruns in 10 000 cycles,"
-        f" {plain.times.rate_hz:.1f} cycles a second held, and it computes nothing",
         f"a loop at {bare.rate_hz:g} Hz that does nothing: {per_10000(bare.times):.1f} overruns in 10 000 cycles, the"
         " machine's own",
     ]
@@ -176,7 +170,7 @@ LINES = ((BLUE, "-"), (ORANGE, "--"), (SKY, ":"))
 
 def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     """Lateness of SYNC, computing time, answer latency, and held over asked rate."""
-    scan, plain, bare = measured[:3]
+    scan, bare = measured[:2]
     rate, seconds = f"{scan.rate_hz:g} Hz", f"{scan.times.seconds:.0f} s"
     title = (
         f"How well the cycle keeps time: {rate} on a real SocketCAN interface for {seconds}, emulated nodes beside it\n"
@@ -184,7 +178,7 @@ def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     )
     with picture(path, title, 6.6) as figure:
         panels = parts(figure, 2, 2)
-        late = {"canprobe": scan, "plain canopen": plain, "a loop that does nothing": bare}
+        late = {"canprobe": scan, "a loop that does nothing": bare}
         _histogram(panels[0], "lateness of SYNC (µs)", {name: m.times.lateness_ns for name, m in late.items()})
         done = {"RPDOs out": scan.times.response_ns, "work behind them done": scan.times.compute_ns}
         axes = _histogram(panels[1], "from the last TPDO, whole controller (µs)", done)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
+import os
+import re
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import process_time
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
@@ -23,13 +29,13 @@ from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
-from canprobe.lab.studies.cycle_times import CycleTimes, answer_latencies, processor_share, woken
-from canprobe.lab.studies.harness import CHANNEL
-from canprobe.lab.studies.no_bus import on_any_bitrate
-from canprobe.lab.studies.plain_canopen import run_plain
+from canprobe.fieldbus.eds.packaged import eds_file
+from canprobe.fieldbus.protocol.frames import SYNC_ID
+from canprobe.lab.studies.result import CHANNEL
 
 RATE_HZ = 400.0
 MISSED_SYNCS, LATE_PERCENT = 250, 100
@@ -37,6 +43,99 @@ PATIENCE = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCEN
 """Limits in the scenes of the cases: neither a drop-out nor late cycles end a run at a rate that cannot be held."""
 WIRE_BITRATE = 50_000_000
 """Bit rate of the plans at any rate: a virtual bus has none."""
+
+
+Times = NDArray[np.int64]
+
+
+def _nothing() -> Times:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleTimes:
+    """Times of the cycles of one run; empty arrays where a time was not measured.
+
+    Attributes:
+        period_ns: requested period of SYNC.
+        lateness_ns: time of each SYNC behind its deadline (n,), ns.
+        seconds: time from the first SYNC to the last.
+        response_ns: time from the last TPDO to the RPDOs in every fifth cycle (m,), ns.
+        compute_ns: that time and the controller's work after the RPDOs (m,), ns.
+        latency_ns: time from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
+        missed: number of TPDOs that did not come in their cycle.
+        processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
+    """
+
+    period_ns: int
+    lateness_ns: Times
+    seconds: float
+    response_ns: Times = field(default_factory=_nothing)
+    compute_ns: Times = field(default_factory=_nothing)
+    latency_ns: Times = field(default_factory=_nothing)
+    missed: int = 0
+    processor_share: float | None = None
+
+    @property
+    def overruns(self) -> int:
+        """Number of cycles woken more than half a period late."""
+        return int(np.count_nonzero(self.lateness_ns > self.period_ns // 2))
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles."""
+        return len(self.lateness_ns)
+
+    @property
+    def rate_hz(self) -> float:
+        """Held rate, cycles per second."""
+        return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
+
+
+def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
+    """Wake at a number of deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
+
+    Yields:
+        The deadline, ns, or the last one that has passed by then.
+    """
+    deadline_ns = clock.now_ns() + period_ns
+    for _ in range(cycles):
+        clock.sleep_until_ns(deadline_ns)
+        lateness.append(clock.now_ns() - deadline_ns)
+        deadline_ns += lateness[-1] // period_ns * period_ns
+        yield deadline_ns
+        deadline_ns += period_ns
+
+
+def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -> Times:
+    """Measure the time from each SYNC of a candump log to the last of the TPDOs that answer it within a period.
+
+    Args:
+        path: path of the log.
+        feedback_ids: COB-IDs of the TPDOs.
+        period_ns: period of SYNC.
+
+    Returns:
+        One number for each SYNC that all of them answered (k,), ns, in whole microseconds.
+    """
+    syncs: list[int] = []
+    arrivals: dict[int, list[int]] = {can_id: [] for can_id in feedback_ids}
+    for t_ns, _, can_id, _ in read_candump(path):
+        if can_id == SYNC_ID:
+            syncs.append(t_ns)
+        elif can_id in arrivals:
+            arrivals[can_id].append(t_ns)
+    if not syncs or not arrivals:
+        return _nothing()
+    begins = np.array(sorted(syncs), np.int64)
+    last = np.full(len(begins), -1, np.int64)
+    complete = np.ones(len(begins), bool)
+    for times in arrivals.values():
+        stamps = np.array([*sorted(times), np.iinfo(np.int64).max], np.int64)
+        delays = stamps[np.searchsorted(stamps, begins)] - begins
+        complete &= delays < period_ns
+        last = np.maximum(last, delays)
+    return last[complete]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +153,6 @@ def measure_scan(seconds: float) -> Measured:
     """The scene `cylinder` with servo and estimator."""
     scene = _scene(seconds)
     return _measured("whole controller", scene, lambda session: make_task(session.plan))
-
-
-def measure_plain(seconds: float) -> Measured:
-    """The cycle of `run_plain` with the same nodes."""
-    plan = make_plan(resolve(holding_scene("window", RATE_HZ)))
-    with served(), realtime(MASTER_PRIORITY, _unheard):
-        return Measured("plain canopen", "window", RATE_HZ, run_plain(plan, seconds))
 
 
 def measure_bare(seconds: float) -> Measured:
@@ -173,3 +265,29 @@ def _times(session: Session, folder: Path, used_s: float) -> CycleTimes:
         missed=cell.drives.missed,
         processor_share=processor_share(used_s, seconds),
     )
+
+
+def processor_share(used_before_s: float, passed_s: float) -> float | None:
+    """Processor share since `process_time` gave `used_before_s`; None in a guest, which counts whole ticks."""
+    if os.environ.get("CANPROBE_VCAN") == "guest" or passed_s <= 0:
+        return None
+    return (process_time() - used_before_s) / passed_s
+
+
+def on_any_bitrate(scene: Scene, bitrate: int) -> Scene:
+    """The scene with a bit rate (bit/s) that no CAN has, and copies of its EDS files that list no bit rates."""
+    arm, sensor = scene.arm, scene.sensor
+    if arm is not None:
+        arm = replace(arm, eds=_eds_for_any_bitrate(arm.eds))
+    if sensor is not None:
+        sensor = replace(sensor, eds=_eds_for_any_bitrate(sensor.eds))
+    return replace(scene, bus=replace(scene.bus, bitrate=bitrate), arm=arm, sensor=sensor)
+
+
+@functools.cache
+def _eds_for_any_bitrate(eds: str) -> str:
+    folder = Path(tempfile.mkdtemp(prefix="canprobe-eds-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy = folder / eds_file(eds).name
+    copy.write_bytes(re.sub(rb"(?m)^(BaudRate_\w+)=1", rb"\1=0", eds_file(eds).read_bytes()))
+    return str(copy)

@@ -30,9 +30,8 @@ from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult
 from canprobe.lab.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 SOAK_S = 1800.0

@@ -1,28 +1,50 @@
-"""Study `recover`: a thousand cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
+"""Study `faults --recover`: cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
 
 What is lost, when, for how long, alone or in pairs, follows from a seed, while the arm holds, moves, presses or scans
-(`recover_cases`). A run fails where a drive is enabled with a target more than one count beside its position, where the
+(`recover_score`). A run fails where a drive is enabled with a target more than one count beside its position, where the
 force exceeds the limit at another time than between loss and stop (study `faults` judges that time), where the cell
 does not come back or takes more than a second from the boot-up of the last node to the hold, or where its log lacks a
 cycle. Behind a loss without a boot-up the cell may take as long again as its nodes may take to stop. A stop that
-somebody has to look at, such as a probe that is left pressing, is counted by itself. `canprobe study recover --seed N`
-carries out one run again; a failure is shrunk to the fewest losses that still fail.
+somebody has to look at, such as a probe that is left pressing, is counted by itself. `canprobe study faults --recover
+--seed N` carries out one run again; a failure is shrunk to the fewest losses that still fail.
 """
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from canprobe.cell.master.options import RunOptions
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import MASTER_NODE_ID
 from canprobe.cell.results.picture import BLUE, picture
-from canprobe.lab.studies.harness import Column, Row, Say, StudyResult
-from canprobe.lab.studies.recover_cases import SCENES, draw_case, shrink
-from canprobe.lab.studies.recover_runs import run_case
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.session import Session
+from canprobe.errors import InterfaceError
+from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID, Frame
+from canprobe.lab.studies.recover_score import (
+    END_S,
+    FIRST_SYNCS,
+    REPLUG,
+    SCENES,
+    STALL,
+    RecoverCase,
+    RecoverScore,
+    draw_case,
+    forces_of,
+    shrink,
+)
+from canprobe.lab.studies.result import Column, Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS, QUICK_RUNS, SEEDS_A_CELL = 1000, 8, 20
@@ -71,7 +93,7 @@ def replay(seed: int, say: Say) -> dict[str, Any]:
     for failure in outcome["failures"]:
         say(f"FAILURE: {failure}")
     if outcome["failures"]:
-        say(f"shrunk: {shrink(case, run_case)} (canprobe study recover --seed {seed})")
+        say(f"shrunk: {shrink(case, run_case)} (canprobe study faults --recover --seed {seed})")
     return outcome
 
 
@@ -109,8 +131,8 @@ def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
         f" last return to the hold: {most['late_s']:.2f} s; {most['rows_lost']} cycles without a row in the log.",
     ]
     for run in failed[:20]:
-        why = "; ".join(run["failures"])
-        lines.append(f"seed {run['seed']}: {run['shrunk']}: {why} (canprobe study recover --seed {run['seed']})")
+        seed, why = run["seed"], "; ".join(run["failures"])
+        lines.append(f"seed {seed}: {run['shrunk']}: {why} (canprobe study faults --recover --seed {seed})")
     return lines
 
 
@@ -121,3 +143,126 @@ def draw_runs(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
         axes.hist([run["late_s"] for run in runs if run["back"]], bins=40, color=BLUE)
         axes.set_xlabel("s")
         axes.set_ylabel("runs")
+
+
+class WatchedDrives(Participant):
+    """Looks at the drives after each SYNC: distance of target and position in the first SYNCs after each enabling.
+
+    Args:
+        nodes: all emulated nodes.
+
+    Attributes:
+        jump_counts: largest distance in those SYNCs, from the second enabling of a drive on.
+        lifting: the cell takes the probe off, which is no jump.
+        syncs: number of SYNCs.
+        boot_ups: time of each boot-up, ns, by node.
+    """
+
+    name = "watcher of the drives"
+    hears_every_sync = True
+    listens = frozenset((SYNC_ID, *range(HEARTBEAT_BASE + 1, HEARTBEAT_BASE + MASTER_NODE_ID)))
+
+    def __init__(self, nodes: Sequence[SlaveNode]) -> None:
+        self._ages = {
+            node.node_id: (-1, 0, node) for node in nodes if node.dictionary.entries.get(0x604100) is not None
+        }
+        self.boot_ups: dict[int, list[int]] = {node.node_id: [] for node in nodes}
+        self.jump_counts = self.syncs = 0
+        self.lifting = False
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
+        """Look at each drive."""
+        if can_id != SYNC_ID:
+            if data == b"\0":
+                self.boot_ups[can_id - HEARTBEAT_BASE].append(t_ns)
+            return []
+        self.syncs += 1
+        for node_id, (age, before, node) in self._ages.items():
+            number = node.dictionary.number
+            if known_state(number(0x6041)) is not DriveState.OPERATION_ENABLED:
+                self._ages[node_id] = (-1, before, node)
+                continue
+            times = before + (age < 0)
+            self._ages[node_id] = (age + 1, times, node)
+            if times > 1 and age + 1 < FIRST_SYNCS and not self.lifting:
+                self.jump_counts = max(self.jump_counts, abs(number(0x607A) - number(0x6064)))
+        return []
+
+
+class RecoverRun:
+    """One run of the study.
+
+    Args:
+        case: what happens.
+        say: called with each step.
+        out: folder of the run's files; None keeps none.
+    """
+
+    def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path | None) -> None:
+        self._case = case
+        changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
+        plan = make_plan(resolve(load_scene(SCENES[case.work], changes)))
+        self._score = RecoverScore(case, plan, say)
+        self._session = session = Session(plan, RunOptions(out, self._say, recover=True))
+        self._faulty = session.world.make_faulty()
+        self._drives = WatchedDrives(session.world.nodes)
+        session.world.participants.append(self._drives)
+        session.around = self._disturbed
+        self._away: list[tuple[int, int, bool]] = []
+        with session:
+            self._score.carry_out(session, self._begin, lambda: self._now_ns * 1e-9)
+
+    @property
+    def _now_ns(self) -> int:
+        assert self._session.lockstep is not None
+        return self._session.lockstep.clock.now_ns()
+
+    def _say(self, text: str) -> None:
+        self._score.say(self._now_ns * 1e-9 if self._session.lockstep is not None else 0.0, text)
+        if text.startswith(("lift off", "enable the drives")):
+            self._drives.lifting = text.startswith("lift off")
+
+    def _begin(self) -> None:
+        """Throw the outages."""
+        for loss in self._case.outages:
+            if loss.name in (REPLUG, STALL):
+                begin_ns = self._now_ns + round(loss.after_s * 1e9)
+                self._away.append((begin_ns, begin_ns + loss.lasts_ms * 1_000_000, loss.name == STALL))
+            for node_id in loss.nodes(self._score.plan.node_ids):
+                self._faulty.inject(loss.fault(node_id, loss.after_s), self._now_ns)
+
+    def _disturbed(self, port: Port) -> Port:
+        """The port of the master: it fails while its interface is down, and its calls do not return in a stall."""
+
+        def around(name: str) -> Callable[..., Any]:
+            method = getattr(port, name)
+
+            def call(*arguments: Any) -> Any:
+                for begin_ns, end_ns, stalls in self._away:
+                    if begin_ns <= self._now_ns < end_ns:
+                        if not stalls:
+                            down = f"{port.channel}: interface is down; type: sudo ip link set {port.channel} up"
+                            raise InterfaceError(down)
+                        port.clock.sleep_until_ns(end_ns)
+                return method(*arguments)
+
+            return call
+
+        for name in ("send_batch", "drain", "wait"):
+            setattr(port, name, around(name))
+        return port
+
+    def outcome(self) -> dict[str, Any]:
+        """What came of it, and what failed; with files, the hash of the bus log too."""
+        session = self._session
+        boot_ups = {node_id: [t_ns * 1e-9 for t_ns in times] for node_id, times in self._drives.boot_ups.items()}
+        times_s = session.cell.log.arrays()["t_s"].tolist() if len(session.cell.log) else list[float]()
+        found = self._score.outcome(boot_ups, times_s, self._drives.syncs, forces_of(session), self._drives.jump_counts)
+        if session.out is not None:
+            found["bus_log_sha256"] = hashlib.sha256((session.out / "bus.log").read_bytes()).hexdigest()
+        return found
+
+
+def run_case(case: RecoverCase, say: Callable[[str], None] = lambda _: None, out: Path | None = None) -> dict[str, Any]:
+    """Carry out a run, and score it."""
+    return RecoverRun(case, say, out).outcome()

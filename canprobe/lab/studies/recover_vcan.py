@@ -1,8 +1,9 @@
-"""Study `recover` on a real vcan0: the cases of `recover_cases`, with nodes in their own process.
+"""Study `faults --recover` on a real vcan0: the cases of `recover_score`, with nodes in their own process.
 
-`canprobe vcan -- canprobe study recover --vcan`. Faults are thrown as `canprobe inject` throws them, the interface is
-taken down and up by `ip`, and the master stands still in its controller. The score is that of the study in lockstep;
-first targets, boot-ups and SYNCs are read from the bus log, forces from the plant. Real time is not repeated by a seed.
+`canprobe vcan -- canprobe study faults --recover --vcan`. Faults are thrown as `canprobe inject` throws them, the
+interface is taken down and up by `ip`, and the master stands still in its controller. The score is that of the study in
+lockstep; first targets, boot-ups and SYNCs are read from the bus log, forces from the plant. Real time is not repeated
+by a seed.
 """
 
 from __future__ import annotations
@@ -28,12 +29,20 @@ from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.lab.studies.faults_vcan import link
-from canprobe.lab.studies.harness import CHANNEL, StudyResult
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
-from canprobe.lab.studies.recover_cases import END_S, REPLUG, SCENES, STALL, RecoverCase, draw_case
-from canprobe.lab.studies.recover_runs import RecoverScore, WatchedDrives, forces_of
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.recover_score import (
+    END_S,
+    FIRST_SYNCS,
+    REPLUG,
+    SCENES,
+    STALL,
+    RecoverCase,
+    RecoverScore,
+    draw_case,
+    forces_of,
+)
+from canprobe.lab.studies.result import CHANNEL, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS, QUICK_RUNS = 50, 2
@@ -147,7 +156,7 @@ class FirstTargets:
         if STATUSWORD in got:
             enabled = known_state(got[STATUSWORD]) is DriveState.OPERATION_ENABLED
             self._ages[node_id] = (age + 1, times + (age < 0)) if enabled else (-1, times)
-        elif TARGET in got and times > 1 and 0 <= age < WatchedDrives.FIRST_SYNCS and POSITION in values:
+        elif TARGET in got and times > 1 and 0 <= age < FIRST_SYNCS and POSITION in values:
             self.jump_counts = max(self.jump_counts, abs(got[TARGET] - values[POSITION]))
 
 

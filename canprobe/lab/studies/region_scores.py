@@ -8,7 +8,7 @@ within the last 1.5 mm of the way of the contact, no answer of a smooth surface 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -23,8 +23,8 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import PlanError, SafetyStop
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS
 from canprobe.lab.studies.random_scenes import DrawnScene, SceneSeed, random_scene
+from canprobe.lab.studies.result import CHI2_95_OF_3, FROBENIUS
 from canprobe.mechanics.types import Floats
 
 BEHIND_JUMP_M = 1.5e-3
@@ -89,6 +89,12 @@ class ScoredScan(NamedTuple):
         scan = cls(*answer)
         scores, behind = (np.array(rows).reshape(-1, 5) for rows in (scan.scores, scan.behind))
         return scan._replace(scores=scores, behind=behind)
+
+
+def held_share(scans: Sequence[ScoredScan]) -> float | None:
+    """Share of the regions of some scans that hold the truth; None without any."""
+    squares = [scan.scores[:, 3] for scan in scans if len(scan.scores)]
+    return float(np.mean(np.concatenate(squares) < CHI2_95_OF_3)) if squares else None
 
 
 def measure(seed: int) -> ScoredScan:

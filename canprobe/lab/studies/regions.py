@@ -17,7 +17,6 @@ rules, prediction, and estimation", 2007.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -26,32 +25,40 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
+from canprobe.cell.results.picture import AMBER, BLUE, INK, ORANGE, SHADE, legend, log_scale, parts, picture
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.files import whole_file
-from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, Say, StudyResult
 from canprobe.lab.studies.random_scenes import FOREIGN, KINDS, SceneSeed
-from canprobe.lab.studies.region_figure import draw_regions
-from canprobe.lab.studies.region_scores import ScoredScan, measure
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.region_scores import ScoredScan, held_share, measure
+from canprobe.lab.studies.result import (
+    CHI2_95_OF_3,
+    Column,
+    Row,
+    Say,
+    StudyResult,
+    drawn_anew,
+    interval_of,
+    measuring_facts,
+    shown,
+    write_csv,
+)
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.types import Floats
 
-TEST_DRAW, DEVELOPMENT_DRAW = 1, 2
+TEST_DRAW = 1
 SCENES, QUICK_SCENES = 60, 3
-"""Number of scenes of a kind that answer, and be it that K is not observed."""
-TRIES = 4
-"""Most scenes that are drawn for one that answers."""
+"""Scenes wanted of a kind that yield an estimate, K observed or not."""
+DRAWS_PER_SCENE = 4
+"""Largest number of scenes that are drawn for each one that is wanted."""
 COVERAGE_GOAL, STATED_GOAL = (0.93, 0.97), (0.9, 1.4)
 """Pooled coverage, and geometric mean over scenes of stated over error, of every kind."""
-SELDOM_SHARE, HARDLY_SHARE = 0.8, 0.4
+LOW_COVERAGE, VERY_LOW_COVERAGE = 0.8, 0.4
 """Shares of the answers of a scene."""
-SELDOM_GOAL, HARDLY_GOAL = 0.08, 0.01
+LOW_SCENES_GOAL, VERY_LOW_SCENES_GOAL = 0.08, 0.01
 """Largest shares of such scenes."""
-WORST = 8
-BOOTSTRAPS = 2000
+SCENES_NAMED = 8
 MODEL = (
-    "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/arrays.py",
+    "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/array_presses.py",
     "lab/studies/random_scenes.py", "lab/studies/region_scores.py",
 )  # fmt: skip
 COLUMNS = (
@@ -103,7 +110,7 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW, against: Path | Non
     earlier = None if against is None else earlier_rows(against)
     wanted = QUICK_SCENES if quick else SCENES
     scans = scan_all(sweep, draw, KINDS, wanted)
-    write_scenes(sweep.folder / "regions_scenes.csv", scans)
+    write_csv(sweep.folder / "regions_scenes.csv", [scene_row(scan) for scan in scans])
     rows = rows_of(scans)
     said = findings(rows, scans)
     if earlier is not None:
@@ -113,13 +120,13 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW, against: Path | Non
 
 
 def scan_all(sweep: Sweep, draw: int, kinds: Sequence[str], wanted: int) -> list[ScoredScan]:
-    """Scan scenes of each kind until the wanted number of them answers, or `TRIES` times as many are drawn."""
+    """Scan scenes of each kind until the wanted number of them answers; at most `DRAWS_PER_SCENE` for each."""
     scans: dict[str, list[ScoredScan]] = {kind: [] for kind in kinds}
     while True:
         todo = []
         for kind, done in scans.items():
             missing = wanted - sum(scan.late > 0 for scan in done)
-            numbers = range(len(done), min(len(done) + missing, TRIES * wanted))
+            numbers = range(len(done), min(len(done) + missing, DRAWS_PER_SCENE * wanted))
             todo += [SceneSeed(draw, kind, number).value() for number in numbers]
         if not todo:
             return [scan for done in scans.values() for scan in done]
@@ -154,8 +161,12 @@ def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
         [len(scan.scores), len(scan.scores) * scan.share, math.log(scan.stated_per_m / scan.error_per_m)]
         for scan in answering
     ]).reshape(-1, 3)  # fmt: skip
-    drawn = _drawn(sums)
-    coverage, stated = _interval(drawn[:, 1] / drawn[:, 0]), np.exp(_interval(drawn[:, 2] / max(len(sums), 1)))
+    coverage, stated = (math.nan, math.nan), (math.nan, math.nan)
+    if answering:  # intervals over scenes that are drawn anew
+        drawn = sums[drawn_anew(len(sums))].sum(axis=1)
+        coverage = interval_of(drawn[:, 1] / drawn[:, 0])
+        low, high = interval_of(drawn[:, 2] / len(sums))
+        stated = math.exp(low), math.exp(high)
     shares = [scan.share for scan in answering]
     worst = min(answering, key=lambda scan: scan.share, default=None)
     seeds = sorted(scan.seed for scan in scans)
@@ -165,29 +176,15 @@ def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
         "scenes": len(scans), "refused": sum(scan.ended.startswith("refused") for scan in scans),
         "stopped": sum(scan.ended.startswith("stopped") for scan in scans), "answers": int(sums[:, 0].sum()),
         "observed": float(sums[:, 0].sum()) / max(sum(scan.late for scan in scans), 1),
-        "coverage": float(np.mean(answers[:, 3] < CHI2_95_OF_3)) if answering else math.nan,
+        "coverage": math.nan if (held := held_share(answering)) is None else held,
         "coverage_low": coverage[0], "coverage_high": coverage[1],
-        "below_80": float(np.mean(np.array(shares) < SELDOM_SHARE)) if shares else math.nan,
-        "below_40": float(np.mean(np.array(shares) < HARDLY_SHARE)) if shares else math.nan,
+        "below_80": float(np.mean(np.array(shares) < LOW_COVERAGE)) if shares else math.nan,
+        "below_40": float(np.mean(np.array(shares) < VERY_LOW_COVERAGE)) if shares else math.nan,
         "error_per_m": math.sqrt(float(np.mean(answers[:, 1]))),
         "stated_over_error": math.exp(float(np.mean(sums[:, 2]))) if shares else math.nan,
         "stated_low": stated[0], "stated_high": stated[1], "log_score": float(np.mean(answers[:, 4])),
         "worst": f"{worst.seed}: {worst.share:.2f}" if worst is not None else "",
     }  # fmt: skip
-
-
-def _drawn(sums: Floats) -> Floats:
-    """Sums over scenes that are drawn anew, a row each."""
-    if not len(sums):
-        return np.full((1, sums.shape[1]), np.nan)
-    drawn: Floats = sums[np.random.default_rng(0).integers(len(sums), size=(BOOTSTRAPS, len(sums)))].sum(axis=1)
-    return drawn
-
-
-def _interval(values: Floats) -> tuple[float, float]:
-    """Interval of 95 % of the draws."""
-    low, high = np.quantile(values, [0.025, 0.975])
-    return float(low), float(high)
 
 
 def findings(rows: Sequence[Row], scans: Sequence[ScoredScan]) -> list[str]:
@@ -202,41 +199,32 @@ def findings(rows: Sequence[Row], scans: Sequence[ScoredScan]) -> list[str]:
     ]
     low, high = COVERAGE_GOAL
     least, most = STATED_GOAL
-    said += [
-        _goal(
-            f"{100 * low:g}–{100 * high:g} % of the regions of every kind hold the truth",
-            [f"{r['of']} {100 * r['coverage']:.1f} %" for r in surfaces if not low <= r["coverage"] <= high],
-        ),
-        _goal(
-            f"stated over error {least:g}–{most:g} for every kind (geometric mean over scenes)",
-            [
-                f"{r['of']} {r['stated_over_error']:.2f}"
-                for r in surfaces
-                if not least <= r["stated_over_error"] <= most
-            ],
-        ),
-    ]
-    for key, edge, goal in (("below_80", 80, SELDOM_GOAL), ("below_40", 40, HARDLY_GOAL)):
-        most_of = [f"{r['of']} {100 * r[key]:.0f} %" for r in surfaces if r[key] > SELDOM_GOAL]
-        missed = [f"{100 * whole[key]:.1f} %", *most_of] if whole[key] > goal else []
-        said.append(_goal(f"at most {100 * goal:g} % of the scenes below {edge} %", missed))
+    odd = {
+        f"{100 * low:g}–{100 * high:g} % of the regions of every kind hold the truth": [
+            f"{r['of']} {100 * r['coverage']:.1f} %" for r in surfaces if not low <= r["coverage"] <= high
+        ],
+        f"stated over error {least:g}–{most:g} for every kind (geometric mean over scenes)": [
+            f"{r['of']} {r['stated_over_error']:.2f}" for r in surfaces if not least <= r["stated_over_error"] <= most
+        ],
+    }
+    for key, edge, goal in (("below_80", 80, LOW_SCENES_GOAL), ("below_40", 40, VERY_LOW_SCENES_GOAL)):
+        kinds_of = [f"{r['of']} {100 * r[key]:.0f} %" for r in surfaces if r[key] > LOW_SCENES_GOAL]
+        missed = [f"{100 * whole[key]:.1f} %", *kinds_of] if whole[key] > goal else []
+        odd[f"at most {100 * goal:g} % of the scenes below {edge} %"] = missed
+    said += [f"Goal: {text}: {'missed by ' + ', '.join(missed) if missed else 'met'}." for text, missed in odd.items()]
     for row in (row for row in rows if row["group"] == "behind a jump"):
         said.append(
             f"Scored apart, up to 1.5 mm behind a jump of the surface: {100 * row['observed']:.0f} % of the answers "
             f"observe all of K, {100 * row['coverage']:.0f} % of those regions hold the truth, error "
             f"{row['error_per_m']:.1f} 1/m."
         )
-    worst = sorted((scan for scan in scans if scan.share < SELDOM_SHARE), key=lambda scan: scan.share)[:WORST]
+    worst = sorted((scan for scan in scans if scan.share < LOW_COVERAGE), key=lambda scan: scan.share)[:SCENES_NAMED]
     if worst:
         said.append("The worst scenes, and the line that repeats each:")
         said += [
             f"  {100 * scan.share:.0f} %, {in_words(scan)}: canprobe study regions --seed {scan.seed}" for scan in worst
         ]
     return said
-
-
-def _goal(text: str, missed: Sequence[str]) -> str:
-    return f"Goal: {text}: {'missed by ' + ', '.join(missed) if missed else 'met'}."
 
 
 def in_words(scan: ScoredScan) -> str:
@@ -269,31 +257,25 @@ def compared(rows: Sequence[Row], earlier: Mapping[str, Row]) -> list[str]:
     said = ["Now / in the earlier run:"]
     for row in rows:
         if row["group"] == "kind" and (before := earlier.get(row["of"])) is not None:
-            pairs = [f"{words} {_shown(row[key], form)} / {_shown(before[key], form)}" for key, words, form in COMPARED]
+            pairs = [f"{words} {shown(row[key], form)} / {shown(before[key], form)}" for key, words, form in COMPARED]
             said.append(f"  {row['of']}: {', '.join(pairs)}")
     return said
 
 
-def _shown(value: float | None, form: str) -> str:
-    return "–" if value is None or math.isnan(value) else format(value, form)
-
-
-def write_scenes(path: Path, scans: Sequence[ScoredScan]) -> None:
-    """Write a CSV file with a line for each scene, its seed first."""
-    facts = [name for name in ScoredScan._fields if name not in ("scores", "behind")]
-    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        lines = csv.writer(file)
-        lines.writerow([*facts, "answers", "share", "error_per_m", "stated_per_m"])
-        for scan in scans:
-            found = [scan.share, scan.error_per_m, scan.stated_per_m] if len(scan.scores) else ["", "", ""]
-            lines.writerow([*(getattr(scan, name) for name in facts), len(scan.scores), *found])
+def scene_row(scan: ScoredScan) -> Row:
+    """The facts of a scene, its seed first, and its scores."""
+    facts = {name: value for name, value in scan._asdict().items() if name not in ("scores", "behind")}
+    scores = ("share", "error_per_m", "stated_per_m")
+    return {**facts, "answers": len(scan.scores)} | {
+        name: getattr(scan, name) if len(scan.scores) else None for name in scores
+    }
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
     """Scan the scene of one seed again and report each answer.
 
     Returns:
-        The facts of the scan; `failures` says so where less than `SELDOM_SHARE` of the regions hold the truth.
+        The facts of the scan; `failures` says so where less than `LOW_COVERAGE` of the regions hold the truth.
     """
     scan = measure(seed)
     say(f"seed {seed}: {in_words(scan)}")
@@ -303,10 +285,67 @@ def replay(seed: int, say: Say) -> dict[str, Any]:
         say(f"  {t_s:.2f} s: error {math.sqrt(error):.2f} 1/m, stated {math.sqrt(stated):.2f}, region {held}{where}")
     say(f"  {len(scan.scores)} of {scan.late} answers observe all of K{', ' + scan.ended if scan.ended else ''}")
     failures = []
-    if scan.share < SELDOM_SHARE:
+    if scan.share < LOW_COVERAGE:
         failures.append(f"{100 * scan.share:.0f} % of the regions hold the truth")
         say(f"  FAILURE: {failures[0]}")
-    facts = {name: value for name, value in scan._asdict().items() if name not in ("scores", "behind")}
-    return {**facts, "answers": len(scan.scores), "share": None if math.isnan(scan.share) else scan.share} | {
-        "failures": failures
-    }
+    return {**scene_row(scan), "failures": failures}
+
+
+SHARES = (
+    (0.8, 1.01, BLUE, "o", "80 % of the scene's regions or more hold the truth"),
+    (0.4, 0.8, AMBER, "s", "40 to 80 %"),
+    (0.0, 0.4, ORANGE, "v", "less than 40 %"),
+)
+"""Least and greatest share of the regions of a scene that hold the truth, with colour, marker and words."""
+PANELS_IN_A_ROW = 4
+
+
+def draw_regions(rows: Sequence[Row], scans: Sequence[ScoredScan], path: Path) -> None:
+    """A panel for each kind with a mark for each scene; below them the coverage with its interval."""
+    kinds = [row for row in rows if row["group"] == "kind"]
+    title = (
+        "Whether the online estimator knows its error: each mark is a random scene, each panel a kind\n"
+        "number: mean of stated over error; above the line: cautious; shade: as asked for, 0.9 to 1.4, 93 to 97 %\n"
+        "lowest: share of the 95 % regions that hold the truth, with 95 % of the draws of scenes"
+    )
+    panels = kinds[:-1]
+    lines = -(-len(panels) // PANELS_IN_A_ROW)
+    with picture(path, title, 3.0 + 1.9 * lines) as figure:
+        upper, lower = parts(figure, 2, 1, height_ratios=(1.9 * lines, 2.2))
+        grid = upper.subplots(lines, PANELS_IN_A_ROW, squeeze=False, sharex=True, sharey=True)
+        found = [value for scan in scans if len(scan.scores) for value in (scan.error_per_m, scan.stated_per_m)]
+        span = (0.8 * min(found), 1.25 * max(found)) if found else (0.1, 10.0)
+        for axes, row in zip(grid.flat, panels, strict=False):
+            mine = [scan for scan in scans if scan.kind == row["of"] and len(scan.scores)]
+            _draw_kind(axes, f"{row['of']}: {row['stated_over_error']:.2f}", mine, span)
+        for axes in grid.flat[len(panels) :]:
+            axes.set_visible(False)
+        for axes in grid[-1]:
+            axes.set_xlabel("RMS error (1/m)")
+        for line in grid:
+            line[0].set_ylabel("stated (1/m)")
+        legend(upper)
+        _draw_coverage(lower.subplots(), kinds)
+
+
+def _draw_kind(axes: Axes, title: str, scans: Sequence[ScoredScan], span: tuple[float, float]) -> None:
+    ends = np.array(span)
+    axes.fill_between(ends, 0.9 * ends, 1.4 * ends, color=SHADE, linewidth=0, zorder=0)
+    axes.plot(ends, ends, color=INK, linewidth=0.8)
+    for low, high, colour, marker, words in SHARES:
+        mine = [scan for scan in scans if low <= scan.share < high]
+        x, y = [scan.error_per_m for scan in mine], [scan.stated_per_m for scan in mine]
+        axes.scatter(x, y, s=14, color=colour, marker=marker, label=words, zorder=3, linewidths=0)
+    log_scale(axes, "xy")
+    axes.set(title=title, xlim=span, ylim=span)
+
+
+def _draw_coverage(axes: Axes, rows: Sequence[Row]) -> None:
+    shown = [row for row in rows if not math.isnan(row["coverage"])]
+    y = np.array([row["coverage"] for row in shown])
+    bars = np.abs(np.array([[row[end] for row in shown] for end in ("coverage_low", "coverage_high")]) - y)
+    axes.axhspan(0.93, 0.97, color=SHADE, linewidth=0, zorder=0)
+    axes.errorbar(range(len(shown)), y, yerr=bars, fmt="o", markersize=4, linewidth=1, color=BLUE, zorder=3)
+    axes.set_xticks(range(len(shown)), [row["of"] for row in shown], rotation=30, ha="right", rotation_mode="anchor")
+    axes.set(ylabel="coverage", xlim=(-0.6, len(shown) - 0.4))
+    axes.grid(visible=False, axis="x")

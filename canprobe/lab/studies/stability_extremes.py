@@ -1,8 +1,9 @@
 """Extreme cases of study `stability`, in one table: each ends right, refused by the plan, or stopped with the reason.
 
 A case is the packaged scene `press` or `cylinder` with one thing at an extreme: dead rows of the array, counts of a few
-bits, a layer from 10⁴ to 10¹² N/m³, a servo from 50 to 1000 Hz, an object of 5 mm to 10 m, encoders up to 100 × as
-coarse, a wrist at or near its singular pose, a period that jitters. Nothing else is adapted to it.
+bits, a layer from 10⁴ to 10¹² N/m³, a servo from 50 to 1000 Hz, drives from 3 to 300 Hz, an object of 5 mm to 10 m, a
+probe of 1 mm, encoders up to 100 × as coarse, ten times the speed, arm or wrist at or near a singular pose, a period
+that jitters. Nothing else is adapted to it.
 
 `right`: it ran to its end, the true force is within `FORCE_PERCENT` of the target (RMS), and the curvature of a scan is
 within `CURVATURE_SHARE` of κ + 1/R_p, or within what it states, or said to be not observed. `wrong`: it ran to its end
@@ -23,34 +24,41 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, ORANGE, legend, picture
+from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import PlantSettings, Scene
+from canprobe.cell.scene.model import PlantSettings, ProbeSettings, Scene
+from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.errors import PlanError
 from canprobe.fieldbus.protocol.frames import SYNC_ID
-from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, StudyResult
 from canprobe.lab.studies.random_scenes import CELLS
 from canprobe.lab.studies.region_scores import scores_of
-from canprobe.lab.studies.result_files import measuring_facts
-from canprobe.lab.studies.stability_runs import LateNode, bent_touch, refused_row, run_touch, scene_of
+from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.stability_runs import LateNode, refused_row, run_touch
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.workprec_cell import SENSOR_HZ
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.inverse import inverse_near
 
 EXTREMES: Mapping[str, tuple[tuple[float, ...], str]] = {
     "dead rows": ((1, 2, 4, 8), "{:g}"),
     "bits of a count": ((4, 6), "{:g}"),
     "K/h": (tuple(10.0**n for n in range(4, 13)), "{:.0e} N/m³"),
     "servo": ((50, 100, 200, 500, 1000), "{:g} Hz"),
+    "drives": ((3, 10, 100, 300), "{:g} Hz"),
     "radius": ((5, 12, 100, 1000, 10_000), "{:g} mm"),
+    "probe": ((1, 5, 10_000), "{:g} mm"),
     "coarser encoders": ((10, 100), "{:g} ×"),
+    "speed": ((50, 100, 250), "{:g} mm/s"),
+    "reach": ((120, 135, 350, 358, 400), "{:g} mm"),
     "joint 5": ((0, 3), "{:g} deg"),
     "jitter of the period": ((5, 20, 50), "{:g} %"),
 }
-"""Thing → its values, and the form of one in words."""
-PROBE_MM = 40.0
-"""Radius of the default probe."""
+"""Thing → its values, and the form of one in words. `reach` is the distance of the touch from the first joint's axis:
+at 127 mm the shoulder is singular, at 360 mm the elbow; `joint 5` at 0 is the singular wrist."""
+SENSOR_HZ = {500.0: 250.0}
+"""Rate of the tactile frames where 200 Hz does not divide the servo's."""
 HOLD_S, SCAN_S = 1.0, 2.0
 FORCE_PERCENT, CURVATURE_SHARE = 20.0, 0.1
 HELD_SHARE = 0.5
@@ -96,6 +104,7 @@ def run_extremes(*, quick: bool, sweep: Sweep) -> StudyResult:
         for name, (values, _) in (list(EXTREMES.items())[:1] if quick else EXTREMES.items())
         for value in (values[:1] if quick else values)
         for scan in (False, True)
+        if scan or name != "speed"
     ]
     sweep.say(f"{len(cases)} extreme cases")
     rows: list[Row] = sweep.map(measure, cases, model=MODEL)
@@ -105,10 +114,7 @@ def run_extremes(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def extreme_scene(case: ExtremeCase) -> Scene:
     """The scene of a case."""
-    seconds = SCAN_S if case.scan else HOLD_S
-    if case.extreme == "joint 5":
-        return scene_of(bent_touch(case.value, 25.0 * case.scan, seconds))
-    name = "cylinder" if case.scan else "press"
+    name, seconds = ("cylinder", SCAN_S) if case.scan else ("press", HOLD_S)
     scene = load_scene(name, {"task.duration_s": seconds, "task.clearance_mm": 0.5, "bus.timed": False})
     if scene.shape is not None:
         scene = replace(scene, shape=replace(scene.shape, also=()))
@@ -142,6 +148,69 @@ def _on_sphere(scene: Scene, radius_mm: float) -> Scene:
     return replace(scene, task=task, object=sphere)
 
 
+def _with_probe(scene: Scene, radius_mm: float) -> Scene:
+    assert scene.probe is not None
+    return replace(scene, probe=replace(scene.probe, radius_mm=radius_mm))
+
+
+def _at_reach(scene: Scene, reach_mm: float) -> Scene:
+    """The touch in the same direction, elsewhere."""
+    x, y, z = scene.task.start_mm
+    share = reach_mm / math.hypot(x, y)
+    return _touched_at(scene, (share * x, share * y, z))
+
+
+def _with_wrist(scene: Scene, wrist_deg: float) -> Scene:
+    """A gently curved object in front of the arm, with the wrist bent by an angle at the touch."""
+    at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
+    assert scene.object is not None
+    ball = replace(scene.object, kind="sphere", radius_mm=300.0, rotation_deg=upright(normal))
+    scene = _touched_at(replace(scene, object=ball), at_mm)
+    joints = {
+        name: replace(joint, start_deg=start)
+        for (name, joint), start in zip(scene.joints.items(), posture_deg, strict=True)
+    }
+    return replace(scene, task=replace(scene.task, approach_normal=normal), joints=joints)
+
+
+def _touched_at(scene: Scene, place: tuple[float, float, float]) -> Scene:
+    assert scene.object is not None
+    task, object_ = replace(scene.task, start_mm=place), replace(scene.object, position_mm=place)
+    return replace(scene, task=task, object=object_, limits=replace(scene.limits, joint_margin_deg=0.5))
+
+
+def touch_in_posture(
+    posture_deg: tuple[float, ...], above_mm: float = 10.0
+) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
+    """A touch with the pole of the default probe and these joint angles, deg.
+
+    Returns:
+        Its place, mm; the outward normal there; joint angles (n,) at `above_mm` above it, deg.
+    """
+    arm, probe = resolve(load_scene("press")).arm, ProbeSettings()
+    assert arm is not None
+    model = arm.model
+    q = np.radians(posture_deg)
+    T_flange_centre = T_flange_probe(probe)
+    T = forward(model.chain, q) @ T_flange_centre
+    pole = T[:3, 2]
+    above = T.copy()
+    above[:3, 3] -= above_mm * 1e-3 * pole
+    away = np.degrees(inverse_near(model, above, T_flange_centre, q))
+    at = 1e3 * T[:3, 3] + probe.radius_mm * pole
+    x, y, z = (float(value) for value in at)
+    nx, ny, nz = (-float(value) for value in pole)
+    return (x, y, z), (nx, ny, nz), tuple(float(angle) for angle in away)
+
+
+def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[float, float, float]:
+    """Roll, pitch and yaw, deg, of an object whose z is a unit normal."""
+    yaw = math.radians(yaw_deg)
+    x = math.cos(yaw) * normal[0] + math.sin(yaw) * normal[1]
+    y = math.cos(yaw) * normal[1] - math.sin(yaw) * normal[0]
+    return math.degrees(-math.asin(y)), math.degrees(math.atan2(x, normal[2])), yaw_deg
+
+
 def _with_coarser_encoders(scene: Scene, times: float) -> Scene:
     joints = {
         name: replace(joint, counts_per_turn=(joint.counts_per_turn or 0.0) / times)
@@ -155,10 +224,15 @@ CHANGES: Mapping[str, Callable[[Scene, float], Scene]] = {
     "bits of a count": lambda scene, bits: _with_plant(scene, adc_bits=int(bits)),
     "K/h": lambda scene, stiffness: _with_plant(scene, stiffness_n_m3=stiffness),
     "servo": _with_rate,
+    "drives": lambda scene, bandwidth: _with_plant(scene, drive_bandwidth_hz=bandwidth),
     "radius": _on_sphere,
+    "probe": _with_probe,
     "coarser encoders": _with_coarser_encoders,
+    "speed": lambda scene, speed: replace(scene, task=replace(scene.task, speed_mm_s=speed)),
+    "reach": _at_reach,
+    "joint 5": _with_wrist,
 }
-"""Extreme thing → change of a scene to a value of it; a wrist has a touch of its own, jitter changes the bus."""
+"""Extreme thing → change of a scene to a value of it; jitter changes the bus."""
 
 
 def value_in_words(case: ExtremeCase) -> str:
@@ -190,7 +264,8 @@ def measure(case: ExtremeCase) -> Row:
     if len(scores):
         found["curvature_per_m"], found["stated_per_m"] = (float(np.sqrt(scores[:, i].mean())) for i in (1, 2))
         found["held"] = float(np.mean(scores[:, 3] < CHI2_95_OF_3))
-    return found | judged(found, 1e3 / PROBE_MM + float(np.abs(session.truth["kappa_per_m"][-1]).max()))
+    assert scene.probe is not None
+    return found | judged(found, 1e3 / scene.probe.radius_mm + float(np.abs(session.truth["kappa_per_m"][-1]).max()))
 
 
 def sync_delay_ns(jitter_ns: float, t_ns: int) -> int:
@@ -262,6 +337,9 @@ def draw_extremes(rows: Sequence[Row], path: Path) -> None:
             axes.grid(visible=False)
         units = {name: form.partition(" ")[2] for name, (_, form) in EXTREMES.items()}
         panels[0].set_yticks(range(len(names)), [f"{n} ({units[n]})" if units[n] else n for n in names])
-        legend(
-            figure, [Line2D([], [], color=c, marker=m, linestyle="", label=words) for c, m, words in END_MARKS.values()]
-        )
+        legend(figure, end_marks(END_MARKS))
+
+
+def end_marks(marks: Mapping[str, tuple[str, str, str]]) -> list[Line2D]:
+    """The legend of some ends, each with colour, marker and words."""
+    return [Line2D([], [], color=colour, marker=m, linestyle="", label=words) for colour, m, words in marks.values()]

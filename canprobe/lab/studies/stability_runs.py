@@ -16,9 +16,8 @@ import numpy as np
 
 from canprobe.cell.master.supervision import Limits, limits_of
 from canprobe.cell.plant.ideal_arm import natural_frequency
-from canprobe.cell.scene.geometry import T_flange_probe, true_object
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
+from canprobe.cell.scene.model import PlantSettings, Scene, ServoSettings
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -28,14 +27,11 @@ from canprobe.errors import PlanError, SafetyStop
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.node.wrapped import WrappedNode
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.lab.studies.harness import Row
 from canprobe.lab.studies.linear_loop import ForceLoop
+from canprobe.lab.studies.result import Row
 from canprobe.lab.studies.witnessed_run import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
-from canprobe.mechanics.robot.chain import forward
-from canprobe.mechanics.robot.inverse import inverse_near
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.touch import Slope, indentation_from_force, make_patch_calibration
-from canprobe.mechanics.types import Floats
+from canprobe.mechanics.touch.contact import Slope, indentation_from_force
+from canprobe.mechanics.touch.image.image_model import make_patch_calibration
 
 
 class LateNode(WrappedNode):
@@ -98,6 +94,8 @@ LOOK_NS = 1_250_000
 HUNTING_SPREAD = 0.2
 """Standard deviation of the force over the second half of the hold, over the target, above which it did not settle."""
 SENSOR_HZ = 200.0
+FORCE_N, PROBE_M, KAPPA = 2.0, 0.040, (1.0 / 0.036, 0.0)
+"""Wanted force (N) and radius of the probe (m) of scene `press`, and the principal curvatures of its cylinder, 1/m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,40 +103,19 @@ class LoopCase:
     """A cell of the map.
 
     Attributes:
-        view: part of the map.
         contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
+        servo: whether it uses the "stated" stiffness of the default pad, or one "estimated" from the touch.
         rate_hz: rate of the servo.
         late_ms: delay of targets and tactile frames.
         height_hz: force gain.
-        feels: whether the servo estimates the stiffness from the touch; else it uses that of the default pad.
-        bandwidth_hz: bandwidth of the drives.
-        fidelity: fidelity of the plant.
-        probe_mm: radius of the probe.
-        kind, radius_mm: kind and radius of the object.
-        speed_mm_s: speed of a scan; 0 presses.
-        at_mm: point at which the object is touched, base frame.
-        normal: outward normal there.
-        posture_deg: selects the branch of the inverse kinematics.
-        force_n: wanted force, N.
-        hold_s: duration of the press or scan.
+        hold_s: duration of the press.
     """
 
-    view: str
     contact_n_m: float
+    servo: str = "estimated"
     rate_hz: float = 400.0
     late_ms: float = 0.0
     height_hz: float = 8.0
-    feels: bool = True
-    bandwidth_hz: float = 30.0
-    fidelity: str = "ideal"
-    probe_mm: float = 40.0
-    kind: str = "cylinder"
-    radius_mm: float = 36.0
-    speed_mm_s: float = 0.0
-    at_mm: tuple[float, float, float] = (-120.0, -122.5, 374.0)
-    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    posture_deg: tuple[float, ...] = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
-    force_n: float = 2.0
     hold_s: float = 0.4
 
 
@@ -149,120 +126,49 @@ class StatedSensing(ContactSensing):
         """Ignore it."""
 
 
-def layer_stiffness(case: LoopCase) -> float:
-    """K/h (N/m³) that gives the contact its stiffness at the wanted force: `dF/dδ = 2F/δ`."""
-    depth = 2.0 * case.force_n / case.contact_n_m
-    return float(indentation_from_force(case.force_n, 1.0, case.probe_mm * 1e-3, _kappa(case)) / depth) ** 2
+def layer_stiffness(contact_n_m: float) -> float:
+    """K/h (N/m³) that gives the contact of scene `press` its stiffness at the wanted force: `dF/dδ = 2F/δ`."""
+    depth = 2.0 * FORCE_N / contact_n_m
+    return float(indentation_from_force(FORCE_N, 1.0, PROBE_M, KAPPA) / depth) ** 2
 
 
-def _kappa(case: LoopCase) -> Floats:
-    place = true_object(_object(case))
-    return np.maximum(place.closest(np.array(case.at_mm) * 1e-3).kappa, -0.9e3 / case.probe_mm)
-
-
-def _object(case: LoopCase) -> ObjectSettings:
-    radius = None if case.kind == "plane" else case.radius_mm
-    return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=upright(case.normal))  # type: ignore[arg-type]
-
-
-def arm_of(scene: Scene) -> ArmModel:
-    """The arm of a scene that has one."""
-    arm = resolve(scene).arm
-    assert arm is not None
-    return arm.model
-
-
-def touch_in_posture(
-    posture_deg: tuple[float, ...], above_mm: float = 10.0
-) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
-    """A touch with the pole of the default probe and these joint angles, deg.
-
-    Returns:
-        Its place, mm; the outward normal there; joint angles (n,) at `above_mm` above it, deg.
-    """
-    model, probe = arm_of(load_scene("press")), ProbeSettings()
-    q = np.radians(posture_deg)
-    T_flange_centre = T_flange_probe(probe)
-    T = forward(model.chain, q) @ T_flange_centre
-    pole = T[:3, 2]
-    above = T.copy()
-    above[:3, 3] -= above_mm * 1e-3 * pole
-    away = np.degrees(inverse_near(model, above, T_flange_centre, q))
-    at = 1e3 * T[:3, 3] + probe.radius_mm * pole
-    x, y, z = (float(value) for value in at)
-    nx, ny, nz = (-float(value) for value in pole)
-    return (x, y, z), (nx, ny, nz), tuple(float(angle) for angle in away)
-
-
-def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[float, float, float]:
-    """Roll, pitch and yaw, deg, of an object whose z is a unit normal."""
-    yaw = math.radians(yaw_deg)
-    x = math.cos(yaw) * normal[0] + math.sin(yaw) * normal[1]
-    y = math.cos(yaw) * normal[1] - math.sin(yaw) * normal[0]
-    return math.degrees(-math.asin(y)), math.degrees(math.atan2(x, normal[2])), yaw_deg
-
-
-def full_scale_kpa(case: LoopCase, stiffness: float) -> float:
+def full_scale_kpa(contact_n_m: float) -> float:
     """Full scale of the array, kPa: the larger one where the wanted force would saturate the other, as in `steel`."""
-    peak_pa = stiffness * 2.0 * case.force_n / case.contact_n_m
+    peak_pa = layer_stiffness(contact_n_m) * 2.0 * FORCE_N / contact_n_m
     return 100.0 if peak_pa < 80e3 else 300.0
 
 
 def scene_of(case: LoopCase) -> Scene:
-    """The scene of a case; its layer may be harder and its radii larger than a scene file allows."""
-    scene = load_scene("press" if case.speed_mm_s == 0.0 else "cylinder", {"task.duration_s": case.hold_s})
-    assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
-    stiffness = layer_stiffness(case)
-    task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm, approach_normal=case.normal)
-    if case.speed_mm_s > 0.0:
-        task = replace(task, speed_mm_s=case.speed_mm_s, regain_mm=0.0)
+    """The scene of a case; its layer may be harder than a scene file allows."""
+    changes = {"task.duration_s": case.hold_s, "task.clearance_mm": 0.5, "bus.timed": False}
+    scene = load_scene("press", changes)
+    assert scene.sensor is not None
+    sensor = replace(
+        scene.sensor, rate_hz=min(SENSOR_HZ, case.rate_hz), mode="features",
+        full_scale_kpa=full_scale_kpa(case.contact_n_m),
+    )  # fmt: skip
     return replace(
         scene,
-        bus=replace(scene.bus, timed=False),
         cycle=replace(scene.cycle, rate_hz=case.rate_hz),
-        limits=replace(scene.limits, joint_margin_deg=0.5),
-        joints={
-            name: replace(joint, start_deg=start)
-            for (name, joint), start in zip(scene.joints.items(), case.posture_deg, strict=True)
-        },
-        sensor=replace(
-            scene.sensor,
-            rate_hz=min(SENSOR_HZ, case.rate_hz),
-            mode="features",
-            full_scale_kpa=full_scale_kpa(case, stiffness),
-        ),
-        probe=replace(scene.probe, radius_mm=case.probe_mm),
-        object=_object(case),
+        sensor=sensor,
         servo=replace(scene.servo or ServoSettings(), surface_height_hz=case.height_hz),
-        plant=replace(
-            scene.plant or PlantSettings(),
-            stiffness_n_m3=stiffness,
-            drive_bandwidth_hz=case.bandwidth_hz,
-            fidelity=case.fidelity,  # type: ignore[arg-type]
-        ),
-        shape=replace(scene.shape, also=(), patch=False) if scene.shape is not None and case.speed_mm_s > 0 else None,
-        task=task,
+        plant=replace(scene.plant or PlantSettings(), stiffness_n_m3=layer_stiffness(case.contact_n_m)),
     )
 
 
 def loop_of(case: LoopCase) -> ForceLoop:
     """The linear loop of a case, with the servo's final stiffness."""
-    scene = scene_of(case)
-    assert scene.probe is not None
-    radius, kappa = case.probe_mm * 1e-3, _kappa(case)
-    slope = 1.0 / float(indentation_from_force(1.0, layer_stiffness(case), radius, kappa))
-    told = 1.0 / stated_sensing(scene, ContactSensing).depth(1.0)
-    if case.feels:
-        sensing = stated_sensing(scene, ContactSensing)
+    slope = 1.0 / float(indentation_from_force(1.0, layer_stiffness(case.contact_n_m), PROBE_M, KAPPA))
+    sensing = stated_sensing(scene_of(case), ContactSensing)
+    if case.servo == "estimated":
         sensing.set_slope(Slope(slope, 0.0))
-        told = 1.0 / sensing.depth(1.0)
     return ForceLoop(
-        depth_ratio=slope / told,
+        depth_ratio=slope * sensing.depth(1.0),
         period_s=1.0 / case.rate_hz,
         sample_cycles=max(1, round(case.rate_hz / SENSOR_HZ)),
         height_hz=case.height_hz,
         late_s=case.late_ms * 1e-3,
-        omega=natural_frequency(case.bandwidth_hz, 1.0),
+        omega=natural_frequency(PlantSettings().drive_bandwidth_hz, 1.0),
     )
 
 
@@ -273,15 +179,6 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     array, probe = setup.array, setup.probe
     patch = make_patch_calibration(array.calibration, array.pad)
     return kind(setup.arm.model, probe.T_flange_probe, patch, probe.radius, probe.stiffness)
-
-
-def bent_touch(wrist_deg: float, speed_mm_s: float, hold_s: float) -> LoopCase:
-    """A touch of a gently curved object in front of the arm, with the wrist bent by an angle; at 0 it is singular."""
-    at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
-    return LoopCase(
-        "pose", 1e4, at_mm=at_mm, normal=normal, posture_deg=posture_deg, kind="sphere", radius_mm=300.0,
-        speed_mm_s=speed_mm_s, hold_s=hold_s,
-    )  # fmt: skip
 
 
 FIGURES = ("force_max_n", "above_ms", "allowed_ms", "error_percent", "spread_percent")
@@ -296,7 +193,7 @@ def carry_out(case: LoopCase) -> Row:
         return refused_row(refusal)
     task = make_task(session.plan)
     assert isinstance(task, TouchTask)
-    if not case.feels:
+    if case.servo == "stated":
         task.sensing = stated_sensing(session.plan.scene)
     if case.late_ms > 0.0:
         assert session.scene.sensor is not None
@@ -305,7 +202,7 @@ def carry_out(case: LoopCase) -> Row:
         delay_ns = round(case.late_ms * 1e6)
         late = [LateNode(node, late_ids, lambda _: delay_ns) for node in world.nodes]
         world.participants[: len(late)] = late
-    return run_touch(session, task, case.force_n, case.late_ms)
+    return run_touch(session, task, FORCE_N, case.late_ms)
 
 
 def refused_row(refusal: PlanError) -> Row:

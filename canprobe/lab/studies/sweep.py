@@ -44,7 +44,7 @@ from canprobe.cell.session.terminal import Progress
 from canprobe.errors import StudyError
 from canprobe.lab.studies.cell_store import CellStore, as_json, cell_key, model_digest
 from canprobe.lab.studies.executors import Opener, dask_executor, process_pool
-from canprobe.lab.studies.harness import Say, StudyResult
+from canprobe.lab.studies.result import Say, StudyResult
 
 
 class Sweep:
@@ -181,34 +181,40 @@ def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
 
 STUDIES: Mapping[str, str] = MappingProxyType(
     {
-        "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
-        "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
-        "arrays": "how well forty touches calibrate an unknown emulated array",
+        "estimators": "error of the shape estimators against their run time, and over the Cramér–Rao bound",
         "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
-        "calibrations": "whether the cell notices that its array has the calibration of another one",
-        "shapes": "surfaces of unknown shapes by the map, every estimator, local fits and Gaussian processes",
-        "explore": "path that exploration needs for an error, against weaves, rasters and a circle, on unknown shapes",
-        "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
-        "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
-        "link": "whether a check of the link says what the next minute of the cell shows",
-        "recover": "whether a cell comes back from power cycles, resets, cuts and unplugged interfaces, drawn by seed",
-        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "calibration": "how well forty touches calibrate an array, and whether a foreign calibration is noticed",
+        "surfaces": "unknown shapes by the map, quadrics, splines and Gaussian processes; the path of exploration",
+        "workprec": "error of the dynamic plant against its run time, by an explicit and an implicit integrator",
+        "stability": "where the force loop settles, predicted and carried out, and how extreme cases end",
         "faults": "the true force with every kind of fault, in each task and phase, and with files that are wrong",
+        "realtime": "how well the cycle keeps time on a real vcan0; needs that interface",
     }
 )
 """Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""
+FORMS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "faults --vcan": ("faults_vcan", "on a real vcan0: processes are killed, the link is taken down"),
+        "faults --recover": ("recover", "whether a cell comes back from what it loses by chance: power, links, time"),
+        "faults --recover --vcan": ("recover_vcan", "the same on a real vcan0"),
+        "realtime --link": ("realtime_link", "whether a check of the link says what the next minute of the cell shows"),
+        "realtime --soak": ("realtime_soak", "memory, clocks and counters of a cell that is held for half an hour"),
+    }
+)
+"""Other forms of a study, as they are typed: module, and measured quantity."""
 
 
-def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "", **chosen: Any) -> StudyResult:
+def run_study(typed: str, *, quick: bool, sweep: Sweep, **chosen: Any) -> StudyResult:
     """Run a study.
 
     Args:
-        name: one of `STUDIES`.
+        typed: one of `STUDIES` or `FORMS`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
-        form: variant of it: ``vcan`` of `faults` and `recover`, on a real vcan0; ``soak`` of `realtime`, half an hour.
         chosen: arguments of this study only.
     """
-    module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")
-    result: StudyResult = module.run(quick=quick, sweep=sweep, **chosen)
+    name, _ = FORMS.get(typed, (typed, ""))
+    result: StudyResult = importlib.import_module(f"canprobe.lab.studies.{name}").run(
+        quick=quick, sweep=sweep, **chosen
+    )
     return result

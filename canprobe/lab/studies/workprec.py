@@ -1,4 +1,4 @@
-"""Study `workprec`: cost and error of the dynamic plant's integrators, over steps and stiffness.
+"""Study `workprec`: error of the dynamic plant against its run time, by an explicit and a linearly implicit integrator.
 
 Each cell integrates the same sliding contact (`trial`) and is compared with scipy's Radau at rtol 1e-10, which holds
 nothing. `held` cells keep mass matrix, bias and contact geometry over a cycle of 2.5 ms, as the plant does; the others
@@ -6,8 +6,6 @@ evaluate them in every call. Cost is processor time per cycle, the best of sever
 RMS over the ends of the cycles: force relative to the reference's RMS force, position of the probe's centre, pressure
 of a taxel in counts of 1/255 of the full scale. Each method and step must also come to rest against a contact of
 10 MN/m, the stiffest here: explicit steps that are too long rattle there.
-
-`workprec_cell` measures the whole cell, of which the plant is a part.
 """
 
 from __future__ import annotations
@@ -30,15 +28,15 @@ from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.plant import Plant, PlantState
-from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, SHADE, legend, log_scale, picture
+from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, log_scale, picture
 from canprobe.cell.scene.arms import Bodies, arm_model
 from canprobe.cell.scene.load import read_cell
 from canprobe.cell.scene.setup import Dynamics
-from canprobe.lab.studies.harness import Column, Row, StudyResult
-from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.errors import UsageError
+from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.workprec_cell import run_cell
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
+from canprobe.mechanics.robot.dynamics import dynamics_problem
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.robot.motors import units_per_motor
@@ -49,9 +47,95 @@ from canprobe.mechanics.types import Floats
 
 CYCLE_NS = 2_500_000
 SPEED_M_S, FORCE_N = 0.025, 2.0
-NUDGE_COUNTS, AT_REST_COUNTS_S = 5.0, 20.0
 _POINT, _TOOL, _RADIUS = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0), 0.036
 _NEAR = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
+STIFFNESSES = (1.6e7, 1.27e8, 1.27e9, 1.27e11)
+"""K/h of the layer, N/m³: foam, the default pad, steel, and a hundred times that. At 2 N: 3.3, 9.4, 30, 300 kN/m."""
+METHODS = ("rk4", "rosenbrock")
+STEPS_US = (2500.0, 1250.0, 625.0, 312.5, 156.25, 78.125)
+FREE_STEPS_US = (1250.0, 312.5, 78.125)
+"""Steps of the cells in which the dynamics are not held."""
+FULL_SCALE_PA = 100e3
+STIFFEST, REST_CYCLES = 1.4e14, 40
+"""K/h at which 2 N make a contact of 10 MN/m, and the cycles in which the arm must come to rest there."""
+NUDGE_COUNTS, AT_REST_COUNTS_S = 5.0, 20.0
+SPAN = STIFFNESSES[:3]
+"""Stiffnesses at which the default must be accurate enough."""
+ENOUGH = {"force_percent": 1.0, "position_um": 2.9, "taxel_counts": 0.29}
+"""Small enough errors: 1 % of the force, and the rounding of encoders (10 µm) and ADC, RMS."""
+MODEL = ("mechanics", "cell/plant", "lab/studies/workprec.py")
+COLUMNS = (
+    Column("stiffness_n_m3", "K/h N/m³", ".3g"),
+    Column("held", "held"),
+    Column("method", "method"),
+    Column("step_us", "step µs", ".0f"),
+    Column("cost_us", "µs a cycle", ".0f"),
+    Column("force_percent", "force %", ".2g"),
+    Column("position_um", "position µm", ".2g"),
+    Column("taxel_counts", "taxel counts", ".2g"),
+    Column("stands", "stands"),
+    Column("verdict", "verdict"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class IntegrationCase:
+    """One integration; method "radau" is the reference, and `step_us` then its relative tolerance."""
+
+    stiffness_n_m3: float
+    method: str
+    step_us: float
+    held: bool
+    cycles: int
+    repeats: int
+
+    @property
+    def stepping(self) -> Stepping:
+        """Method and step, as the plant takes them."""
+        return Stepping(self.method, round(1000.0 * self.step_us))
+
+
+def cases(quick: bool) -> list[IntegrationCase]:
+    """All integrations."""
+    stiffnesses = STIFFNESSES[1:3] if quick else STIFFNESSES
+    steps = STEPS_US[1:3] if quick else STEPS_US
+    cycles, repeats = (4, 1) if quick else (20, 2)
+    return [
+        IntegrationCase(k, method, step, held, cycles, repeats)
+        for held in (True, False)
+        for k, method, step in product(stiffnesses, METHODS, steps)
+        if held or step in FREE_STEPS_US
+    ]
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Integrate all cases, one at a time, and the references beside each other.
+
+    Raises:
+        UsageError: MuJoCo is missing.
+    """
+    if (problem := dynamics_problem("puma260", _arm()[1])) is not None:
+        raise UsageError(problem)
+    todo = cases(quick)
+    stiffnesses, cycles = sorted({c.stiffness_n_m3 for c in todo}), todo[0].cycles
+    sweep.say(f"{len(stiffnesses)} references")
+    exact = [IntegrationCase(k, "radau", rtol, False, cycles, 1) for k in stiffnesses for rtol in (1e-10, 1e-8)]
+    found = [np.array(states) for states in sweep.map(solve, exact, model=MODEL)]
+    truths = {k: observed(k, found[2 * i]) for i, k in enumerate(stiffnesses)}
+    floors = {k: errors(truths[k], observed(k, found[2 * i + 1])) for i, k in enumerate(stiffnesses)}
+    kinds = sorted({(case.method, case.step_us) for case in todo})
+    resting = [IntegrationCase(STIFFEST, *kind, True, REST_CYCLES, 1) for kind in kinds]
+    standing = dict(zip(kinds, sweep.map(stands, resting, model=MODEL), strict=True))
+    sweep.say(f"{len(todo)} integrations, timed one after another")
+    rows = []
+    for case, answer in zip(todo, sweep.time(measure, todo, model=MODEL), strict=True):
+        k, states = case.stiffness_n_m3, answer["states"]
+        row = {"stiffness_n_m3": k, "held": case.held, "method": case.method, "step_us": case.step_us}
+        row |= {"cost_us": answer["cost_us"], "stands": standing[case.method, case.step_us]}
+        row |= dict.fromkeys(ENOUGH) if states is None else errors(truths[k], observed(k, np.array(states)))
+        rows.append(row | {"verdict": verdict(row)})
+    facts, draw = measuring_facts(quick, 0, MODEL), partial(draw_workprec, rows, floors)
+    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw)
 
 
 @cache
@@ -85,15 +169,15 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Floats]:
     ), counts
 
 
-def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: bool) -> Floats | None:
-    """Motor counts and rates at the ends of the cycles (cycles, 12); None where the integration broke down."""
-    config, targets = trial(stiffness_n_m3, cycles)
+def integrated(stiffness_n_m3: float, targets: Floats, stepping: Stepping, *, held: bool = True) -> Floats | None:
+    """Motor counts and rates at the ends of the cycles between targets (cycles, 12); None where it broke down."""
+    config, _ = trial(stiffness_n_m3, 1)
     arm = DynamicArm(_arm()[0], config.q0, make_equations(config, held=held), stepping)
     seen: list[Any] = []
     with np.errstate(all="ignore"):
-        for k in range(cycles):
+        for k, (begin, end) in enumerate(zip(targets[:-1].tolist(), targets[1:].tolist(), strict=True)):
             for i in range(6):
-                arm.set_ramp(i, float(targets[k, i]), float(targets[k + 1, i]), k * CYCLE_NS, (k + 1) * CYCLE_NS)
+                arm.set_ramp(i, begin[i], end[i], k * CYCLE_NS, (k + 1) * CYCLE_NS)
             arm.advance((k + 1) * CYCLE_NS)
             try:
                 seen.append([x for part in arm.motors() for x in part])
@@ -103,42 +187,46 @@ def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: boo
     return found if np.all(np.isfinite(found)) and np.abs(found).max() < 1e9 else None
 
 
-def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
+def measure(case: IntegrationCase) -> dict[str, Any]:
+    """States of one integration, None where it broke down, and its cost in µs a cycle."""
+    targets = trial(case.stiffness_n_m3, case.cycles)[1]
+    costs: list[float] = []
+    states: Floats | None = None
+    for _ in range(1 + case.repeats):
+        begun = process_time()
+        states = integrated(case.stiffness_n_m3, targets, case.stepping, held=case.held)
+        costs.append(1e6 * (process_time() - begun) / case.cycles)
+    return {"states": None if states is None else states.tolist(), "cost_us": min(costs[1:])}
+
+
+def stands(case: IntegrationCase) -> bool:
     """Whether the arm comes to rest in contact after a nudge of one motor, as a real one does."""
-    config, _ = trial(stiffness_n_m3, 1)
-    arm = DynamicArm(_arm()[0], config.q0, make_equations(config), stepping)
-    start, fastest = arm.motor_counts(0), []
-    arm.set_ramp(0, start, start + NUDGE_COUNTS, 0, CYCLE_NS)
-    with np.errstate(all="ignore"):
-        for k in range(cycles):
-            arm.advance((k + 1) * CYCLE_NS)
-            try:
-                fastest.append(max(map(abs, arm.motors()[1])))
-            except (ArithmeticError, ValueError, np.linalg.LinAlgError):
-                return False
-    return bool(max(fastest[-cycles // 4 :]) < AT_REST_COUNTS_S)  # false for NaN too
+    targets = np.repeat(trial(case.stiffness_n_m3, 1)[1][:1], case.cycles + 1, axis=0)
+    targets[1:, 0] += NUDGE_COUNTS
+    found = integrated(case.stiffness_n_m3, targets, case.stepping)
+    return found is not None and bool(np.abs(found[-case.cycles // 4 :, 6:]).max() < AT_REST_COUNTS_S)
 
 
-def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Floats:
+def solve(case: IntegrationCase) -> Any:
     """Motor counts and rates by scipy's Radau, cycle by cycle, nothing held."""
-    config, targets = trial(stiffness_n_m3, cycles)
+    config, targets = trial(case.stiffness_n_m3, case.cycles)
     equations, scale = make_equations(config, held=False), units_per_motor(_arm()[0])
-    h, seen = CYCLE_NS * 1e-9, []
+    h, seen, rtol = CYCLE_NS * 1e-9, [], case.step_us
     y = equations.resting(targets[0] / scale)
-    for k in range(cycles):
+    for k in range(case.cycles):
         slope = (targets[k + 1] - targets[k]) / scale / h
         equations.loops.set_reference(k * h, targets[k] / scale, slope)
         solved = solve_ivp(
             equations.rate, (k * h, (k + 1) * h), y, "Radau", rtol=rtol, atol=1e-2 * rtol, jac=equations.jacobian
         )
         y = solved.y[:, -1]
-        seen.append(np.concatenate((y[:6] * scale, y[6:12] * scale)))
-    return np.array(seen)
+        seen.append(np.concatenate((y[:6] * scale, y[6:12] * scale)).tolist())
+    return seen
 
 
-def observed(stiffness_n_m3: float, cycles: int, states: Floats) -> dict[str, Floats]:
+def observed(stiffness_n_m3: float, states: Floats) -> dict[str, Floats]:
     """Force (n,) N, probe centre (n, 3) m and taxel pressures (n, 256) Pa of states (n, 12), counts and rates."""
-    plant = Plant(trial(stiffness_n_m3, cycles)[0])
+    plant = Plant(trial(stiffness_n_m3, len(states))[0])
     at = [PlantState(0, tuple(row[:6].tolist()), tuple(row[6:].tolist())) for row in states]
     truths = plant.truths(at)
     return {
@@ -146,113 +234,6 @@ def observed(stiffness_n_m3: float, cycles: int, states: Floats) -> dict[str, Fl
         "centre": truths["probe_centre"],
         "taxels": np.array([plant.pressure(state).ravel() for state in at]),
     }
-
-
-STIFFNESSES = (1.6e7, 1.27e8, 1.27e9, 1.27e11)
-"""K/h of the layer, N/m³: foam, the default pad, steel, and a hundred times that. At 2 N: 3.3, 9.4, 30, 300 kN/m."""
-METHODS = ("semi-implicit", "rk4", "implicit", "rosenbrock", "exponential")
-"""Methods that a finding names; the plant has an adaptive one too, whose steps no fixed budget bounds."""
-STEPS_US = (2500.0, 1250.0, 625.0, 312.5, 156.25, 78.125)
-FULL_SCALE_PA = 100e3
-STIFFEST, REST_CYCLES = 1.4e14, 40
-"""K/h at which 2 N make a contact of 10 MN/m, and the cycles in which the arm must come to rest there."""
-SPAN = STIFFNESSES[:3]
-"""Stiffnesses at which the default must be accurate enough."""
-LINEARLY_IMPLICIT = ("implicit", "rosenbrock")
-FREE_METHODS, FREE_STEPS_US = ("rk4", "rosenbrock"), (1250.0, 312.5, 78.125)
-"""Cells in which the dynamics are not held."""
-ENOUGH = {"force_percent": 1.0, "position_um": 2.9, "taxel_counts": 0.29}
-"""Small enough errors: 1 % of the force, and the rounding of encoders (10 µm) and ADC, RMS."""
-MODEL = ("mechanics", "cell/plant", "lab/studies/workprec.py")
-COLUMNS = (
-    Column("stiffness_n_m3", "K/h N/m³", ".3g"),
-    Column("held", "held"),
-    Column("method", "method"),
-    Column("step_us", "step µs", ".0f"),
-    Column("cost_us", "µs a cycle", ".0f"),
-    Column("force_percent", "force %", ".2g"),
-    Column("position_um", "position µm", ".2g"),
-    Column("taxel_counts", "taxel counts", ".2g"),
-    Column("stands", "stands"),
-    Column("verdict", "verdict"),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class IntegrationCase:
-    """One integration; method "radau" is the reference, and `step_us` then its relative tolerance."""
-
-    stiffness_n_m3: float
-    method: str
-    step_us: float
-    held: bool
-    cycles: int
-    repeats: int
-
-
-def cases(quick: bool) -> list[IntegrationCase]:
-    """All integrations."""
-    stiffnesses = STIFFNESSES[1:3] if quick else STIFFNESSES
-    steps = STEPS_US[1:3] if quick else STEPS_US
-    cycles, repeats = (4, 1) if quick else (20, 2)
-    held = [IntegrationCase(k, m, step, True, cycles, repeats) for k, m, step in product(stiffnesses, METHODS, steps)]
-    free_steps = [step for step in FREE_STEPS_US if step in steps]
-    return held + [
-        IntegrationCase(k, m, h, False, cycles, repeats) for k, m, h in product(stiffnesses, FREE_METHODS, free_steps)
-    ]
-
-
-def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Integrate all cases, one at a time, and the references beside each other."""
-    todo = cases(quick)
-    stiffnesses, cycles = sorted({c.stiffness_n_m3 for c in todo}), todo[0].cycles
-    sweep.say(f"{len(stiffnesses)} references")
-    exact = [IntegrationCase(k, "radau", rtol, False, cycles, 1) for k in stiffnesses for rtol in (1e-10, 1e-8)]
-    found = [np.array(states) for states in sweep.map(solve, exact, model=MODEL)]
-    truths = {k: observed(k, cycles, found[2 * i]) for i, k in enumerate(stiffnesses)}
-    floors = {k: errors(truths[k], observed(k, cycles, found[2 * i + 1])) for i, k in enumerate(stiffnesses)}
-    sweep.say(f"{len(todo)} integrations, timed one after another")
-    standing = stand(todo, sweep)
-    rows = []
-    for case, answer in zip(todo, sweep.time(measure, todo, model=MODEL), strict=True):
-        k = case.stiffness_n_m3
-        row = {"stiffness_n_m3": k, "held": case.held, "method": case.method, "step_us": case.step_us}
-        row |= {"cost_us": answer["cost_us"], "stands": standing[case.method, case.step_us]}
-        broke = answer["states"] is None
-        row |= dict.fromkeys(floors[k]) if broke else errors(truths[k], observed(k, cycles, np.array(answer["states"])))
-        rows.append(row | {"verdict": verdict(row)})
-    facts, draw = measuring_facts(quick, 0, MODEL), partial(draw_workprec, rows, floors, default_choice())
-    whole = run_cell(quick=quick, sweep=sweep)
-    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw, (whole,))
-
-
-def stand(todo: Sequence[IntegrationCase], sweep: Sweep) -> dict[tuple[str, float], bool]:
-    """Which methods and steps come to rest at the stiffest contact."""
-    kinds = sorted({(case.method, case.step_us) for case in todo})
-    cells = [IntegrationCase(STIFFEST, method, step, True, REST_CYCLES, 1) for method, step in kinds]
-    return dict(zip(kinds, sweep.map(rests, cells, model=MODEL), strict=True))
-
-
-def rests(case: IntegrationCase) -> bool:
-    """Whether one integration comes to rest."""
-    return stands(case.stiffness_n_m3, case.cycles, Stepping(case.method, round(1000.0 * case.step_us)))
-
-
-def solve(case: IntegrationCase) -> Any:
-    """The reference's states."""
-    return reference(case.stiffness_n_m3, case.cycles, case.step_us).tolist()
-
-
-def measure(case: IntegrationCase) -> dict[str, Any]:
-    """States of one integration, None where it broke down, and its cost in µs a cycle."""
-    stepping = Stepping(case.method, round(1000.0 * case.step_us))
-    costs: list[float] = []
-    states: Floats | None = None
-    for _ in range(1 + case.repeats):
-        begun = process_time()
-        states = integrated(case.stiffness_n_m3, case.cycles, stepping, case.held)
-        costs.append(1e6 * (process_time() - begun) / case.cycles)
-    return {"states": None if states is None else states.tolist(), "cost_us": min(costs[1:])}
 
 
 def errors(truth: dict[str, Floats], seen: dict[str, Floats]) -> dict[str, float]:
@@ -272,78 +253,48 @@ def verdict(row: Row) -> str:
     return "enough" if all(row[name] <= most for name, most in ENOUGH.items()) else "coarse"
 
 
-def default_choice() -> Row:
-    """The default of the dynamic plant."""
-    settings = Dynamics()
-    return {"held": True, "method": settings.integrator, "step_us": settings.step_ns / 1000.0}
-
-
 def knee(rows: Sequence[Row], stiffness: float) -> Row | None:
     """The cheapest integration that is accurate enough, of one stiffness."""
     good = [r for r in rows if r["stiffness_n_m3"] == stiffness and r["verdict"] == "enough"]
     return min(good, key=lambda r: float(r["cost_us"]), default=None)
 
 
-def choice(rows: Sequence[Row], methods: Sequence[str] = LINEARLY_IMPLICIT) -> tuple[tuple[str, float], float] | None:
-    """The cheapest method and step that is accurate enough over the span and stands, and its cost over the span."""
+def choice(rows: Sequence[Row]) -> tuple[str, float] | None:
+    """The cheapest method and step that is accurate enough over the span and stands, everything held."""
     cost: dict[tuple[str, float], float] = {}
-    for kind in {(r["method"], r["step_us"]) for r in rows if r["held"] and r["method"] in methods}:
+    for kind in {(r["method"], r["step_us"]) for r in rows if r["held"]}:
         mine = [r for r in rows if r["held"] and (r["method"], r["step_us"]) == kind and r["stiffness_n_m3"] in SPAN]
         if mine and all(r["verdict"] == "enough" and r["stands"] for r in mine):
             cost[kind] = sum(float(r["cost_us"]) for r in mine)
-    return min(cost.items(), key=lambda item: item[1], default=None)
+    return min(cost, key=lambda kind: cost[kind], default=None)
 
 
-def findings(rows: Sequence[Row], floors: dict[float, dict[str, float]]) -> list[str]:
-    """The knee of every stiffness, the default beside it, the error of holding, and that of the reference."""
-    said = [_chosen(rows)]
+DEFAULT = {"held": True, "method": Dynamics().integrator, "step_us": Dynamics().step_ns / 1000.0}
+"""The default of the dynamic plant, as a row has it."""
+
+
+def findings(rows: Sequence[Row], floors: Mapping[float, Mapping[str, float]]) -> list[str]:
+    """The choice, and of every stiffness the knee, the default beside it, and the errors of holding and reference."""
+    found = choice(rows)
+    default = f"{DEFAULT['method']} at {DEFAULT['step_us']:.0f} µs"
+    said = [
+        f"The cheapest step that is accurate enough over the span (K/h {SPAN[0]:.3g} to {SPAN[-1]:.3g} N/m³) and stands"
+        f" at 10 MN/m is {'none' if found is None else f'{found[0]} at {found[1]:.0f} µs'}; the default is {default}."
+    ]
     for k, floor in floors.items():
-        best = knee(rows, k)
-        default = default_choice() | {"stiffness_n_m3": k}
-        mine = next((r for r in rows if r | default == r), None)
+        best, mine = knee(rows, k), next((r for r in rows if r | DEFAULT | {"stiffness_n_m3": k} == r), None)
         said.append(f"K/h {k:.3g} N/m³: cheapest that is accurate enough {_named(best)}.")
         if mine is not None and best is not None:
             share = mine["cost_us"] / best["cost_us"]
             said.append(f"  the default, {_named(mine)}: {mine['verdict']}, {share:.1f} × that cost.")
-        said += _holding(rows, k)
+        fine = [r for r in rows if r["stiffness_n_m3"] == k and r["method"] == "rosenbrock"]
+        step = min((r["step_us"] for r in fine if not r["held"]), default=0.0)
+        said += [f"  {_named(r)}." for r in fine if r["step_us"] == step]
         said.append(
             f"  the reference's own error (rtol 1e-8 against 1e-10): force {floor['force_percent']:.1g} %, "
             f"position {floor['position_um']:.1g} µm, taxels {floor['taxel_counts']:.1g} counts."
         )
     return said
-
-
-def _chosen(rows: Sequence[Row]) -> str:
-    """Whether the default is the cheapest of those that may be the default."""
-    found, any_found, mine = choice(rows), choice(rows, METHODS), default_choice()
-    default = f"{mine['method']} at {mine['step_us']:.0f} µs"
-    if found is None or any_found is None:
-        return f"No linearly implicit step here is accurate enough over the span and stands; the default is {default}."
-    (method, step), cost = found
-    is_default = found[0] == (mine["method"], mine["step_us"])
-    said = (
-        f"Of the linearly implicit steps that are accurate enough over the span (K/h {SPAN[0]:.3g} to {SPAN[-1]:.3g} "
-        f"N/m³) and stand at 10 MN/m the cheapest is {method} at {step:.0f} µs: "
-        + ("the knee, and the default." if is_default else f"not the default, {default}.")
-    )
-    if any_found[0] == found[0]:
-        return said
-    (method, step), least = any_found
-    return f"{said} Of all steps that do so {method} at {step:.0f} µs costs least, {least / cost:.2f} × as much."
-
-
-def _holding(rows: Sequence[Row], stiffness: float) -> list[str]:
-    """The error of holding mass matrix, bias and geometry over a cycle, at the finest step of rosenbrock."""
-    fine = [r for r in rows if r["stiffness_n_m3"] == stiffness and r["method"] == "rosenbrock"]
-    step = min((r["step_us"] for r in fine if not r["held"]), default=0.0)
-    held, free = (next((r for r in fine if r["step_us"] == step and r["held"] is h), None) for h in (True, False))
-    if held is None or free is None or held["force_percent"] is None or free["force_percent"] is None:
-        return []
-    return [
-        f"  held over a cycle, step {step:.0f} µs: force {held['force_percent']:.2g} %, position "
-        f"{held['position_um']:.2g} µm; evaluated in every call: {free['force_percent']:.2g} %, "
-        f"{free['position_um']:.2g} µm, at {free['cost_us'] / held['cost_us']:.1f} × the cost."
-    ]
 
 
 def _named(row: Row | None) -> str:
@@ -357,11 +308,10 @@ def _named(row: Row | None) -> str:
     return f"{text} ({error}, taxels {row['taxel_counts']:.2g} counts)"
 
 
-COLOURS = dict(zip(METHODS, (AMBER, ORANGE, GREY, BLUE, PINK), strict=True))
 LABELS = ("force error (%)", "position error (µm)", "taxel error (counts)")
 
 
-def draw_workprec(rows: Sequence[Row], floors: Mapping[float, dict[str, float]], default: Row, path: Path) -> None:
+def draw_workprec(rows: Sequence[Row], floors: Mapping[float, Mapping[str, float]], path: Path) -> None:
     """Error against cost: a row of panels for each measure, a column for each stiffness."""
     title = (
         "Integrators of the dynamic plant: error over the processor time of a cycle of 2.5 ms; a dot: one step size\n"
@@ -374,7 +324,7 @@ def draw_workprec(rows: Sequence[Row], floors: Mapping[float, dict[str, float]],
         for line, (key, enough), label in zip(grid, ENOUGH.items(), LABELS, strict=True):
             known = [r for r in rows if r[key] is not None]
             for axes, (stiffness, floor) in zip(line, floors.items(), strict=True):
-                _draw(axes, [r for r in known if r["stiffness_n_m3"] == stiffness], key, floor[key], default)
+                _draw(axes, [r for r in known if r["stiffness_n_m3"] == stiffness], key, floor[key])
                 axes.axhspan(1e-12, enough, color=SHADE, linewidth=0, zorder=0)
                 log_scale(axes, "xy")
             line[0].set_ylabel(label)
@@ -387,23 +337,18 @@ def draw_workprec(rows: Sequence[Row], floors: Mapping[float, dict[str, float]],
         legend(figure)
 
 
-def _draw(axes: Axes, rows: Sequence[Row], key: str, floor: float, default: Row) -> None:
+def _draw(axes: Axes, rows: Sequence[Row], key: str, floor: float) -> None:
     """One panel; nothing below the reference's own error."""
-    for method, colour in COLOURS.items():
+
+    def plot(some: Sequence[Row], style: str, **how: Any) -> None:
+        axes.plot([r["cost_us"] for r in some], [max(r[key], floor) for r in some], style, **how)
+
+    for method, colour in zip(METHODS, (ORANGE, BLUE), strict=True):
         for held, line in ((True, "-"), (False, ":")):
             mine = [r for r in rows if r["method"] == method and r["held"] is held]
-            axes.plot(
-                [r["cost_us"] for r in mine], [max(r[key], floor) for r in mine], line, color=colour,
-                label=method if held else None,
-            )  # fmt: skip
-            for stands in (True, False):
+            plot(mine, line, color=colour, label=method if held else None)
+            for stands, face in ((True, colour), (False, "white")):
                 dots = [r for r in mine if r["stands"] is stands]
-                axes.plot(
-                    [r["cost_us"] for r in dots], [max(r[key], floor) for r in dots], "o", color=colour, markersize=4.5,
-                    markerfacecolor=colour if stands else "white",
-                )  # fmt: skip
-    chosen = [r for r in rows if r | default == r]
-    axes.plot(
-        [r["cost_us"] for r in chosen], [max(r[key], floor) for r in chosen], "o", markersize=12,
-        markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1.4,
-    )  # fmt: skip
+                plot(dots, "o", color=colour, markersize=4.5, markerfacecolor=face)
+    chosen = [r for r in rows if r | DEFAULT == r]
+    plot(chosen, "o", markersize=12, markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1.4)

@@ -14,8 +14,8 @@ from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import SceneError, UsageError
-from canprobe.lab.studies.array_forces import score_holds
-from canprobe.lab.studies.arrays import RADIUS_M, Presses, measure, random_array
+from canprobe.lab.studies.array_presses import RADIUS_M, Presses, random_array
+from canprobe.lab.studies.calibration import measure, score_holds
 from canprobe.mechanics.touch.array_calibration.calibrate import calibrate_array
 from canprobe.mechanics.touch.image.force_errors import UNSTATED
 from canprobe.mechanics.touch.image.image_model import make_patch_calibration
@@ -58,7 +58,7 @@ def fit(touched):
 def test_force_stiffness_and_curvature_of_an_unseen_array_are_within_the_goals():
     found = measure(121)
     assert found["force_percent"] < 2.0
-    assert abs(found["stiffness_percent"]) < 5.0  # 3 % RMS over twenty arrays: `canprobe study arrays`
+    assert abs(found["stiffness_percent"]) < 5.0  # 3 % RMS over twenty arrays: `canprobe study calibration`
     assert found["curvature_percent"] < 5.0
 
 
@@ -96,7 +96,7 @@ def test_the_force_of_each_second_is_within_what_is_stated(fit, touched):
     presses = Presses(config, stiffness, rng)  # the same array
     score = score_holds(fit.calibration, touched_pad(config), [presses.held() for _ in range(6)])
     assert score["error_percent"] < 0.7 * score["uncorrected_percent"]
-    # of one array; 95 % of the seconds of many are within 2σ: `canprobe study arrays`
+    # of one array; 95 % of the seconds of many are within 2σ: `canprobe study calibration`
     assert 0.5 < score["stated_percent"] / score["error_percent"] < 2.0 and score["within_percent"] > 75.0
 
 

@@ -1,19 +1,15 @@
-"""Study `bound`: its ground is exact, and a fixed subset of its cases is inside the bands that its seeds allow."""
+"""The bound of study `estimators`: its ground is exact, and some cases are inside the bands that their seeds allow."""
 
 from __future__ import annotations
 
-import json
 import math
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from canprobe.cli import main
 from canprobe.errors import UsageError
-from canprobe.lab.studies import bound
-from canprobe.lab.studies.bound_cases import BoundCase, all_cases
-from canprobe.lab.studies.bound_scores import findings
+from canprobe.lab.studies.bound import METHODS, BoundCase, all_cases, findings, rows_of, verdict
 from canprobe.lab.studies.cell_store import CellStore
 from canprobe.lab.studies.ground import PATHS, SURFACES, make_ground
 from canprobe.lab.studies.sweep import Sweep
@@ -37,7 +33,7 @@ OUTSIDE = (
 def rows(tmp_path_factory):
     store = CellStore(tmp_path_factory.mktemp("cells"))
     sweep = Sweep(lambda: ThreadPoolExecutor(1), store, say=lambda line: None)
-    yield bound.measure_all([*SUBSET, *OUTSIDE], SEEDS, sweep).rows
+    yield rows_of([*SUBSET, *OUTSIDE], SEEDS, sweep)
     store.close()
 
 
@@ -93,22 +89,14 @@ def test_outside_the_region_ml_is_honest(rows):
         assert row["coverage"] >= 0.82, row
 
 
-@pytest.mark.slow(reason="a whole study in its quick form")
-def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
-    assert main(["study", "bound", "--quick", "--out", str(tmp_path), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert {r["surface"] for r in document["rows"]} == set(SURFACES)
-    assert {"commit", "machine", "model", "seeds"} <= set(document["facts"])
-    assert {p.suffix for p in tmp_path.iterdir()} == {".jsonl", ".csv", ".txt", ".json", ".png"}
-    assert main(["study", "bound", "--quick", "--out", str(tmp_path), "--json"]) == 0
-    again = capsys.readouterr()
-    assert json.loads(again.out) == document
-    assert f"{2 * len(SURFACES)} of {2 * len(SURFACES)} cells are kept" in again.err
-
-
-def test_the_table_says_what_is_wrong(rows):
-    bad = dict(rows[0], ratio=3.0, coverage=0.5, inside=True, verdict="error, overconfident")
-    said = findings([*rows, bad])
+def test_the_table_says_what_is_wrong():
+    good = {"surface": "cylinder", "path": "weave", "size_mm": 40.0, "sigma_point_um": 20.0, "observed": 1.0}
+    good |= {"inside": True, "ratio": 1.0, "bias": 0.0, "coverage": 0.95}
+    rows = [good | {"method": method} for method in METHODS]
+    rows.append(rows[0] | {"ratio": 3.0, "coverage": 0.5})
+    rows = [row | {"verdict": verdict(row, 200)} for row in rows]
+    assert [row["verdict"] for row in rows] == ["good", "good", "error, overconfident"]
+    said = findings(rows)
     assert any("out of line: cylinder" in line and "overconfident" in line for line in said)
 
 

@@ -19,9 +19,9 @@ from canprobe.lab.studies.estimators import (
     on_the_move,
     settings,
 )
-from canprobe.lab.studies.harness import Column, StudyResult
-from canprobe.lab.studies.result_files import as_document, table_lines, write_study
-from canprobe.lab.studies.sweep import STUDIES
+from canprobe.lab.studies.ground import SURFACES
+from canprobe.lab.studies.result import Column, StudyResult, as_document, table_lines, write_study
+from canprobe.lab.studies.sweep import FORMS, STUDIES
 from canprobe.mechanics.touch.estimate.fit import METHODS
 
 FEW = [EstimatorSetting("chen1996", 160, 10), EstimatorSetting("ml", 160), EstimatorSetting("recursive", 160)]
@@ -52,7 +52,13 @@ def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert {r["method"] for r in document["rows"]} == set(METHODS)
     assert all(r["bound_percent"] > 0 and r["sample_us"] > 0 for r in document["rows"])
     assert {"commit", "machine", "model", "seeds"} <= set(document["facts"])
-    assert (tmp_path / "estimators.png").stat().st_size > 10_000
+    (bound,) = document["more"]
+    assert {r["surface"] for r in bound["rows"]} == set(SURFACES)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {
+        "cells.jsonl",
+        *(f"{n}.{e}" for n in ("estimators", "bound") for e in ("csv", "txt", "json", "png")),
+    }
 
 
 def test_ratios_are_to_the_paper_in_the_same_run():
@@ -86,18 +92,24 @@ def test_what_does_not_apply_is_null_and_a_dash(tmp_path):
 def test_list(capsys):
     assert main(["study", "--list"]) == 0
     out = capsys.readouterr().out
-    assert all(name in out for name in STUDIES)
+    assert all(name in out for name in (*STUDIES, *FORMS))
     assert main(["study", "--list", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == dict(STUDIES)
+    described = json.loads(capsys.readouterr().out)
+    assert described == {**STUDIES, **{typed: words for typed, (_, words) in FORMS.items()}}
 
 
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["study", "bond"], "did you mean bound?"),
+        (["study", "region"], "did you mean regions?"),
         (["study"], "expected NAME"),
         (["study", "soak"], "canprobe study realtime --soak"),
-        (["study", "bound", "--soak"], "only realtime has"),
+        (["study", "shapes"], "canprobe study surfaces"),
+        (["study", "bound"], "canprobe study estimators"),
+        (["study", "regions", "--soak"], "expected one of faults --vcan"),
+        (["study", "faults", "--link"], "realtime --link"),
+        (["study", "recover"], "canprobe study faults --recover"),
+        (["study", "link"], "canprobe study realtime --link"),
     ],
 )
 def test_a_wrong_name_is_told(argv, said, capsys):

@@ -62,7 +62,7 @@ def test_every_kind_of_the_registry_is_drawn_in_every_task_phase_and_plant_at_a_
     assert {fault.duration_ns < 2 * S for _, fault in faults} == {True, False}
 
 
-@pytest.mark.parametrize("task", ["press", "calibrate"])
+@pytest.mark.parametrize("task", ["press", pytest.param("calibrate", marks=pytest.mark.slow(reason="a second task"))])
 def test_the_phases_of_a_task_follow_each_other(task):
     windows = phase_windows(task, "ideal")
     assert tuple(windows) == PHASES
@@ -91,7 +91,7 @@ def test_one_run_is_told_by_its_number(capsys):
     told = capsys.readouterr()
     outcome = json.loads(told.out)
     assert outcome["number"] == 0 and outcome["fault"] in told.err
-    assert main(["study", "bound", "--seed", "3"]) == 2
+    assert main(["study", "estimators", "--seed", "3"]) == 2
 
 
 def deaf_to_findings(monkeypatch):
@@ -151,9 +151,20 @@ def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch, tm
     assert any(failure.startswith("summary: ValueError") for failure in failures)
 
 
+MORE = pytest.mark.slow(reason="more kinds of a study")
+
+
 @pytest.mark.parametrize(
     ("kind", "node"),
-    [("drop", 3), ("delay", 2), ("corrupt", 16), ("reboot", 5), ("freeze", 3), ("wrong-data", 3), ("sto", 2)],
+    [
+        ("drop", 3),
+        ("freeze", 3),
+        ("sto", 2),
+        *(
+            pytest.param(*more, marks=MORE)
+            for more in (("delay", 2), ("corrupt", 16), ("reboot", 5), ("wrong-data", 3))
+        ),
+    ],
 )
 def test_a_node_that_has_a_fault_in_contact_is_answered(kind, node):
     run = thrown(kind, node, "contact").result()
@@ -274,6 +285,6 @@ def test_without_the_right_to_set_the_interface_the_study_says_so_before_anythin
 
 
 def test_vcan_belongs_to_faults_and_knows_no_seed(capsys):
-    assert main(["study", "bound", "--vcan"]) == 2
+    assert main(["study", "estimators", "--vcan"]) == 2
     assert main(["study", "faults", "--vcan", "--seed", "3"]) == 2
     assert "--vcan" in capsys.readouterr().err

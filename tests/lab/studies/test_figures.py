@@ -18,25 +18,23 @@ import canprobe
 from canprobe.cell.results.figures import draw_run
 from canprobe.cell.results.plan_figure import draw_plan
 from canprobe.cell.results.surface_figure import draw_surface
-from canprobe.lab.studies import estimators, fault_cases, stability, workprec
+from canprobe.lab.studies import estimators, exploration, fault_cases, stability, workprec
 from canprobe.lab.studies import faults as faults_study
-from canprobe.lab.studies import stability as stability_figure
-from canprobe.lab.studies.bound_cases import NOISES, SIZES_M
-from canprobe.lab.studies.bound_figure import draw_bound
-from canprobe.lab.studies.cycle_times import CycleTimes
+from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.faults_vcan import draw_ends
+from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
-from canprobe.lab.studies.realtime_cases import Measured
+from canprobe.lab.studies.realtime_cases import CycleTimes, Measured
 from canprobe.lab.studies.realtime_soak import draw_soak
-from canprobe.lab.studies.region_figure import draw_regions
 from canprobe.lab.studies.region_scores import ScoredScan
-from canprobe.lab.studies.regions import rows_of
+from canprobe.lab.studies.regions import draw_regions, rows_of
 from canprobe.lab.studies.stability_extremes import END_MARKS, EXTREMES, ExtremeCase, draw_extremes, value_in_words
+from canprobe.lab.studies.surface_methods import METHODS
+from canprobe.lab.studies.surfaces import draw_surfaces
 from canprobe.lab.studies.workprec import draw_workprec
-from canprobe.lab.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell, over_seeds
 
 COLUMN_PX, WIDEST_PX, LEAST_TYPE_PX, LEAST_BAR_PX = 800, 1400, 9.0, 4.0
 FILLED, TILES = 0.3, 3
@@ -111,21 +109,7 @@ def plant(path, stiffnesses=workprec.STIFFNESSES, steps=workprec.STEPS_US):
         for step in steps
         for held in (True, False)
     ]  # fmt: skip
-    draw_workprec(rows, floors, workprec.default_choice(), path)
-
-
-def whole_cell(path):
-    rows = [
-        {"rate_hz": rate, "mode": mode, "bus": one_of((*REAL, FASTER), i), "fidelity": fidelity, "stiff": "holds",
-         "reason": "", "method": one_of(("chord", "ml", "recursive"), i)}
-        | over_seeds([
-            {"ended": "done", "cost_ms_per_s": 40 + 0.5 * rate + 20 * i, "curvature_percent": (2 - 0.2 * i) * share,
-             "bound_percent": 0.8, "normal_deg": (0.09 - 0.01 * i) * share, "force_percent": (5.8 - 0.3 * i) * share}
-            for share in (0.9, 1.1)])
-        for fidelity in FIDELITIES
-        for i, (rate, mode) in enumerate(itertools.product(RATES_HZ, MODES[:1]))
-    ]  # fmt: skip
-    draw_cell(rows, path)
+    draw_workprec(rows, floors, path)
 
 
 def faults(count):
@@ -155,12 +139,14 @@ def ends(path):
 
 
 def map_of_touches(path):
-    """Every table beside the map, and of the map four buses with a few contacts."""
+    """Four buses with a few contacts."""
     cases = [case for case in stability.cases(False) if case.rate_hz != 200.0 and case.late_ms != 6.0]
-    chosen = [case for case in cases if case.view not in stability_figure.VIEWS or case.contact_n_m in (1e3, 1e5)]
     names = ("stable", "stopped", "approach", "refused")
-    rows = [stability.row_of(case, {"ended": one_of(names, i), "reason": REASON}) for i, case in enumerate(chosen)]
-    stability_figure.draw_stability(rows, path)
+    rows = [
+        stability.row_of(case, {"ended": one_of(names, i), "reason": REASON})
+        for i, case in enumerate(case for case in cases if case.contact_n_m in (1e3, 1e5))
+    ]
+    stability.draw_stability(rows, path)
 
 
 def extremes(path):
@@ -180,9 +166,7 @@ def realtime(path):
         some = some.astype(int)
         return CycleTimes(2_500_000, late.astype(int), 4000 / rate, some, 2 * some, 3 * some)
 
-    cases = [
-        Measured(case, "window", 400.0, times(400.0)) for case in ("whole controller", "plain canopen", "bare clock")
-    ]
+    cases = [Measured(case, "window", 400.0, times(400.0)) for case in ("whole controller", "bare clock")]
     held = [Measured("hold", mode, rate, times(rate - 30 * i)) for i, mode in enumerate(("features", "window", "image"))
             for rate in (200.0, 400.0, 1000.0)]  # fmt: skip
     draw_realtime([*cases, *held], path)
@@ -194,6 +178,42 @@ def soak(path):
     draw_soak(samples, path)
 
 
+def predicted(path):
+    rows = [
+        {
+            "kind": one_of(("machine", "still", "slow"), i),
+            "seen": 0.02 * 1.3**i,
+            "told": 0.02 * 1.3**i * (1 + i % 4 / 5),
+        }
+        for i in range(30)
+    ]
+    lines = ((1.0, "as predicted"),)
+    draw_points(
+        rows, ("seen", "seen, %"), ("told", "predicted, %"), path, title="Overruns", by="kind", log=True, lines=lines
+    )
+
+
+def surfaces_of_methods(path):
+    rng, rows = np.random.default_rng(0), []
+    for name, settings in (("map", (1,)), *((name, settings) for name, (_, settings, _) in METHODS.items())):
+        for k, _ in enumerate(settings):
+            scores = dict(
+                zip(("height_um", "normal_mrad", "curvature_per_m", "nll"), rng.uniform(1, 40, 4), strict=True)
+            )
+            rows.append({"method": name, "cpu_s": 0.02 * 2**k * rng.uniform(1, 2), **scores})
+    draw_surfaces(rows, path)
+
+
+def paths(path):
+    marks = np.arange(1, 51) * exploration.MARK_M
+    each = {
+        name: [{"path": marks.tolist(), **{key: (limit * (0.3 + i / 9 + 0.02 / marks)).tolist()
+                                           for key, limit in exploration.LIMITS.items()}}]
+        for i, name in enumerate(exploration.STRATEGIES)
+    }  # fmt: skip
+    exploration.draw(each, path)
+
+
 def bridge_bars(path):
     names = ("none", "mcap", "foxglove", "ros2", "view", "mcap + foxglove + ros2")
     rows = [{"bridge": name, "watched": "–", "added_p50_us": 40 + 9 * i, "added_p99_us": 150 + 200 * i}
@@ -202,7 +222,7 @@ def bridge_bars(path):
 
 
 FOUND = {"tool_centre_mm": [0.394, None, 80.478], "sigma_mm": [0.05, None, 0.08], "believed_mm": [0.0, 0.0, 80.0],
-         "true_mm": [0.4, -0.3, 80.5], "touches": 13}  # fmt: skip
+         "true_mm": [0.4, -0.3, 80.5], "error_mm": [0.006, None, 0.022], "touches": 13}  # fmt: skip
 REASON = (
     "node 3 lost: $no frame^^$, no heartbeat for 250 ms; " + "quick stop of every drive, the probe was lifted off; " * 3
 )
@@ -219,20 +239,22 @@ PICTURES = {
     "regions": regions,
     "workprec": plant,
     "workprec, quick": functools.partial(plant, stiffnesses=workprec.STIFFNESSES[:2], steps=workprec.STEPS_US[1:3]),
-    "workprec, cell": whole_cell,
     "faults": faults(1020),
     "faults, quick": faults(8),
     "faults, files": wrong_files,
     "faults, vcan": ends,
     "stability": map_of_touches,
     "stability, extremes": extremes,
+    "predicted": predicted,
+    "surfaces": surfaces_of_methods,
+    "exploration": paths,
     "realtime": realtime,
     "soak": soak,
     "bridges": bridge_bars,
 }
 
 
-SHOWN = ("plane, stopped", "free", "plan", "bound", "faults", "soak")
+SHOWN = ("plane, stopped", "plan", "bound", "faults, quick", "soak")
 OTHERS = pytest.mark.slow(reason="one more picture; the default draws one of each kind")
 
 

@@ -17,7 +17,7 @@ from canprobe.cli import main
 from canprobe.errors import PlanError, UsageError
 from canprobe.lab.studies.random_scenes import CELLS, KINDS, SceneSeed, random_scene
 from canprobe.lab.studies.region_scores import ScoredScan, behind_jump, measure, scored
-from canprobe.lab.studies.regions import TRIES, compared, earlier_rows, findings, row_of, rows_of, scan_all
+from canprobe.lab.studies.regions import DRAWS_PER_SCENE, compared, earlier_rows, findings, row_of, rows_of, scan_all
 
 ROW = 400
 TRUTH = {
@@ -113,7 +113,7 @@ def test_a_scene_without_answers_is_counted_and_another_one_is_drawn():
     planes = [one for one in scans if one.kind == "plane"]
     assert sum(len(one.scores) > 0 for one in planes) == 10
     assert [one.seed for one in planes] == [200_000 + i for i in range(len(planes))]
-    assert sum(one.kind == "bowl" for one in scans) == TRIES * 10
+    assert sum(one.kind == "bowl" for one in scans) == DRAWS_PER_SCENE * 10
 
 
 def test_an_earlier_run_is_compared_by_kind(tmp_path):
@@ -173,7 +173,10 @@ def test_the_line_of_a_seed_repeats_its_scene(capsys):
 @pytest.mark.parametrize(
     "words, expected",
     [
-        (["bound", "--draw", "2"], "study bound: only arrays, calibrations, explore, link, regions, shapes has it"),
+        (
+            ["estimators", "--draw", "2"],
+            "only calibration, realtime --link, regions, surfaces has it",
+        ),
         (["regions", "--draw", "2", "--seed", "200000"], "--draw: study regions: a seed names its draw"),
         (["regions", "--against", str(Path("no") / "where.json")], "expected the regions.json of an earlier run"),
     ],

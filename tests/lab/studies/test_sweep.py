@@ -30,7 +30,7 @@ import os, signal, sys
 from dataclasses import dataclass
 from pathlib import Path
 import numpy as np
-from canprobe.lab.studies.harness import Column, StudyResult
+from canprobe.lab.studies.result import Column, StudyResult
 HERE = Path(__file__).parent
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def test_times_are_taken_one_by_one_and_belong_to_a_machine(demo, tmp_path, monk
     store.close()
 
 
-@pytest.mark.parametrize("study", [name for name in sweep.STUDIES if name != "shapes"])
+@pytest.mark.parametrize("study", [*sweep.STUDIES, *(module for module, _ in sweep.FORMS.values())])
 def test_the_code_that_a_study_names_is_there(study):
     model_digest(getattr(importlib.import_module(f"canprobe.lab.studies.{study}"), "MODEL", ()))
 
@@ -221,7 +221,12 @@ def test_only_one_study_writes_into_a_folder(tmp_path):
     CellStore(tmp_path).close()
 
 
-@pytest.mark.parametrize(("fate", "status"), [("SIGKILL", -9), ("SIGINT", 130), ("SIGTERM", 143)])
+OTHER_SIGNAL = pytest.mark.slow(reason="a third way to end a sweep")
+
+
+@pytest.mark.parametrize(
+    ("fate", "status"), [("SIGKILL", -9), ("SIGINT", 130), pytest.param("SIGTERM", 143, marks=OTHER_SIGNAL)]
+)
 def test_an_ended_sweep_goes_on_where_it_was(demo, tmp_path, fate, status):
     ended = run_demo(tmp_path, fate)
     assert ended.returncode == status, ended.stderr

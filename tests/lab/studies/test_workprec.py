@@ -1,21 +1,26 @@
-"""Study `workprec` in its quick form, and what its words rest on."""
+"""Study `workprec`: the plant's integrators against the reference, and the words of the study."""
+
+import sys
 
 import numpy as np
 import pytest
 
 from canprobe.cell.plant.dynamic_arm import Stepping
+from canprobe.cli import main
 from canprobe.lab.studies import workprec
 from canprobe.lab.studies.workprec import (
     ENOUGH,
     IntegrationCase,
     cases,
+    choice,
     errors,
     findings,
     integrated,
     knee,
     observed,
-    reference,
+    solve,
     stands,
+    trial,
     verdict,
 )
 
@@ -25,12 +30,12 @@ PAD = 1.27e8
 
 @pytest.fixture(scope="module")
 def truth():
-    return observed(PAD, CYCLES, reference(PAD, CYCLES, 1e-10))
+    return observed(PAD, np.array(solve(IntegrationCase(PAD, "radau", 1e-10, False, CYCLES, 1))))
 
 
 def errors_of(truth, method, step_us, held):
-    stepping = Stepping(method, round(1000 * step_us))
-    return errors(truth, observed(PAD, CYCLES, integrated(PAD, CYCLES, stepping, held)))
+    found = integrated(PAD, trial(PAD, CYCLES)[1], Stepping(method, round(1000 * step_us)), held=held)
+    return errors(truth, observed(PAD, found))
 
 
 def test_the_whole_plant_converges_with_the_order_of_its_step(truth):
@@ -58,17 +63,19 @@ def test_the_knee_is_the_cheapest_that_is_accurate_enough():
     assert knee(rows[:1], PAD) is None
 
 
-def test_the_choice_is_linearly_implicit_accurate_over_the_span_and_stands():
+def test_the_choice_is_accurate_over_the_span_and_stands():
     def over_the_span(method, cost, step, **changes):
         return [row(method, cost, 0.5, step=step, stiffness=k, **changes) for k in workprec.SPAN]
 
     good = over_the_span("rosenbrock", 9.0, 625.0)
-    rows = [*good, *over_the_span("rk4", 2.0, 625.0), *over_the_span("implicit", 3.0, 625.0, stands=False)]
-    rows += [row("rosenbrock", 1.0, 0.5, step=1250.0), row("rosenbrock", 1.0, 3.0, step=1250.0, stiffness=1.27e9)]
-    assert workprec.choice(rows) == (("rosenbrock", 625.0), 27.0)
-    assert workprec.choice(rows, workprec.METHODS) == (("rk4", 625.0), 6.0)
-    assert "rk4 at 625 µs costs least, 0.22 × as much" in findings(rows, {})[0]
-    assert workprec.choice(rows[3:]) is None
+    rows = [*good, *over_the_span("rk4", 2.0, 625.0, stands=False), row("rosenbrock", 1.0, 0.5, step=1250.0)]
+    rows.append(row("rosenbrock", 1.0, 3.0, step=1250.0, stiffness=1.27e9))
+    assert choice(rows) == ("rosenbrock", 625.0)
+    assert "is rosenbrock at 625 µs; the default is rosenbrock at 625 µs" in findings(rows, {})[0]
+    assert choice(rows[3:]) is None
+    said = "\n".join(findings(rows, {PAD: dict.fromkeys(ENOUGH, 1e-9)}))
+    assert "cheapest that is accurate enough rosenbrock at 1250 µs, held, 1 µs a cycle" in said
+    assert "the default, rosenbrock at 625 µs, held, 9 µs a cycle (force 0.5 %" in said
 
 
 def test_quick_cells_cover_every_method_and_free_dynamics_too():
@@ -86,17 +93,12 @@ def test_a_cell_measures_states_and_cost():
 
 @pytest.mark.parametrize(("method", "step_us", "quiet"), [("rosenbrock", 625.0, True), ("rk4", 1250.0, False)])
 def test_explicit_steps_rattle_at_rest_and_linearly_implicit_ones_do_not(method, step_us, quiet):
-    assert stands(workprec.STIFFEST, 40, Stepping(method, round(1000 * step_us))) is quiet
-    assert stands(PAD, 40, Stepping(method, round(1000 * step_us))) is quiet
+    for stiffness in (workprec.STIFFEST, PAD):
+        assert stands(IntegrationCase(stiffness, method, step_us, True, 40, 1)) is quiet
 
 
-def test_findings_say_whether_the_default_is_the_knee():
-    floor = {PAD: {"force_percent": 1e-9, "position_um": 1e-9, "taxel_counts": 1e-9}}
-    mine = workprec.default_choice()
-    rows = [row("rosenbrock", 7.0, 0.5, step=mine["step_us"], stiffness=k) for k in workprec.SPAN]
-    rows.append(row("rosenbrock", 20.0, 0.1, held=False, step=mine["step_us"]))
-    said = "\n".join(findings(rows, floor))
-    assert "the knee, and the default" in said
-    assert "2.9 × the cost" in said
-    others = [r | {"method": "implicit", "step_us": 78.0} for r in rows]
-    assert "not the default" in "\n".join(findings(others, floor))
+def test_without_mujoco_it_is_refused_at_once(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, package=None: None)
+    assert main(["study", "workprec", "--quick", "--out", str(tmp_path)]) == 2
+    assert "needs the package mujoco" in capsys.readouterr().err

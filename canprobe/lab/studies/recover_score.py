@@ -1,127 +1,153 @@
-"""Runs of study `recover`: a cell in lockstep that loses nodes or its bus (`recover_cases`), and what comes of it.
+"""What a cell loses while it works, by chance, and the score of what comes of it: for study `faults --recover`.
 
-The score looks at the emulated nodes and the plant, not at what the master believes.
+What is lost, when and for how long follows from a seed: power of a node or of all nodes, the link of a node (bus-off),
+its SYNC or its heartbeats, its state by itself, the interface of the master, or the master's own time; one of them or a
+pair, while the arm holds, moves, presses or scans. The score looks at the emulated nodes and the plant, not at what the
+master believes.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
+from random import Random
+from types import MappingProxyType
 from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
-from canprobe.cell.master.options import RunOptions
-from canprobe.cell.master.trail import TakenWay
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.free_and_listen import HoldTask
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.errors import CanprobeError, InterfaceError
-from canprobe.fieldbus.bus.port import Port
-from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
-from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID, Frame
-from canprobe.lab.studies.recover_cases import BOOTING, END_S, REPLUG, SCENES, STALL, Outage, RecoverCase
+from canprobe.errors import CanprobeError
 
+FIRST_SYNCS = 8
+"""SYNCs after each enabling of a drive in which its target is compared with its position."""
 HELD_S = 0.25
 """Time of the hold before motion is asked for."""
 SETTLED_S = 0.5
 """Time of the work after the last outage, and after motion was asked for: what is lost is noticed within 0.2 s."""
 SLACK_S = 1.0
 """Time that a cell may take from the boot-up of a node to the hold, besides the node's SDO times."""
+SCENES: Mapping[str, str] = MappingProxyType({"hold": "free", "free": "free", "press": "press", "scan": "plane"})
+"""Scene of each kind of work."""
+LOST: Mapping[str, str] = MappingProxyType(
+    {
+        "reboot": "reboot",
+        "bus-off": "bus-off",
+        "freeze": "freeze",
+        "sync-lost": "sync-lost",
+        "heartbeat-off": "heartbeat-off",
+        "nmt-reset": "nmt command=129",
+        "nmt-preop": "nmt command=128",
+    }
+)
+"""Faults of a node in the words of the registry, by name."""
+POWER, REPLUG, STALL = "power", "replug", "stall"
+"""All nodes are without power; the interface of the master is down; the master itself stands still."""
+BOOTING = frozenset(("reboot", "nmt-reset", POWER))
+"""Outages after which a node boots."""
+AT_ONCE = frozenset(("nmt-reset", "nmt-preop"))
+"""Outages that have no length: the node is back at once."""
+BEGIN_S, END_S = 0.3, 3.0
+"""Time of the first loss after the first cycle of the task."""
 
 
-class WatchedDrives(Participant):
-    """Looks at the drives after each SYNC: distance of target and position in the first SYNCs after each enabling.
-
-    Args:
-        nodes: all emulated nodes.
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """One thing that is lost.
 
     Attributes:
-        jump_counts: largest distance in those SYNCs, from the second enabling of a drive on.
-        lifting: the cell takes the probe off, which is no jump.
-        syncs: number of SYNCs.
-        boot_ups: time of each boot-up, ns, by node.
+        name: key of `LOST`, `POWER`, `REPLUG` or `STALL`.
+        node_id: the node; 0 for all nodes, or the master.
+        after_s: time of the loss after the first cycle of the task.
+        lasts_ms: how long it lasts; 0 of `AT_ONCE`.
     """
 
-    name = "watcher of the drives"
-    hears_every_sync = True
-    listens = frozenset((SYNC_ID, *range(HEARTBEAT_BASE + 1, HEARTBEAT_BASE + MASTER_NODE_ID)))
-    FIRST_SYNCS = 8
+    name: str
+    node_id: int
+    after_s: float
+    lasts_ms: int
 
-    def __init__(self, nodes: Sequence[SlaveNode]) -> None:
-        self._ages = {
-            node.node_id: (-1, 0, node) for node in nodes if node.dictionary.entries.get(0x604100) is not None
-        }
-        self.boot_ups: dict[int, list[int]] = {node.node_id: [] for node in nodes}
-        self.jump_counts = self.syncs = 0
-        self.lifting = False
+    @property
+    def ends_s(self) -> float:
+        """Time of its end after the first cycle of the task."""
+        return self.after_s + self.lasts_ms * 1e-3
 
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """Look at each drive."""
-        if can_id != SYNC_ID:
-            if data == b"\0":
-                self.boot_ups[can_id - HEARTBEAT_BASE].append(t_ns)
-            return []
-        self.syncs += 1
-        for node_id, (age, before, node) in self._ages.items():
-            number = node.dictionary.number
-            if known_state(number(0x6041)) is not DriveState.OPERATION_ENABLED:
-                self._ages[node_id] = (-1, before, node)
-                continue
-            times = before + (age < 0)
-            self._ages[node_id] = (age + 1, times, node)
-            if times > 1 and age + 1 < self.FIRST_SYNCS and not self.lifting:
-                self.jump_counts = max(self.jump_counts, abs(number(0x607A) - number(0x6064)))
-        return []
+    def nodes(self, node_ids: Collection[int]) -> tuple[int, ...]:
+        """The nodes that it takes away, of those of the cell."""
+        return tuple(node_ids) if self.name == POWER else (self.node_id,) if self.node_id else ()
+
+    def fault(self, node_id: int, after_s: float) -> str:
+        """The outage of a node as text for the registry, to begin in a time."""
+        words = LOST["reboot" if self.name == POWER else self.name]
+        lasts = f" for {self.lasts_ms} ms" if self.lasts_ms else ""
+        return f"node {node_id}: {words} at {after_s:.4f} s{lasts}"
+
+    def __str__(self) -> str:
+        who = f" of node {self.node_id}" if self.node_id else ""
+        lasts = f" for {self.lasts_ms} ms" if self.lasts_ms else ""
+        return f"{self.name}{who} at {self.after_s:g} s{lasts}"
 
 
-class Work(Controller):
-    """The work of a case: it ends with its own loss, or is held and goes on.
+@dataclass(frozen=True, slots=True)
+class RecoverCase:
+    """One run.
 
-    Args:
-        task: the task.
-        is_over: called with each measurement; whether the case is over.
+    Attributes:
+        seed: seed that it follows from.
+        work: what the cell does: a key of `SCENES`.
+        outages: what is lost, in order.
     """
 
-    def __init__(self, task: Controller, is_over: Callable[[Measurement], bool]) -> None:
-        self._task, self._is_over = task, is_over
-        self.can_go_on = task.can_go_on
+    seed: int
+    work: str
+    outages: tuple[Outage, ...]
 
-    def step(self, measurement: Measurement) -> Command:
-        """One cycle of the task."""
-        over = self._is_over(measurement)
-        command = self._task.step(measurement)
+    def __str__(self) -> str:
+        return f"{self.work}: " + "; ".join(map(str, self.outages))
+
+
+def draw_case(seed: int) -> RecoverCase:
+    """The run of a seed: every other one has a pair, whose second outage begins 1 ms to 3 s after the first."""
+    rng = Random(seed)
+    work = rng.choice([*SCENES])
+    nodes = (*range(1, 7), *((16,) if work in ("press", "scan") else ()))
+    outages = []
+    after_s = rng.uniform(BEGIN_S, END_S)
+    for _ in range(rng.choice((1, 2))):
+        name = rng.choice((*LOST, "reboot", POWER, REPLUG, STALL))
+        node_id = rng.choice(nodes) if name in LOST else 0
+        lasts_ms = 0 if name in AT_ONCE else round(10 ** rng.uniform(1.0, 3.5))
+        outages.append(Outage(name, node_id, round(after_s, 4), lasts_ms))
+        after_s += 10 ** rng.uniform(-3.0, 0.5)
+    return RecoverCase(seed, work, tuple(outages))
+
+
+def shrink(case: RecoverCase, run: Callable[[RecoverCase], Mapping[str, Any]]) -> RecoverCase:
+    """The case with the fewest outages that still fails when it is run; the case itself where none of them does."""
+    for i in range(len(case.outages)):
+        fewer = replace(case, outages=case.outages[:i] + case.outages[i + 1 :])
+        if fewer.outages and run(fewer)["failures"]:
+            return shrink(fewer, run)
+    return case
+
+
+def ending(task: Controller, is_over: Callable[[Measurement], bool]) -> Controller:
+    """The task, which is done when the case is over.
+
+    Its step is replaced, as a wrapper would have to pass on all that a cell may ask of a task that is held.
+    """
+    step = task.step
+
+    def step_until_over(measurement: Measurement) -> Command:
+        over = is_over(measurement)
+        command = step(measurement)
         return replace(command, done=True) if over else command
 
-    def update(self) -> None:
-        """Let the task work."""
-        self._task.update()
-
-    def go_on(self, measurement: Measurement) -> None:
-        """Let the task go on."""
-        self._task.go_on(measurement)
-
-    @property
-    def lets_go(self) -> bool:  # type: ignore[override]
-        """Whether the task lets go."""
-        return self._task.lets_go
-
-    @property
-    def trail(self) -> TakenWay | None:
-        """The way by which the task's probe has come."""
-        return self._task.trail
-
-    def retreat(self, reason: str) -> None:
-        """Let the task let go."""
-        self._task.retreat(reason)
+    task.step = step_until_over  # type: ignore[method-assign]
+    return task
 
 
 class RecoverScore:
@@ -179,7 +205,7 @@ class RecoverScore:
         task = HoldTask() if self.case.work == "hold" else make_task(self.plan)
         for controller in (task, *(HoldTask() for _ in range(len(self.case.outages) + 1))):
             try:
-                session.run(Work(controller, is_over), after_cycle)
+                session.run(ending(controller, is_over), after_cycle)
                 if is_over(Measurement(0, 0)):
                     break
             except CanprobeError as error:
@@ -278,85 +304,6 @@ class RecoverScore:
             return end_s
         behind = [[time for time in boot_ups[i] if time >= end_s - 1e-6] for i in loss.nodes(self.plan.node_ids)]
         return max((times[0] for times in behind if times), default=end_s)
-
-
-class RecoverRun:
-    """One run of the study.
-
-    Args:
-        case: what happens.
-        say: called with each step.
-        out: folder of the run's files; None keeps none.
-    """
-
-    def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path | None) -> None:
-        self._case = case
-        changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
-        plan = make_plan(resolve(load_scene(SCENES[case.work], changes)))
-        self._score = RecoverScore(case, plan, say)
-        self._session = session = Session(plan, RunOptions(out, self._say, recover=True))
-        self._faulty = session.world.make_faulty()
-        self._drives = WatchedDrives(session.world.nodes)
-        session.world.participants.append(self._drives)
-        session.around = self._disturbed
-        self._away: list[tuple[int, int, bool]] = []
-        with session:
-            self._score.carry_out(session, self._begin, lambda: self._now_ns * 1e-9)
-
-    @property
-    def _now_ns(self) -> int:
-        assert self._session.lockstep is not None
-        return self._session.lockstep.clock.now_ns()
-
-    def _say(self, text: str) -> None:
-        self._score.say(self._now_ns * 1e-9 if self._session.lockstep is not None else 0.0, text)
-        if text.startswith(("lift off", "enable the drives")):
-            self._drives.lifting = text.startswith("lift off")
-
-    def _begin(self) -> None:
-        """Throw the outages."""
-        for loss in self._case.outages:
-            if loss.name in (REPLUG, STALL):
-                begin_ns = self._now_ns + round(loss.after_s * 1e9)
-                self._away.append((begin_ns, begin_ns + loss.lasts_ms * 1_000_000, loss.name == STALL))
-            for node_id in loss.nodes(self._score.plan.node_ids):
-                self._faulty.inject(loss.fault(node_id, loss.after_s), self._now_ns)
-
-    def _disturbed(self, port: Port) -> Port:
-        """The port of the master: it fails while its interface is down, and its calls do not return in a stall."""
-
-        def around(name: str) -> Callable[..., Any]:
-            method = getattr(port, name)
-
-            def call(*arguments: Any) -> Any:
-                for begin_ns, end_ns, stalls in self._away:
-                    if begin_ns <= self._now_ns < end_ns:
-                        if not stalls:
-                            down = f"{port.channel}: interface is down; type: sudo ip link set {port.channel} up"
-                            raise InterfaceError(down)
-                        port.clock.sleep_until_ns(end_ns)
-                return method(*arguments)
-
-            return call
-
-        for name in ("send_batch", "drain", "wait"):
-            setattr(port, name, around(name))
-        return port
-
-    def outcome(self) -> dict[str, Any]:
-        """What came of it, and what failed; with files, the hash of the bus log too."""
-        session = self._session
-        boot_ups = {node_id: [t_ns * 1e-9 for t_ns in times] for node_id, times in self._drives.boot_ups.items()}
-        times_s = session.cell.log.arrays()["t_s"].tolist() if len(session.cell.log) else list[float]()
-        found = self._score.outcome(boot_ups, times_s, self._drives.syncs, forces_of(session), self._drives.jump_counts)
-        if session.out is not None:
-            found["bus_log_sha256"] = hashlib.sha256((session.out / "bus.log").read_bytes()).hexdigest()
-        return found
-
-
-def run_case(case: RecoverCase, say: Callable[[str], None] = lambda _: None, out: Path | None = None) -> dict[str, Any]:
-    """Carry out a run, and score it."""
-    return RecoverRun(case, say, out).outcome()
 
 
 def forces_of(session: Session) -> list[tuple[float, float]]:

@@ -1,4 +1,4 @@
-"""A study's result as text, CSV, JSON and picture, and the facts of every measurement."""
+"""The result of a study: a table with its facts and findings, and a picture; as text, CSV, JSON and PNG."""
 
 from __future__ import annotations
 
@@ -9,16 +9,90 @@ import json
 import math
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import canprobe
 from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text
 from canprobe.lab.studies.cell_store import PACKAGE, model_digest
-from canprobe.lab.studies.harness import Column, StudyResult
+from canprobe.mechanics.types import Floats
+
+Say = Callable[[str], None]
+Row = dict[str, Any]
+"""A row of a table, by the keys of its columns."""
+CHANNEL = "vcan0"
+"""The interface of studies in real time."""
+CHI2_95_OF_3 = 7.815
+FROBENIUS = np.array([1.0, 2.0, 1.0])
+"""Weights of (K11², K12², K22²) in ‖K‖²."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a study's table.
+
+    Attributes:
+        key: key of the rows, and heading in the CSV; it ends in the unit.
+        heading: heading in the printed table.
+        form: format of a value, as for `format`.
+    """
+
+    key: str
+    heading: str
+    form: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyResult:
+    """The result of a study.
+
+    Attributes:
+        name: name of the study.
+        columns: columns of the table.
+        rows: one row for each case; None where a value does not apply.
+        findings: sentences with figures.
+        facts: machine, versions and settings of the measurement.
+        draw: function that writes the picture to a path; it needs matplotlib.
+        more: further tables of the study, each with its findings, files and picture.
+    """
+
+    name: str
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+    findings: Sequence[str]
+    facts: Mapping[str, Any]
+    draw: Callable[[Path], None]
+    more: Sequence[StudyResult] = ()
+
+
+BOOTSTRAPS = 2000
+
+
+def drawn_anew(count: int) -> NDArray[np.int64]:
+    """Indices (`BOOTSTRAPS`, count) of repeats that are drawn anew, with replacement.
+
+    Source: Efron and Tibshirani, "An introduction to the bootstrap", 1993.
+    """
+    return np.random.default_rng(0).integers(count, size=(BOOTSTRAPS, count))
+
+
+def interval_of(values: Floats) -> tuple[float, float]:
+    """Lowest and highest of the middle 95 % of values."""
+    low, high = np.quantile(values, [0.025, 0.975]).tolist()
+    return low, high
+
+
+def mean_and_interval(key: str, values: Floats) -> Row:
+    """Mean of some repeats, with the interval of 95 % of the repeats drawn anew, NaN where a repeat is."""
+    known = bool(len(values)) and bool(np.isfinite(values).all())
+    low, high = interval_of(values[drawn_anew(len(values))].mean(axis=1)) if known else (math.nan, math.nan)
+    return {key: float(values.mean()) if known else math.nan, f"{key}_low": low, f"{key}_high": high}
+
 
 SIGMA_COLUMNS = (
     Column("sigma_point_um", "σp µm", ".0f"),
@@ -62,7 +136,7 @@ def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
 def table_lines(result: StudyResult) -> list[str]:
     """The table, a line for each row, numbers flush right."""
     cells = [[c.heading for c in result.columns]]
-    cells += [[_shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
+    cells += [[shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     words = [bool(result.rows) and isinstance(result.rows[0].get(c.key), str) for c in result.columns]
     return [
@@ -103,10 +177,7 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     """
     make_folder(out)
     paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
-    keys = list(dict.fromkeys(key for row in result.rows for key in row))
-    with whole_file(paths[0]) as part, part.open("w", newline="", encoding="utf-8") as file:
-        lines = [["" if (v := _plain(row.get(key))) is None else v for key in keys] for row in result.rows]
-        csv.writer(file).writerows([keys, *lines])
+    write_csv(paths[0], result.rows)
     write_text(paths[1], text_of(result))
     document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
     write_text(paths[2], document + "\n")
@@ -116,7 +187,16 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     return [*paths, *(path for more in result.more for path in write_study(more, out))]
 
 
-def _shown(value: Any, form: str) -> str:
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows with a column for each of their keys; what does not apply is empty."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        lines = [["" if (v := _plain(row.get(key))) is None else v for key in keys] for row in rows]
+        csv.writer(file).writerows([keys, *lines])
+
+
+def shown(value: Any, form: str) -> str:
+    """A value as a table shows it; a dash for what does not apply."""
     value = _plain(value)
     if value is None:
         return "–"

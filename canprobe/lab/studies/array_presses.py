@@ -1,13 +1,9 @@
-"""Study `arrays`: how well forty touches calibrate an unknown emulated array.
+"""Emulated arrays that are drawn at random, and the touches that calibrate one, directly and without a bus.
 
-Each cell is an array drawn at random: stiffness of its layer, full scale, blur, crosstalk, hysteresis, creep, gains. It
-is touched as `canprobe calibrate array` touches it, directly and without a bus: a plane at 4 places with 3 forces, a
-ball at 9 places with 2 forces, three reference loads, short rolls to and fro, a rod to verify. Then quadrics with
-curvatures, forces, places and dwell times by chance are pressed on it, and its calibration says what they are;
-`array_forces` holds some of them for up to a minute.
-
-The images come from `canprobe.cell.plant.taxels`, whose pressure is that of the exact sphere, sampled nine times a
-taxel, with hysteresis, creep and noise; the calibration knows none of its formulas.
+An array is touched as `canprobe calibrate array` touches it: a plane at 4 places with 3 forces, a ball at 9 places with
+2 forces, three reference loads, short rolls to and fro, a rod to verify. The images come from `cell.plant.taxels`,
+whose pressure is that of the exact sphere, sampled nine times a taxel, with hysteresis, creep and noise; a calibration
+knows none of its formulas.
 """
 
 from __future__ import annotations
@@ -15,38 +11,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from canprobe.cell.emulated.image_processing import follow
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
-from canprobe.cell.results.picture import BLUE, INK, picture
-from canprobe.lab.studies.array_forces import GROUPS, HOLD_S, HOLDS, result_of, score_holds
-from canprobe.lab.studies.harness import Column, Row, StudyResult
-from canprobe.lab.studies.result_files import measuring_facts
-from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch import Pad, PatchCalibration, calibrate_array, make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
-from canprobe.mechanics.touch.array_calibration.parameter_fit import curvature_errors, moment_errors
-from canprobe.mechanics.touch.array_calibration.touches import Dwell, what_is_shown
-from canprobe.mechanics.touch.linear_algebra import rms
+from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit, calibrate_array
+from canprobe.mechanics.touch.array_calibration.touches import Dwell
+from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
 
 RADIUS_M = 0.040
 BALL_PER_M = 40.0
-FIRST_ARRAY, ARRAYS, QUICK_ARRAYS = 100, 20, 2
-"""Seed of the first array of draw 0, and number of arrays of a draw."""
-DEVELOPMENT_DRAW, TEST_DRAW = 0, 1
-"""Draws: settings of calibration and force come from the first, and the second was only looked at."""
-OTHER_ARRAY = 10_000
-"""Distance of the seed of the array whose calibration is taken for that of a make."""
-PRESSES = 20
 WINDOW = 8
 FRAME_S, LOADING_S, DWELL_S, APART_S = 0.02, 0.5, 3.0, 2.5
+HOLD_S = (8.0, 20.0, 60.0)
+"""Durations of a hold, s."""
 REFERENCE_S = 9.0
 """Time of a reference load, s: creep has ended by then."""
 REFERENCE_SIGMA = 0.005
@@ -54,33 +35,31 @@ FORCE_RELATIVE_SIGMA, FORCE_CORRELATION_S = 0.03, 0.1
 """The force wanders under a servo: relative standard deviation, and correlation time."""
 ENCODER_M = 3e-6
 EIGHT_M, STROKE_M, STROKE_HZ = (1.5e-3, 0.6e-3), (0.5e-3, 0.0), (0.5, 1.5)
-GOALS = {"force_percent": 2.0, "stiffness_percent": 3.0, "curvature_percent": 5.0}
-MODEL = ("mechanics/touch", "cell/plant", "lab/studies/arrays.py", "lab/studies/array_forces.py")
-COLUMNS = (
-    Column("array", "array"),
-    Column("full_scale_kpa", "kPa", ".0f"),
-    Column("stiffness_n_m3", "K/h N/m³", ".3g"),
-    Column("blur", "blur pitches", ".2f"),
-    Column("crosstalk", "crosstalk", ".3f"),
-    Column("left_out", "left out"),
-    Column("force_percent", "force %", ".1f"),
-    Column("stiffness_percent", "stiffness %", ".1f"),
-    Column("by_depth_percent", "by depth %", ".1f"),
-    Column("moments_percent", "moments %", ".1f"),
-    Column("curvature_percent", "curvature %", ".1f"),
-)
 
 
-def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW) -> StudyResult:
-    """Calibrate the arrays of a draw and press on them."""
-    first = FIRST_ARRAY + ARRAYS * draw
-    seeds = range(first, first + (QUICK_ARRAYS if quick else ARRAYS))
-    sweep.say(f"{len(seeds)} arrays, draw {draw}: seeds {seeds[0]} to {seeds[-1]}")
-    rows: list[Row] = list(sweep.map(measure, list(seeds), model=MODEL))
-    forces = [row for each in sweep.map(measure_forces, list(seeds), model=MODEL) for row in each]
-    facts = measuring_facts(quick, len(seeds), MODEL)
-    more = (result_of(forces, facts),)
-    return StudyResult("arrays", COLUMNS, rows, findings(rows), facts, partial(draw_arrays, rows), more)
+def pad_of(config: TaxelConfig) -> Pad:
+    """The pad of an array."""
+    return Pad(full_scale_pa=config.full_scale_pa, mount_radius_m=RADIUS_M)
+
+
+def calibrated(presses: Presses, name: str, *, own_gains: bool = True) -> ArrayFit:
+    """The fit that the touches of an array give.
+
+    Args:
+        presses: presses on the array.
+        name: name of the array.
+        own_gains: whether the calibration has gains of its taxels, or is one of a make.
+    """
+    return calibrate_array(
+        list(presses.protocol()),
+        pad=pad_of(presses.config),
+        reference="scale",
+        reference_sigma=REFERENCE_SIGMA,
+        array=name,
+        date="",
+        made_on="study calibration",
+        own_gains=own_gains,
+    )
 
 
 def random_array(seed: int) -> tuple[TaxelConfig, float, np.random.Generator]:
@@ -105,11 +84,12 @@ class Presses:
         rng: generator of gains and noise.
 
     Attributes:
+        config: the array.
         forces: (n,) true force at each image of the last touch, N.
     """
 
     def __init__(self, config: TaxelConfig, stiffness: float, rng: np.random.Generator) -> None:
-        self._config, self._stiffness, self._rng = config, stiffness, rng
+        self.config, self._stiffness, self._rng = config, stiffness, rng
         self.forces: Floats = np.empty(0)
         self._array, self._t = TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness), 0.0
 
@@ -187,7 +167,7 @@ class Presses:
 
     def rest(self) -> None:
         """Wait until the array has recovered from the presses before."""
-        array = TaxelArray(self._config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self._stiffness)
+        array = TaxelArray(self.config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self._stiffness)
         array.take_gains(self._array)
         self._array, self._t = array, 0.0
 
@@ -248,95 +228,3 @@ class Presses:
             hz=(float(rng.uniform(0.05, 0.5)),),
         )
         return dwell, self.forces
-
-
-def _calibrated(seed: int, *, own_gains: bool) -> tuple[ArrayFit, TaxelConfig, float, Presses, Pad]:
-    """The fit of a random array, the array, the stiffness of its layer (N/m³), its presses and its pad."""
-    config, stiffness, rng = random_array(seed)
-    presses, pad = Presses(config, stiffness, rng), Pad(full_scale_pa=config.full_scale_pa, mount_radius_m=RADIUS_M)
-    fit = calibrate_array(
-        list(presses.protocol()),
-        pad=pad,
-        reference="scale",
-        reference_sigma=REFERENCE_SIGMA,
-        array=f"emulated, seed {seed}",
-        date="",
-        made_on="study arrays",
-        own_gains=own_gains,
-    )
-    return fit, config, stiffness, presses, pad
-
-
-def measure_forces(seed: int) -> list[Row]:
-    """Hold quadrics on one array, and read their forces with its own calibration and with another one: two rows."""
-    own, config, _, presses, pad = _calibrated(seed, own_gains=True)
-    other = _calibrated(seed + OTHER_ARRAY, own_gains=False)[0]
-    holds = [presses.held() for _ in range(HOLDS)]
-    return [
-        {
-            "array": seed,
-            "calibration": group,
-            "creep_percent": 100.0 * config.creep_per_decade,
-            "creep_found_percent": 100.0 * fit.calibration.force.creep,
-            **score_holds(fit.calibration, pad, holds),
-        }
-        for group, fit in zip(GROUPS, (own, other), strict=True)
-    ]
-
-
-def measure(seed: int) -> dict[str, Any]:
-    """Calibrate one array and press on it: a row of the table."""
-    fit, config, stiffness, presses, pad = _calibrated(seed, own_gains=True)
-    found = fit.calibration
-    patch = make_patch_calibration(found, pad)
-    model = make_image_model(found, patch, seen=WINDOW)
-    plain = PatchCalibration(pad, gains=found.gains)
-    forces, curvatures, moments = [], [], []
-    for _ in range(PRESSES):
-        dwell = presses.by_chance()
-        shown = what_is_shown(dwell, plain)
-        force = patch.force_gain * shown.total + patch.edge_gain * math.sqrt(shown.total)
-        assert dwell.force is not None
-        if not shown.usable or model.trust((dwell.kappa[0], 0.0, dwell.kappa[1]), force) < 1.0:
-            continue
-        forces.append(force / dwell.force - 1.0)
-        curvatures.append(curvature_errors(model, [(dwell, shown)], [force])[0])
-        moments.append(moment_errors(model, [(dwell, shown)], [force])[0, :2])
-    return {
-        "array": seed,
-        "full_scale_kpa": 1e-3 * config.full_scale_pa,
-        "stiffness_n_m3": stiffness,
-        "blur": config.blur_pitch,
-        "crosstalk": config.crosstalk,
-        "left_out": fit.left_out,
-        "force_percent": 100.0 * rms(np.array(forces)),
-        "stiffness_percent": 100.0 * (found.stiffness.moments / stiffness - 1.0),
-        "by_depth_percent": 100.0 * (found.stiffness.depth / stiffness - 1.0),
-        "moments_percent": 100.0 * rms(np.array(moments)),
-        "curvature_percent": 100.0 * rms(np.array(curvatures)),
-    }
-
-
-def findings(rows: Sequence[Row]) -> list[str]:
-    """RMS over the arrays, beside the goals."""
-    rms = {key: math.sqrt(float(np.mean([row[key] ** 2 for row in rows]))) for key in GOALS}
-    worst = {key: max(abs(row[key]) for row in rows) for key in GOALS}
-    return [
-        f"{key.removesuffix('_percent')}: RMS {rms[key]:.1f} % over {len(rows)} arrays, worst {worst[key]:.1f} %, goal"
-        f" {goal:g} %."
-        for key, goal in GOALS.items()
-    ]
-
-
-def draw_arrays(rows: Sequence[Row], path: Path) -> None:
-    """The three errors of each array beside their goals."""
-    title = (
-        "What a calibration by forty touches leaves: error of each of some emulated arrays, drawn at random; line: goal"
-    )
-    with picture(path, title, 3.6) as figure:
-        for axes, (key, goal) in zip(figure.subplots(1, 3), GOALS.items(), strict=True):
-            axes.bar([str(row["array"]) for row in rows], [abs(row[key]) for row in rows], color=BLUE)
-            axes.axhline(goal, color=INK, linewidth=0.8)
-            axes.set(title=key.removesuffix("_percent"), ylabel="%", xlabel="array")
-            axes.tick_params(axis="x", rotation=90)
-            axes.grid(visible=False, axis="x")
