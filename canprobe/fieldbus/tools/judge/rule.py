@@ -113,7 +113,7 @@ class Rule:
             return
         self.count += 1
         if len(self.findings) < _KEPT_FINDINGS:
-            shown = sorted({frame for frame in frames if frame is not None}, key=lambda frame: frame.t_ns)
+            shown = sorted(dict.fromkeys(frame for frame in frames if frame is not None), key=lambda frame: frame.t_ns)
             self.findings.append(RuleFinding(t_ns, node_id, what, tuple(shown)))
 
     def in_a_row(self, key: Hashable, bad: bool, wanted: int = 2) -> bool:
