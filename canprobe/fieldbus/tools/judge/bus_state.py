@@ -222,7 +222,7 @@ class BusState:
         node.addressed = True
         node.rpdo_counts[pdo.number] = node.rpdo_counts.get(pdo.number, 0) + 1
         values = _unpacked(pdo, frame)
-        before = {place: node.value(*place) if node.is_sure(place[0]) else node.number(*place) for place in values}
+        before = {place: node.sure_value(*place) for place in values}
         yield RpdoSeen(frame, node, pdo, values, before)
         yield from self._valued(node, values, frame, pdo, written=True)
 

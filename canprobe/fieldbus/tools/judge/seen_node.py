@@ -164,6 +164,10 @@ class SeenNode:
         entry = self._description.entry(index, subindex)
         return entry.initial if entry is not None and isinstance(entry.initial, int) else None
 
+    def sure_value(self, index: int, subindex: int = 0) -> int | None:
+        """The last value that passed, or that of the EDS where it is true of the device; None where neither is."""
+        return self.value(index, subindex) if self.is_sure(index) else self.number(index, subindex)
+
     def is_sure(self, index: int) -> bool:
         """Whether `value` is true of the device: it passed on the bus, the node has booted, or it is served here."""
         return self._served or self.booted or index in self._touched
