@@ -168,7 +168,7 @@ class FaultyNode(WrappedNode):
 
     def _begin(self, fault: Fault, t_ns: int) -> Sequence[Frame]:
         self.history.append((t_ns, "begins", fault))
-        effect = fault.kind.effect(fault, self)
+        effect = fault.kind(fault, self)
         effect.end_ns = t_ns + fault.duration_ns
         self._effects.append(effect)
         return effect.begin(t_ns)
