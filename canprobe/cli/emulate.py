@@ -40,7 +40,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_scene(parser, optional=True)
     add_options(parser, *BUS, "--realtime", "--seed")
     add_eds_nodes(parser, more="; 255: no id, the node waits for LSS")

@@ -233,7 +233,6 @@ class VirtualTimeBus(EmulatedBus):
         return PortNetwork(self.port())
 
     def port(self) -> Port:
-        """A port of the lockstep bus."""
         port = self._bus.port()
         self._stack.callback(port.close)
         return port
@@ -294,14 +293,12 @@ class ServedBus(EmulatedBus):
         self._start([0], partial(self._record, listener))
 
     def network(self) -> canopen.Network:
-        """A network with the thread of python-can."""
         network = RealTimeNetwork()
         network.connect(interface=self._interface, channel=self.channel, bitrate=self._bitrate)
         self._stack.callback(network.disconnect)
         return network
 
     def port(self) -> Port:
-        """A port of the interface."""
         port = open_port(self._interface, self.channel, self._bitrate, self.clock, waits=True)
         return self._stack.enter_context(closing(port))
 
@@ -323,7 +320,6 @@ class ServedBus(EmulatedBus):
             self._writer.flush()
 
     def _act(self, node_id: int, act: Callable[[], T]) -> T:
-        """Let the thread of the node do it, which looks for requests after each wait."""
         future: Future[T] = Future()
 
         def request() -> None:

@@ -42,11 +42,9 @@ class HeardPort(TappedPort):
         self._frames = frames
 
     def hear_sent(self, frames: Sequence[Frame], t_ns: int) -> None:
-        """Keep frames of the nodes."""
         self._frames += [BusFrame(t_ns, can_id, data, True) for can_id, data in frames]
 
     def hear_received(self, frames: Sequence[TimedFrame]) -> None:
-        """Keep frames of others."""
         self._frames += [BusFrame(t_ns, can_id, data, False) for can_id, data, t_ns in frames]
 
 

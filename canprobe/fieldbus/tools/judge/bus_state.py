@@ -11,6 +11,7 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.frames import (
     EMCY_BASE,
     HEARTBEAT_BASE,
+    NMT_GOALS,
     NMT_ID,
     RTR_FLAG,
     SDO_RX_BASE,
@@ -48,11 +49,6 @@ from canprobe.fieldbus.tools.judge.seen_node import (
     SeenNode,
 )
 
-_STATE_AFTER = {
-    NmtCommand.START: NmtState.OPERATIONAL,
-    NmtCommand.STOP: NmtState.STOPPED,
-    NmtCommand.PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
-}
 _STORE = 0x1010
 _ARBITRATION_BITS = 135
 """Length of the longest frame, for which another has to wait."""
@@ -167,7 +163,7 @@ class BusState:
         yield NmtSeen(frame, command, nodes, node_id == 0)  # the nodes are as they were before it
         for node in nodes:
             node.addressed = True
-            node.nmt, node.nmt_ns = _STATE_AFTER.get(command, NmtState.INITIALISING), frame.t_ns
+            node.nmt, node.nmt_ns = NMT_GOALS[command], frame.t_ns
             node.started_ns = frame.t_ns if command is NmtCommand.START else None
             node.syncs = 0
 
