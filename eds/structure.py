@@ -22,7 +22,6 @@ Subs = dict[int, Section]
 """Sections of the sub-objects of an object, by subindex."""
 _MAX_COMPACT_MEMBERS = 254
 _NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, _ARRAY, _RECORD = 0, 2, 5, 6, 7, 8, 9
-_OBJECT_CODES = frozenset({_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, _ARRAY, _RECORD})
 
 
 def find_objects(source: Source) -> tuple[dict[int, Section], dict[int, Subs]]:
