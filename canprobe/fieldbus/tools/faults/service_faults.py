@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
@@ -15,10 +14,10 @@ from canprobe.fieldbus.protocol.frames import (
     SDO_TX_BASE,
     Frame,
 )
+from canprobe.fieldbus.protocol.sdo import pack_abort, place_of
 from canprobe.fieldbus.tools.faults.fault import MOST, UNANSWERED, Effect, Parameter, error_code, in_ms, numbers
 from canprobe.fieldbus.tools.faults.frame_faults import Babble
 
-_ABORT = struct.Struct("<BHBI")
 _BOOT_UP = b"\0"
 _TOGGLE_FLAG = 0x10
 _SEGMENT_ANSWERS = (0, 1)  # server command specifiers: upload segment, download segment
@@ -91,9 +90,10 @@ class ObjectAborted(Effect):
         can_id, data = frame
         if can_id != SDO_RX_BASE + self.node.node_id or len(data) != CLASSIC_BYTES:
             return None
-        if data[0] >> 5 not in _INITIATE_REQUESTS or int.from_bytes(data[1:3], "little") != self.index(data):
+        index, subindex = place_of(data)
+        if data[0] >> 5 not in _INITIATE_REQUESTS or index != self.index(data):
             return None
-        self.host.say((SDO_TX_BASE + self.node.node_id, _ABORT.pack(0x80, self.index(data), data[3], self.code)))
+        self.host.say((SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
         return ()
 
     def index(self, data: bytes) -> int:
@@ -165,7 +165,7 @@ class SdoWrongObject(SdoAnswer):
     fails = "47 77 82 92"
 
     def changed(self, data: bytes) -> bytes | None:
-        index = (int.from_bytes(data[1:3], "little") + 1) & 0xFFFF
+        index = (place_of(data)[0] + 1) & 0xFFFF
         return data[:1] + index.to_bytes(2, "little") + data[3:] if data[0] >> 5 in _INITIATE_ANSWERS else None
 
 

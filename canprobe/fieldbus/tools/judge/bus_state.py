@@ -20,7 +20,8 @@ from canprobe.fieldbus.protocol.frames import (
     NmtCommand,
     NmtState,
 )
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.protocol.sdo import Place
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import (
     AnswerSeen,
     BusEvent,

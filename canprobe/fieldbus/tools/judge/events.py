@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.protocol.sdo import Place
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.seen_node import PdoView, SeenNode
 
 

@@ -7,7 +7,8 @@ from itertools import pairwise
 
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, place_text
+from canprobe.fieldbus.protocol.sdo import place_text
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import BusEvent, RequestSeen, RpdoSeen, StatusSeen, SyncSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity, Watch
 from canprobe.fieldbus.tools.judge.seen_node import (
@@ -59,7 +60,7 @@ class ZeroFilled(Rule):
                     continue
                 shown = node.known(MODE_DISPLAY) if index == MODE else None
                 if was := (shown.value if shown is not None else event.before[place]):
-                    what = f"{place_text(place)} is 0 in the first RPDO {event.pdo.number}; it was {was}"
+                    what = f"{place_text(*place)} is 0 in the first RPDO {event.pdo.number}; it was {was}"
                     self.blame(node, what, shown, event)
 
     def _judge_target(self, node: SeenNode, first: BusFrame) -> None:
@@ -107,7 +108,7 @@ class WrittenWhileOperational(Rule):
                 continue
             self.looked += 1
             if node.operational and event.frame.t_ns - node.nmt_ns > QUEUED_NS:
-                self.blame(node, f"{place_text(event.place)} is written while the node is operational", event)
+                self.blame(node, f"{place_text(*event.place)} is written while the node is operational", event)
 
 
 class RemappedWhileValid(Rule):
@@ -131,7 +132,7 @@ class RemappedWhileValid(Rule):
             if valid or count:
                 why = f"{parameters:04X}h:01 is {cob_id:08X}h, valid" if valid else f"{index:04X}h:00 is {count}, not 0"
                 shown = node.known(parameters, 1) if valid else node.known(index)
-                self.blame(node, f"{place_text(event.place)} is written while {why}", shown, event)
+                self.blame(node, f"{place_text(*event.place)} is written while {why}", shown, event)
 
 
 class LengthNotMapping(Rule):

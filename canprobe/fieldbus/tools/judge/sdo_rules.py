@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place, place_text
+from canprobe.fieldbus.protocol.sdo import Place, place_text
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.enable import enables
 from canprobe.fieldbus.tools.judge.events import AbortSeen, AnswerSeen, ControlSeen, RequestSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity, Watch
@@ -32,7 +33,7 @@ class AbortPassedOver(Rule):
             elif enables(event):
                 self.looked += 1
                 for place, abort in aborts.items():
-                    what = f"enables after the write to {place_text(place)} was aborted with {abort.code:08X}h"
+                    what = f"enables after the write to {place_text(*place)} was aborted with {abort.code:08X}h"
                     self.blame(node, what, abort.request, abort, event)
                 aborts.clear()
 
@@ -54,7 +55,7 @@ class PollsEachCycle(Rule):
             before, now = last.get(event.place), self.bus.sync_count
             last[event.place] = now
             if before != now and self.in_a_row((node, event.place), before == now - 1, self._WANTED):
-                self.blame(node, f"{place_text(event.place)} was read in {self._WANTED} periods in a row", event)
+                self.blame(node, f"{place_text(*event.place)} was read in {self._WANTED} periods in a row", event)
 
 
 class TimeoutTooShort(Rule):
@@ -110,10 +111,10 @@ class AbortWithoutObject(Rule):
             if event.place is None and over is None and not node.booted:
                 continue
             self.looked += 1
-            named = place_text(event.named)
+            named = place_text(*event.named)
             if event.place is not None:
                 if event.named != event.place:
-                    what = f"the abort of the transfer of {place_text(event.place)} names {named}"
+                    what = f"the abort of the transfer of {place_text(*event.place)} names {named}"
                     self.blame(node, what, event.request, event)
             elif over is None or over[0] != event.named or event.frame.t_ns - over[1].t_ns > QUEUED_NS:
                 what = f"an abort that names {named}, and no transfer is open"

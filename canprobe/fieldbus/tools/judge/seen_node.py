@@ -12,7 +12,8 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode, known_state
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, NmtState
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.protocol.sdo import Place
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 
 CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY = 0x6040, 0x6041, 0x6060, 0x6061
 POSITION, VELOCITY, TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE = 0x6064, 0x606C, 0x607A, 0x60FF, 0x6071

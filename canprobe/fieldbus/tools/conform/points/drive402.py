@@ -19,12 +19,13 @@ from canprobe.fieldbus.protocol.cia402 import (
     describe_state,
     known_state,
 )
+from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import CONTROLWORD, STATUSWORD
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused, pack_write
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
 point = PointGroup("drive402")
 AUTOMATON = "CiA 402-2, finite state automaton"

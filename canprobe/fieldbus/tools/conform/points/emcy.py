@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, NmtCommand
+from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import pack_request, pack_write
 
 point = PointGroup("emcy")
 _INHIBIT_MS = 200
@@ -66,7 +66,7 @@ def empty_entry(bench: Bench) -> None:
     bench.need((0x1003, 0), written=False)
     beyond = bench.number(0x1003) + 1
     codes = (*accepted.NO_DATA, *accepted.NO_SUBINDEX)
-    bench.must_refuse(pack_request(0x40, 0x1003, beyond), codes, f"read of 1003h:{beyond:02X}, which is empty")
+    bench.must_refuse(pack_read(0x1003, beyond), codes, f"read of 1003h:{beyond:02X}, which is empty")
 
 
 @point(42, "clearing the history", "CiA 301, 1003h", "0 to 1003h:00 empties it")

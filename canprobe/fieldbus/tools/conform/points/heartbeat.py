@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
+from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import pack_write
 
 point = PointGroup("heartbeat")
 _PERIOD_MS, _CONSUMED_MS, _GUARD_MS, _LIFE_FACTOR = 50, 200, 100, 2

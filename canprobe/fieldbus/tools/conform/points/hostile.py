@@ -17,13 +17,13 @@ from canprobe.fieldbus.protocol.frames import (
     NmtState,
 )
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
+from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request
 
 point = PointGroup("hostile")
-_READ_TYPE = pack_request(0x40, 0x1000, 0)
+_READ_TYPE = pack_read(0x1000)
 _FD_BYTES = 12
 _PACE_S = 0.02
 
@@ -87,7 +87,7 @@ def every_command(bench: Bench) -> None:
         frame = bench.next(answer_id, _PACE_S)
         if frame is not None and len(frame.data) != 8:
             bench.deviates(f"command {command:02X}h is answered with {len(frame.data)} bytes")
-    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, 0x1000, 0, bytes.fromhex("00000008")))
+    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(0x1000, 0, 0x08000000))
     while not bench.is_silent():
         pass  # answers that come late
     bench.serves("all command bytes")

@@ -12,16 +12,16 @@ from canprobe.fieldbus.protocol.frames import (
     NmtCommand,
     NmtState,
 )
+from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted, PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import pack_request
 
 point = PointGroup("nmt")
 _STATES = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
-_READ_TYPE = pack_request(0x40, 0x1000, 0)
+_READ_TYPE = pack_read(0x1000)
 _QUEUED_NS = 5_000_000
 _PACE_S = 0.02
 

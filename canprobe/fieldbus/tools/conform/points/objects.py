@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
+from canprobe.fieldbus.protocol.sdo import ABORT, pack_read, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
-from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_request, pack_write
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
 point = PointGroup("objects")
 _MANDATORY = ((0x1000, 0), (0x1001, 0), (0x1018, 1))
@@ -70,7 +70,7 @@ def write_every_read_only(bench: Bench) -> None:
 @point(79, "sub-index FFh", "CiA 301, structure of an object", "four bytes, or " + accepted_text(accepted.NO_ENTRY))
 def structure(bench: Bench) -> None:
     """Sub-index FFh of the identity."""
-    answer = bench.ask(pack_request(0x40, 0x1018, 0xFF))
+    answer = bench.ask(pack_read(0x1018, 0xFF))
     if answer[0] == ABORT:
         bench.check_abort(answer, accepted.NO_ENTRY, "read of 1018h:FF")
     elif answer[0] not in (0x43, 0x42):
@@ -112,7 +112,7 @@ def pdos_of_the_eds(bench: Bench) -> None:
                 if bench.device.described(*place) is not None and not bench.device.has(*place):
                     bench.deviates(f"the device has no {place_text(*place)}, which the EDS describes")
         beyond = area[max(numbers, default=0)]
-        bench.must_refuse(pack_request(0x40, beyond, 1), accepted.NO_OBJECT, f"read of {beyond:04X}h:01")
+        bench.must_refuse(pack_read(beyond, 1), accepted.NO_OBJECT, f"read of {beyond:04X}h:01")
 
 
 @point(86, "SYNC identifier", "CiA 301, 1005h", "080h, bit 30 as it may be")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.protocol.sdo import ABORT, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -20,7 +21,7 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
 )
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_write
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
 point = PointGroup("pdo")
 MAPPING = "CiA 301, PDO mapping"

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE
+from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request, pack_write
 
 point = PointGroup("sdo")
 CODES = "CiA 301, SDO abort codes"
@@ -36,7 +35,7 @@ def read_write_only(bench: Bench) -> None:
     if not entries:
         raise PointNotApplicable("the EDS describes no entry as wo")
     for entry in entries:
-        request = pack_request(0x40, entry.index, entry.subindex)
+        request = pack_read(entry.index, entry.subindex)
         bench.must_refuse(request, accepted.WRITE_ONLY, f"read of {place_text(entry.index, entry.subindex)}")
 
 
@@ -45,7 +44,7 @@ def absent_object(bench: Bench) -> None:
     """Reads of indices that the device does not have."""
     for index in _ABSENT:
         if bench.device.described(index) is None:
-            bench.must_refuse(pack_request(0x40, index, 0), accepted.NO_OBJECT, f"read of {index:04X}h")
+            bench.must_refuse(pack_read(index), accepted.NO_OBJECT, f"read of {index:04X}h")
 
 
 @point(13, "absent sub-index", CODES, accepted_text(accepted.NO_SUBINDEX))
@@ -53,7 +52,7 @@ def absent_subindex(bench: Bench) -> None:
     """1018h beyond its highest sub-index: a read, and a write of zeros."""
     bench.need((0x1018, 0), written=False)
     beyond = bench.device.number(0x1018) + 1
-    bench.must_refuse(pack_request(0x40, 0x1018, beyond), accepted.NO_SUBINDEX, f"read of 1018h:{beyond:02X}")
+    bench.must_refuse(pack_read(0x1018, beyond), accepted.NO_SUBINDEX, f"read of 1018h:{beyond:02X}")
     bench.must_refuse(pack_write(0x1018, beyond, bytes(4)), accepted.NO_SUBINDEX, f"write to 1018h:{beyond:02X}")
 
 
@@ -120,7 +119,7 @@ def further_channels(bench: Bench) -> None:
     """Channels that the EDS does not describe are not there."""
     for index in (0x1201, 0x1202, 0x1240, 0x127F):
         if bench.device.described(index) is None and bench.device.described(index, 1) is None:
-            bench.must_refuse(pack_request(0x40, index, 0), accepted.NO_OBJECT, f"read of {index:04X}h")
+            bench.must_refuse(pack_read(index), accepted.NO_OBJECT, f"read of {index:04X}h")
 
 
 @point(24, "two channels", "CiA 301, 1200h to 127Fh", "transfers on two channels do not disturb each other")
@@ -132,11 +131,11 @@ def two_channels(bench: Bench) -> None:
         raise PointNotApplicable("channel 1201h is not in use")
     name = bench.device.values.get((0x1008, 0), b"")
     answer = bench.request(0x40, 0x1008)
-    bench.send(request_id, pack_request(0x40, 0x1000, 0))
+    bench.send(request_id, pack_read(0x1000))
     frame = bench.next(answer_id, bench.times.sdo_s)
     if frame is None or frame.data != bench.first_answer:
         bench.deviates("no answer with 1000h on the channel of 1201h")
     segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]
     if segment and segment != name[:7].ljust(7, b"\0"):
         bench.deviates("a segment of 1008h is wrong after a transfer on the other channel")
-    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, 0x1008, 0, bytes.fromhex("00000008")))
+    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(0x1008, 0, 0x08000000))

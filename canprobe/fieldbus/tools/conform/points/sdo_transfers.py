@@ -8,12 +8,12 @@ from __future__ import annotations
 from binascii import crc_hqx
 
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
+from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_abort, pack_request
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import AbortSet, accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request
 
 point = PointGroup("sdo")
 SEGMENTS = "CiA 301, SDO segmented transfer"
@@ -47,7 +47,7 @@ def _segment(value: bytes, toggle: int = 0, *, last: bool = True) -> bytes:
 
 def _abort(bench: Bench) -> None:
     """End the transfer from the client's side."""
-    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, _HEARTBEAT, 0, bytes.fromhex("00000008")))
+    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(_HEARTBEAT, 0, 0x08000000))
 
 
 def _own_value(bench: Bench) -> bytes:
@@ -157,7 +157,7 @@ def segmented_download(bench: Bench) -> None:
 def _block_answer(bench: Bench, request: bytes) -> bytes:
     """Begin a block transfer; where the device has none, the point does not apply."""
     answer = bench.ask(request)
-    if answer[0] == ABORT and int.from_bytes(answer[4:], "little") == _COMMAND_UNSUPPORTED:
+    if answer[0] == ABORT and abort_code(answer) == _COMMAND_UNSUPPORTED:
         raise PointNotApplicable("the device has no block transfer (05040001h)")
     return answer
 

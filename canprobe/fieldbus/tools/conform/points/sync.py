@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
 from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync, synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.pdo import syncs
-from canprobe.fieldbus.tools.conform.sdo_client import pack_write
 
 point = PointGroup("sync")
 _PERIOD_US = 100_000

@@ -6,10 +6,10 @@ from itertools import pairwise
 
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE, NmtCommand
 from canprobe.fieldbus.protocol.response_times import NS_PER_S
+from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.sdo_client import pack_request
 
 point = PointGroup("timing")
 SDO_TIME, SYNC_TIME, HEARTBEAT_TIME = "SDO answer", "SYNC to TPDO", "heartbeat period"
@@ -31,7 +31,7 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     times: list[float] = []
     for _ in range(count):
         bench.taken(SDO_TX_BASE + bench.node_id)
-        t_ns = bench.send(SDO_RX_BASE + bench.node_id, pack_request(0x40, 0x1000, 0))
+        t_ns = bench.send(SDO_RX_BASE + bench.node_id, pack_read(0x1000))
         frame = bench.next(SDO_TX_BASE + bench.node_id, bench.times.sdo_s)
         if frame is None or frame.data != bench.first_answer:
             bench.deviates(f"read {len(times) + 1} of {count} of 1000h is not answered within {bench.times.sdo_s:g} s")
