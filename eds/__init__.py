@@ -8,9 +8,8 @@ The stages, each in its module:
     source        one file while it is read: its sections, and the findings so far
     numbers       texts → numbers, sums with $NODEID, flags
     structure     sections → objects: the order of everything below; arrays and records, also in the compact form
-    data_types    the data type of a variable: as stated, as its editor defined it, or as the standard demands
     values        default, parameter value and limits by data type
-    variables     one section → one variable
+    variables     one section → one variable; its data type as stated, as the editor defined it, or as is demanded
     object_lists  the lists of objects against the objects that the file describes
     device_info   [DeviceInfo], [Comments], [DeviceComissioning]
     mandatory     what the standards fix about objects that a node cannot do without

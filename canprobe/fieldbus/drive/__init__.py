@@ -12,8 +12,7 @@ table of states in `protocol.cia402` and runs one mode at a time.
     loop                    torque limit and feed-forwards, given to the plant's position loop
     self_stop               what makes a drive stop by itself
     mode                    what all modes share
-    cyclic_position, cyclic_velocity, cyclic_torque   modes with a target for every SYNC
-    interpolated_position   the same by 60C1h
+    cyclic_modes            modes with a target for every SYNC: position, velocity, torque, interpolated position
     profile_position        set-points by handshake, each a trapezoidal move
     homing                  limit switches, index pulses, or the present position
     profile                 trapezoids and other motion as pieces of constant acceleration

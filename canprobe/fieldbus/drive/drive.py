@@ -14,11 +14,8 @@ from functools import partial
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.fieldbus.drive.cyclic_position import CyclicPosition
-from canprobe.fieldbus.drive.cyclic_torque import CyclicTorque
-from canprobe.fieldbus.drive.cyclic_velocity import CyclicVelocity
+from canprobe.fieldbus.drive.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, InterpolatedPosition
 from canprobe.fieldbus.drive.homing import HomingMode
-from canprobe.fieldbus.drive.interpolated_position import InterpolatedPosition
 from canprobe.fieldbus.drive.mode import DriveMode, DriveParts
 from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
