@@ -92,11 +92,6 @@ class BusState:
         times = list(self.syncs_ns)
         return round(median(b - a for a, b in pairwise(times)))
 
-    @property
-    def some_enabled(self) -> bool:
-        """Whether a drive is in operation enabled."""
-        return any(node.enabled for node in self.nodes.values())
-
     def take(self, frame: BusFrame) -> Iterator[BusEvent]:
         """Take a frame and yield what it means, all of which must be consumed before the next one.
 
