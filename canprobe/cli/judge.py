@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.argument_types import seconds, word
-from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_options, add_scene, add_verbosity
+from canprobe.cli.argument_types import seconds
+from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_inject, add_options, add_scene, add_verbosity
 from canprobe.cli.emulate import eds_files, scene_target
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_json, print_table, say
@@ -68,14 +68,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"
     )
-    parser.add_argument(
-        "--inject",
-        metavar="FAULT",
-        action="append",
-        default=[],
-        type=word,
-        help="throw this fault in the place of the sequence; may be repeated; `canprobe inject --list` lists them",
-    )
+    add_inject(parser, "throw this fault in the place of the sequence")
     parser.add_argument("--passive", action="store_true", help="throw no faults")
     parser.add_argument(
         "--without",

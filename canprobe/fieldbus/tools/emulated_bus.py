@@ -6,7 +6,6 @@ serves the nodes and another one writes the log; the master under test may live 
 
 from __future__ import annotations
 
-import re
 import struct
 import threading
 import time
@@ -37,6 +36,7 @@ from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.serve import serve
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
+from canprobe.fieldbus.tools.faults.text import node_of
 
 T = TypeVar("T")
 Requests = SimpleQueue[Callable[[], None]]
@@ -98,9 +98,7 @@ class EmulatedBus(ABC):
         Raises:
             UsageError: the text is wrong, there is no such node, or the kind needs another device.
         """
-        match = re.match(r"\s*node\s+(\d+)", text)
-        node_id = int(match[1]) if match else 0
-        return self._act(node_id, lambda: self.faulty.inject(text, self.clock.now_ns()))
+        return self._act(node_of(text), lambda: self.faulty.inject(text, self.clock.now_ns()))
 
     def end(self, fault: Fault) -> None:
         """End a fault at the next frame or deadline of its node."""

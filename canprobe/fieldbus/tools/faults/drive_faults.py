@@ -39,8 +39,7 @@ class DriveFault(DriveEffect):
     clause, reaction = "CiA 402-2, 605Eh, 603Fh", "stops the others; resets by an edge only"
     trips = "drive_fault"
     parameters = numbers(
-        code=error_code(0x4310, "error code"),
-        resettable=Parameter(1, 0, 1, "0: it comes back after a reset"),
+        code=error_code(0x4310, "error code"), resettable=Parameter(1, 0, 1, "0: it comes back after a reset")
     )
 
     def begin(self, t_ns: int) -> Sequence[Frame]:

@@ -210,8 +210,7 @@ class EmcyStorm(Babble):
     clause, reaction = "CiA 301, 1015h", "counts, and stays below the load"
     trips, fails = "emcy_communication", MOST
     parameters = numbers(
-        gap_ms=in_ms(1, "time between two messages, ms"),
-        code=error_code(0x8210, "emergency error code"),
+        gap_ms=in_ms(1, "time between two messages, ms"), code=error_code(0x8210, "emergency error code")
     )
     _present = False
 

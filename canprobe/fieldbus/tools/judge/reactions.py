@@ -25,12 +25,7 @@ from canprobe.fieldbus.tools.judge.targets import Onward
 _COMMUNICATION = (0x81, 0x82)
 """High bytes of codes on communication, after which a node may go on."""
 _FAULTY = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
-_DOWN = (
-    DriveCommand.DISABLE_VOLTAGE,
-    DriveCommand.QUICK_STOP,
-    DriveCommand.SHUTDOWN,
-    DriveCommand.DISABLE_OPERATION,
-)
+_DOWN = (DriveCommand.DISABLE_VOLTAGE, DriveCommand.QUICK_STOP, DriveCommand.SHUTDOWN, DriveCommand.DISABLE_OPERATION)
 _SECOND_NS = 1_000_000_000
 
 

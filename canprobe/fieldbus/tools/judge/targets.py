@@ -5,14 +5,7 @@ from __future__ import annotations
 from canprobe.fieldbus.protocol.cia402 import FOLLOWING_ERROR_BIT, HALT_BIT, DriveCommand, OperationMode, command_of
 from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.events import (
-    ControlSeen,
-    ModeSeen,
-    NmtSeen,
-    RpdoSeen,
-    StatusSeen,
-    TargetSeen,
-)
+from canprobe.fieldbus.tools.judge.events import ControlSeen, ModeSeen, NmtSeen, RpdoSeen, StatusSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity, Watch
 from canprobe.fieldbus.tools.judge.seen_node import (
     CONTROLWORD,
