@@ -10,7 +10,7 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
-from canprobe.fieldbus.tools.judge.rule import Charges, Rule, Watch
+from canprobe.fieldbus.tools.judge.rule import Rule, Watch
 from canprobe.fieldbus.tools.judge.rules import NO_RULES, RULES
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.judge.sync_rules import IrregularSync
@@ -46,7 +46,7 @@ class Judge:
         without: Collection[int] = (),
     ) -> None:
         self.bus = BusState(nodes, served=served, bitrate=bitrate)
-        charges = Charges(list(charges_ns))
+        charges = list(charges_ns)
         self.rules: list[Rule] = [rule(self.bus, charges) for rule in RULES if rule.number not in without]
         self._left_out = [(f"{r.number:02} {r.name}", "left out on request") for r in RULES if r.number in without]
         self.frame_count = 0

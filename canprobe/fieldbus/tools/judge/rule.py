@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Hashable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from types import NoneType
 from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
@@ -50,26 +50,15 @@ class RuleFinding:
     frames: tuple[BusFrame, ...]
 
 
-@dataclass(slots=True)
-class Charges:
-    """Times in which what happens is charged to a fault that was thrown, not to the master.
-
-    Attributes:
-        spans_ns: begin and end of each.
-    """
-
-    spans_ns: list[tuple[int, int]] = field(default_factory=list)
-
-    def cover(self, t_ns: int) -> bool:
-        """Whether a time is charged to a fault."""
-        return any(begin <= t_ns <= end + CHARGED_NS for begin, end in self.spans_ns)
-
-
 class Rule:
     """One rule, which follows each node by itself; a `BusRule` follows the whole bus.
 
     Subclasses set the class attributes and write `watch`: a generator that gets the events one after the other, each
     when the state of the bus has it already. What the rule remembers are the variables of the generator.
+
+    Args:
+        bus: state of the bus.
+        charges_ns: begin and end of each fault of ours; what happens meanwhile is charged to it, not to the master.
 
     Attributes:
         number: number of the fault, stable.
@@ -95,12 +84,12 @@ class Rule:
     answers: ClassVar[bool] = False
     watch: Callable[..., Watch[Any]]
 
-    def __init__(self, bus: BusState, charges: Charges) -> None:
+    def __init__(self, bus: BusState, charges_ns: Sequence[tuple[int, int]]) -> None:
         self.bus = bus
         self.looked = 0
         self.count = 0
         self.findings: list[RuleFinding] = []
-        self._charges = charges
+        self._charges_ns = charges_ns
         self._runs: Counter[Hashable] = Counter()
 
     def watches(self) -> Iterable[tuple[SeenNode | None, Watch[Any]]]:
@@ -114,21 +103,24 @@ class Rule:
 
     def blame(self, node: SeenNode | None, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
         """Note a finding at the present time, with the frames that show it."""
-        t_ns = self.bus.now_ns
-        if not self.answers and self._charges.cover(t_ns):
+        if self._is_excused():
             return
         self.count += 1
         if len(self.findings) < _KEPT_FINDINGS:
             frames = dict.fromkeys(one if isinstance(one, BusFrame) else one.frame for one in shown if one is not None)
             ordered = tuple(sorted(frames, key=lambda frame: frame.t_ns))
-            self.findings.append(RuleFinding(t_ns, node.node_id if node is not None else None, what, ordered))
+            node_id = node.node_id if node is not None else None
+            self.findings.append(RuleFinding(self.bus.now_ns, node_id, what, ordered))
 
     def in_a_row(self, key: Hashable, bad: bool, wanted: int = 2) -> bool:
         """Count what is bad in a row; whether it has just become `wanted`. While a fault excuses it nothing counts."""
         self.looked += 1
-        excused = bad and not self.answers and self._charges.cover(self.bus.now_ns)
-        self._runs[key] = self._runs[key] + 1 if bad and not excused else 0
+        self._runs[key] = self._runs[key] + 1 if bad and not self._is_excused() else 0
         return self._runs[key] == wanted
+
+    def _is_excused(self) -> bool:
+        spans = () if self.answers else self._charges_ns
+        return any(begin <= self.bus.now_ns <= end + CHARGED_NS for begin, end in spans)
 
 
 class BusRule(Rule):
