@@ -2,7 +2,7 @@
 
 Live tools never delay a cycle: `process` is an observer that packs the cell's measurements (`codec`) and hands them to
 a separate process by a bounded queue (`pipe_queue`); `worker` is that process. There `sampling` makes one neutral
-`sample.Sample` in SI units of each observation, with the tree of `frames` and the `node_states`. It goes into a sink:
+`sample.Sample` in SI units of each observation, with the tree of `frames` and the states of the nodes. It goes into:
 
     mcap_file, foxglove_live, ros2_dds   ROS 2 `messages` on `topics` into a file, a WebSocket, DDS (`dds_types`)
     view/                                three dimensions in a browser

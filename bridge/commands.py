@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.load import dump_scene, parse_scene
+from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks import Trajectory
 from canprobe.errors import UsageError
@@ -34,11 +33,11 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
         return f'task.kind = "{task.kind}" has none'
     if value is None or not math.isfinite(value):
         return f"expected a number, got {value}"
-    changed = replace(task, force_n=value) if kind == "target_force_n" else replace(task, speed_mm_s=value * 1e3)
+    changed = {"task.force_n": value} if kind == "target_force_n" else {"task.speed_mm_s": value * 1e3}
     try:
-        make_plan(resolve(parse_scene(dump_scene(replace(plan.scene, task=changed)))))
+        make_plan(resolve(load_scene(plan.scene, changed)))
     except UsageError as error:
-        return str(error).splitlines()[0].removeprefix("scene: ")
+        return str(error).splitlines()[0].removeprefix(f"{plan.scene.name} as changed: ")
     return None
 
 

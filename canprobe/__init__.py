@@ -6,48 +6,46 @@ Public names are imported when they are first used, so that `import canprobe` co
 from __future__ import annotations
 
 import importlib
-import sys
 from typing import TYPE_CHECKING, Any
 
-from canprobe.moved import MovedModules
-
-if TYPE_CHECKING:
-    from canprobe.api import open_cell, plan, run
-    from canprobe.cell.master.controller import Command, Controller, Measurement
-    from canprobe.cell.recorded.reestimate import ReplayResult, replay
-    from canprobe.cell.results.contacts import Contacts
-    from canprobe.cell.results.files import load_table
-    from canprobe.cell.results.result import RunResult
-    from canprobe.cell.results.surface_file import load_surface_map
-    from canprobe.cell.results.traffic import measure_traffic
-    from canprobe.cell.scene.load import load_scene
-    from canprobe.errors import (
-        BusError,
-        CanprobeError,
-        EdsError,
-        InterfaceError,
-        NodeError,
-        PlanError,
-        ProtocolError,
-        ResultsError,
-        SafetyStop,
-        SceneError,
-        StudyError,
-        UsageError,
-    )
-    from canprobe.lab.studies.many import Runs, run_many
-    from canprobe.mechanics.touch.contact import ContactSample
-    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-    from canprobe.mechanics.touch.estimate.fit import fit_surface
-    from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-    from canprobe.mechanics.touch.map.fit import fit_map
-    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-    from canprobe.mechanics.touch.surface import SurfaceMatrix
+if TYPE_CHECKING:  # for type checkers, which do not read the table
+    from canprobe.api import open_cell as open_cell
+    from canprobe.api import plan as plan
+    from canprobe.api import run as run
+    from canprobe.cell.master.controller import Command as Command
+    from canprobe.cell.master.controller import Controller as Controller
+    from canprobe.cell.master.controller import Measurement as Measurement
+    from canprobe.cell.recorded.reestimate import ReplayResult as ReplayResult
+    from canprobe.cell.recorded.reestimate import replay as replay
+    from canprobe.cell.results.contacts import Contacts as Contacts
+    from canprobe.cell.results.files import load_table as load_table
+    from canprobe.cell.results.result import RunResult as RunResult
+    from canprobe.cell.results.surface_file import load_surface_map as load_surface_map
+    from canprobe.cell.results.traffic import measure_traffic as measure_traffic
+    from canprobe.cell.scene.load import load_scene as load_scene
+    from canprobe.errors import BusError as BusError
+    from canprobe.errors import CanprobeError as CanprobeError
+    from canprobe.errors import EdsError as EdsError
+    from canprobe.errors import InterfaceError as InterfaceError
+    from canprobe.errors import NodeError as NodeError
+    from canprobe.errors import PlanError as PlanError
+    from canprobe.errors import ProtocolError as ProtocolError
+    from canprobe.errors import ResultsError as ResultsError
+    from canprobe.errors import SafetyStop as SafetyStop
+    from canprobe.errors import SceneError as SceneError
+    from canprobe.errors import StudyError as StudyError
+    from canprobe.errors import UsageError as UsageError
+    from canprobe.lab.studies.many import Runs as Runs
+    from canprobe.lab.studies.many import run_many as run_many
+    from canprobe.mechanics.touch.contact import ContactSample as ContactSample
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate as SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.fit import fit_surface as fit_surface
+    from canprobe.mechanics.touch.estimate.likelihood import cramer_rao as cramer_rao
+    from canprobe.mechanics.touch.map.fit import fit_map as fit_map
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap as SurfaceMap
+    from canprobe.mechanics.touch.surface import SurfaceMatrix as SurfaceMatrix
 
 __version__ = "0.2.0"
-
-sys.meta_path.insert(0, MovedModules())
-
 _MODULES = {
     "canprobe.api": ("open_cell", "plan", "run"),
     "canprobe.cell.master.controller": ("Command", "Controller", "Measurement"),
@@ -71,57 +69,17 @@ _MODULES = {
     "canprobe.cell.results.result": ("RunResult",),
     "canprobe.cell.results.traffic": ("measure_traffic",),
 }
-_EXPORTS = {name: (module, name) for module, names in _MODULES.items() for name in names}
-
-__all__ = [
-    "BusError",
-    "CanprobeError",
-    "Command",
-    "ContactSample",
-    "Contacts",
-    "Controller",
-    "EdsError",
-    "InterfaceError",
-    "Measurement",
-    "NodeError",
-    "PlanError",
-    "ProtocolError",
-    "ReplayResult",
-    "ResultsError",
-    "RunResult",
-    "Runs",
-    "SafetyStop",
-    "SceneError",
-    "StudyError",
-    "SurfaceEstimate",
-    "SurfaceMap",
-    "SurfaceMatrix",
-    "UsageError",
-    "__version__",
-    "cramer_rao",
-    "fit_map",
-    "fit_surface",
-    "load_scene",
-    "load_surface_map",
-    "load_table",
-    "measure_traffic",
-    "open_cell",
-    "plan",
-    "replay",
-    "run",
-    "run_many",
-]
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604 - they are strings
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use (PEP 562)."""
-    if name not in _EXPORTS:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'canprobe' has no attribute {name!r}")
-    module, attribute = _EXPORTS[name]
-    value = getattr(importlib.import_module(module), attribute)
-    globals()[name] = value
+    value = globals()[name] = getattr(importlib.import_module(_MODULE_OF[name]), name)
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_EXPORTS})
+    return sorted({*globals(), *_MODULE_OF})

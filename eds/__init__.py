@@ -7,11 +7,9 @@ The stages, each in its module:
     sections      bytes → sections and keys, each with its line
     source        one file while it is read: its sections, and the findings so far
     numbers       texts → numbers, sums with $NODEID, flags
-    structure     sections → objects: the order of everything below
-    data_types    the data type of a variable: as stated, as its editor defined it, or as the standard demands
+    structure     sections → objects: the order of everything below; arrays and records, also in the compact form
     values        default, parameter value and limits by data type
-    variables     one section → one variable
-    records       sections → arrays and records, also in the compact form
+    variables     one section → one variable; its data type as stated, as the editor defined it, or as is demanded
     object_lists  the lists of objects against the objects that the file describes
     device_info   [DeviceInfo], [Comments], [DeviceComissioning]
     mandatory     what the standards fix about objects that a node cannot do without

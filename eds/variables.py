@@ -1,21 +1,36 @@
 """Builds a variable of the dictionary from a section of an EDS file: data type, values and limits.
 
-Source: CiA 306-1, "Object description".
+Source: CiA 306-1, "Object description"; CiA 301, "Data types".
 """
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from canprobe.fieldbus.eds.data_types import data_type_of
-from canprobe.fieldbus.eds.mandatory import CHOICE_INDICES, decides, standard_access
-from canprobe.fieldbus.eds.numbers import parse_flag, parse_sum
+from canprobe.fieldbus.eds.mandatory import CHOICE_INDICES, U8, USUAL_TYPES, decides, standard_access, standard_type
+from canprobe.fieldbus.eds.numbers import parse_flag, parse_integer, parse_sum
 from canprobe.fieldbus.eds.sections import Section
 from canprobe.fieldbus.eds.source import Source
-from canprobe.fieldbus.eds.values import TEXT_TYPES, convert, convert_limit, name_of
+from canprobe.fieldbus.eds.values import (
+    FOREIGN_TYPE_NUMBERS,
+    KNOWN_TYPES,
+    TEXT_TYPES,
+    TYPE_NUMBERS,
+    convert,
+    convert_limit,
+    name_of,
+)
 
+_OBJECT_DOMAIN = 2
+_OTHER_TYPES = {
+    range(0x20, 0x24): "is a record of CiA 301, not the type of one value",
+    range(0x40, 0x60): "is a type of the manufacturer, which this file does not define",
+    range(0x60, 0x260): "is a type of a device profile, which this file does not define",
+}
+"""Data types beyond `KNOWN_TYPES`. Source: CiA 301, "Object dictionary data types"."""
 _ACCESS_TYPES = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly": "wo", "readwrite": "rw", "c": "const"}
 
@@ -29,7 +44,7 @@ def build_variable(source: Source, section: Section, index: int, subindex: int, 
         index, subindex: place of the variable.
         composite: whether it is part of an array or record.
     """
-    known = data_type_of(source, section, index, subindex, composite)
+    known = _data_type_of(source, section, index, subindex, composite)
     data_type = int(datatypes.DOMAIN) if known is None else known
     variable = ODVariable(_name(source, section, index, subindex), index, subindex)
     variable.data_type = data_type
@@ -125,3 +140,55 @@ def _limit(source: Source, section: Section, key: str, data_type: int) -> int | 
     except (ValueError, OverflowError):
         source.warn(section, key, f"{text!r} is not a value of type {name_of(data_type)}; not used")
         return None
+
+
+def _data_type_of(source: Source, section: Section, index: int, subindex: int, composite: bool) -> int | None:
+    """Data type that a section means, one of `KNOWN_TYPES`; None where it cannot be known."""
+    text = section.value("DataType")
+    demanded = standard_type(index, subindex, source.drive)
+    usual = U8 if composite and subindex == 0 else USUAL_TYPES.get((index, subindex)) if source.drive else None
+    if not text:
+        return _untyped(source, section, demanded or usual, "missing")
+    if (named := _named_type(text)) is not None:
+        source.warn(section, "DataType", f"{text} is read as {named:#06x}")
+        data_type = named
+    else:
+        try:
+            data_type = parse_integer(text, source.remark(section, "DataType"))
+        except ValueError:
+            return _untyped(source, section, demanded or usual, f"{text!r} is not a data type")
+    if data_type not in KNOWN_TYPES:
+        data_type = _foreign(source, section, data_type)
+    if demanded is not None and data_type != demanded:
+        source.warn(section, "DataType", f"{name_of(data_type)}, but the standard demands {name_of(demanded)}; taken")
+        return demanded
+    return data_type
+
+
+def _named_type(text: str) -> int | None:
+    word = re.sub(r"[\s_]", "", text.upper())
+    named = TYPE_NUMBERS.get(
+        text.upper(), FOREIGN_TYPE_NUMBERS.get(word.removesuffix("T") if word[-2:-1].isdigit() else word)
+    )
+    return named if named in KNOWN_TYPES else None
+
+
+def _untyped(source: Source, section: Section, demanded: int | None, why: str) -> int | None:
+    if demanded is not None:
+        source.warn(section, "DataType", f"{why}; the standard demands {name_of(demanded)}; taken")
+    elif section.value("ObjectType") and source.number(section, "ObjectType") == _OBJECT_DOMAIN:
+        return int(datatypes.DOMAIN)
+    else:
+        source.warn(section, "DataType", f"{why}, so the length of the object is not known; served as octets")
+    return demanded
+
+
+def _foreign(source: Source, section: Section, data_type: int) -> int:
+    """A type of the maker, which some editors define in a section such as [A0]; else it is served as octets."""
+    definition = source.sections.get(f"{data_type:x}sub1")
+    base = source.number(definition, "DefaultValue") if definition is not None else 0
+    if base in KNOWN_TYPES:
+        return base
+    what = next((what for numbers, what in _OTHER_TYPES.items() if data_type in numbers), "is not a type of CiA 301")
+    source.warn(section, "DataType", f"{data_type:#06x} {what}; the object is served as octets")
+    return int(datatypes.DOMAIN)

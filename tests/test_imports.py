@@ -51,7 +51,6 @@ MASTER = PLANNING | {"master", "tasks", "npz", "rows"}
 BOTH = MASTER | {"drive", "tools", "plant", "emulated", "session"}
 ALLOWED = {
     "errors": set(),
-    "moved": set(),
     "protocol": set(),
     "eds": {"protocol"},
     "bus": {"protocol", "eds"},
@@ -80,10 +79,10 @@ ALLOWED = {
     "studies": BOTH | {"results", "recorded", "api"},
     "cli": BOTH | {"results", "recorded", "api", "studies", "bridge", "vcan"},
     "examples": {"package", "api", "gym"},
-    "package": {*MASTER, "moved", "api", "cli", "session", "results", "recorded", "studies"},
+    "package": {*MASTER, "api", "cli", "session", "results", "recorded", "studies"},
     **{wing: set() for wing in WINGS},  # the doors
 }
-ROOT = {"__init__", "__main__", "api", "errors", "moved", "testing"}
+ROOT = {"__init__", "__main__", "api", "errors", "testing"}
 # module → packages of its extra; it is imported only where the extra is asked for
 EXTRAS = {
     "testing.py": {"pytest"},

@@ -21,7 +21,6 @@ _READY = "nothing; for example --bus {} --channel {}"
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_options(parser, "--json")
 
 

@@ -41,7 +41,6 @@ def _positive(text: str) -> float:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("kind", metavar="array", choices=["array"], help="what is calibrated")
     parser.add_argument("cell", metavar="CELL", type=word, help="name of a packaged cell, or path of a cell file")
     parser.add_argument(

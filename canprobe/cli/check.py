@@ -25,7 +25,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_scene(parser)
     add_options(parser, *BUS, "--realtime", "--patient")
     parser.add_argument("--seconds", metavar="S", type=seconds, default=10.0, help="length of the measurement [10]")

@@ -95,6 +95,18 @@ def add_eds_nodes(parser: Parser, *, more: str = "") -> None:
     )
 
 
+def add_inject(parser: Parser, what: str) -> None:
+    """Add --inject; `what` begins its help."""
+    parser.add_argument(
+        "--inject",
+        metavar="FAULT",
+        action="append",
+        default=[],
+        type=word,
+        help=f"{what}; may be repeated; `canprobe inject --list` lists them",
+    )
+
+
 def add_options(parser: argparse._ActionsContainer, *names: str) -> None:
     """Add options of `OPTIONS`, in this order."""
     for name in names:

@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import channel, seconds, whole, word
 from canprobe.cli.common_arguments import OPTIONS, add_verbosity
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_json, print_table, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.progress import say
 from canprobe.cli.reports import (
     add_report_options,
     command_line,
@@ -61,7 +60,6 @@ _REAL_SLACK_S = 0.05
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("--node", metavar="N", type=whole(1, 127), help="node id of the device")
     parser.add_argument("--eds", metavar="FILE", type=word, help="EDS or DCF file of the device, or a packaged name")
     parser.add_argument(

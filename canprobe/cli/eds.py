@@ -34,7 +34,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     listing = actions.add_parser(
         "list",

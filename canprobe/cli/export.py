@@ -21,7 +21,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folder of a run, an episode each")
     parser.add_argument(
         "--lerobot", metavar="DIR", type=folder_path, required=True, help="folder of the dataset; it must not exist"

@@ -29,7 +29,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("folder", metavar="DIR", type=folder_path, help="folder to write into; made if it is missing")
     parser.add_argument("--urdf", metavar="FILE", type=Path, help="URDF of the arm [rows of a PUMA 560]")
     parser.add_argument("--base", metavar="LINK", help="link of the URDF that is the base [its root]")

@@ -12,7 +12,7 @@ import numpy as np
 
 from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.load import packaged_files, toml_key
-from canprobe.cli.progress import say
+from canprobe.cli.output import say
 from canprobe.errors import UsageError
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import check_eds

@@ -26,7 +26,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("faults", metavar="FAULT", nargs="*", type=word, help="fault, such as 'node 3: mute for 2 s'")
     parser.add_argument("--list", action="store_true", help="list the kinds of faults, and end")
     parser.add_argument("--clear", action="store_true", help="end the faults that hold, before others are thrown")

@@ -18,13 +18,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.argument_types import seconds, word
-from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_options, add_scene, add_verbosity
+from canprobe.cli.argument_types import seconds
+from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_inject, add_options, add_scene, add_verbosity
 from canprobe.cli.emulate import eds_files, scene_target
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_json, print_table, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.progress import say
 from canprobe.cli.reports import (
     add_report_options,
     command_line,
@@ -60,7 +59,6 @@ _SHOWN_FRAMES = 6
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.takes_command = True
     parser.usage = "canprobe judge [SCENE | --eds FILE --node-id N ...] [--record FILE] [options] [-- COMMAND...]"
     add_scene(parser, optional=True)
@@ -70,14 +68,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"
     )
-    parser.add_argument(
-        "--inject",
-        metavar="FAULT",
-        action="append",
-        default=[],
-        type=word,
-        help="throw this fault in the place of the sequence; may be repeated; `canprobe inject --list` lists them",
-    )
+    add_inject(parser, "throw this fault in the place of the sequence")
     parser.add_argument("--passive", action="store_true", help="throw no faults")
     parser.add_argument(
         "--without",

@@ -25,7 +25,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_scene(parser)
     add_options(parser, *BUS)
     parser.add_argument(

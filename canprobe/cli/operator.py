@@ -8,7 +8,7 @@ import select
 import sys
 
 from canprobe.cell.tasks.joint_finding import Answer, SeenWay
-from canprobe.cli.progress import say
+from canprobe.cli.output import say
 
 _CHOICES = {False: "Enter or y: yes, n: no, q: end", True: "a number, Enter or y: just so, n: otherwise, q: end"}
 """The choices of a question, by whether it asks for a way."""

@@ -1,4 +1,4 @@
-"""Output of commands on stdout: JSON documents, tables, summaries."""
+"""Output of commands: JSON documents, tables and summaries on stdout, lines of progress on stderr."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ import textwrap
 from collections.abc import Iterable, Sequence
 
 from canprobe.cell.session.terminal import MARKED_WORDS, MIN_COLUMNS, columns, painted
+
+
+def say(line: str) -> None:
+    """Report one line, on stderr."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def print_json(document: object) -> None:

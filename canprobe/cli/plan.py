@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.session.terminal import columns
 from canprobe.cli.common_arguments import add_options, add_scene
-from canprobe.cli.output import print_json
+from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.progress import say
 from canprobe.cli.target import loaded, with_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
 
@@ -48,7 +47,6 @@ EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_scene(parser)
     parser.add_argument("--full", action="store_true", help="print the tables of nodes, PDOs, times and choices too")
     parser.add_argument(

@@ -34,7 +34,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_scene(parser)
     add_options(parser, *BUS, "--realtime", "--patient", "--bridge", "--out", "--force", "--seed", "--duration")
     parser.add_argument(

@@ -40,7 +40,6 @@ Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_scene(parser, optional=True)
     parser.add_argument(
         "--bus",

@@ -23,7 +23,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     add_options(parser, "--json")
 
 

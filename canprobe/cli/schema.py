@@ -21,7 +21,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("kind", metavar="KIND", choices=KINDS, help=f"kind of file: {', '.join(KINDS)}")
 
 

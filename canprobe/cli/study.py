@@ -54,7 +54,6 @@ RENAMED: Mapping[str, str] = {
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("name", metavar="NAME", nargs="?", help="study to run; --list lists them")
     parser.add_argument("--list", action="store_true", help="list the studies, and end")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the files [runs/study-NAME]")

@@ -26,7 +26,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.usage = "canprobe vcan [--install] [--timeout S] [--realtime] [-- COMMAND...]"
     parser.add_argument(
         "--install",

@@ -34,7 +34,6 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
     parser.add_argument("what", metavar="SCENE|RUN_DIR", help="scene to run, or folder of a recorded run")
     parser.add_argument(
         "--host",

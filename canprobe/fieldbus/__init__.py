@@ -32,18 +32,22 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
-    from canprobe.fieldbus.bus.canopen_network import PortNetwork
-    from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
-    from canprobe.fieldbus.bus.real.opening import open_port
-    from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
-    from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
-    from canprobe.fieldbus.bus.virtual.timed import TimedBus
-    from canprobe.fieldbus.drive.from_eds import make_eds_node
-    from canprobe.fieldbus.eds.packaged import check_eds, eds_path, load_eds
-    from canprobe.fieldbus.node.serve import serve
-    from canprobe.fieldbus.node.slave_node import SlaveNode
+if TYPE_CHECKING:  # for type checkers, which do not read the table
+    from canprobe.fieldbus.bus.candump import CandumpWriter as CandumpWriter
+    from canprobe.fieldbus.bus.candump import read_candump as read_candump
+    from canprobe.fieldbus.bus.canopen_network import PortNetwork as PortNetwork
+    from canprobe.fieldbus.bus.clock import MonotonicClock as MonotonicClock
+    from canprobe.fieldbus.bus.clock import VirtualClock as VirtualClock
+    from canprobe.fieldbus.bus.real.opening import open_port as open_port
+    from canprobe.fieldbus.bus.real.socketcan import SocketCanPort as SocketCanPort
+    from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus as LockstepBus
+    from canprobe.fieldbus.bus.virtual.timed import TimedBus as TimedBus
+    from canprobe.fieldbus.drive.from_eds import make_eds_node as make_eds_node
+    from canprobe.fieldbus.eds.packaged import check_eds as check_eds
+    from canprobe.fieldbus.eds.packaged import eds_path as eds_path
+    from canprobe.fieldbus.eds.packaged import load_eds as load_eds
+    from canprobe.fieldbus.node.serve import serve as serve
+    from canprobe.fieldbus.node.slave_node import SlaveNode as SlaveNode
 
 _MODULES = {
     "CandumpWriter": "bus.candump",
@@ -62,24 +66,7 @@ _MODULES = {
     "read_candump": "bus.candump",
     "serve": "node.serve",
 }
-
-__all__ = [
-    "CandumpWriter",
-    "LockstepBus",
-    "MonotonicClock",
-    "PortNetwork",
-    "SlaveNode",
-    "SocketCanPort",
-    "TimedBus",
-    "VirtualClock",
-    "check_eds",
-    "eds_path",
-    "load_eds",
-    "make_eds_node",
-    "open_port",
-    "read_candump",
-    "serve",
-]
+__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
 
 
 def __getattr__(name: str) -> Any:

@@ -17,7 +17,7 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.fieldbus.tools.faults import Fault, FaultKind
+from canprobe.fieldbus.tools.faults import Fault
 from canprobe.fieldbus.tools.faults.fault import Effect
 
 FREE_CYCLE = 80
@@ -125,13 +125,14 @@ def altered(node, can_id, change):
     """Let a node send an identifier with other data; with None it does not send it."""
 
     class Altered(Effect):
+        name = "altered"
+
         def frame(self, frame, t_ns):
             if frame[0] != can_id:
                 return None
             data = change(frame[1])
             return () if data is None else ((can_id, data),)
 
-    kind = FaultKind("altered", "a test changes it", "", "", Altered, incoming=False)
-    fault = Fault(kind, node.node_id)
+    fault = Fault(Altered, node.node_id)
     node.add(fault)
     return fault

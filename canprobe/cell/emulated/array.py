@@ -101,7 +101,6 @@ class TactileApplication(Application):
         self.publish: Callable[[TactileHeader, Image | Features], None] = self._put
 
     def attach(self, node: SlaveNode) -> None:
-        """Hang the sensor's objects on the node."""
         self._node = node
         for index in (HEADER, FEATURES, IMAGE_ROWS, WINDOW_ROWS):
             node.pdos.on_trigger(index, self._trigger)
@@ -124,7 +123,6 @@ class TactileApplication(Application):
         self._window = number(WINDOW_SIZE, 0, DEFAULT_WINDOW) if self._sized else DEFAULT_WINDOW
 
     def keep(self) -> bytes:
-        """The tare."""
         return b"" if self._tare is None else self._tare.tobytes()
 
     def recall(self, kept: bytes) -> None:
@@ -135,7 +133,6 @@ class TactileApplication(Application):
         self._tare = np.frombuffer(kept).reshape(self._pad.shape) if kept else None
 
     def reset(self, t_ns: int) -> None:
-        """Power on."""
         self._pipeline.clear()
         self._taring = None
         self._frames = 0
@@ -150,7 +147,6 @@ class TactileApplication(Application):
             self._sample(t_ns)
 
     def advance(self, t_ns: int) -> None:
-        """The plant moves on."""
         self._plant.advance(t_ns)
 
     def sync(self, t_ns: int, counter: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
@@ -11,10 +12,9 @@ from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.emulated.image_processing import Raw
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter, numbers
 from canprobe.fieldbus.tools.faults.frame_faults import tactile_ids
-from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
-from canprobe.fieldbus.tools.faults.row import make_kind
+from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS, kinds_of
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.types import Floats
 
@@ -22,7 +22,13 @@ _CRC_BYTE = 6
 """First byte of the CRC in a tactile header."""
 
 
-class ImageFault(Effect):
+class ArrayEffect(Effect):
+    """Base class of the faults of a tactile array."""
+
+    needs = "array"
+
+
+class ImageFault(ArrayEffect):
     """Base class of faults of the image that the array samples."""
 
     def __init__(self, fault: Fault, host: Host) -> None:
@@ -33,13 +39,11 @@ class ImageFault(Effect):
         self._begun_ns = 0
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Change the images from now on."""
         self._begun_ns = t_ns
         self._array.distortions.append(self._sampled)
         return ()
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        """Leave the images as they are."""
         self._array.distortions.remove(self._sampled)
         return ()
 
@@ -51,25 +55,36 @@ class ImageFault(Effect):
         """The image that is sampled, of counts; `held_s`: time since the beginning, s."""
         return raw
 
+    def rows(self) -> slice:
+        """The rows of taxels that it hits."""
+        first = int(self.fault.value("first"))
+        return slice(first, first + int(self.fault.value("rows")))
+
 
 class DeadRows(ImageFault):
     """Some rows of taxels measure nothing."""
 
+    name, what = "dead-rows", "rows of taxels measure nothing"
+    clause, reaction = "tactile node, 2100h", "names them; interpolates, or retreats"
+    parameters = numbers(
+        first=Parameter(7, 0, 255, "first row, 0-based"),
+        rows=Parameter(1, 1, 256, "number of rows"),
+    )
+
     def changed(self, raw: Raw, held_s: float) -> Raw:
-        """Blank them."""
         image = raw.copy()
-        first = int(self.fault.value("first"))
-        image[first : first + int(self.fault.value("rows"))] = 0
+        image[self.rows()] = 0
         return image
 
 
 class StuckImage(ImageFault):
     """The array samples the same image again and again; its counters go on."""
 
+    name, what = "stuck-image", "the same image again and again"
+    clause, reaction = "tactile node, 2120h", "does not press on"
     _kept: Raw | None = None
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
-        """The first image of the fault."""
         self._kept = raw if self._kept is None else self._kept
         return self._kept
 
@@ -80,15 +95,20 @@ class ReplayedImage(ImageFault):
     One image with fresh noise looks alive, and so does a recorded stretch: no image of it equals the one before.
     """
 
+    name, what = "replayed-image", "a recorded stretch of images again and again, or one image with fresh noise"
+    clause, reaction = "tactile node, 2120h", "does not press on"
+    parameters = numbers(
+        images=Parameter(1, 1, 1000, "images of the recorded stretch"),
+        noise=Parameter(1.3, 0, 255, "standard deviation of the fresh noise, counts"),
+    )
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Record from now on."""
         self._recorded: list[Raw] = []
         self._replayed = 0
         self._noise = np.random.default_rng(self.fault.seed)
         return super().begin(t_ns)
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
-        """The image itself while the stretch is recorded, then the next one of the stretch."""
         if len(self._recorded) < int(self.fault.value("images")):
             self._recorded.append(raw)
             return raw
@@ -100,31 +120,40 @@ class ReplayedImage(ImageFault):
 class GainLost(ImageFault):
     """Every taxel measures a share of its load."""
 
+    name, what = "gain-lost", "all taxels measure a share of their load"
+    clause, reaction = "tactile node, 2003h", "does not press on"
+    parameters = numbers(gain=Parameter(0.3, 0, 10, "measured over true load"))
+
     def changed(self, raw: Raw, held_s: float) -> Raw:
-        """Scale all counts."""
         return _as_sampled(self.fault.value("gain") * raw.astype(np.float64), raw)
 
 
 class StuckRows(ImageFault):
     """Some rows of taxels keep their last values; the others go on."""
 
+    name, what = "stuck-rows", "rows of taxels keep their last values"
+    clause, reaction = "tactile node, 2100h", "does not press on"
+    parameters = numbers(
+        first=Parameter(6, 0, 255, "first row, 0-based"),
+        rows=Parameter(4, 1, 256, "number of rows"),
+    )
     _kept: Raw | None = None
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
-        """Put the first values of the fault into the rows."""
         self._kept = raw if self._kept is None else self._kept
         image = raw.copy()
-        first = int(self.fault.value("first"))
-        rows = slice(first, first + int(self.fault.value("rows")))
-        image[rows] = self._kept[rows]
+        image[self.rows()] = self._kept[self.rows()]
         return image
 
 
 class Drift(ImageFault):
-    """All taxels drift upward."""
+    """All taxels drift upward, in whole counts where the array has such."""
+
+    name, what = "drift", "all taxels drift upward"
+    clause, reaction = "tactile node, 2003h", "retreats at the limit of the force"
+    parameters = numbers(counts_s=Parameter(5, 0, 1e6, "rate, counts/s"))
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
-        """Add what has come together, in whole counts where the array has such."""
         image = raw.copy()
         image[...] = np.minimum(raw + self.fault.value("counts_s") * held_s, COUNTS_MAX)
         return image
@@ -133,8 +162,10 @@ class Drift(ImageFault):
 class Saturation(ImageFault):
     """Every taxel that is pressed is at full scale."""
 
+    name, what = "saturation", "every pressed taxel is at full scale"
+    clause, reaction = "tactile node, 2005h", "retreats"
+
     def changed(self, raw: Raw, held_s: float) -> Raw:
-        """Raise them."""
         image = raw.copy()
         image[raw > 0] = COUNTS_MAX
         return image
@@ -153,11 +184,14 @@ def _as_sampled(counts: Floats, raw: Raw) -> Raw:
     return image
 
 
-class Torn(Effect):
+class Torn(ArrayEffect):
     """One PDO of each tactile frame is lost, the header never."""
 
+    name, what = "torn", "a PDO of each tactile frame is lost"
+    clause, reaction = "tactile node, 2120h", "drops the frame, and counts it"
+    trips = "torn_frame"
+
     def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
-        """Lose one of them."""
         taxels = tactile_ids(self.node)[1:]
         there = [frame for frame in frames if frame[0] in taxels]
         if not there or self.rng.random() >= self.fault.share:
@@ -167,109 +201,19 @@ class Torn(Effect):
         return [frame for frame in frames if frame is not lost]
 
 
-class HeaderCrc(Effect):
-    """The CRC of each tactile header is wrong."""
+class HeaderCrc(ArrayEffect):
+    """A bit of the CRC of each tactile header is wrong."""
+
+    name, what = "header-crc", "the CRC of each tactile header is wrong"
+    clause, reaction = "tactile node, 2120h", "drops the frame, and counts it"
+    trips = "torn_frame"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Change a bit of it."""
         can_id, data = frame
         if can_id not in tactile_ids(self.node)[:1] or len(data) <= _CRC_BYTE:
             return None
         return ((can_id, data[:_CRC_BYTE] + bytes((data[_CRC_BYTE] ^ 1,)) + data[_CRC_BYTE + 1 :]),)
 
 
-_ROWS = (
-    make_kind(
-        "dead-rows",
-        DeadRows,
-        "rows of taxels measure nothing",
-        "tactile node, 2100h",
-        "names them; interpolates, or retreats",
-        incoming=False,
-        needs="array",
-        first=Parameter(7, 0, 255, "first row, 0-based"),
-        rows=Parameter(1, 1, 256, "number of rows"),
-    ),
-    make_kind(
-        "stuck-image",
-        StuckImage,
-        "the same image again and again",
-        "tactile node, 2120h",
-        "does not press on",
-        incoming=False,
-        needs="array",
-    ),
-    make_kind(
-        "replayed-image",
-        ReplayedImage,
-        "a recorded stretch of images again and again, or one image with fresh noise",
-        "tactile node, 2120h",
-        "does not press on",
-        incoming=False,
-        needs="array",
-        images=Parameter(1, 1, 1000, "images of the recorded stretch"),
-        noise=Parameter(1.3, 0, 255, "standard deviation of the fresh noise, counts"),
-    ),
-    make_kind(
-        "gain-lost",
-        GainLost,
-        "all taxels measure a share of their load",
-        "tactile node, 2003h",
-        "does not press on",
-        incoming=False,
-        needs="array",
-        gain=Parameter(0.3, 0, 10, "measured over true load"),
-    ),
-    make_kind(
-        "stuck-rows",
-        StuckRows,
-        "rows of taxels keep their last values",
-        "tactile node, 2100h",
-        "does not press on",
-        incoming=False,
-        needs="array",
-        first=Parameter(6, 0, 255, "first row, 0-based"),
-        rows=Parameter(4, 1, 256, "number of rows"),
-    ),
-    make_kind(
-        "drift",
-        Drift,
-        "all taxels drift upward",
-        "tactile node, 2003h",
-        "retreats at the limit of the force",
-        incoming=False,
-        needs="array",
-        counts_s=Parameter(5, 0, 1e6, "rate, counts/s"),
-    ),
-    make_kind(
-        "saturation",
-        Saturation,
-        "every pressed taxel is at full scale",
-        "tactile node, 2005h",
-        "retreats",
-        incoming=False,
-        needs="array",
-    ),
-    make_kind(
-        "torn",
-        Torn,
-        "a PDO of each tactile frame is lost",
-        "tactile node, 2120h",
-        "drops the frame, and counts it",
-        trips="torn_frame",
-        incoming=False,
-        needs="array",
-    ),
-    make_kind(
-        "header-crc",
-        HeaderCrc,
-        "the CRC of each tactile header is wrong",
-        "tactile node, 2120h",
-        "drops the frame, and counts it",
-        trips="torn_frame",
-        incoming=False,
-        needs="array",
-    ),
-)
-CELL_FAULTS: Mapping[str, FaultKind] = MappingProxyType({**BUS_FAULTS, **{kind.name: kind for kind in _ROWS}})
+CELL_FAULTS: Mapping[str, FaultKind] = MappingProxyType({**BUS_FAULTS, **kinds_of(sys.modules[__name__])})
 """Kinds of faults of the nodes of a cell by name."""

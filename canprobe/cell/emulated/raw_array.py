@@ -57,18 +57,15 @@ class RawArray(Participant):
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Time of the next sample, or of the next image to send, ns."""
         dues = [due for due, _ in self._waiting]
         return min([*dues, self._due_ns]) if self._due_ns is not None else min(dues, default=None)
 
     def start(self, t_ns: int) -> Sequence[Frame]:
-        """Power on."""
         if self.running and self._wire.sampling == "free":
             self._due_ns = t_ns + self._period_ns
         return ()
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """Take a command, or a SYNC."""
         wire, frame = self._wire, (can_id, data)
         if wire.start and frame == wire.start[-1]:
             self.running = True
@@ -85,7 +82,6 @@ class RawArray(Participant):
         return self._ready(t_ns)
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Sample, and send what is due."""
         if self._due_ns is not None and self._due_ns <= t_ns:
             self._sample(self._due_ns)
             self._due_ns += self._period_ns * (1 + (t_ns - self._due_ns) // self._period_ns)

@@ -66,7 +66,6 @@ class TruthRecorder(Participant):
         self._truths: list[TruthRow] = []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """Take the state of the plant at a SYNC."""
         if can_id == SYNC_ID:
             self._plant.advance(t_ns)
             self._stamps.append((t_ns, data[0] if data else 0))

@@ -111,12 +111,10 @@ class TactileReceiver(ArrayReceiver):
         self._complete: list[TactileFrame] = []
 
     def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
-        """Take one tactile PDO; the frame that it completes."""
         message = self.assembler.push(can_id, data, t_ns)
         return decode(message, self.assembler.shape) if message is not None else None
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take one tactile PDO."""
         frame = self.assemble(can_id, data, t_ns)
         if frame is not None:
             self.put(frame)
@@ -150,7 +148,6 @@ class TactileReceiver(ArrayReceiver):
 
     @property
     def torn(self) -> int:
-        """Count of torn, corrupt or mixed frames."""
         return self.assembler.torn + self.assembler.crc_errors + self.assembler.orphans
 
     @property
@@ -160,7 +157,6 @@ class TactileReceiver(ArrayReceiver):
 
     @property
     def lost(self) -> int:
-        """Count of lost frames, from gaps of the frame counter."""
         return self.assembler.lost
 
     def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
@@ -224,7 +220,6 @@ class RawReceiver(ArrayReceiver):
         return self._frame(image) if image is not None else None
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take one frame."""
         image = self.assembler.push(can_id, data, t_ns)
         if image is None:
             return
@@ -238,7 +233,6 @@ class RawReceiver(ArrayReceiver):
     def take(
         self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
     ) -> TactileSample | None:
-        """The newest image that was sampled before the present SYNC."""
         sample, early = None, []
         for frame, instant, sigma in self._complete:
             if instant > sync_stamps[-1]:

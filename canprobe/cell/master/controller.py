@@ -235,7 +235,6 @@ class WrappingController(Controller):
 
     @property
     def array_alive(self) -> bool:
-        """Whether an image of the array has changed since bring-up."""
         return self._alive if self.inner is None else self.inner.array_alive
 
     @array_alive.setter
@@ -246,7 +245,6 @@ class WrappingController(Controller):
 
     @property
     def array_blind(self) -> str | None:
-        """Why the controller does not believe the array any more."""
         return None if self.inner is None else self.inner.array_blind
 
     @array_blind.setter
@@ -256,17 +254,14 @@ class WrappingController(Controller):
 
     @property
     def reader(self) -> SampleReader | None:
-        """The reader of the other controller's samples."""
         return None if self.inner is None else self.inner.reader
 
     @property
     def remarks(self) -> Sequence[str]:
-        """The remarks of the other controller."""
         return () if self.inner is None else self.inner.remarks
 
     @property
     def restarts(self) -> int:
-        """How often the other controller's estimator started again."""
         return 0 if self.inner is None else self.inner.restarts
 
 
@@ -277,7 +272,6 @@ class _Function(Controller):
         self._step = step
 
     def step(self, measurement: Measurement) -> Command:
-        """Call the function for one cycle."""
         return self._step(measurement)
 
 

@@ -58,7 +58,6 @@ class CalibrateTask(ProbingTask):
         self._depths: list[tuple[float, float]] = []
 
     def retreat(self, reason: str) -> None:
-        """Let go and end for a reason that the cell has."""
         if self.reason is None and self.phase is not Phase.DONE and self._motion is not None:
             self.reason = reason
             self._let_go()
@@ -70,7 +69,6 @@ class CalibrateTask(ProbingTask):
             self._let_go()
 
     def record(self) -> TaskRecord:
-        """The record of the calibration so far."""
         return replace(super().record(), tool=self.estimate)
 
     def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:

@@ -93,7 +93,6 @@ class ExploreTask(TouchTask):
         return self.explorer
 
     def record(self) -> TaskRecord:
-        """The results so far."""
         explored = None if self.explorer is None else end_of(self.explorer, self._scan_t, over=not self._ends)
         return replace(super().record(), explored=explored)
 

@@ -35,7 +35,6 @@ class FreeTask(Task):
         self._q0: Floats | None = None
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
         if self._q0 is None:
             assert measurement.q is not None
             self._q0 = measurement.q
@@ -66,15 +65,12 @@ class ListenTask(Task):
 
     @property
     def reader(self) -> PatchReader:
-        """The reader of its samples."""
         return self._reader
 
     def record(self) -> TaskRecord:
-        """The results so far."""
         return TaskRecord(taxels=self.taxels)
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
         self._left -= self._period
         if measurement.tactile is not None:
             self.taxels = measurement.tactile.frame.taxels

@@ -73,7 +73,6 @@ class HeldTask(WrappingController):
         return elsewhere if elsewhere is not None else self.inner.inspect(q)
 
     def step(self, measurement: Measurement) -> Command:
-        """Hold, or let the controller decide."""
         if self.held:
             assert self._asked is not None
             wanted = self.inner.asks_to_go_on()  # which also drops what was asked of it during the hold
@@ -86,7 +85,6 @@ class HeldTask(WrappingController):
         return self.inner.step(measurement)
 
     def update(self) -> None:
-        """Let the controller do its work."""
         if not self.held:
             self.inner.update()
 
@@ -101,5 +99,4 @@ class HeldTask(WrappingController):
         return None if self.held else self.inner.trail
 
     def retreat(self, reason: str) -> None:
-        """Let the controller let go."""
         self.inner.retreat(reason)

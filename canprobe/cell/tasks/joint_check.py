@@ -84,18 +84,15 @@ class JointCheck(Controller):
 
     @property
     def reader(self) -> PatchReader | None:
-        """The reader of its samples."""
         return self._reader
 
     def step(self, measurement: Measurement) -> Command:
-        """Give the target of a cycle."""
         try:
             return self._script.send(measurement)
         except StopIteration:
             return Command(done=self._pressed is None, stop_reason=self._pressed)
 
     def inspect(self, q: Floats) -> str | None:
-        """Why an arm that stands at joint positions (n,), rad or m, must not be enabled."""
         self.start = q
         outside = np.flatnonzero((q < self._guard.low) | (q > self._guard.high))
         if not outside.size:

@@ -107,11 +107,9 @@ class ProbingTask(Task):
 
     @property
     def reader(self) -> PatchReader:
-        """The reader of its sensing."""
         return self.sensing.reader
 
     def record(self) -> TaskRecord:
-        """The results so far."""
         slowed = self._motion.slowed if self._motion is not None else 0
         contacts = self.depth.watched + self.depth.silent
         watched = self.depth.watched / contacts if contacts else None
@@ -123,7 +121,6 @@ class ProbingTask(Task):
         return self._way_here if self.phase in COMING else None
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
         self._cycle = measurement.cycle
         self._dt = self._time.step(measurement.t_ns) * 1e-9
         if self._motion is None:
@@ -145,7 +142,6 @@ class ProbingTask(Task):
         return self._command(pose)
 
     def retreat(self, reason: str) -> None:
-        """Let go and end for a reason that the cell has."""
         raise NotImplementedError
 
     def stop(self) -> None:

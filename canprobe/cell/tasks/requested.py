@@ -128,7 +128,6 @@ class RequestedTask(WrappingController):
         return command
 
     def update(self) -> None:
-        """Let the task do its work once its commands are sent."""
         if self.inner is not None:
             self.inner.update()
 
@@ -155,16 +154,13 @@ class RequestedTask(WrappingController):
 
     @property
     def lets_go(self) -> bool:  # type: ignore[override]
-        """Whether the task lets go by itself."""
         return self.inner is not None and self.inner.lets_go
 
     @property
     def trail(self) -> TakenWay | None:
-        """The way by which the task's probe has come."""
         return None if self.inner is None else self.inner.trail
 
     def retreat(self, reason: str) -> None:
-        """Let the task let go."""
         if self.inner is not None:
             self.inner.retreat(reason)
 

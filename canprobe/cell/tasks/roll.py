@@ -116,13 +116,11 @@ class RollTask(ProbingTask):
         sensing.set_kappa(np.full(2, 0.0 if math.isinf(radius) else 1.0 / radius))
 
     def retreat(self, reason: str) -> None:
-        """Let go and end for a reason that the cell has."""
         if self.reason is None and self.phase is not Phase.DONE and self._motion is not None:
             self.reason = reason
             self._let_go()
 
     def stop(self) -> None:
-        """Let go and be done."""
         self._number = len(self.presses)
         if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
             self._let_go()

@@ -101,7 +101,6 @@ class TouchTask(ProbingTask):
         return self._remarks
 
     def record(self) -> TaskRecord:
-        """The results so far."""
         return replace(super().record(), shape=self.shape, losses=self.losses, scan_cycles=self.scan_cycles)
 
     @property
@@ -129,7 +128,6 @@ class TouchTask(ProbingTask):
             self._leave(None)
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle of the task."""
         self.update()
         self._updated = False
         self._estimate = self.shape.answer(measurement.t_ns * 1e-9) if self.shape is not None else None

@@ -128,7 +128,6 @@ class Trajectory(Controller):
         return q
 
     def step(self, measurement: Measurement) -> Command:
-        """Give the target of a cycle."""
         passed_ns = self._time.step(measurement.t_ns)
         if self._gone_ns is None:
             assert measurement.q is not None

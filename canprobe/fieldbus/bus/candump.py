@@ -303,11 +303,9 @@ class RecordingPort(TappedPort):
         self._write = write
 
     def hear_sent(self, frames: Sequence[Frame], t_ns: int) -> None:
-        """Record frames that were sent."""
         for can_id, data in frames:
             self._write(can_id, data, t_ns)
 
     def hear_received(self, frames: Sequence[TimedFrame]) -> None:
-        """Record frames that arrived."""
         for can_id, data, t_ns in frames:
             self._write(can_id, data, t_ns)

@@ -6,10 +6,11 @@ from collections.abc import Iterable
 
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
+from canprobe.fieldbus.protocol.sdo import pack_read
 
 SECOND_ANSWER_S = 0.05
 """Time in which a second answer to one request shows that two devices have one node id."""
-DEVICE_TYPE_REQUEST = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+DEVICE_TYPE_REQUEST = pack_read(0x1000)
 BURST_FRAMES = 8
 BURST_PAUSE_S = 0.002
 

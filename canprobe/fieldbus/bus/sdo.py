@@ -19,15 +19,15 @@ from canopen.objectdictionary.datatypes import SIGNED_TYPES
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
+from canprobe.fieldbus.protocol import sdo
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 
 Dialogue = Generator[bytes | None, bytes, Any]
 """The transfers with one node."""
 
 _SDO_BYTES = 8
-_ABORT_COMMAND, _DOWNLOAD_ANSWER, _UPLOAD_ANSWER, _SEGMENT_ANSWER = 0x80, 0x60, 0x40, 0x00
-_EXPEDITED_FLAG, _SIZE_FLAG = 0x02, 0x01
-_MAX_EXPEDITED_BYTES = 4
+_DOWNLOAD_ANSWER, _UPLOAD_ANSWER, _SEGMENT_ANSWER = 0x60, 0x40, 0x00
+_EXPEDITED_FLAG = 0x02
 _NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
 _TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
 MAX_UPLOAD_BYTES = 4096
@@ -49,10 +49,10 @@ def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, 
         SdoAbortedError: the node refused.
         SdoCommunicationError: no answer came, or there are not one to four bytes.
     """
-    if not 0 < len(data) <= _MAX_EXPEDITED_BYTES:
-        raise SdoCommunicationError(f"{index:04X}h:{subindex:02X} takes {len(data)} bytes; a concise write has 1 to 4")
-    command = 0x23 | (_MAX_EXPEDITED_BYTES - len(data)) << 2
-    yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOAD_ANSWER)
+    if not 0 < len(data) <= sdo.MAX_EXPEDITED_BYTES:
+        place = sdo.place_text(index, subindex)
+        raise SdoCommunicationError(f"{place} takes {len(data)} bytes; a concise write has 1 to 4")
+    yield from _answered(sdo.pack_write(index, subindex, data), _DOWNLOAD_ANSWER)
 
 
 def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
@@ -74,7 +74,7 @@ def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
     return variable.decode_raw(own)
 
 
-def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED_BYTES) -> Generator[bytes | None, bytes, bytes]:
+def upload(index: int, subindex: int, size: int = sdo.MAX_EXPEDITED_BYTES) -> Generator[bytes | None, bytes, bytes]:
     """Read an entry of any length.
 
     Args:
@@ -86,11 +86,10 @@ def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED_BYTES) -> Gener
         SdoCommunicationError: no answer came, one segment came twice, or the node sent more or fewer bytes than it
             announced, or more than `MAX_UPLOAD_BYTES`. The node gets an abort.
     """
-    answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOAD_ANSWER)
+    answer = yield from _answered(sdo.pack_read(index, subindex), _UPLOAD_ANSWER)
     if answer[0] & _EXPEDITED_FLAG:
-        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZE_FLAG else answer[4 : 4 + size]
-    announced = int.from_bytes(answer[4:], "little") if answer[0] & _SIZE_FLAG else None
-    return (yield from _segments(answer[1:4], announced))
+        return sdo.expedited_value(answer, size)
+    return (yield from _segments((index, subindex), sdo.stated_size(answer)))
 
 
 def decode_text(data: bytes) -> str:
@@ -102,56 +101,49 @@ def decode_text(data: bytes) -> str:
         return text.decode("latin-1")
 
 
-def _answered(
-    command: bytes, index: int, subindex: int, data: bytes, expected: int
-) -> Generator[bytes | None, bytes, bytes]:
-    multiplexer = index.to_bytes(2, "little") + bytes((subindex,))
-    answer = yield command + multiplexer + data
-    while answer[1:4] != multiplexer or not (answer[0] == _ABORT_COMMAND or answer[0] & 0xE0 == expected):
+def _answered(request: bytes, expected: int) -> Generator[bytes | None, bytes, bytes]:
+    answer = yield request
+    while answer[1:4] != request[1:4] or not (answer[0] == sdo.ABORT or answer[0] & 0xE0 == expected):
         answer = yield None  # a late one, to an earlier request, maybe of the same entry
     _check_abort(answer)
     return answer
 
 
-def _segments(multiplexer: bytes, announced: int | None) -> Generator[bytes | None, bytes, bytes]:
+def _segments(place: sdo.Place, announced: int | None) -> Generator[bytes | None, bytes, bytes]:
     if announced is not None and announced > MAX_UPLOAD_BYTES:
-        yield from _give_up(multiplexer, _OUT_OF_MEMORY, f"{announced} bytes announced, {MAX_UPLOAD_BYTES} at most")
+        yield from _give_up(place, _OUT_OF_MEMORY, f"{announced} bytes announced, {MAX_UPLOAD_BYTES} at most")
     data, toggle, last = b"", 0, False
     while not last:
         answer = yield bytes((0x60 | toggle,)) + bytes(7)
-        while answer[0] != _ABORT_COMMAND and answer[0] & 0xE0 != _SEGMENT_ANSWER:
+        while answer[0] != sdo.ABORT and answer[0] & 0xE0 != _SEGMENT_ANSWER:
             answer = yield None  # a late one, to the request that began this transfer
         _check_abort(answer)
         if answer[0] & 0xF0 != toggle:
-            yield from _give_up(multiplexer, _NOT_TOGGLED, "Toggle bit mismatch")
-        piece = answer[1 : 8 - (answer[0] >> 1 & 7)]
+            yield from _give_up(place, _NOT_TOGGLED, "Toggle bit mismatch")
+        piece = sdo.segment_value(answer)
         data += piece
         toggle ^= 0x10
         last = bool(answer[0] & 1)
         if announced is not None and len(data) > announced:
-            yield from _give_up(multiplexer, _TOO_LONG, f"{announced} bytes announced, more sent")
+            yield from _give_up(place, _TOO_LONG, f"{announced} bytes announced, more sent")
         if len(data) > MAX_UPLOAD_BYTES:
-            yield from _give_up(multiplexer, _OUT_OF_MEMORY, f"no end after {MAX_UPLOAD_BYTES} bytes")
+            yield from _give_up(place, _OUT_OF_MEMORY, f"no end after {MAX_UPLOAD_BYTES} bytes")
         if not piece and not last:
-            yield from _give_up(multiplexer, _GENERAL, "a segment without a byte that is not the last")
+            yield from _give_up(place, _GENERAL, "a segment without a byte that is not the last")
     if announced is not None and len(data) < announced:
-        yield from _give_up(multiplexer, _TOO_SHORT, f"{announced} bytes announced, {len(data)} sent")
+        yield from _give_up(place, _TOO_SHORT, f"{announced} bytes announced, {len(data)} sent")
     return data
 
 
-def _give_up(multiplexer: bytes, code: int, why: str) -> Generator[bytes | None, bytes, NoReturn]:
+def _give_up(place: sdo.Place, code: int, why: str) -> Generator[bytes | None, bytes, NoReturn]:
     """Abort the transfer of the node, and raise SdoCommunicationError."""
-    yield _abort(multiplexer, code)
+    yield sdo.pack_abort(*place, code)
     raise SdoCommunicationError(f"transfer aborted: {why}")
 
 
-def _abort(multiplexer: bytes, code: int) -> bytes:
-    return bytes((_ABORT_COMMAND,)) + multiplexer + code.to_bytes(4, "little")
-
-
 def _check_abort(answer: bytes) -> None:
-    if answer[0] == _ABORT_COMMAND:
-        raise SdoAbortedError(int.from_bytes(answer[4:], "little"))
+    if answer[0] == sdo.ABORT:
+        raise SdoAbortedError(sdo.abort_code(answer))
 
 
 class _Talk:
@@ -168,7 +160,7 @@ class _Talk:
         self._timeout_ns = timeout_ns
         self._retries = retries
         self._request = b""
-        self._multiplexer = b""  # that of the transfer: a request for a segment has none
+        self._place = 0, 0  # that of the transfer: a request for a segment has none
         self._end_ns = 0  # latest end of the transfer
         self._tries = 0
         self._go_on(lambda: next(dialogue))
@@ -185,7 +177,7 @@ class _Talk:
             self._go_on(lambda answer=answer: self._dialogue.send(answer))  # type: ignore[misc]
         if self.over or self.due_ns > self._network.port.clock.now_ns():
             return
-        self._transmit(_abort(self._multiplexer, _TIMED_OUT))
+        self._transmit(sdo.pack_abort(*self._place, _TIMED_OUT))
         if self._tries <= self._retries and not self._asks_for_segment:  # which cannot be asked for twice
             self.repeated += 1
             self._ask()
@@ -207,7 +199,7 @@ class _Talk:
     def _go_on(self, step: Callable[[], bytes | None]) -> None:
         try:
             request = step()
-            while request is not None and request[0] == _ABORT_COMMAND:
+            while request is not None and request[0] == sdo.ABORT:
                 self._transmit(request)
                 request = next(self._dialogue)
         except StopIteration:
@@ -224,7 +216,7 @@ class _Talk:
         if self._asks_for_segment:
             self.due_ns = min(self.due_ns, self._end_ns)
         else:
-            self._multiplexer = self._request[1:4]
+            self._place = sdo.place_of(self._request)
             self._end_ns = self.due_ns + (MAX_TRANSFER_TIMEOUTS - 1) * self._timeout_ns
         self._transmit(self._request)
 

@@ -33,7 +33,6 @@ class TappedPort(PlainPort, ABC):
 
     @property
     def descriptor(self) -> int | None:
-        """Descriptor of the port."""
         return self._port.descriptor
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:

@@ -4,7 +4,7 @@ Controlword, mode and targets come in through the dictionary of a node; statuswo
 and a reference goes to one axis of the plant. `drive.DriveApplication` is the application of the node. It follows the
 table of states in `protocol.cia402` and runs one mode at a time.
 
-    drive                   states, faults, options, and which mode is active
+    drive                   states, faults, options, the table of all modes and which one is active
     from_eds                a node from an EDS alone, and a drive where the file describes one
     parameters              limits, ramps and options, read from the dictionary whenever one is written
     units                   position units of the master ↔ counts of the axis
@@ -12,9 +12,7 @@ table of states in `protocol.cia402` and runs one mode at a time.
     loop                    torque limit and feed-forwards, given to the plant's position loop
     self_stop               what makes a drive stop by itself
     mode                    what all modes share
-    modes                   the table of all modes
-    cyclic_position, cyclic_velocity, cyclic_torque   modes with a target for every SYNC
-    interpolated_position   the same by 60C1h
+    cyclic_modes            modes with a target for every SYNC: position, velocity, torque, interpolated position
     profile_position        set-points by handshake, each a trapezoidal move
     homing                  limit switches, index pulses, or the present position
     profile                 trapezoids and other motion as pieces of constant acceleration

@@ -14,9 +14,11 @@ from functools import partial
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.fieldbus.drive.mode import DriveParts
-from canprobe.fieldbus.drive.modes import make_modes
+from canprobe.fieldbus.drive.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, InterpolatedPosition
+from canprobe.fieldbus.drive.homing import HomingMode
+from canprobe.fieldbus.drive.mode import DriveMode, DriveParts
 from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS
+from canprobe.fieldbus.drive.profile_position import ProfilePosition
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
@@ -37,6 +39,15 @@ from canprobe.fieldbus.protocol.cia402 import (
 from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE, HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import NmtState
 
+MODES: tuple[type[DriveMode], ...] = (
+    DriveMode,
+    ProfilePosition,
+    HomingMode,
+    InterpolatedPosition,
+    CyclicPosition,
+    CyclicVelocity,
+    CyclicTorque,
+)
 _STATUSWORD_KEY = key_of(0x6041)
 _VOLATILE_INDICES = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
 _ABORT_COMMANDS = {2: DriveCommand.DISABLE_VOLTAGE, 3: DriveCommand.QUICK_STOP}  # by 6007h; 1 is a fault, 0 nothing
@@ -99,7 +110,7 @@ class DriveApplication(Application):
             noise=self._noise,
         )
         self._parameters, self._motion = parts.parameters, parts.motion
-        self._modes = make_modes(parts)
+        self._modes = _make_modes(parts)
         self._mode = self._modes[0]
         self._take_word_soon = node.core.timers.new(self._take_word)
         self._pass_on_soon = node.core.timers.new(self._pass_on)
@@ -136,7 +147,6 @@ class DriveApplication(Application):
         self._show()
 
     def advance(self, t_ns: int) -> None:
-        """Let the plant move on."""
         self._plant.advance(t_ns)
 
     def connection_lost(self, t_ns: int) -> None:
@@ -351,3 +361,14 @@ def make_drive_node(
     noise = partial(random.Random(f"{seed} {axis}").gauss, 0.0, sigma) if sigma else None
     application = DriveApplication(axis, plant, delivery=delivery, incremental=incremental, noise=noise)
     return SlaveNode(od, node_id, application, od_of=od_of, quirks=quirks)
+
+
+def _make_modes(parts: DriveParts) -> dict[int, DriveMode]:
+    """Modes of a drive, by number: the EDS has their objects, and lists them in 6502h if it has that."""
+    dictionary = parts.node.dictionary
+    claimed = dictionary.number(0x6502) or ~0
+    return {
+        int(mode.number): mode(parts)
+        for mode in MODES
+        if not mode.number or (claimed >> mode.number - 1 & 1 and all(key in dictionary for key in mode.needs))
+    }

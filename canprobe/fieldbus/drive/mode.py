@@ -163,7 +163,6 @@ class ProfiledMode(DriveMode):
         self._timer = parts.node.core.timers.new(self._look)
 
     def leave(self, t_ns: int) -> None:
-        """Stop the timer."""
         self._timer.cancel()
 
     def watch(self, t_ns: int, counts: float) -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from math import inf
 from typing import NamedTuple
 
-from canprobe.fieldbus.drive.cyclic_position import POSITION_TARGET_KEY
+from canprobe.fieldbus.drive.cyclic_modes import POSITION_TARGET_KEY
 from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS

@@ -5,7 +5,6 @@ both return frames to send, and `next_deadline_ns` says when `advance` has to be
 Each service of the standard is one module:
 
     core                what all services share: identity, NMT state, time, timers, dictionary, frames to send
-    nmt                 the NMT state machine as a table
     timers              the deadlines of one node
     entry               one entry of the dictionary: type, rights, limits, bytes
     dictionary          all values, with the checks that an access over the bus must pass
@@ -20,7 +19,7 @@ Each service of the standard is one module:
     emcy                emergencies, error register, error history
     heartbeat           heartbeat producer and consumer
     guarding            node guarding and life guarding
-    lss, lss_search     node ids over the bus, and how a node without one is found
+    lss                 node ids over the bus, and how a node without one is found
     store, stored_file  stored parameters, in memory and in a file
     quirks              what makes a node difficult
     wrapped             what stands in a node's place on a lockstep bus

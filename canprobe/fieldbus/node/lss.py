@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node.abort import SdoAbort
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
-from canprobe.fieldbus.node.lss_search import IDENTIFY_COMMANDS, SELECT_COMMANDS, LssSearch
 from canprobe.fieldbus.node.store import Store
 from canprobe.fieldbus.protocol.lss import (
     BIT_RATES,
     LSS_ANSWER_ID,
     LSS_BYTES,
     LSS_REQUEST_ID,
+    PRESENCE_CHECK,
     UNCONFIGURED_ID,
     LssAddress,
     LssCommand,
@@ -28,6 +28,9 @@ from canprobe.fieldbus.protocol.lss import (
     pack_number,
 )
 
+_SELECT_COMMANDS = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
+_IDENTIFY_COMMANDS = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
+_NUMBER_MASK = 0xFFFFFFFF
 _INQUIRE_COMMANDS = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
 
 
@@ -103,11 +106,11 @@ class LssSlave(Service):
         """Answer the questions by which a master finds the slave; only a slave without an id answers fastscan."""
         command, waits = data[0], self.state is LssState.WAITING
         blank = self.unconfigured and self.pending == UNCONFIGURED_ID  # it has no id, and was given none yet
-        if command in IDENTIFY_COMMANDS and self._search.identifies(data, self.address):
+        if command in _IDENTIFY_COMMANDS and self._search.identifies(data, self.address):
             return pack_lss(LssCommand.IDENTIFIED)
         if command == LssCommand.IDENTIFY_UNCONFIGURED and blank:
             return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED)
-        if waits and command in SELECT_COMMANDS and self._search.selects(data, self.address):
+        if waits and command in _SELECT_COMMANDS and self._search.selects(data, self.address):
             self._enter(LssState.CONFIGURATION)
             return pack_lss(LssCommand.SELECTED)
         if waits and command == LssCommand.FASTSCAN and blank:
@@ -140,3 +143,64 @@ class LssSlave(Service):
         else:
             return None
         return pack_lss(LssCommand(command), bytes((error,)))
+
+
+class LssSearch:
+    """Questions that one slave has heard so far: for its whole address, for bounds, or bit by bit.
+
+    Source: CiA 305, switch state selective, identify remote slave, fastscan.
+    """
+
+    def __init__(self) -> None:
+        self._heard: list[tuple[int, int]] = []  # command and number, of the sequence under way
+        self._position = 0
+
+    def forget(self) -> None:
+        """Forget all questions."""
+        self._heard.clear()
+        self._position = 0
+
+    def selects(self, data: bytes, mine: LssAddress) -> bool:
+        """Switch state selective: the four numbers come one after another, and the last one decides."""
+        return tuple(self._complete(data, _SELECT_COMMANDS)) == mine.numbers
+
+    def identifies(self, data: bytes, mine: LssAddress) -> bool:
+        """Identify remote slave: vendor and product, and a lowest and a highest revision and serial number."""
+        numbers = self._complete(data, _IDENTIFY_COMMANDS)
+        if not numbers:
+            return False
+        vendor, product, revision_low, revision_high, serial_low, serial_high = numbers
+        return (
+            (vendor, product) == (mine.vendor_id, mine.product_code)
+            and revision_low <= mine.revision_number <= revision_high
+            and serial_low <= mine.serial_number <= serial_high
+        )
+
+    def fastscan(self, data: bytes, mine: LssAddress) -> tuple[bool, bool]:
+        """Whether the asked bits of one number are mine, and whether the whole address is found."""
+        bit, position, following = data[5:]
+        if not (bit < 32 or bit == PRESENCE_CHECK) or position > 3 or following > 3:
+            return False, False
+        if bit == PRESENCE_CHECK:
+            self._position = 0
+            return True, False
+        asked = _NUMBER_MASK << bit & _NUMBER_MASK
+        if position != self._position or (_number_in(data) ^ mine.numbers[position]) & asked:
+            return False, False
+        self._position = following
+        return True, bit == 0 and following < position
+
+    def _complete(self, data: bytes, sequence: range) -> list[int]:
+        """Take one number of a sequence; return all of them after the last one, if none was left out, else nothing."""
+        if data[0] != sequence[0] and (not self._heard or self._heard[-1][0] != data[0] - 1):
+            self._heard.clear()
+            return []
+        if data[0] == sequence[0]:
+            self._heard.clear()
+        self._heard.append((data[0], _number_in(data)))
+        return [number for _, number in self._heard] if data[0] == sequence[-1] else []
+
+
+def _number_in(data: bytes) -> int:
+    """Number in the 32 bits behind the command specifier."""
+    return int.from_bytes(data[1:5], "little")

@@ -86,7 +86,6 @@ class PdoEngine(Service):
         self._samplers[index] = sampler
 
     def reset(self, t_ns: int) -> None:
-        """Read all parameters."""
         for pdo in self._all:
             pdo.configure()
         self._rebuild()

@@ -156,7 +156,6 @@ class SegmentedUpload(Transfer):
         self._position = self._toggle = 0
 
     def step(self, data: bytes) -> list[bytes]:
-        """Send the segment that is asked for."""
         toggle = self._toggle
         _check_toggle(data[0], toggle)
         self._toggle ^= _TOGGLE_FLAG

@@ -24,13 +24,12 @@ from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.guarding import NodeGuarding
 from canprobe.fieldbus.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from canprobe.fieldbus.node.lss import LssSlave
-from canprobe.fieldbus.node.nmt import NMT_GOALS
 from canprobe.fieldbus.node.pdo import PdoEngine
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.sdo_server import SdoServer
 from canprobe.fieldbus.node.store import Store
 from canprobe.fieldbus.node.sync import SyncConsumer
-from canprobe.fieldbus.protocol.frames import NMT_ID, Frame, NmtCommand, NmtState
+from canprobe.fieldbus.protocol.frames import NMT_GOALS, NMT_ID, Frame, NmtCommand, NmtState
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 
 OdOf = Callable[[int], ObjectDictionary]
@@ -130,7 +129,6 @@ class SlaveNode(Participant):
 
     @property
     def name(self) -> str:
-        """Name of the node in messages."""
         return f"node {self.core.node_id}" if self.core.node_id != UNCONFIGURED_ID else "node without an id"
 
     @property
@@ -149,11 +147,9 @@ class SlaveNode(Participant):
         return type(self.application)
 
     def connect(self, rerouted: Callable[[], None]) -> None:
-        """Call `rerouted` from now on whenever identifiers have changed."""
         self._rerouted = rerouted
 
     def start(self, t_ns: int) -> list[Frame]:
-        """Power on."""
         self.core.now_ns = t_ns
         if self.lss is not None:
             self.lss.power_on()
@@ -176,7 +172,6 @@ class SlaveNode(Participant):
         return out
 
     def advance(self, t_ns: int) -> list[Frame]:
-        """Do everything that is due up to and at `t_ns`."""
         self._run(t_ns)
         return self._taken()
 

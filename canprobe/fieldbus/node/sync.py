@@ -33,7 +33,6 @@ class SyncConsumer(Service):
         dictionary.on_change(self._configure, 0x1006, 0x1019)
 
     def reset(self, t_ns: int) -> None:
-        """Read the parameters."""
         self._configure()
 
     def _configure(self) -> None:

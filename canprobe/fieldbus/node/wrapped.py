@@ -25,24 +25,19 @@ class WrappedNode(Participant):
 
     @property
     def name(self) -> str:
-        """Name of the node in messages."""
         return self.node.name
 
     @property
     def listens(self) -> Container[int]:
-        """Identifiers that the node takes now."""
         return self.node.listens
 
     @property
     def kind(self) -> type:
-        """Class of the device of the node."""
         return self.node.kind
 
     @property
     def patient(self) -> frozenset[int]:
-        """Identifiers that require nothing of the node before the next SYNC."""
         return self.node.patient
 
     def connect(self, rerouted: Callable[[], None]) -> None:
-        """Connect the node."""
         self.node.connect(rerouted)

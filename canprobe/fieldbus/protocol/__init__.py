@@ -6,6 +6,7 @@ one of them shows on both sides of the bus.
     frames                identifiers of CiA 301, NMT and heartbeat, flags of long identifiers and remote requests
     sync                  the SYNC object and its counter
     pdo                   PDO mappings, compiled once to struct formats
+    sdo                   SDO requests, and what stands where in requests and answers
     emcy                  emergency messages and the words for their codes
     lss                   layer setting services
     cia402                the state machine of a drive as one table, which the drive and its master both read

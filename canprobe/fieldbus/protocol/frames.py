@@ -63,6 +63,18 @@ class NmtState(IntEnum):
     PRE_OPERATIONAL = 0x7F
 
 
+NMT_GOALS = {
+    NmtCommand.START: NmtState.OPERATIONAL,
+    NmtCommand.STOP: NmtState.STOPPED,
+    NmtCommand.PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
+    NmtCommand.RESET_NODE: NmtState.INITIALISING,
+    NmtCommand.RESET_COMMUNICATION: NmtState.INITIALISING,
+}
+"""State to which each command leads, from every state but INITIALISING, in which none works; a slave leaves that for
+PRE_OPERATIONAL by itself. Source: CiA 301, "NMT state machine" and "NMT node control".
+"""
+
+
 def _check_node(node_id: int, lowest: int = 1) -> int:
     if not lowest <= node_id <= 127:
         raise ProtocolError(f"node id {node_id}: must be {lowest}..127")

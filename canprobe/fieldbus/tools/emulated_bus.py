@@ -6,7 +6,6 @@ serves the nodes and another one writes the log; the master under test may live 
 
 from __future__ import annotations
 
-import re
 import struct
 import threading
 import time
@@ -37,6 +36,7 @@ from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.serve import serve
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
+from canprobe.fieldbus.tools.faults.text import node_of
 
 T = TypeVar("T")
 Requests = SimpleQueue[Callable[[], None]]
@@ -98,9 +98,7 @@ class EmulatedBus(ABC):
         Raises:
             UsageError: the text is wrong, there is no such node, or the kind needs another device.
         """
-        match = re.match(r"\s*node\s+(\d+)", text)
-        node_id = int(match[1]) if match else 0
-        return self._act(node_id, lambda: self.faulty.inject(text, self.clock.now_ns()))
+        return self._act(node_of(text), lambda: self.faulty.inject(text, self.clock.now_ns()))
 
     def end(self, fault: Fault) -> None:
         """End a fault at the next frame or deadline of its node."""
@@ -233,7 +231,6 @@ class VirtualTimeBus(EmulatedBus):
         return PortNetwork(self.port())
 
     def port(self) -> Port:
-        """A port of the lockstep bus."""
         port = self._bus.port()
         self._stack.callback(port.close)
         return port
@@ -294,14 +291,12 @@ class ServedBus(EmulatedBus):
         self._start([0], partial(self._record, listener))
 
     def network(self) -> canopen.Network:
-        """A network with the thread of python-can."""
         network = RealTimeNetwork()
         network.connect(interface=self._interface, channel=self.channel, bitrate=self._bitrate)
         self._stack.callback(network.disconnect)
         return network
 
     def port(self) -> Port:
-        """A port of the interface."""
         port = open_port(self._interface, self.channel, self._bitrate, self.clock, waits=True)
         return self._stack.enter_context(closing(port))
 
@@ -323,7 +318,6 @@ class ServedBus(EmulatedBus):
             self._writer.flush()
 
     def _act(self, node_id: int, act: Callable[[], T]) -> T:
-        """Let the thread of the node do it, which looks for requests after each wait."""
         future: Future[T] = Future()
 
         def request() -> None:

@@ -8,7 +8,7 @@ from examined import NODE_ID, eds_device, failed
 from canprobe.errors import NodeError
 from canprobe.fieldbus.tools.conform import ExaminationSettings
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
-from canprobe.fieldbus.tools.faults.row import MOST, UNANSWERED
+from canprobe.fieldbus.tools.faults.fault import MOST, UNANSWERED
 from canprobe.fieldbus.tools.reports import Verdict
 
 

@@ -26,10 +26,10 @@ from canprobe.fieldbus.bus.port import (
     state_after,
 )
 from canprobe.fieldbus.bus.real.adapters import backend_channel, check_interface_name, open_failure
-from canprobe.fieldbus.bus.real.echoes import Echoes
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
+_MAX_ECHO_DELAY_NS = 1_000_000_000
 _STATES = {
     can.BusState.ACTIVE: ControllerState.ACTIVE,
     can.BusState.PASSIVE: ControllerState.PASSIVE,
@@ -39,6 +39,34 @@ _ECHOING_INTERFACES = ("udp_multicast",)
 """Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
 _ERROR_CLASS_INTERFACES = ("socketcan", "socketcand")
 """Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
+
+
+class Echoes:
+    """Our own frames on a bus that returns them: the first received frame that equals a sent one is its echo, once.
+
+    A frame of another sender with the same identifier and data comes besides the echo, so one of the two is kept. An
+    echo is expected for a second.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[Frame, deque[int]] = {}
+
+    def sent(self, frame: Frame, t_ns: int) -> None:
+        """Note a frame that was sent."""
+        self._waiting.setdefault(frame, deque()).append(t_ns)
+
+    def is_one(self, frame: Frame, t_ns: int) -> bool:
+        """Whether a received frame is the echo of a sent one, which then expects no other."""
+        waiting = self._waiting.get(frame)
+        while waiting and t_ns - waiting[0] > _MAX_ECHO_DELAY_NS:
+            waiting.popleft()
+        if not waiting:
+            self._waiting.pop(frame, None)
+            return False
+        waiting.popleft()
+        if not waiting:
+            del self._waiting[frame]
+        return True
 
 
 class PythonCanPort(PlainPort):

@@ -311,7 +311,6 @@ class LockstepPort(Participant, PlainPort):
     stamps_arrival = True
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """Keep a frame for `drain`."""
         self.inbox.append((can_id, data, t_ns))
         return ()
 

@@ -8,9 +8,9 @@ from typing import NoReturn
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NMT_ID, RTR_FLAG, SYNC_ID, NmtCommand, NmtState
+from canprobe.fieldbus.protocol.sdo import place_text
 from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
-from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import Permits
 from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused

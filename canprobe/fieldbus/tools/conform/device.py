@@ -9,8 +9,9 @@ from canprobe.fieldbus.bus.sdo import decode_text
 from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.reading import is_drive
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.conform.outcome import Deviation
-from canprobe.fieldbus.tools.conform.permits import Place, WriteList
+from canprobe.fieldbus.tools.conform.permits import WriteList
 from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
 
 RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)

@@ -13,6 +13,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.port import ControllerState, Port, nothing
@@ -104,7 +105,6 @@ class Examination:
         self._port, self._node_id, self._description = port, node_id, description
         self._boots = 0
         self._ended = ""
-        self._frames: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     def run(
         self, points: Sequence[Point] = POINTS, on_row: Callable[[ReportRow, int, int], object] = nothing
@@ -231,33 +231,16 @@ class Examination:
 
     def _examine(self, point: Point) -> ReportRow:
         """One point: run it, put back what it wrote, look for what it left behind."""
-        bench, began_ns = self.bench, self.bench.now_ns
-        verdict, detail, written = Verdict.PASS, "", list[str]()
-        self._frames = ((), ())
         if self._ended:
-            return self._row(point, Verdict.ERROR, self._ended, [], 0.0)
+            return _row(point, Verdict.ERROR, self._ended)
         if why := self._lacks(point):
-            return self._row(point, Verdict.NOT_APPLICABLE, why, [], 0.0)
-        bench.notes.clear()
-        try:
-            self._prepare()
-            point.run(bench)
-        except PowerStageOn as error:
-            verdict, detail = Verdict.ERROR, str(error)
-            self._ended = f"not examined: {error}"
-        except NotPermitted as error:
-            verdict, detail = Verdict.NOT_APPLICABLE, str(error)
-            self.report.left_out.append((f"{point.group} {point.title}", str(error)))
-        except PointNotApplicable as error:
-            verdict, detail = Verdict.NOT_APPLICABLE, str(error)
-        except (Deviation, SdoRefused) as error:
-            verdict, detail = Verdict.FAIL, str(error)
-        except CanprobeError as error:
-            verdict, detail = Verdict.ERROR, str(error)
+            return _row(point, Verdict.NOT_APPLICABLE, why)
+        bench, began_ns = self.bench, self.bench.now_ns
+        verdict, detail = self._run(point)
         sent, came = (
             tuple(frame_text(*frame, self._node_id) for frame in frames) for frames in (bench.sent, bench.came)
         )
-        self._frames = sent, came
+        written: list[str] = []
         if not self._ended:
             try:
                 with interrupts_held():
@@ -274,7 +257,27 @@ class Examination:
                 verdict = verdict if verdict is Verdict.FAIL else Verdict.ERROR
         if verdict is Verdict.PASS:
             detail = "; ".join(bench.notes)
-        return self._row(point, verdict, detail, written, (bench.now_ns - began_ns) * 1e-9)
+        seconds = (bench.now_ns - began_ns) * 1e-9
+        return _row(point, verdict, detail, sent=sent, came=came, written=tuple(written), seconds=seconds)
+
+    def _run(self, point: Point) -> tuple[Verdict, str]:
+        """Run a point; its verdict, and why."""
+        self.bench.notes.clear()
+        try:
+            self._prepare()
+            point.run(self.bench)
+        except PowerStageOn as error:
+            self._ended = f"not examined: {error}"
+            return Verdict.ERROR, str(error)
+        except PointNotApplicable as error:
+            if isinstance(error, NotPermitted):
+                self.report.left_out.append((f"{point.group} {point.title}", str(error)))
+            return Verdict.NOT_APPLICABLE, str(error)
+        except (Deviation, SdoRefused) as error:
+            return Verdict.FAIL, str(error)
+        except CanprobeError as error:
+            return Verdict.ERROR, str(error)
+        return Verdict.PASS, ""
 
     def _by_hand(self, step: str) -> bool:
         """Let a person do something, and let the report list it."""
@@ -378,28 +381,12 @@ class Examination:
             way = "" if path is None else "; " + _WAY_OUT.format(path=path, node_id=self._node_id)
             raise BenchFailure(f"node {self._node_id}: not everything was put back: {error}{way}") from error
 
-    def _row(
-        self,
-        point: Point,
-        verdict: Verdict,
-        detail: str,
-        written: Sequence[str],
-        seconds: float,
-    ) -> ReportRow:
-        return ReportRow(
-            group=point.group,
-            name=point.title,
-            verdict=verdict,
-            clause=point.clause,
-            expected=point.expected,
-            sent=self._frames[0],
-            came=self._frames[1],
-            detail=detail,
-            hint=(point.hint or HINTS.get(point.number, "")) if verdict is Verdict.FAIL else "",
-            severity="wrong" if verdict is Verdict.FAIL else "",
-            written=tuple(written),
-            seconds=seconds,
-        )
+
+def _row(point: Point, verdict: Verdict, detail: str, **more: Any) -> ReportRow:
+    failed = verdict is Verdict.FAIL
+    hint = (point.hint or HINTS.get(point.number, "")) if failed else ""
+    more |= {"clause": point.clause, "expected": point.expected, "hint": hint, "severity": "wrong" if failed else ""}
+    return ReportRow(point.group, point.title, verdict, detail=detail, **more)
 
 
 def restore_snapshot(port: Port, node_id: int, path: Path, times: BenchTimes | None = None) -> list[str]:

@@ -13,8 +13,9 @@ from typing import NamedTuple
 from canprobe.fieldbus.bus.port import ControllerState, Port, TimedFrame
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Frame
+from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.conform.outcome import BenchFailure
-from canprobe.fieldbus.tools.conform.permits import Permits, Place
+from canprobe.fieldbus.tools.conform.permits import Permits
 from canprobe.fieldbus.tools.conform.surroundings import MAX_BASE_ID
 
 _KEPT_FRAMES = 12

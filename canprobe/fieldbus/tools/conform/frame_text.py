@@ -17,6 +17,7 @@ from canprobe.fieldbus.protocol.frames import (
     NmtState,
 )
 from canprobe.fieldbus.protocol.lss import LSS_ANSWER_ID, LSS_REQUEST_ID
+from canprobe.fieldbus.protocol.sdo import abort_code, place_of, place_text
 from canprobe.fieldbus.tools.conform.accepted import abort_text
 
 _CLIENT = ("segment", "write", "read", "next segment", "abort", "block read", "block write", "unknown command")
@@ -57,16 +58,6 @@ def sdo_text(data: bytes, words: tuple[str, ...] = _CLIENT) -> str:
         return f"SDO with {len(data)} bytes"
     kind = words[data[0] >> 5]
     if kind == "abort":
-        return f"SDO abort of {place_text(*place_of(data))}: {abort_text(int.from_bytes(data[4:], 'little'))}"
+        return f"SDO abort of {place_text(*place_of(data))}: {abort_text(abort_code(data))}"
     has_place = kind in ("write", "read", "value", "written") or (kind.startswith("block") and not data[0] & 1)
     return f"SDO {kind} {place_text(*place_of(data))}" if has_place else f"SDO {kind}"
-
-
-def place_of(data: bytes) -> tuple[int, int]:
-    """Index and sub-index in an SDO frame."""
-    return int.from_bytes(data[1:3], "little"), data[3]
-
-
-def place_text(index: int, subindex: int) -> str:
-    """An index and a sub-index as the standard writes them."""
-    return f"{index:04X}h:{subindex:02X}"

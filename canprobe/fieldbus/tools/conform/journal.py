@@ -14,9 +14,9 @@ from pathlib import Path
 from canprobe.errors import UsageError, check_schema, regular_file
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
-from canprobe.fieldbus.tools.conform.frame_text import place_text
+from canprobe.fieldbus.protocol.sdo import Place, place_text
 from canprobe.fieldbus.tools.conform.outcome import BenchFailure, Deviation
-from canprobe.fieldbus.tools.conform.permits import Place, WriteRule, rule_of
+from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
 
 SCHEMA = 1

@@ -30,11 +30,10 @@ from typing import Any
 
 from canprobe.errors import UsageError, did_you_mean, regular_file
 from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.protocol.sdo import Place, place_text
 from canprobe.fieldbus.tools.conform.accepted import abort_text
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
-from canprobe.fieldbus.tools.conform.permits import Place
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 

@@ -36,12 +36,10 @@ from canprobe.fieldbus.protocol.frames import (
     is_restricted,
 )
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
-from canprobe.fieldbus.tools.conform.frame_text import place_of, place_text
+from canprobe.fieldbus.protocol.sdo import Place, place_of, place_text
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.surroundings import Surroundings
 
-Place = tuple[int, int]
-"""Index and sub-index."""
 WORDS = {
     "reset": "NMT reset node, which also resets application objects that nobody can restore",
     "history": "clearing the error history 1003h",

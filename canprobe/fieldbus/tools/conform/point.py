@@ -39,12 +39,22 @@ class Point:
         return f"{self.number} {self.name}"
 
 
-def conformance_point(
-    number: int, group: str, name: str, clause: str, expected: str, *, needs: str = ""
-) -> Callable[[Callable[[Bench], None]], Point]:
-    """Make a `Point` of the function below; `needs` are words with blanks between them."""
+@dataclass(frozen=True, slots=True)
+class PointGroup:
+    """Makes the points of one service, as a decorator of the functions that examine them.
 
-    def make(run: Callable[[Bench], None]) -> Point:
-        return Point(number, group, name, clause, expected, run, frozenset(needs.split()))
+    Attributes:
+        name: name of the group, such as ``sdo``.
+    """
 
-    return make
+    name: str
+
+    def __call__(
+        self, number: int, name: str, clause: str, expected: str, *, needs: str = ""
+    ) -> Callable[[Callable[[Bench], None]], Point]:
+        """Make a `Point` of the function below; `needs` are words with blanks between them."""
+
+        def make(run: Callable[[Bench], None]) -> Point:
+            return Point(number, self.name, name, clause, expected, run, frozenset(needs.split()))
+
+        return make

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from canprobe.errors import CanprobeError
+from canprobe.fieldbus.protocol import sdo
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 from canprobe.fieldbus.tools.conform.accepted import AbortSet, abort_text
 from canprobe.fieldbus.tools.conform.frame_link import FrameLink
-from canprobe.fieldbus.tools.conform.frame_text import place_of, place_text, sdo_text
+from canprobe.fieldbus.tools.conform.frame_text import sdo_text
 from canprobe.fieldbus.tools.conform.outcome import Deviation
 
-ABORT = 0x80
 MAX_VALUE_BYTES = 1 << 16
 
 
@@ -22,7 +22,7 @@ class SdoRefused(CanprobeError):  # noqa: N818 - what a server does
 
     def __init__(self, index: int, subindex: int, code: int) -> None:
         self.code = code
-        super().__init__(f"{place_text(index, subindex)}: abort {abort_text(code)}")
+        super().__init__(f"{sdo.place_text(index, subindex)}: abort {abort_text(code)}")
 
 
 class SdoClient(FrameLink):
@@ -48,7 +48,7 @@ class SdoClient(FrameLink):
         named = request[0] >> 5 in (1, 2) or request[0] & 0xE1 == 0xC0 or request[0] & 0xE3 == 0xA0
         while (frame := self.next(answer_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
             answer = frame.data
-            if len(answer) != 8 or not named or place_of(answer) == place_of(request):
+            if len(answer) != 8 or not named or sdo.place_of(answer) == sdo.place_of(request):
                 break
         if answer is None:
             raise Deviation(f"no answer within {self.times.sdo_s:g} s to: {sdo_text(request)}")
@@ -58,7 +58,7 @@ class SdoClient(FrameLink):
 
     def request(self, command: int, index: int = 0, subindex: int = 0, data: bytes = b"") -> bytes:
         """Send a request with a multiplexer; return the answer."""
-        return self.ask(pack_request(command, index, subindex, data))
+        return self.ask(sdo.pack_request(command, index, subindex, data))
 
     def upload(self, index: int, subindex: int = 0) -> bytes:
         """Read an entry, expedited or segmented.
@@ -67,22 +67,21 @@ class SdoClient(FrameLink):
             SdoRefused: the device aborted.
             Deviation: no answer, or one that does not follow the protocol.
         """
-        answer = self._initiated(pack_request(0x40, index, subindex), 2)
+        answer = self._initiated(sdo.pack_read(index, subindex), 2)
         if answer[0] & 2:
-            return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & 1 else answer[4:]
-        announced = int.from_bytes(answer[4:], "little") if answer[0] & 1 else None
-        value, toggle, last = b"", 0, False
+            return sdo.expedited_value(answer)
+        announced, value, toggle, last = sdo.stated_size(answer), b"", 0, False
         while not last and len(value) < MAX_VALUE_BYTES:
             answer = self.ask(bytes((0x60 | toggle,)) + bytes(7))
-            if answer[0] == ABORT:
-                raise SdoRefused(index, subindex, int.from_bytes(answer[4:], "little"))
+            if answer[0] == sdo.ABORT:
+                raise SdoRefused(index, subindex, sdo.abort_code(answer))
             if answer[0] & 0xF0 != toggle:
-                raise Deviation(f"a segment of {place_text(index, subindex)} has the wrong command or toggle bit")
-            value += answer[1 : 8 - (answer[0] >> 1 & 7)]
+                raise Deviation(f"a segment of {sdo.place_text(index, subindex)} has the wrong command or toggle bit")
+            value += sdo.segment_value(answer)
             toggle ^= 0x10
             last = bool(answer[0] & 1)
         if announced is not None and announced != len(value):
-            raise Deviation(f"{place_text(index, subindex)} announced {announced} bytes and sent {len(value)}")
+            raise Deviation(f"{sdo.place_text(index, subindex)} announced {announced} bytes and sent {len(value)}")
         return value
 
     def download(self, index: int, subindex: int, value: bytes) -> None:
@@ -92,16 +91,16 @@ class SdoClient(FrameLink):
             SdoRefused: the device aborted.
             Deviation: no answer, or a wrong one.
         """
-        self._initiated(pack_write(index, subindex, value), 3)
+        self._initiated(sdo.pack_write(index, subindex, value), 3)
 
     def _initiated(self, request: bytes, specifier: int) -> bytes:
-        answer, place = self.ask(request), place_of(request)
-        if answer[0] == ABORT:
-            raise SdoRefused(*place, int.from_bytes(answer[4:], "little"))
+        answer, place = self.ask(request), sdo.place_of(request)
+        if answer[0] == sdo.ABORT:
+            raise SdoRefused(*place, sdo.abort_code(answer))
         if answer[0] >> 5 != specifier:
             raise Deviation(f"command byte {answer[0]:02X}h answers: {sdo_text(request)}")
-        if place_of(answer) != place:
-            raise Deviation(f"the answer names {place_text(*place_of(answer))}, asked was {place_text(*place)}")
+        if (named := sdo.place_of(answer)) != place:
+            raise Deviation(f"the answer names {sdo.place_text(*named)}, asked was {sdo.place_text(*place)}")
         return answer
 
     def must_refuse(self, request: bytes, accepted: AbortSet, what: str) -> None:
@@ -114,9 +113,9 @@ class SdoClient(FrameLink):
 
     def check_abort(self, answer: bytes, accepted: AbortSet, what: str) -> None:
         """Check that an answer is an abort with an accepted code. Raises Deviation."""
-        if answer[0] != ABORT:
+        if answer[0] != sdo.ABORT:
             raise Deviation(f"{what}: expected an abort, got {answer.hex(' ').upper()}")
-        code = int.from_bytes(answer[4:], "little")
+        code = sdo.abort_code(answer)
         if code not in accepted:
             raise Deviation(f"{what}: aborted with {abort_text(code)}")
         if code != accepted[0]:
@@ -126,13 +125,3 @@ class SdoClient(FrameLink):
         """Whether no SDO answer has come, and none comes for the time of a silence."""
         self.pass_time(self.times.silence_s)
         return not self.taken(SDO_TX_BASE + self.node_id)
-
-
-def pack_request(command: int, index: int, subindex: int, data: bytes = b"") -> bytes:
-    """Pack a request: command byte, multiplexer, up to four bytes."""
-    return bytes((command,)) + index.to_bytes(2, "little") + bytes((subindex,)) + data.ljust(4, b"\0")
-
-
-def pack_write(index: int, subindex: int, value: bytes) -> bytes:
-    """Pack an expedited download of one to four bytes."""
-    return pack_request(0x23 | (4 - len(value)) << 2, index, subindex, value)

@@ -1,7 +1,7 @@
 """The registry of faults, and how they are thrown at emulated nodes: in studies, tests, commands and programs.
 
-A `Fault` says what happens (a `FaultKind`, one row of `registry.BUS_FAULTS`), to which node, when, for how long, and
-how often. A `FaultyNode` stands between a node and a bus, in the node's place, on a lockstep bus and in a process that
+A `Fault` says what happens (its kind, a class in `registry.BUS_FAULTS`), to which node, when, for how long, and how
+often. A `FaultyNode` stands between a node and a bus, in the node's place, on a lockstep bus and in a process that
 serves nodes on a real one alike; it begins and ends its faults by the time of the bus, and lets the `Effect` of each
 change the frames that come in and go out, or the node itself. `FaultyNodes` throws faults that are written as text:
 
@@ -11,12 +11,12 @@ change the frames that come in and go out, or the node itself. `FaultyNodes` thr
 Invariants: the same seed does the same; a fault holds from the next frame or deadline of its node on, so within one
 cycle; when it ends, what it changed in the node is undone; a node without faults is the node itself.
 
-    fault           what a fault is; the base class of what it does
+    fault           what a fault is; the base class of the kinds, with their facts
     faulty_node     the node that has them
     frame_faults    the link: lost, late, twice, changed, made up; power and bus-off
     service_faults  heartbeat, NMT, SDO, EMCY, mapping
     drive_faults    CiA 402: fault, torque off, encoder, brake, zero
-    registry        the table of all kinds; drive_registry has those of a drive, row how a row is written
+    registry        the table of all kinds
     text, injection faults as text, and thrown at running nodes
     planned         faults of a test, which wait for their nodes
     control         the local channel by which `canprobe inject` reaches served nodes

@@ -20,6 +20,7 @@ from typing import Any
 
 from canprobe.errors import CanprobeError, InterfaceError, UsageError
 from canprobe.fieldbus.tools.faults.injection import FaultyNodes
+from canprobe.fieldbus.tools.faults.text import node_of
 
 _MAX_BYTES = 1 << 16
 _MAX_LINES, _MAX_IDLE_NS = 8, 1_000_000_000
@@ -147,9 +148,7 @@ def request_faults(channel: str, faults: Sequence[str], *, clear: bool = False) 
             f"{channel}: no process of this user serves nodes there; type: canprobe emulate SCENE --channel {channel}"
         )
     for text in faults:
-        match = re.match(r"\s*node\s+(\d+)", text)
-        node_id = int(match[1]) if match else 0
-        name = next((name for name, nodes in nodes_of.items() if node_id in nodes), next(iter(nodes_of)))
+        name = next((name for name, nodes in nodes_of.items() if node_of(text) in nodes), next(iter(nodes_of)))
         answer = _ask(name, [text], clear=False)
         done["thrown"] += answer["thrown"] if answer is not None else []
     return done

@@ -1,4 +1,4 @@
-"""Faults of a CiA 402 drive: its states, its encoder, its brake, its zero and its torque."""
+"""Faults of a CiA 402 drive: its states, its encoder, its brake, its zero and its torque. Source: CiA 402-2."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from canprobe.fieldbus.drive.drive import DriveApplication
 from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.fieldbus.tools.faults.fault import Effect, Fault, Host
+from canprobe.fieldbus.tools.faults.fault import LOST, Effect, Fault, Host, Parameter, error_code, numbers
 from canprobe.fieldbus.tools.faults.service_faults import ObjectAborted
 
 VALUE_ABORT_CODE = 0x06090030
@@ -17,10 +17,13 @@ _MODE_INDEX = 0x6060
 _MAX_TORQUE_INDEX = 0x6072
 _FAULT_STATES = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _RESTING_STATES = (DriveState.NOT_READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED, *_FAULT_STATES)
+_LEAST, _MOST = -(2**31), 2**31 - 1
 
 
 class DriveEffect(Effect):
     """Base class of the faults of a drive."""
+
+    needs = "drive"
 
     def __init__(self, fault: Fault, host: Host) -> None:
         super().__init__(fault, host)
@@ -32,33 +35,37 @@ class DriveEffect(Effect):
 class DriveFault(DriveEffect):
     """The drive detects a fault. One that is not resettable comes back at once after a fault reset."""
 
+    name, what = "drive-fault", "the drive detects a fault"
+    clause, reaction = "CiA 402-2, 605Eh, 603Fh", "stops the others; resets by an edge only"
+    trips = "drive_fault"
+    parameters = numbers(
+        code=error_code(0x4310, "error code"), resettable=Parameter(1, 0, 1, "0: it comes back after a reset")
+    )
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Detect it."""
-        return self._detect(t_ns)
-
-    def watch(self, t_ns: int) -> Sequence[Frame]:
-        """Detect it again after a reset."""
-        if self.fault.value("resettable") or self.drive.state in _FAULT_STATES:
-            return ()
-        return self._detect(t_ns)
-
-    def _detect(self, t_ns: int) -> Sequence[Frame]:
         self.host.hits += 1
         self.node.core.now_ns = t_ns
         self.drive.inject_fault(int(self.fault.value("code")))
         return self.node.advance(t_ns)
 
+    def watch(self, t_ns: int) -> Sequence[Frame]:
+        if self.fault.value("resettable") or self.drive.state in _FAULT_STATES:
+            return ()
+        return self.begin(t_ns)
+
 
 class Sto(DriveEffect):
     """Safe torque off: the drive has no power, and leaves switch-on disabled for no command."""
 
+    name, what = "sto", "safe torque off"
+    clause, reaction = "CiA 402-2, state automaton", "does not enable it again and again"
+    trips, fails = "drive_fault", "49 50 51 54 55"
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Take the power away."""
         self.host.hits += 1
         return self.watch(t_ns)
 
     def watch(self, t_ns: int) -> Sequence[Frame]:
-        """Keep it away."""
         if self.drive.state in _RESTING_STATES:
             return ()
         self.node.core.now_ns = t_ns
@@ -67,29 +74,30 @@ class Sto(DriveEffect):
 
 
 class ModeRefused(ObjectAborted):
-    """Writes to 6060h are refused."""
+    """Writes to 6060h are refused: value range exceeded."""
+
+    name, what = "mode-refused", "writes to 6060h are refused"
+    clause, reaction = "CiA 402-2, 6060h, 6061h", "sends no targets"
+    fails, incoming, needs = "49 50 51 53 54 55", True, "drive"
+    code = VALUE_ABORT_CODE
 
     def index(self, data: bytes) -> int:
-        """6060h, where the request is a download."""
         return _MODE_INDEX if data[0] >> 5 == 1 else -1
-
-    @property
-    def code(self) -> int:
-        """Value range exceeded."""
-        return VALUE_ABORT_CODE
 
 
 class BrakeStuck(DriveEffect):
-    """The motor stays where it is, whatever its reference."""
+    """The motor stays where it is, whatever its reference; at the end it goes on from the next one."""
+
+    name, what = "brake-stuck", "the motor stays where it is"
+    clause, reaction = "CiA 402-2, 6065h, 8611h", "the drive finds a following error"
+    trips = "following"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Hold the motor."""
         self.host.hits += 1
         self.drive.parts.motion.block(t_ns)
         return ()
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        """Let it go, from the next reference on."""
         self.drive.parts.motion.blocked = False
         return ()
 
@@ -98,13 +106,11 @@ class EncoderFault(DriveEffect):
     """Base class of faults of the encoder."""
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Distort what is measured."""
         self.host.hits += 1
         self.drive.parts.feedback.distortions.append(self.measured)
         return ()
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        """Measure the motor again."""
         self.drive.parts.feedback.distortions.remove(self.measured)
         return ()
 
@@ -116,18 +122,24 @@ class EncoderFault(DriveEffect):
 class EncoderJump(EncoderFault):
     """The encoder is wrong by so many counts from the beginning on."""
 
+    name, what = "encoder-jump", "the encoder is wrong by some counts"
+    clause, reaction = "CiA 402-2, 6064h", "drops what cannot be"
+    trips = LOST
+    parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "error, counts"))
+
     def measured(self, counts: float) -> float:
-        """Counts beside the true ones."""
         return counts + self.fault.value("counts")
 
 
 class EncoderFrozen(EncoderFault):
     """The encoder keeps the last position."""
 
+    name, what = "encoder-frozen", "the encoder keeps its position"
+    clause, reaction = "CiA 402-2, 6064h", "the drive finds a following error"
+    trips = "following"
     _kept: float | None = None
 
     def measured(self, counts: float) -> float:
-        """The first counts of the fault."""
         self._kept = counts if self._kept is None else self._kept
         return self._kept
 
@@ -135,8 +147,10 @@ class EncoderFrozen(EncoderFault):
 class HomingLost(DriveEffect):
     """The drive forgets that it was homed: bit 12 of the homing mode is gone."""
 
+    name, what = "homing-lost", "the drive forgets that it was homed"
+    clause, reaction = "CiA 402-2, homing, bit 12", "moves nothing before it is homed"
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Forget it."""
         self.host.hits += 1
         self.drive.forget_homing()
         return ()
@@ -145,8 +159,12 @@ class HomingLost(DriveEffect):
 class ZeroShift(DriveEffect):
     """The zero of the drive is elsewhere from the beginning on: every position is reported and taken beside it."""
 
+    name, what = "zero-shift", "the zero of the drive is elsewhere"
+    clause, reaction = "CiA 402-2, 607Ch", "does not hold the old zero"
+    trips = "drive_fault"
+    parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "way of the zero, units of position"))
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Shift the zero."""
         self.host.hits += 1
         units = self.drive.parts.parameters.units
         units.origin += self.fault.value("counts") * units.scale
@@ -156,15 +174,17 @@ class ZeroShift(DriveEffect):
 class TorqueLimit(DriveEffect):
     """The torque is limited to a share of the rated one, as if 6072h had been written."""
 
+    name, what = "torque-limit", "the torque is limited"
+    clause, reaction = "CiA 402-2, 6072h, bit 11", "goes no faster than the drive follows"
+    parameters = numbers(permille=Parameter(10, 0, 10_000, "limit, 1/1000 of the rated torque"))
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Lower 6072h."""
         self.host.hits += 1
         self._before = self.node.dictionary.number(_MAX_TORQUE_INDEX)
         self._limit(int(self.fault.value("permille")))
         return ()
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        """Put it back."""
         self._limit(self._before)
         return ()
 

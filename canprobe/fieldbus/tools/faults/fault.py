@@ -1,11 +1,12 @@
-"""A fault of a node or its link: its kind, when it holds, and how often; and the base class of what it does."""
+"""A fault of a node or its link: when it holds, and how often; and the base class of its kinds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from random import Random
-from typing import Protocol
+from types import MappingProxyType
+from typing import Any, ClassVar, Protocol
 
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import Frame
@@ -13,6 +14,12 @@ from canprobe.fieldbus.protocol.frames import Frame
 FOREVER_NS = 1 << 62
 """Duration of a fault without an end."""
 ENDLESS_HITS = 1 << 62
+SHORT_NS = 100_000_000
+"""Duration of a power failure and of bus-off where none is given."""
+UNANSWERED, MOST = "unanswered", "most"
+"""In the place of points: the device does not answer, so that none is examined; most of those examined fail."""
+LOST = "pdo_missed drive_late drive_silent"
+"""Conditions of a drive whose TPDOs do not come."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,36 +38,19 @@ class Parameter:
     what: str
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class FaultKind:
-    """One row of the registry.
+def numbers(**parameters: Parameter) -> Mapping[str, Parameter]:
+    """The numbers that a kind takes, by name."""
+    return MappingProxyType(parameters)
 
-    Attributes:
-        name: name in texts, tests and studies.
-        what: what happens.
-        clause: clause or object of the standard that it breaks, or that says how to answer it.
-        reaction: what a conforming peer does.
-        effect: class that makes it happen.
-        conditions: keys of the supervision's conditions that it trips in a cell in motion, at full share.
-        points: numbers of the points of `conform` that a drive fails with it, thrown from the start with `--motion`;
-            or one of the words of `row`.
-        parameters: its numbers by name.
-        incoming: whether it hits frames that the node receives; None: either, as the fault says, else those it sends.
-        needs: device that it needs: a node, a drive, or an array.
-        lasts_ns: its duration where a text gives none.
-    """
 
-    name: str
-    what: str
-    clause: str
-    reaction: str
-    effect: Callable[[Fault, Host], Effect]
-    conditions: frozenset[str] = frozenset()
-    points: frozenset[str] = frozenset()
-    parameters: Mapping[str, Parameter] = field(default_factory=dict)
-    incoming: bool | None = None
-    needs: str = "node"
-    lasts_ns: int = FOREVER_NS
+def in_ms(default: float, what: str) -> Parameter:
+    """A time in milliseconds, up to an hour."""
+    return Parameter(default, 0.001, 3_600_000, what)
+
+
+def error_code(default: int, what: str) -> Parameter:
+    """An emergency error code."""
+    return Parameter(default, 0, 0xFFFF, what)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +58,7 @@ class Fault:
     """One fault.
 
     Attributes:
-        kind: row of the registry.
+        kind: its kind, a row of the registry.
         node_id: id of the node.
         start_ns: beginning, on the clock of the bus; with an event it counts from then on only.
         duration_ns: duration.
@@ -144,22 +134,64 @@ class Host(Protocol):
         """Send a frame that the node did not make, with its next answers."""
 
 
+_DEFAULTS: Mapping[str, Any] = {
+    "trips": "",
+    "fails": "",
+    "parameters": numbers(),
+    "incoming": False,
+    "lasts_ns": FOREVER_NS,
+}
+"""Facts of a kind that states nothing else."""
+
+
 class Effect:
-    """What one fault does while it holds. The base class does nothing; subclasses override what they need.
+    """A kind of fault: its facts, and what a fault of it does while it holds.
+
+    A subclass with a name is a row of the registry. It states the facts, of which it inherits none but `needs`, and
+    overrides what it needs of the methods; here they do nothing.
 
     Args:
         fault: the fault.
         host: the node that has it.
 
     Attributes:
+        name: name in texts, tests and studies.
+        what: what happens.
+        clause: clause or object of the standard that it breaks, or that says how to answer it.
+        reaction: what a conforming peer does.
+        trips: keys of the supervision's conditions that it trips in a cell in motion, at full share, with blanks;
+            `conditions` has them as a set.
+        fails: numbers of the points of `conform` that a drive fails with it, thrown from the start with `--motion`; or
+            `UNANSWERED` or `MOST`; `points` has them as a set.
+        parameters: its numbers by name.
+        incoming: whether it hits frames that the node receives; None: either, as the fault says, else those it sends.
+        needs: device that it needs: a node, a drive, or an array.
+        lasts_ns: its duration where a text gives none.
         dark: whether the node neither sends nor hears nor computes.
         due_ns: time at which `advance` is called next; None: never.
         end_ns: time at which it ends.
         left: number of frames that it may still hit.
     """
 
+    name: ClassVar[str]
+    what: ClassVar[str]
+    clause: ClassVar[str]
+    reaction: ClassVar[str]
+    trips: ClassVar[str]
+    fails: ClassVar[str]
+    conditions: ClassVar[frozenset[str]]
+    points: ClassVar[frozenset[str]]
+    parameters: ClassVar[Mapping[str, Parameter]]
+    incoming: ClassVar[bool | None]
+    needs: ClassVar[str] = "node"
+    lasts_ns: ClassVar[int]
     dark = False
     due_ns: int | None = None
+
+    def __init_subclass__(cls) -> None:
+        for fact, default in _DEFAULTS.items():
+            setattr(cls, fact, vars(cls).get(fact, default))
+        cls.conditions, cls.points = frozenset(cls.trips.split()), frozenset(cls.fails.split())
 
     def __init__(self, fault: Fault, host: Host) -> None:
         self.fault, self.host, self.node = fault, host, host.node
@@ -190,3 +222,6 @@ class Effect:
     def watch(self, t_ns: int) -> Sequence[Frame]:
         """Look at the node after it received or did something; return frames that it sends because of it."""
         return ()
+
+
+FaultKind = type[Effect]

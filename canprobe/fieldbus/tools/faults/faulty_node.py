@@ -96,12 +96,10 @@ class FaultyNode(WrappedNode):
         return first if first < FOREVER_NS else None
 
     def start(self, t_ns: int) -> Sequence[Frame]:
-        """Power on."""
         self.now_ns = t_ns
         return self._finished(self.node.start(t_ns), (), t_ns)
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """Take a frame from the bus, which may not reach the node."""
         self.now_ns = t_ns
         if not self._busy:
             return self.node.receive(can_id, data, t_ns)
@@ -115,7 +113,6 @@ class FaultyNode(WrappedNode):
         return [*ready, *self._finished(out, (), t_ns, synchronised=can_id == SYNC_ID)]
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Do what is due in the node and in its faults."""
         self.now_ns = t_ns
         if not self._busy:
             return self.node.advance(t_ns)
@@ -168,7 +165,7 @@ class FaultyNode(WrappedNode):
 
     def _begin(self, fault: Fault, t_ns: int) -> Sequence[Frame]:
         self.history.append((t_ns, "begins", fault))
-        effect = fault.kind.effect(fault, self)
+        effect = fault.kind(fault, self)
         effect.end_ns = t_ns + fault.duration_ns
         self._effects.append(effect)
         return effect.begin(t_ns)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
+from typing import ClassVar
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.node.slave_node import SlaveNode
@@ -20,7 +21,7 @@ from canprobe.fieldbus.protocol.frames import (
     Frame,
 )
 from canprobe.fieldbus.protocol.tactile import TactileHeader, crc16_ccitt
-from canprobe.fieldbus.tools.faults.fault import Effect
+from canprobe.fieldbus.tools.faults.fault import LOST, MOST, SHORT_NS, UNANSWERED, Effect, Parameter, in_ms, numbers
 
 BUS_OFF_RECOVERED_CODE = 0x8140
 HEADER_INDEX, POSITION_INDEX = 0x2120, 0x6064
@@ -38,16 +39,23 @@ def is_pdo(can_id: int) -> bool:
 class Drop(Effect):
     """Frames are lost."""
 
+    name, what = "drop", "frames are lost"
+    clause, reaction = "CiA 301, PDO", "misses them, then the node is lost"
+    trips, fails = LOST, UNANSWERED
+    incoming: ClassVar[bool | None] = None
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        """Lose it."""
         return ()
 
 
 class Delay(Effect):
     """Frames come later."""
 
+    name, what = "delay", "frames come later"
+    clause, reaction = "CiA 301, 1007h", "takes a late PDO for a missed one"
+    parameters, incoming = numbers(ms=in_ms(1, "delay, ms")), None
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        """Let it wait."""
         delay_ns = max(1, round(self.fault.value("ms") * 1e6))
         self.host.later(frame, t_ns + delay_ns, incoming=self.fault.hears)
         return ()
@@ -56,105 +64,94 @@ class Delay(Effect):
 class Duplicate(Effect):
     """Frames come twice, or more often."""
 
+    name, what = "duplicate", "frames come twice"
+    clause, reaction = "ISO 11898-1, acknowledgement", "takes the first"
+    parameters, incoming = numbers(n=Parameter(2, 2, 100, "number of frames for each")), None
+    fails = "1 8 19 23 30 31 37 102"
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        """Repeat it."""
         return [frame] * int(self.fault.value("n"))
 
 
 class Corrupt(Effect):
     """A bit of each frame is another, or its end is missing, as the CRC of the wire lets it pass once in a lifetime."""
 
+    name, what = "corrupt", "a bit is another, or the end is missing"
+    clause, reaction = "ISO 11898-1, CRC", "drops what cannot be"
+    trips, fails, incoming = "pdo_missed drive_late drive_fault", MOST, None
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        """Change it."""
         return ((frame[0], _flip_bit(frame[1], self.rng)),)
 
 
 class Reorder(Effect):
     """A frame comes behind the next ones."""
 
+    name, what = "reorder", "a frame comes behind the next ones"
+    clause, reaction = "CiA 301, PDO", "goes by the identifier, not by the order"
+    trips, fails, incoming = LOST, UNANSWERED, None
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        """Keep it back."""
         self.host.swap(frame)
         return ()
 
 
-class Short(Effect):
-    """PDOs have a byte too few."""
+class Mute(Drop):
+    """The node sends nothing."""
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Cut it."""
-        return ((frame[0], frame[1][:-1]),) if is_pdo(frame[0]) and frame[1] else None
-
-
-class Long(Effect):
-    """PDOs have a byte too many, where a classical frame has room for it."""
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Lengthen it."""
-        return ((frame[0], frame[1] + b"\0"),) if is_pdo(frame[0]) and len(frame[1]) < CLASSIC_BYTES else None
+    name, what = "mute", "the node sends nothing"
+    clause, reaction = "CiA 301, 1016h", "stops the others"
+    trips, fails = LOST, UNANSWERED
 
 
-class WrongId(Effect):
-    """PDOs come under another identifier."""
+class Deaf(Drop):
+    """The node hears nothing."""
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Rename it."""
-        return ((frame[0] + int(self.fault.value("offset")), frame[1]),) if is_pdo(frame[0]) else None
-
-
-class Freeze(Effect):
-    """The node stands still: it neither hears nor sends, and goes on where it was."""
-
-    dark = True
+    name, what = "deaf", "the node hears nothing"
+    clause, reaction = "CiA 301, 1016h, 6007h", "the node stops by itself: 8130h, 8250h"
+    trips, fails, incoming = f"{LOST} emcy_communication", UNANSWERED, True
 
 
-class Reboot(Freeze):
+class Reboot(Effect):
     """The power fails for the duration; the node boots when it is back."""
 
+    name, what = "reboot", "the power fails for the duration"
+    clause, reaction = "CiA 301, boot-up", "sends no targets; configures it anew"
+    trips, fails, lasts_ns = f"{LOST} emcy_communication", UNANSWERED, SHORT_NS
+    dark = True
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Lose the power."""
         self.host.hits += 1
         self.node.start(t_ns)
         return ()
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        """Boot."""
         self.host.hits += 1
         return self.node.start(t_ns)
 
 
-class BusOff(Freeze):
-    """The controller is off the bus; the node itself goes on, and reports its return."""
+class Freeze(Effect):
+    """The node stands still: it neither hears nor sends, and goes on where it was."""
 
-    dark = False
-
-    def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
-        """Lose what the node sends."""
-        self.host.hits += len(frames)
-        return []
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        """Lose what it would hear."""
-        return ()
-
-    def end(self, t_ns: int) -> Sequence[Frame]:
-        """Come back with EMCY 8140h."""
-        self.node.core.now_ns = t_ns
-        self.node.emcy.report(BUS_OFF_RECOVERED_CODE)
-        self.node.emcy.clear(BUS_OFF_RECOVERED_CODE)
-        return self.node.advance(t_ns)
+    name, what = "freeze", "the node stands still for the duration"
+    clause, reaction = "CiA 301, 1016h", "stops the others"
+    trips, fails = f"{LOST} emcy_communication", UNANSWERED
+    dark = True
 
 
 class Babble(Effect):
     """The node sends frames that nobody asked for; each seed has its own sort."""
 
+    name, what = "babble", "frames that nobody asked for; the seed chooses their sort"
+    clause, reaction = "ISO 11898-1, arbitration", "stays below the load that it bears"
+    trips, fails = "drive_fault", "6 30 31 37 40"
+    parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Begin to talk."""
         self.due_ns = t_ns
         return ()
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Say it again, as often as its time has come."""
         out = []
         while self.due_ns is not None and self.due_ns <= t_ns:
             self.due_ns += max(1, round(self.fault.value("gap_ms") * 1e6))
@@ -175,48 +172,14 @@ class Babble(Effect):
         return sorts[self.fault.seed % len(sorts)]
 
 
-class OddFrames(Babble):
-    """Remote requests and frames of 29 bits under the identifiers of the node's TPDO and RPDO."""
-
-    def made(self) -> Frame:
-        """A remote request for a PDO that allows none, or a 29-bit frame with the bits of an RPDO."""
-        if self.rng.random() < 0.5:
-            return RTR_FLAG | _TPDO1 + 0x40 + self.node.node_id, b""
-        return EFF_FLAG | _TPDO1 + 0x80 + self.node.node_id, self.rng.randbytes(8)
-
-
-class SyncJitter(Effect):
-    """SYNC reaches the node later, each time by another time."""
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Let it wait."""
-        if frame[0] != SYNC_ID:
-            return None
-        self.host.later(frame, t_ns + max(1, round(1e3 * self.rng.uniform(0.0, self.fault.value("us")))), incoming=True)
-        return ()
-
-
-class SyncLost(Effect):
-    """SYNC does not reach the node."""
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Lose it."""
-        return () if frame[0] == SYNC_ID else None
-
-
-class SyncDouble(Effect):
-    """SYNC reaches the node twice."""
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Repeat it."""
-        return (frame, frame) if frame[0] == SYNC_ID else None
-
-
 class WrongData(Effect):
     """A drive reports another position, an array another SYNC counter (even seeds) or age, with the right CRC."""
 
+    name, what = "wrong-data", "another position, or another tactile header with the right CRC"
+    clause, reaction = "CiA 402-2, 6064h", "drops what cannot be"
+    trips = LOST
+
     def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
-        """Change what the node sends at one time."""
         if self.rng.random() >= self.fault.share:
             return frames
         ids = tactile_ids(self.node)
@@ -249,6 +212,119 @@ class WrongData(Effect):
         first = replace(header, crc=0).pack()
         packed = replace(header, crc=crc16_ccitt(body, crc16_ccitt(first[:6]))).pack()
         return [(can_id, packed if can_id == ids[0] else data) for can_id, data in frames]
+
+
+class Short(Effect):
+    """PDOs have a byte too few."""
+
+    name, what = "short", "PDOs have a byte too few"
+    clause, reaction = "CiA 301, PDO length, 8210h", "does not apply them"
+    trips, fails, incoming = LOST, "30 83", None
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        return ((frame[0], frame[1][:-1]),) if is_pdo(frame[0]) and frame[1] else None
+
+
+class Long(Effect):
+    """PDOs have a byte too many, where a classical frame has room for it."""
+
+    name, what = "long", "PDOs have a byte too many"
+    clause, reaction = "CiA 301, PDO length, 8220h", "applies or drops them"
+    incoming = None
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        return ((frame[0], frame[1] + b"\0"),) if is_pdo(frame[0]) and len(frame[1]) < CLASSIC_BYTES else None
+
+
+class Burst(Duplicate):
+    """Frames come many times."""
+
+    name, what = "burst", "frames come many times"
+    clause, reaction = "CiA 301, inhibit time", "takes the first"
+    parameters, incoming = numbers(n=Parameter(10, 2, 100, "number of frames for each")), None
+    trips, fails = f"{LOST} emcy_communication", "1 8 19 23 30 31 37 45 102"
+
+
+class WrongId(Effect):
+    """PDOs come under another identifier."""
+
+    name, what = "wrong-id", "PDOs come under another identifier"
+    clause, reaction = "CiA 301, 18xxh:01", "misses them"
+    parameters, incoming = numbers(offset=Parameter(16, -0x180, 0x180, "distance of the identifiers")), None
+    trips, fails = LOST, "30 31 37 101"
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        return ((frame[0] + int(self.fault.value("offset")), frame[1]),) if is_pdo(frame[0]) else None
+
+
+class OddFrames(Babble):
+    """Remote requests for PDOs that allow none, and 29-bit frames with the bits of an RPDO."""
+
+    name, what = "odd-frames", "remote requests and 29-bit frames under the node's PDOs"
+    clause, reaction = "CiA 301, COB-ID bits 29 and 30", "ignores them"
+    parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
+
+    def made(self) -> Frame:
+        if self.rng.random() < 0.5:
+            return RTR_FLAG | _TPDO1 + 0x40 + self.node.node_id, b""
+        return EFF_FLAG | _TPDO1 + 0x80 + self.node.node_id, self.rng.randbytes(8)
+
+
+class SyncJitter(Effect):
+    """SYNC reaches the node later, each time by another time."""
+
+    name, what = "sync-jitter", "SYNC reaches the node late, each time otherwise"
+    clause, reaction = "CiA 301, 1006h", "bears half a period"
+    parameters, incoming = numbers(us=Parameter(200, 1, 1e6, "longest delay, µs")), True
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        if frame[0] != SYNC_ID:
+            return None
+        self.host.later(frame, t_ns + max(1, round(1e3 * self.rng.uniform(0.0, self.fault.value("us")))), incoming=True)
+        return ()
+
+
+class SyncLost(Effect):
+    """SYNC does not reach the node."""
+
+    name, what = "sync-lost", "SYNC does not reach the node"
+    clause, reaction = "CiA 301, 1006h, 8100h, 6007h", "the node stops by itself: 8100h"
+    trips, fails, incoming = f"{LOST} emcy_communication", "30 37 40 101", True
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        return () if frame[0] == SYNC_ID else None
+
+
+class SyncDouble(Effect):
+    """SYNC reaches the node twice."""
+
+    name, what = "sync-double", "SYNC reaches the node twice"
+    clause, reaction = "CiA 301, 1019h", "goes by the counter"
+    fails, incoming = "30 37", True
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        return (frame, frame) if frame[0] == SYNC_ID else None
+
+
+class BusOff(Effect):
+    """The controller is off the bus; the node itself goes on, and reports its return by EMCY 8140h."""
+
+    name, what = "bus-off", "the controller is off the bus for the duration"
+    clause, reaction = "CiA 301, 8140h", "stops the others; the node reports its return"
+    trips, fails, incoming, lasts_ns = LOST, UNANSWERED, True, SHORT_NS
+
+    def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
+        self.host.hits += len(frames)
+        return []
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
+        return ()
+
+    def end(self, t_ns: int) -> Sequence[Frame]:
+        self.node.core.now_ns = t_ns
+        self.node.emcy.report(BUS_OFF_RECOVERED_CODE)
+        self.node.emcy.clear(BUS_OFF_RECOVERED_CODE)
+        return self.node.advance(t_ns)
 
 
 def tpdos(node: SlaveNode) -> dict[int, list[int]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
@@ -15,10 +14,10 @@ from canprobe.fieldbus.protocol.frames import (
     SDO_TX_BASE,
     Frame,
 )
-from canprobe.fieldbus.tools.faults.fault import Effect
+from canprobe.fieldbus.protocol.sdo import pack_abort, place_of
+from canprobe.fieldbus.tools.faults.fault import MOST, UNANSWERED, Effect, Parameter, error_code, in_ms, numbers
 from canprobe.fieldbus.tools.faults.frame_faults import Babble
 
-_ABORT = struct.Struct("<BHBI")
 _BOOT_UP = b"\0"
 _TOGGLE_FLAG = 0x10
 _SEGMENT_ANSWERS = (0, 1)  # server command specifiers: upload segment, download segment
@@ -30,16 +29,23 @@ _EXPEDITED_FLAGS = 0x43
 class HeartbeatOff(Effect):
     """The heartbeat is not sent; the boot-up message is."""
 
+    name, what = "heartbeat-off", "no heartbeat"
+    clause, reaction = "CiA 301, 1016h, 8130h, 1029h", "stops the others"
+    trips, fails = "heartbeat", "1 2 3 5 7 8 9 45 89 95 98 102 103"
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Lose a heartbeat."""
         return () if frame[0] == HEARTBEAT_BASE + self.node.node_id and frame[1] != _BOOT_UP else None
 
 
 class HeartbeatState(Effect):
     """The heartbeat reports a state in which the node is not."""
 
+    name, what = "heartbeat-state", "the heartbeat reports another state"
+    clause, reaction = "CiA 301, heartbeat", "takes the node for what it says"
+    trips, fails = "nmt_state", "1 2 3 5 7 95 98"
+    parameters = numbers(state=Parameter(4, 0, 127, "state: 4 stopped, 127 pre-operational"))
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Change a heartbeat."""
         if frame[0] != HEARTBEAT_BASE + self.node.node_id or frame[1] == _BOOT_UP:
             return None
         return ((frame[0], bytes((int(self.fault.value("state")),))),)
@@ -48,47 +54,46 @@ class HeartbeatState(Effect):
 class NoBootUp(Effect):
     """The boot-up message is not sent."""
 
+    name, what = "no-boot-up", "no boot-up message"
+    clause, reaction = "CiA 301, boot-up", "reads 1000h"
+    fails = "1 2 4"
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Lose a boot-up message."""
         return () if frame == (HEARTBEAT_BASE + self.node.node_id, _BOOT_UP) else None
 
 
 class Nmt(Effect):
     """The node changes its NMT state as if commanded, without a command on the bus."""
 
+    name, what = "nmt", "the node changes its state by itself"
+    clause, reaction = "CiA 301, NMT", "stops the others"
+    trips, fails = "nmt_state pdo_missed", UNANSWERED
+    parameters = numbers(command=Parameter(2, 1, 130, "command: 2 stop, 128 pre-operational, 129 reset"))
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Give the node the command."""
         self.host.hits += 1
         return self.node.receive(NMT_ID, bytes((int(self.fault.value("command")), self.node.node_id)), t_ns)
-
-
-class SdoAnswer(Effect):
-    """Base class of faults of the default SDO server's answers."""
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Change an answer."""
-        can_id, data = frame
-        if can_id != SDO_TX_BASE + self.node.node_id or len(data) != CLASSIC_BYTES:
-            return None
-        changed = self.changed(data)
-        return None if changed is None else ((can_id, changed),)
-
-    def changed(self, data: bytes) -> bytes | None:
-        """The answer that is sent instead; None where it stays as it is."""
-        return None
 
 
 class ObjectAborted(Effect):
     """Accesses to one object are aborted."""
 
+    name, what = "sdo-abort", "accesses to one object are aborted"
+    clause, reaction = "CiA 301, SDO abort", "names node and object, and does not go on"
+    fails, incoming = "77", True
+    parameters = numbers(
+        index=Parameter(0x1017, 0, 0xFFFF, "index of the object"),
+        code=Parameter(0x08000020, 0, 0xFFFFFFFF, "abort code"),
+    )
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Answer a request for the object in the place of the node."""
         can_id, data = frame
         if can_id != SDO_RX_BASE + self.node.node_id or len(data) != CLASSIC_BYTES:
             return None
-        if data[0] >> 5 not in _INITIATE_REQUESTS or int.from_bytes(data[1:3], "little") != self.index(data):
+        index, subindex = place_of(data)
+        if data[0] >> 5 not in _INITIATE_REQUESTS or index != self.index(data):
             return None
-        self.host.say((SDO_TX_BASE + self.node.node_id, _ABORT.pack(0x80, self.index(data), data[3], self.code)))
+        self.host.say((SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
         return ()
 
     def index(self, data: bytes) -> int:
@@ -104,44 +109,74 @@ class ObjectAborted(Effect):
 class SdoSilent(Effect):
     """SDO requests are not answered."""
 
+    name, what = "sdo-silent", "SDO requests are not answered"
+    clause, reaction = "CiA 301, SDO, 05040000h", "times out"
+    fails, incoming = UNANSWERED, True
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Lose a request."""
         return () if frame[0] == SDO_RX_BASE + self.node.node_id else None
 
 
 class SdoSlow(Effect):
     """SDO answers come late."""
 
+    name, what = "sdo-slow", "SDO answers come late"
+    clause, reaction = "CiA 301, SDO, 05040000h", "waits, or times out once"
+    parameters = numbers(ms=in_ms(100, "delay, ms"))
+
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        """Let an answer wait."""
         if frame[0] != SDO_TX_BASE + self.node.node_id:
             return None
         self.host.later(frame, t_ns + max(1, round(self.fault.value("ms") * 1e6)), incoming=False)
         return ()
 
 
+class SdoAnswer(Effect):
+    """Base class of faults of the default SDO server's answers."""
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        can_id, data = frame
+        if can_id != SDO_TX_BASE + self.node.node_id or len(data) != CLASSIC_BYTES:
+            return None
+        changed = self.changed(data)
+        return None if changed is None else ((can_id, changed),)
+
+    def changed(self, data: bytes) -> bytes | None:
+        """The answer that is sent instead; None where it stays as it is."""
+        return None
+
+
 class SdoToggle(SdoAnswer):
     """Segments have the wrong toggle bit."""
 
+    name, what = "sdo-toggle", "segments have the wrong toggle bit"
+    clause, reaction = "CiA 301, SDO, 05030000h", "aborts the transfer"
+    fails = "23 77"
+
     def changed(self, data: bytes) -> bytes | None:
-        """Turn the bit round."""
         return bytes((data[0] ^ _TOGGLE_FLAG,)) + data[1:] if data[0] >> 5 in _SEGMENT_ANSWERS else None
 
 
 class SdoWrongObject(SdoAnswer):
-    """Answers name another object than the one that was asked for."""
+    """Answers name the index behind the one that was asked for."""
+
+    name, what = "sdo-wrong-object", "answers name another object"
+    clause, reaction = "CiA 301, SDO", "drops them"
+    fails = "47 77 82 92"
 
     def changed(self, data: bytes) -> bytes | None:
-        """Name the next index."""
-        index = (int.from_bytes(data[1:3], "little") + 1) & 0xFFFF
+        index = (place_of(data)[0] + 1) & 0xFFFF
         return data[:1] + index.to_bytes(2, "little") + data[3:] if data[0] >> 5 in _INITIATE_ANSWERS else None
 
 
 class SdoSize(SdoAnswer):
-    """Expedited answers have a byte too few."""
+    """Expedited answers announce a byte too few; one byte becomes four."""
+
+    name, what = "sdo-size", "expedited answers have a byte too few"
+    clause, reaction = "CiA 301, SDO, 06070010h", "refuses the value"
+    fails = MOST
 
     def changed(self, data: bytes) -> bytes | None:
-        """Announce a byte less; one byte becomes four."""
         if data[0] & 0xF3 != _EXPEDITED_FLAGS:
             return None
         unused = (data[0] >> 2 & 3) + 1 & 3
@@ -149,17 +184,20 @@ class SdoSize(SdoAnswer):
 
 
 class EmcyOnce(Effect):
-    """The node reports an error, and that it is gone at the end of the fault."""
+    """The node reports an error in EMCY, 1001h and 1003h, and that it is gone at the end of the fault."""
+
+    name, what = "emcy", "an error in EMCY, 1001h and 1003h, until the end"
+    clause, reaction = "CiA 301, EMCY", "stops for a device error"
+    trips = "emcy"
+    parameters = numbers(code=error_code(0x5000, "emergency error code"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Report the error in EMCY, 1001h and 1003h."""
         self.host.hits += 1
         self.node.core.now_ns = t_ns
         self.node.emcy.report(int(self.fault.value("code")), source=self)
         return self.node.advance(t_ns)
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        """Report that it is gone."""
         self.node.core.now_ns = t_ns
         self.node.emcy.clear(int(self.fault.value("code")), source=self)
         return self.node.advance(t_ns)
@@ -168,22 +206,32 @@ class EmcyOnce(Effect):
 class EmcyStorm(Babble):
     """An error comes and goes without an end, whatever the inhibit time."""
 
+    name, what = "emcy-storm", "an error comes and goes without an end"
+    clause, reaction = "CiA 301, 1015h", "counts, and stays below the load"
+    trips, fails = "emcy_communication", MOST
+    parameters = numbers(
+        gap_ms=in_ms(1, "time between two messages, ms"), code=error_code(0x8210, "emergency error code")
+    )
     _present = False
 
     def made(self) -> Frame:
-        """The error, or its end."""
         self._present = not self._present
         code = int(self.fault.value("code")) if self._present else NO_ERROR_CODE
         return EMCY_BASE + self.node.node_id, Emcy(code, 0x11 if self._present else 0).pack()
 
 
 class Remapped(Effect):
-    """The first two entries of the first TPDO that has two are exchanged, in the frames and in 1Axxh."""
+    """The first two entries of the first TPDO that has two are exchanged, in the frames and in 1Axxh.
 
+    At the end they are exchanged back, unless somebody has mapped anew.
+    """
+
+    name, what = "remapped", "two entries of a TPDO are exchanged"
+    clause, reaction = "CiA 301, 1A00h", "reads 1Axxh at bring-up; drops what cannot be"
+    trips = "drive_fault"
     _exchanged: tuple[int, int, int] | None = None
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Exchange them."""
         dictionary = self.node.dictionary
         for index in dictionary.indices_in(range(0x1A00, 0x1C00)):
             if dictionary.number(index) >= 2:
@@ -195,7 +243,6 @@ class Remapped(Effect):
         return ()
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        """Exchange them back, unless somebody has mapped anew."""
         if self._exchanged is not None:
             index, first, second = self._exchanged
             if [self.node.dictionary.number(index, sub) for sub in (1, 2)] == [second, first]:

@@ -30,6 +30,12 @@ _COMMON = {
 }
 
 
+def node_of(text: str) -> int:
+    """Node id that a fault names, before it is read; 0 where it names none."""
+    match = re.match(r"\s*node\s+(\d+)", text)
+    return int(match[1]) if match else 0
+
+
 def parse_fault(text: str, kinds: Mapping[str, FaultKind], now_ns: int = 0) -> Fault:
     """Read one fault.
 

@@ -7,8 +7,8 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
     seen_node   what is known of one node, from frames and its EDS
     sdo_channel which SDO transfer is open, and what it carried
     bus_state   frames → events; nothing that was not on the bus
-    rule        what a rule is; one module for each family of rules: enable, targets, pdo_rules, nmt_rules, sync_rules,
-                sdo_rules, homing_rules, reactions, supervision
+    rule        what a rule is: its facts, and a generator that gets events; one module a family: enable, targets,
+                pdo_rules, nmt_rules, sync_rules, sdo_rules, homing_rules, reactions, supervision
     rules       the table of all rules
     judging     `Judge`: events to rules, findings to a report
     record      a candump log as frames

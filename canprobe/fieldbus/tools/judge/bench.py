@@ -17,14 +17,17 @@ from canprobe.fieldbus.tools.faults import FaultyNodes
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.command import MasterCommand
-from canprobe.fieldbus.tools.judge.events import BusEvent, ControlSeen, NmtSeen, RequestSeen
+from canprobe.fieldbus.tools.judge.events import ControlSeen, NmtSeen, RequestSeen
 from canprobe.fieldbus.tools.judge.injections import Injections, Thrown
 from canprobe.fieldbus.tools.judge.judging import Judge
+from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
 _AFTER_NS = 500_000_000
 """Time for which the nodes are served after the end of the command."""
 _ANSWER_NS = 5_000_000_000
 """Time after the end of a fault up to which the master may answer it."""
+_HABIT_NS = 1_000_000_000
+"""Time without a request after which the next one is something else than before."""
 _START = 100_000
 """Place of a drive at first, counts, where its limits do not ask for less."""
 
@@ -42,11 +45,9 @@ class HeardPort(TappedPort):
         self._frames = frames
 
     def hear_sent(self, frames: Sequence[Frame], t_ns: int) -> None:
-        """Keep frames of the nodes."""
         self._frames += [BusFrame(t_ns, can_id, data, True) for can_id, data in frames]
 
     def hear_received(self, frames: Sequence[TimedFrame]) -> None:
-        """Keep frames of others."""
         self._frames += [BusFrame(t_ns, can_id, data, False) for can_id, data, t_ns in frames]
 
 
@@ -167,33 +168,19 @@ def first_answers(
     """
     bus = BusState(nodes, served=True)
     answers: list[BusFrame | None] = [None] * len(thrown)
-    habits = _Habits()
+    commands: dict[SeenNode, DriveCommand | None] = {}  # the last one to each node
+    asked_ns: dict[SeenNode, int] = {}
     for frame in frames:
         for event in bus.take(frame):
-            if not habits.is_new(event):
-                continue
-            before = [number for number, one in enumerate(thrown) if one.begin_ns <= frame.t_ns]
+            new = isinstance(event, NmtSeen)
+            if isinstance(event, RequestSeen):
+                new = event.node not in asked_ns or frame.t_ns - asked_ns[event.node] > _HABIT_NS
+                asked_ns[event.node] = frame.t_ns
+            elif isinstance(event, ControlSeen):
+                command = command_of(event.word)
+                new = command is not commands.get(event.node)
+                commands[event.node] = command
+            before = [number for number, one in enumerate(thrown) if one.begin_ns <= frame.t_ns] if new else []
             if before and answers[before[-1]] is None and frame.t_ns < thrown[before[-1]].end_ns + _ANSWER_NS:
                 answers[before[-1]] = event.frame
     return answers
-
-
-class _Habits:
-    """What the master did last: its command to each node, and when it asked each."""
-
-    def __init__(self) -> None:
-        self._commands: dict[int, DriveCommand | None] = {}
-        self._asked_ns: dict[int, int] = {}
-
-    def is_new(self, event: BusEvent) -> bool:
-        """Take an event; whether the master does something else than before."""
-        if isinstance(event, RequestSeen):
-            before_ns = self._asked_ns.get(event.node.node_id)
-            self._asked_ns[event.node.node_id] = event.frame.t_ns
-            return before_ns is None or event.frame.t_ns - before_ns > 1_000_000_000
-        if isinstance(event, ControlSeen):
-            command = command_of(event.word)
-            before = self._commands.get(event.node.node_id)
-            self._commands[event.node.node_id] = command
-            return command is not before
-        return isinstance(event, NmtSeen)

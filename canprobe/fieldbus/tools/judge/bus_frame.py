@@ -1,13 +1,10 @@
-"""A frame that was seen on a bus, and the place of an object."""
+"""A frame that was seen on a bus."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, EFF_MASK, RTR_FLAG
-
-Place = tuple[int, int]
-"""Index and sub-index of an object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +26,3 @@ class BusFrame:
     def __str__(self) -> str:
         name = f"{self.can_id & EFF_MASK:08X}" if self.can_id & EFF_FLAG else f"{self.can_id & 0x7FF:03X}"
         return f"({self.t_ns * 1e-9:.6f}) {name}#{'R' if self.can_id & RTR_FLAG else self.data.hex().upper()}"
-
-
-def place_text(place: Place) -> str:
-    """The place of an object in words, such as 1600h:01."""
-    return f"{place[0]:04X}h:{place[1]:02X}"

@@ -11,6 +11,7 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.frames import (
     EMCY_BASE,
     HEARTBEAT_BASE,
+    NMT_GOALS,
     NMT_ID,
     RTR_FLAG,
     SDO_RX_BASE,
@@ -19,7 +20,8 @@ from canprobe.fieldbus.protocol.frames import (
     NmtCommand,
     NmtState,
 )
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.protocol.sdo import Place
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import (
     AnswerSeen,
     BusEvent,
@@ -48,11 +50,6 @@ from canprobe.fieldbus.tools.judge.seen_node import (
     SeenNode,
 )
 
-_STATE_AFTER = {
-    NmtCommand.START: NmtState.OPERATIONAL,
-    NmtCommand.STOP: NmtState.STOPPED,
-    NmtCommand.PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
-}
 _STORE = 0x1010
 _ARBITRATION_BITS = 135
 """Length of the longest frame, for which another has to wait."""
@@ -94,11 +91,6 @@ class BusState:
             return 0
         times = list(self.syncs_ns)
         return round(median(b - a for a, b in pairwise(times)))
-
-    @property
-    def some_enabled(self) -> bool:
-        """Whether a drive is in operation enabled."""
-        return any(node.enabled for node in self.nodes.values())
 
     def take(self, frame: BusFrame) -> Iterator[BusEvent]:
         """Take a frame and yield what it means, all of which must be consumed before the next one.
@@ -167,7 +159,7 @@ class BusState:
         yield NmtSeen(frame, command, nodes, node_id == 0)  # the nodes are as they were before it
         for node in nodes:
             node.addressed = True
-            node.nmt, node.nmt_ns = _STATE_AFTER.get(command, NmtState.INITIALISING), frame.t_ns
+            node.nmt, node.nmt_ns = NMT_GOALS[command], frame.t_ns
             node.started_ns = frame.t_ns if command is NmtCommand.START else None
             node.syncs = 0
 
@@ -222,7 +214,7 @@ class BusState:
         node.addressed = True
         node.rpdo_counts[pdo.number] = node.rpdo_counts.get(pdo.number, 0) + 1
         values = _unpacked(pdo, frame)
-        before = {place: node.value(*place) if node.is_sure(place[0]) else node.number(*place) for place in values}
+        before = {place: node.sure_value(*place) for place in values}
         yield RpdoSeen(frame, node, pdo, values, before)
         yield from self._valued(node, values, frame, pdo, written=True)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.protocol.sdo import Place
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.seen_node import PdoView, SeenNode
 
 
@@ -19,6 +20,24 @@ class BusEvent:
     """
 
     frame: BusFrame
+
+    def among(self, nodes: Iterable[SeenNode]) -> Iterable[SeenNode]:
+        """Those of the nodes that it is about: all, unless it names some."""
+        return nodes
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSeen(BusEvent):
+    """Base of the events of one node.
+
+    Attributes:
+        node: the node.
+    """
+
+    node: SeenNode
+
+    def among(self, nodes: Iterable[SeenNode]) -> Iterable[SeenNode]:
+        return (self.node,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +55,14 @@ class NmtSeen(BusEvent):
     nodes: tuple[SeenNode, ...]
     to_all: bool
 
+    def among(self, nodes: Iterable[SeenNode]) -> Iterable[SeenNode]:
+        return self.nodes
+
 
 @dataclass(frozen=True, slots=True)
-class HeartbeatSeen(BusEvent):
+class HeartbeatSeen(NodeSeen):
     """A heartbeat of a node that is judged; a boot-up is the state INITIALISING."""
 
-    node: SeenNode
     state: NmtState
     before: NmtState | None
 
@@ -54,10 +75,9 @@ class OtherHeartbeatSeen(BusEvent):
 
 
 @dataclass(frozen=True, slots=True)
-class EmcySeen(BusEvent):
+class EmcySeen(NodeSeen):
     """An emergency message."""
 
-    node: SeenNode
     code: int
 
 
@@ -67,37 +87,32 @@ class RemoteSeen(BusEvent):
 
 
 @dataclass(frozen=True, slots=True)
-class ForgedSeen(BusEvent):
+class ForgedSeen(NodeSeen):
     """A frame from outside under an identifier that belongs to a served node."""
-
-    node: SeenNode
 
 
 @dataclass(frozen=True, slots=True)
-class RpdoSeen(BusEvent):
+class RpdoSeen(NodeSeen):
     """A frame for an RPDO of a node; `before` has what the objects in it were; empty where its length does not fit."""
 
-    node: SeenNode
     pdo: PdoView
     values: Mapping[Place, int]
     before: Mapping[Place, int | None]
 
 
 @dataclass(frozen=True, slots=True)
-class ControlSeen(BusEvent):
+class ControlSeen(NodeSeen):
     """A controlword, by RPDO or by an SDO write that was confirmed."""
 
-    node: SeenNode
     word: int
     before: int | None
     pdo: PdoView | None
 
 
 @dataclass(frozen=True, slots=True)
-class TargetSeen(BusEvent):
+class TargetSeen(NodeSeen):
     """A target: 607Ah, 60C1h:01, 60FFh or 6071h."""
 
-    node: SeenNode
     index: int
     value: int
     before: int | None
@@ -106,28 +121,25 @@ class TargetSeen(BusEvent):
 
 
 @dataclass(frozen=True, slots=True)
-class ModeSeen(BusEvent):
+class ModeSeen(NodeSeen):
     """A mode of operation that the master asked for (6060h)."""
 
-    node: SeenNode
     mode: int
     before: int | None
 
 
 @dataclass(frozen=True, slots=True)
-class StatusSeen(BusEvent):
+class StatusSeen(NodeSeen):
     """A statusword."""
 
-    node: SeenNode
     word: int
     before: int | None
 
 
 @dataclass(frozen=True, slots=True)
-class RequestSeen(BusEvent):
+class RequestSeen(NodeSeen):
     """The first frame of an SDO transfer; `pending` is a request on this channel that has no answer yet."""
 
-    node: SeenNode
     writes: bool
     place: Place
     value: int | None
@@ -135,10 +147,9 @@ class RequestSeen(BusEvent):
 
 
 @dataclass(frozen=True, slots=True)
-class AnswerSeen(BusEvent):
+class AnswerSeen(NodeSeen):
     """The end of an SDO transfer without an abort; `late`: after the client had aborted it."""
 
-    node: SeenNode
     writes: bool
     place: Place
     value: int | None
@@ -147,10 +158,9 @@ class AnswerSeen(BusEvent):
 
 
 @dataclass(frozen=True, slots=True)
-class AbortSeen(BusEvent):
+class AbortSeen(NodeSeen):
     """An SDO abort; `place` is that of the transfer, `named` that in the abort."""
 
-    node: SeenNode
     writes: bool
     place: Place | None
     named: Place

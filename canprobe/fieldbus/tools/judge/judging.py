@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+import contextlib
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
-from canprobe.fieldbus.tools.judge.rule import Charges, Rule
+from canprobe.fieldbus.tools.judge.rule import Rule, Watch
 from canprobe.fieldbus.tools.judge.rules import NO_RULES, RULES
+from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.judge.sync_rules import IrregularSync
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
+
+_Key = tuple[type[BusEvent], SeenNode | None]
+"""Kind of an event, and the node that it is about; None for rules on the whole bus."""
 
 
 class Judge:
@@ -40,21 +46,26 @@ class Judge:
         without: Collection[int] = (),
     ) -> None:
         self.bus = BusState(nodes, served=served, bitrate=bitrate)
-        charges = Charges(list(charges_ns))
+        charges = list(charges_ns)
         self.rules: list[Rule] = [rule(self.bus, charges) for rule in RULES if rule.number not in without]
         self._left_out = [(f"{r.number:02} {r.name}", "left out on request") for r in RULES if r.number in without]
         self.frame_count = 0
-        self._ears: dict[type[BusEvent], list[Callable[[BusEvent], None]]] = {}
+        self._watches: list[Watch[Any]] = []
+        self._ears: dict[_Key, list[Watch[Any]]] = {}
         for rule in self.rules:
-            for kind in rule.hears:
-                self._ears.setdefault(kind, []).append(rule.see)
+            for node, watch in rule.watches():
+                next(watch)
+                self._watches.append(watch)
+                for kind in rule.hears():
+                    self._ears.setdefault((kind, node), []).append(watch)
 
     def take(self, frame: BusFrame) -> None:
         """Take the next frame."""
         self.frame_count += 1
         for event in self.bus.take(frame):
-            for see in self._ears.get(type(event), ()):
-                see(event)
+            for node in (None, *event.among(self.bus.nodes.values())):
+                for watch in self._ears.get((type(event), node), ()):
+                    watch.send(event)
 
     def finish(self, end_ns: int = 0) -> list[Rule]:
         """End the bus; return the rules that found something.
@@ -63,8 +74,9 @@ class Judge:
             end_ns: time up to which the bus was heard, where that is later than its last frame.
         """
         self.bus.now_ns = max(self.bus.now_ns, end_ns)
-        for rule in self.rules:
-            rule.end()
+        for watch in self._watches:
+            with contextlib.suppress(StopIteration):
+                watch.send(None)
         return [rule for rule in self.rules if rule.count]
 
     def report(self, title: str, facts: Mapping[str, str], log: str | None = None) -> Report:

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar
+from types import NoneType
+from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
 
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
+from canprobe.fieldbus.tools.judge.seen_node import Known, SeenNode
 
 QUEUED_NS = 5_000_000
 """Time for which a frame may have waited in its sender's queue."""
 CHARGED_NS = 1_000_000_000
 """Time after a fault of ours for which what follows is charged to it."""
 _KEPT_FINDINGS = 5
+Event = TypeVar("Event", bound=BusEvent)
+Watch = Generator[None, Event | None, None]
+"""Gets the events that its annotation names, one after the other, and None at the end of the bus."""
 
 
 class Severity(StrEnum):
@@ -45,24 +50,15 @@ class RuleFinding:
     frames: tuple[BusFrame, ...]
 
 
-@dataclass(slots=True)
-class Charges:
-    """Times in which what happens is charged to a fault that was thrown, not to the master.
-
-    Attributes:
-        spans_ns: begin and end of each.
-    """
-
-    spans_ns: list[tuple[int, int]] = field(default_factory=list)
-
-    def cover(self, t_ns: int) -> bool:
-        """Whether a time is charged to a fault."""
-        return any(begin <= t_ns <= end + CHARGED_NS for begin, end in self.spans_ns)
-
-
 class Rule:
-    """One rule. Subclasses set the class attributes and override `see`, `begin` for what
-    they remember, and `end` where the end of the bus matters.
+    """One rule, which follows each node by itself; a `BusRule` follows the whole bus.
+
+    Subclasses set the class attributes and write `watch`: a generator that gets the events one after the other, each
+    when the state of the bus has it already. What the rule remembers are the variables of the generator.
+
+    Args:
+        bus: state of the bus.
+        charges_ns: begin and end of each fault of ours; what happens meanwhile is charged to it, not to the master.
 
     Attributes:
         number: number of the fault, stable.
@@ -72,8 +68,8 @@ class Rule:
         source: where the fault was seen, or the clause.
         expected: what a good master does.
         hint: what to change.
-        hears: events that `see` gets.
         answers: whether it judges the reaction to a fault, so that faults of ours do not excuse it.
+        watch: the generator; its annotation names the kinds of the events that it gets.
         looked: number of times that there was something to judge.
         findings: first findings; `count` has the number of all.
     """
@@ -85,40 +81,50 @@ class Rule:
     source: ClassVar[str] = "CiA 301, CiA 402-2"
     expected: ClassVar[str]
     hint: ClassVar[str]
-    hears: ClassVar[tuple[type[BusEvent], ...]] = ()
     answers: ClassVar[bool] = False
+    watch: Callable[..., Watch[Any]]
 
-    def __init__(self, bus: BusState, charges: Charges) -> None:
+    def __init__(self, bus: BusState, charges_ns: Sequence[tuple[int, int]]) -> None:
         self.bus = bus
         self.looked = 0
         self.count = 0
         self.findings: list[RuleFinding] = []
-        self._charges = charges
+        self._charges_ns = charges_ns
         self._runs: Counter[Hashable] = Counter()
-        self.begin()
 
-    def begin(self) -> None:
-        """Set up what the rule remembers."""
+    def watches(self) -> Iterable[tuple[SeenNode | None, Watch[Any]]]:
+        """Each node with the generator that follows it; None with the one that follows the bus."""
+        return [(node, self.watch(node)) for node in self.bus.nodes.values()]
 
-    def see(self, event: BusEvent) -> None:
-        """Take an event; the state of the bus has it already."""
+    def hears(self) -> tuple[type[BusEvent], ...]:
+        """Kinds of the events that `watch` gets."""
+        _, sent, _ = get_args(get_type_hints(self.watch)["return"])
+        return tuple(kind for kind in get_args(sent) if kind is not NoneType)
 
-    def end(self) -> None:
-        """Take the end of the bus."""
-
-    def blame(self, what: str, *frames: BusFrame | None, node_id: int | None = None) -> None:
-        """Note a finding at the present time."""
-        t_ns = self.bus.now_ns
-        if not self.answers and self._charges.cover(t_ns):
+    def blame(self, node: SeenNode | None, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
+        """Note a finding at the present time, with the frames that show it."""
+        if self._is_excused():
             return
         self.count += 1
         if len(self.findings) < _KEPT_FINDINGS:
-            shown = sorted({frame for frame in frames if frame is not None}, key=lambda frame: frame.t_ns)
-            self.findings.append(RuleFinding(t_ns, node_id, what, tuple(shown)))
+            frames = dict.fromkeys(one if isinstance(one, BusFrame) else one.frame for one in shown if one is not None)
+            ordered = tuple(sorted(frames, key=lambda frame: frame.t_ns))
+            node_id = node.node_id if node is not None else None
+            self.findings.append(RuleFinding(self.bus.now_ns, node_id, what, ordered))
 
     def in_a_row(self, key: Hashable, bad: bool, wanted: int = 2) -> bool:
         """Count what is bad in a row; whether it has just become `wanted`. While a fault excuses it nothing counts."""
         self.looked += 1
-        excused = bad and not self.answers and self._charges.cover(self.bus.now_ns)
-        self._runs[key] = self._runs[key] + 1 if bad and not excused else 0
+        self._runs[key] = self._runs[key] + 1 if bad and not self._is_excused() else 0
         return self._runs[key] == wanted
+
+    def _is_excused(self) -> bool:
+        spans = () if self.answers else self._charges_ns
+        return any(begin <= self.bus.now_ns <= end + CHARGED_NS for begin, end in spans)
+
+
+class BusRule(Rule):
+    """A rule on what several nodes, or frames of nobody, show."""
+
+    def watches(self) -> Iterable[tuple[SeenNode | None, Watch[Any]]]:
+        return [(None, self.watch())]

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.protocol import sdo
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import AbortSeen, AnswerSeen, BusEvent, RequestSeen
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
-_ABORT = 0x80
 _DOWNLOAD, _UPLOAD, _BLOCK_UPLOAD, _BLOCK_DOWNLOAD = 1, 2, 5, 6
 """Client command specifiers that open a transfer; 0 and 3 are its segments."""
 _BLOCK_END = 0xA1
@@ -23,7 +23,7 @@ _BLOCK_END = 0xA1
 class _Transfer:
     request: BusFrame
     writes: bool
-    place: Place
+    place: sdo.Place
     data: bytes = b""
     answered: bool = False
     segmented: bool = False
@@ -49,8 +49,8 @@ class SdoChannel:
         if len(data) < 1:
             return
         command = data[0] >> 5
-        place = _place(data)
-        if data[0] == _ABORT:
+        place = sdo.place_of(data)
+        if data[0] == sdo.ABORT:
             transfer = one
             self._open, self._aborted = None, (one, frame) if one is not None else self._aborted
             yield AbortSeen(
@@ -59,7 +59,7 @@ class SdoChannel:
                 transfer.writes if transfer else False,
                 transfer.place if transfer else None,
                 place,
-                int.from_bytes(data[4:8], "little"),
+                sdo.abort_code(data),
                 True,
                 transfer.request if transfer else None,
             )
@@ -77,7 +77,7 @@ class SdoChannel:
             value = self._node.value_of(place, made.data) if writes and not made.segmented else None
             yield RequestSeen(frame, self._node, writes, place, value, pending)
         elif command == 0 and one is not None and one.writes and one.segmented:
-            one.data += data[1 : 8 - (data[0] >> 1 & 7)]
+            one.data += sdo.segment_value(data)
             one.last = bool(data[0] & 1)
 
     def from_server(self, frame: BusFrame) -> Iterator[BusEvent]:
@@ -88,10 +88,10 @@ class SdoChannel:
         command = data[0] >> 5
         if one is None:
             yield from self._late(frame, command)
-        elif data[0] == _ABORT:
+        elif data[0] == sdo.ABORT:
             self._open = None
-            code = int.from_bytes(data[4:8], "little")
-            yield AbortSeen(frame, self._node, one.writes, one.place, _place(data), code, False, one.request)
+            code = sdo.abort_code(data)
+            yield AbortSeen(frame, self._node, one.writes, one.place, sdo.place_of(data), code, False, one.request)
         elif _ends(one, data, command):
             yield from self._end(frame)
 
@@ -103,7 +103,7 @@ class SdoChannel:
 
     def _late(self, frame: BusFrame, command: int) -> Iterator[BusEvent]:
         """An answer to a transfer that the client has given up."""
-        if self._aborted is not None and command in (2, 3) and _place(frame.data) == self._aborted[0].place:
+        if self._aborted is not None and command in (2, 3) and sdo.place_of(frame.data) == self._aborted[0].place:
             one, _ = self._aborted
             self._aborted = None
             yield AnswerSeen(frame, self._node, one.writes, one.place, None, one.request, late=True)
@@ -115,24 +115,18 @@ def _ends(one: _Transfer, data: bytes, command: int) -> bool:
         one.answered = True
         return one.writes and data[0] == _BLOCK_END
     if one.writes:
-        initiated = command == 3 and _place(data) == one.place
+        initiated = command == 3 and sdo.place_of(data) == one.place
         return not one.segmented if initiated else command == 1 and one.segmented and one.last
-    if command == 2 and _place(data) == one.place:
+    if command == 2 and sdo.place_of(data) == one.place:
         one.segmented = not data[0] & 2
         one.data = _expedited(data)
         return not one.segmented
     if command == 0 and one.segmented:
-        one.data += data[1 : 8 - (data[0] >> 1 & 7)]
+        one.data += sdo.segment_value(data)
         return bool(data[0] & 1)
     return False
 
 
-def _place(data: bytes) -> Place:
-    return int.from_bytes(data[1:3], "little"), data[3] if len(data) > 3 else 0
-
-
 def _expedited(data: bytes) -> bytes:
     """Bytes of an expedited transfer."""
-    if not data[0] & 2:
-        return b""
-    return data[4 : 8 - (data[0] >> 2 & 3)] if data[0] & 1 else data[4:8]
+    return sdo.expedited_value(data) if data[0] & 2 else b""

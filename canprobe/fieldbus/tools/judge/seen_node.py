@@ -12,7 +12,8 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode, known_state
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, NmtState
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, Place
+from canprobe.fieldbus.protocol.sdo import Place
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 
 CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY = 0x6040, 0x6041, 0x6060, 0x6061
 POSITION, VELOCITY, TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE = 0x6064, 0x606C, 0x607A, 0x60FF, 0x6071
@@ -163,6 +164,10 @@ class SeenNode:
             return found.value
         entry = self._description.entry(index, subindex)
         return entry.initial if entry is not None and isinstance(entry.initial, int) else None
+
+    def sure_value(self, index: int, subindex: int = 0) -> int | None:
+        """The last value that passed, or that of the EDS where it is true of the device; None where neither is."""
+        return self.value(index, subindex) if self.is_sure(index) else self.number(index, subindex)
 
     def is_sure(self, index: int) -> bool:
         """Whether `value` is true of the device: it passed on the bus, the node has booted, or it is served here."""

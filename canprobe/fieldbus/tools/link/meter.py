@@ -77,7 +77,6 @@ class LinkMeter(TappedPort):
         self.bits = self.foreign = 0
 
     def defer(self, can_ids: Collection[int]) -> None:
-        """Let the port defer frames."""
         self._port.defer(can_ids)
 
     def send_on(self, channel: str, frames: Sequence[Frame]) -> None:

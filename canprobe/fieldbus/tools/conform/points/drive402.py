@@ -19,13 +19,15 @@ from canprobe.fieldbus.protocol.cia402 import (
     describe_state,
     known_state,
 )
+from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import CONTROLWORD, STATUSWORD
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused, pack_write
+from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
+point = PointGroup("drive402")
 AUTOMATON = "CiA 402-2, finite state automaton"
 _WORDS = {
     DriveCommand.SHUTDOWN: 0x06,
@@ -99,9 +101,7 @@ def _go(bench: Bench, state: DriveState) -> None:
     _reach(bench, state, "on the way up")
 
 
-@conformance_point(
-    48, "drive402", "statusword", "CiA 402-2, 6041h", "the bits of a state, the power stage off", needs="drive"
-)
+@point(48, "statusword", "CiA 402-2, 6041h", "the bits of a state, the power stage off", needs="drive")
 def statusword(bench: Bench) -> None:
     """The bits of 6041h are those of a state."""
     word = bench.number(STATUSWORD)
@@ -109,9 +109,8 @@ def statusword(bench: Bench) -> None:
         bench.deviates(f"6041h is {word:04X}h, which is no state")
 
 
-@conformance_point(
+@point(
     53,
-    "drive402",
     "supported modes",
     "CiA 402-2, 6502h",
     "6061h shows one of them or 0; what differs from the EDS is noted",
@@ -130,13 +129,8 @@ def supported_modes(bench: Bench) -> None:
         bench.deviates(f"6061h shows mode {mode}, which 6502h does not list")
 
 
-@conformance_point(
-    53,
-    "drive402",
-    "mode display",
-    "CiA 402-2, 6060h 6061h",
-    "6061h follows 6060h; other modes are refused",
-    needs="drive motion",
+@point(
+    53, "mode display", "CiA 402-2, 6060h 6061h", "6061h follows 6060h; other modes are refused", needs="drive motion"
 )
 def mode_display(bench: Bench) -> None:
     """Every mode from 1 to 10, with the power stage off."""
@@ -155,9 +149,7 @@ def mode_display(bench: Bench) -> None:
             bench.deviates(f"6061h is {shown} after mode {mode}")
 
 
-@conformance_point(
-    49, "drive402", "transitions", AUTOMATON, "every command leads where the table says", needs="drive motion"
-)
+@point(49, "transitions", AUTOMATON, "every command leads where the table says", needs="drive motion")
 def transitions(bench: Bench) -> None:
     """Every command that does something, in every state up to operation enabled; quick stop is point 51."""
     with _at_rest(bench):
@@ -171,9 +163,7 @@ def transitions(bench: Bench) -> None:
             _reach(bench, goal, f"{command.name} in {source.name}")
 
 
-@conformance_point(
-    50, "drive402", "illegal commands", AUTOMATON, "commands without a transition change nothing", needs="drive motion"
-)
+@point(50, "illegal commands", AUTOMATON, "commands without a transition change nothing", needs="drive motion")
 def illegal_commands(bench: Bench) -> None:
     """Commands that have no transition, in the states below operation enabled."""
     with _at_rest(bench):
@@ -187,13 +177,8 @@ def illegal_commands(bench: Bench) -> None:
                 _reach(bench, source, f"{command.name} in {source.name}")
 
 
-@conformance_point(
-    51,
-    "drive402",
-    "quick stop",
-    "CiA 402-2, 605Ah",
-    "5 to 8 stay in quick stop active, others switch off",
-    needs="drive motion",
+@point(
+    51, "quick stop", "CiA 402-2, 605Ah", "5 to 8 stay in quick stop active, others switch off", needs="drive motion"
 )
 def quick_stop(bench: Bench) -> None:
     """Quick stop at rest, with the option that the drive has."""
@@ -206,9 +191,8 @@ def quick_stop(bench: Bench) -> None:
         _reach(bench, goal, f"quick stop with 605Ah = {option}")
 
 
-@conformance_point(
+@point(
     54,
-    "drive402",
     "handshake of profile position",
     "CiA 402-2, profile position",
     "bit 12 follows bit 4 of 6040h",
@@ -225,7 +209,7 @@ def handshake(bench: Bench) -> None:
                 bench.deviates(f"bit 12 of 6041h is {found} after controlword {word:04X}h")
 
 
-@conformance_point(55, "drive402", "homing", "CiA 402-2, homing", "bit 12 comes, bit 13 does not", needs="drive motion")
+@point(55, "homing", "CiA 402-2, homing", "bit 12 comes, bit 13 does not", needs="drive motion")
 def homing(bench: Bench) -> None:
     """Method 37 or 35, which takes the present position as home."""
     with _at_rest(bench, _HOMING):

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, NmtCommand
+from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import pack_request, pack_write
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
+point = PointGroup("emcy")
 _INHIBIT_MS = 200
 _GENERIC, _COMMUNICATION = 0x01, 0x10
 
@@ -38,9 +39,7 @@ def _end(bench: Bench) -> None:
     bench.pass_time(bench.times.slack_s)
 
 
-@conformance_point(
-    42, "emcy", "history", "CiA 301, 1003h", "the newest error first: its code in the low 16 bits", needs="nmt sync"
-)
+@point(42, "history", "CiA 301, 1003h", "the newest error first: its code in the low 16 bits", needs="nmt sync")
 def history(bench: Bench) -> None:
     """The count and the first entry after an error."""
     bench.need((0x1003, 0), written=False)
@@ -54,23 +53,23 @@ def history(bench: Bench) -> None:
         bench.deviates(f"1003h:01 is {newest:08X}h after EMCY 8240h")
 
 
-@conformance_point(42, "emcy", "write to the history", "CiA 301, 1003h", accepted_text(accepted.VALUE))
+@point(42, "write to the history", "CiA 301, 1003h", accepted_text(accepted.VALUE))
 def write_to_history(bench: Bench) -> None:
     """1003h:00 takes nothing but 0."""
     bench.need((0x1003, 0))
     bench.must_refuse(pack_write(0x1003, 0, b"\1"), (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
 
 
-@conformance_point(42, "emcy", "empty entry", "CiA 301, 1003h", accepted_text(accepted.NO_DATA) + ", or 06090011h")
+@point(42, "empty entry", "CiA 301, 1003h", accepted_text(accepted.NO_DATA) + ", or 06090011h")
 def empty_entry(bench: Bench) -> None:
     """The entry behind the last error."""
     bench.need((0x1003, 0), written=False)
     beyond = bench.number(0x1003) + 1
     codes = (*accepted.NO_DATA, *accepted.NO_SUBINDEX)
-    bench.must_refuse(pack_request(0x40, 0x1003, beyond), codes, f"read of 1003h:{beyond:02X}, which is empty")
+    bench.must_refuse(pack_read(0x1003, beyond), codes, f"read of 1003h:{beyond:02X}, which is empty")
 
 
-@conformance_point(42, "emcy", "clearing the history", "CiA 301, 1003h", "0 to 1003h:00 empties it")
+@point(42, "clearing the history", "CiA 301, 1003h", "0 to 1003h:00 empties it")
 def clear_history(bench: Bench) -> None:
     """Where the user permits it."""
     bench.need((0x1003, 0))
@@ -79,9 +78,7 @@ def clear_history(bench: Bench) -> None:
         bench.deviates(f"1003h:00 is {count} after 0 was written")
 
 
-@conformance_point(
-    43, "emcy", "identifier", "CiA 301, 1014h", "080h+id by default, and the one of the messages", needs="nmt sync"
-)
+@point(43, "identifier", "CiA 301, 1014h", "080h+id by default, and the one of the messages", needs="nmt sync")
 def identifier(bench: Bench) -> None:
     """1014h names the identifier on which an error comes."""
     bench.need((0x1014, 0), written=False)
@@ -103,9 +100,7 @@ def identifier(bench: Bench) -> None:
     _end(bench)
 
 
-@conformance_point(
-    43, "emcy", "inhibit time", "CiA 301, 1015h", "no two messages within the inhibit time", needs="nmt sync"
-)
+@point(43, "inhibit time", "CiA 301, 1015h", "no two messages within the inhibit time", needs="nmt sync")
 def inhibit_time(bench: Bench) -> None:
     """An error and its end within 200 ms."""
     bench.need((0x1015, 0))
@@ -119,9 +114,8 @@ def inhibit_time(bench: Bench) -> None:
         bench.deviates(f"two EMCY messages within {(times[0] - first_ns) * 1e-6:.0f} ms, 1015h is {_INHIBIT_MS} ms")
 
 
-@conformance_point(
+@point(
     47,
-    "emcy",
     "error register",
     "CiA 301, 1001h",
     "bits 0 and 4 with 8240h, at least one of them; as before after its end",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
+from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import pack_write
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
+point = PointGroup("heartbeat")
 _PERIOD_MS, _CONSUMED_MS, _GUARD_MS, _LIFE_FACTOR = 50, 200, 100, 2
 _SHARE = 0.1
 """Share by which a period of the device may be off."""
@@ -32,9 +33,7 @@ def _beat(bench: Bench, producer: int) -> int:
     return bench.send(HEARTBEAT_BASE + producer, bytes((NmtState.OPERATIONAL,)))
 
 
-@conformance_point(
-    8, "heartbeat", "producer", "CiA 301, 1017h", "a write acts at once: the period is kept within 10 %, 0 is silence"
-)
+@point(8, "producer", "CiA 301, 1017h", "a write acts at once: the period is kept within 10 %, 0 is silence")
 def producer(bench: Bench) -> None:
     """Heartbeats every 50 ms, then none."""
     bench.need((0x1017, 0))
@@ -70,9 +69,7 @@ def _need_guarding(bench: Bench) -> None:
         raise PointNotApplicable("the heartbeat cannot be switched off, and excludes guarding")
 
 
-@conformance_point(
-    9, "heartbeat", "guarding", "CiA 301, node guarding", "the state, with a bit that toggles, from 0 on", needs="nmt"
-)
+@point(9, "guarding", "CiA 301, node guarding", "the state, with a bit that toggles, from 0 on", needs="nmt")
 def guarding(bench: Bench) -> None:
     """Remote requests: the state of each answer, and its toggle bit."""
     try:
@@ -89,9 +86,7 @@ def guarding(bench: Bench) -> None:
         bench.deviates(f"guarding answers {got}; expected {', '.join(f'{one:02X}h' for one in wanted)}")
 
 
-@conformance_point(
-    9, "heartbeat", "life guarding", "CiA 301, life guarding, 100Ch 100Dh", "EMCY 8130h when requests stop", needs="nmt"
-)
+@point(9, "life guarding", "CiA 301, life guarding, 100Ch 100Dh", "EMCY 8130h when requests stop", needs="nmt")
 def life_guarding(bench: Bench) -> None:
     """Two requests, then none for the life time."""
     _need_guarding(bench)
@@ -107,9 +102,7 @@ def life_guarding(bench: Bench) -> None:
     bench.put(0x100D, 0, 0)
 
 
-@conformance_point(
-    89, "heartbeat", "before guarding", "CiA 301, error control", "with 1017h set the heartbeat comes, not guarding"
-)
+@point(89, "before guarding", "CiA 301, error control", "with 1017h set the heartbeat comes, not guarding")
 def heartbeat_wins(bench: Bench) -> None:
     """Guard and life time are set beside the heartbeat: heartbeats come, and no request starts life guarding."""
     bench.need((0x100C, 0), (0x100D, 0), (0x1017, 0))
@@ -127,9 +120,8 @@ def heartbeat_wins(bench: Bench) -> None:
         bench.deviates("a heartbeat has the toggle bit of guarding")
 
 
-@conformance_point(
+@point(
     44,
-    "heartbeat",
     "consumer",
     "CiA 301, 1016h",
     "watched from the first heartbeat on: silence in time, EMCY 8130h when it is late",
@@ -156,7 +148,7 @@ def consumer(bench: Bench) -> None:
     bench.put(0x1016, 1, 0)
 
 
-@conformance_point(44, "heartbeat", "duplicate consumer", "CiA 301, 1016h", accepted_text(accepted.DUPLICATE))
+@point(44, "duplicate consumer", "CiA 301, 1016h", accepted_text(accepted.DUPLICATE))
 def duplicate_consumer(bench: Bench) -> None:
     """Two entries for one producer."""
     bench.need((0x1016, 2))
@@ -165,9 +157,8 @@ def duplicate_consumer(bench: Bench) -> None:
     bench.must_refuse(request, accepted.DUPLICATE, "a second entry for one producer")
 
 
-@conformance_point(
+@point(
     45,
-    "heartbeat",
     "error behaviour",
     "CiA 301, 1029h:01",
     "after the loss 0: pre-operational, 1: no change, 2: stopped",

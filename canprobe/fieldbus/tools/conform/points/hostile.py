@@ -17,17 +17,18 @@ from canprobe.fieldbus.protocol.frames import (
     NmtState,
 )
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
+from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
-_READ_TYPE = pack_request(0x40, 0x1000, 0)
+point = PointGroup("hostile")
+_READ_TYPE = pack_read(0x1000)
 _FD_BYTES = 12
 _PACE_S = 0.02
 
 
-@conformance_point(93, "hostile", "SDO of every length", "CiA 301, SDO: eight bytes", "0 to 7 bytes are not answered")
+@point(93, "SDO of every length", "CiA 301, SDO: eight bytes", "0 to 7 bytes are not answered")
 def sdo_lengths(bench: Bench) -> None:
     """A request cut to 0 to 7 bytes. Some devices answer shorter requests on purpose, which is noted."""
     answer_id = SDO_TX_BASE + bench.node_id
@@ -44,9 +45,7 @@ def sdo_lengths(bench: Bench) -> None:
     bench.serves("short requests")
 
 
-@conformance_point(
-    94, "hostile", "remote requests", "CiA 301, CAN data frames", "remote requests for SDO and EMCY are ignored"
-)
+@point(94, "remote requests", "CiA 301, CAN data frames", "remote requests for SDO and EMCY are ignored")
 def remote_requests(bench: Bench) -> None:
     """Remote requests under every identifier of the device but guarding and TPDOs."""
     answer_id = SDO_TX_BASE + bench.node_id
@@ -58,14 +57,7 @@ def remote_requests(bench: Bench) -> None:
     bench.serves("remote requests")
 
 
-@conformance_point(
-    95,
-    "hostile",
-    "29-bit frames",
-    "CiA 301, CAN base frames",
-    "frames with 29 bits are another device's",
-    needs="alone nmt",
-)
+@point(95, "29-bit frames", "CiA 301, CAN base frames", "frames with 29 bits are another device's", needs="alone nmt")
 def extended_frames(bench: Bench) -> None:
     """The identifiers of SDO and NMT in 29 bits, as they are and above the 11 bits."""
     answer_id = SDO_TX_BASE + bench.node_id
@@ -82,13 +74,7 @@ def extended_frames(bench: Bench) -> None:
     bench.serves("29-bit frames")
 
 
-@conformance_point(
-    96,
-    "hostile",
-    "every SDO command",
-    "CiA 301, SDO command specifiers",
-    "an answer of eight bytes or none; then it serves",
-)
+@point(96, "every SDO command", "CiA 301, SDO command specifiers", "an answer of eight bytes or none; then it serves")
 def every_command(bench: Bench) -> None:
     """All 256 command bytes with 1000h, which cannot be written; what may begin a transfer is aborted."""
     answer_id = SDO_TX_BASE + bench.node_id
@@ -101,15 +87,13 @@ def every_command(bench: Bench) -> None:
         frame = bench.next(answer_id, _PACE_S)
         if frame is not None and len(frame.data) != 8:
             bench.deviates(f"command {command:02X}h is answered with {len(frame.data)} bytes")
-    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, 0x1000, 0, bytes.fromhex("00000008")))
+    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(0x1000, 0, 0x08000000))
     while not bench.is_silent():
         pass  # answers that come late
     bench.serves("all command bytes")
 
 
-@conformance_point(
-    97, "hostile", "CAN FD frames", "ISO 11898-1, FD format", "an FD frame is no SDO request", needs="alone"
-)
+@point(97, "CAN FD frames", "ISO 11898-1, FD format", "an FD frame is no SDO request", needs="alone")
 def fd_frames(bench: Bench) -> None:
     """A request in a frame of twelve bytes, where the bus carries such frames."""
     if not bench.fd:
@@ -121,9 +105,7 @@ def fd_frames(bench: Bench) -> None:
     bench.serves("CAN FD frames")
 
 
-@conformance_point(
-    99, "hostile", "own frames", "CiA 301, CAN base frames", "data frames with 11 bits only", needs="alone"
-)
+@point(99, "own frames", "CiA 301, CAN base frames", "data frames with 11 bits only", needs="alone")
 def own_frames(bench: Bench) -> None:
     """What came so far, where nobody else is on the bus."""
     if bench.odd_ids:
@@ -131,9 +113,8 @@ def own_frames(bench: Bench) -> None:
         bench.deviates(f"remote requests or frames with 29 bits come: {', '.join(texts[:4])} (with flags)")
 
 
-@conformance_point(
+@point(
     98,
-    "hostile",
     "identifiers of nobody",
     "CiA 301, CAN identifiers",
     "frames of every length under other identifiers are ignored",

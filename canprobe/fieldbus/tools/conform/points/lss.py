@@ -21,8 +21,9 @@ from canprobe.fieldbus.protocol.lss import (
 )
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
-from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
+point = PointGroup("lss")
 _NO_BIT_RATE = 5
 """Index of table 0 that is reserved."""
 _ANSWER_S = 0.2
@@ -72,14 +73,7 @@ def _configuration(bench: Bench) -> Iterator[None]:
         _release(bench)
 
 
-@conformance_point(
-    66,
-    "lss",
-    "switch state selective",
-    "CiA 305, switch state selective",
-    "44h from the one address alone",
-    needs="alone",
-)
+@point(66, "switch state selective", "CiA 305, switch state selective", "44h from the one address alone", needs="alone")
 def switch_selective(bench: Bench) -> None:
     """The address of the device, and one with another serial number."""
     numbers = _address(bench)
@@ -99,9 +93,7 @@ def switch_selective(bench: Bench) -> None:
         bench.deviates("an inquiry is answered in waiting state")
 
 
-@conformance_point(
-    67, "lss", "identify remote slave", "CiA 305, identify remote slave", "4Fh inside the ranges only", needs="alone"
-)
+@point(67, "identify remote slave", "CiA 305, identify remote slave", "4Fh inside the ranges only", needs="alone")
 def identify(bench: Bench) -> None:
     """Ranges round the address, and a range of serial numbers beside it."""
     vendor, product, revision, serial = _address(bench)
@@ -118,9 +110,8 @@ def identify(bench: Bench) -> None:
             bench.deviates("the device answers identify remote slave outside the range")
 
 
-@conformance_point(
+@point(
     68,
-    "lss",
     "only without an id",
     "CiA 305, identify non-configured, fastscan",
     "a device with an id is silent",
@@ -135,14 +126,7 @@ def only_without_id(bench: Bench) -> None:
             bench.deviates(f"command {message[0]:02X}h is answered although the device has an id")
 
 
-@conformance_point(
-    69,
-    "lss",
-    "configure node-ID",
-    "CiA 305, configure node-ID",
-    "0 and 128: error 1; the own id: no error",
-    needs="alone",
-)
+@point(69, "configure node-ID", "CiA 305, configure node-ID", "0 and 128: error 1; the own id: no error", needs="alone")
 def configure_node_id(bench: Bench) -> None:
     """Ids that are none, then its own, which changes nothing."""
     with _configuration(bench):
@@ -153,9 +137,7 @@ def configure_node_id(bench: Bench) -> None:
                 bench.deviates(f"configure node-ID {node_id}: {got}, expected {'an' if refused else 'no'} error")
 
 
-@conformance_point(
-    70, "lss", "configure bit timing", "CiA 305, configure bit timing", "a reserved rate: error 1", needs="alone"
-)
+@point(70, "configure bit timing", "CiA 305, configure bit timing", "a reserved rate: error 1", needs="alone")
 def configure_bit_timing(bench: Bench) -> None:
     """A reserved index; nothing is activated."""
     with _configuration(bench):
@@ -166,9 +148,7 @@ def configure_bit_timing(bench: Bench) -> None:
             bench.deviates("no answer to configure bit timing")
 
 
-@conformance_point(
-    73, "lss", "inquire", "CiA 305, inquire services", "the four numbers of 1018h and the node-ID", needs="alone"
-)
+@point(73, "inquire", "CiA 305, inquire services", "the four numbers of 1018h and the node-ID", needs="alone")
 def inquire(bench: Bench) -> None:
     """All five inquiries."""
     numbers = _address(bench)

@@ -12,20 +12,21 @@ from canprobe.fieldbus.protocol.frames import (
     NmtCommand,
     NmtState,
 )
+from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted, PointNotApplicable
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import pack_request
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
+point = PointGroup("nmt")
 _STATES = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
-_READ_TYPE = pack_request(0x40, 0x1000, 0)
+_READ_TYPE = pack_read(0x1000)
 _QUEUED_NS = 5_000_000
 _PACE_S = 0.02
 
 
-@conformance_point(1, "nmt", "boot-up", "CiA 301, NMT boot-up", "700h+id with 00h, then pre-operational", needs="nmt")
+@point(1, "boot-up", "CiA 301, NMT boot-up", "700h+id with 00h, then pre-operational", needs="nmt")
 def boot_up(bench: Bench) -> None:
     """After a reset the device announces itself once, and is pre-operational."""
     before = bench.boots
@@ -40,9 +41,7 @@ def boot_up(bench: Bench) -> None:
         bench.deviates(f"{bench.boots - before} boot-up messages after one reset")
 
 
-@conformance_point(
-    1, "nmt", "power on", "CiA 301, NMT boot-up", "700h+id with 00h after the power came back", needs="nmt"
-)
+@point(1, "power on", "CiA 301, NMT boot-up", "700h+id with 00h after the power came back", needs="nmt")
 def power_on(bench: Bench) -> None:
     """The device announces itself when it gets its power, which a person switches."""
     before = bench.boots
@@ -53,9 +52,8 @@ def power_on(bench: Bench) -> None:
         bench.deviates("no boot-up message after the power came back")
 
 
-@conformance_point(
+@point(
     2,
-    "nmt",
     "reset communication",
     "CiA 301, NMT node control",
     "82h boots again from every state, and 1017h has its power-on value",
@@ -73,7 +71,7 @@ def reset_communication(bench: Bench) -> None:
             bench.deviates(f"1017h is {found} after the reset, {default} after the one before")
 
 
-@conformance_point(2, "nmt", "reset node", "CiA 301, NMT node control", "81h boots again from every state", needs="nmt")
+@point(2, "reset node", "CiA 301, NMT node control", "81h boots again from every state", needs="nmt")
 def reset_node(bench: Bench) -> None:
     """81h, where the user permits that application objects are reset."""
     for state in _STATES:
@@ -83,9 +81,8 @@ def reset_node(bench: Bench) -> None:
         bench.reset(NmtCommand.RESET_NODE)
 
 
-@conformance_point(
+@point(
     3,
-    "nmt",
     "wrong commands",
     "CiA 301, NMT node control",
     "commands that do not exist, or of another length, change nothing",
@@ -106,9 +103,7 @@ def wrong_commands(bench: Bench) -> None:
             bench.deviates(f"state {found:02X}h after wrong commands in state {state:02X}h")
 
 
-@conformance_point(
-    4, "nmt", "initialisation", "CiA 301, NMT initialisation", "nothing is served before the boot-up", needs="nmt"
-)
+@point(4, "initialisation", "CiA 301, NMT initialisation", "nothing is served before the boot-up", needs="nmt")
 def initialisation(bench: Bench) -> None:
     """SDO requests from the reset on: none is answered before the boot-up message."""
     beat_id, answer_id = HEARTBEAT_BASE + bench.node_id, SDO_TX_BASE + bench.node_id
@@ -134,7 +129,7 @@ def initialisation(bench: Bench) -> None:
         )
 
 
-@conformance_point(5, "nmt", "stopped", "CiA 301, NMT stopped", "SDO requests are not answered in stopped", needs="nmt")
+@point(5, "stopped", "CiA 301, NMT stopped", "SDO requests are not answered in stopped", needs="nmt")
 def stopped(bench: Bench) -> None:
     """SDO is silent in stopped, and served again in pre-operational."""
     bench.watch_state()
@@ -147,9 +142,8 @@ def stopped(bench: Bench) -> None:
     bench.serves("the return to pre-operational")
 
 
-@conformance_point(
+@point(
     6,
-    "nmt",
     "PDOs",
     "CiA 301, NMT states",
     "TPDOs come in operational only: neither SYNC nor a remote request brings one elsewhere",
@@ -186,13 +180,8 @@ def request_pdo(bench: Bench, cob_id: int) -> None:
         bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
 
 
-@conformance_point(
-    7,
-    "nmt",
-    "operational",
-    "CiA 301, NMT state machine",
-    "01h leads to operational, and the device stays there",
-    needs="nmt",
+@point(
+    7, "operational", "CiA 301, NMT state machine", "01h leads to operational, and the device stays there", needs="nmt"
 )
 def reaches_operational(bench: Bench) -> None:
     """What was seen before the first point; points that need operational do not apply where it is not reached."""
@@ -200,9 +189,8 @@ def reaches_operational(bench: Bench) -> None:
         bench.deviates(f"{bench.kept_out}; end this error, and examine the device again")
 
 
-@conformance_point(
+@point(
     7,
-    "nmt",
     "transitions",
     "CiA 301, NMT state machine",
     "01h, 02h and 80h lead to their states from every state, and error control reports them",

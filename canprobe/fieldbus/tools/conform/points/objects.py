@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
+from canprobe.fieldbus.protocol.sdo import ABORT, pack_read, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
-from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_request, pack_write
+from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
+point = PointGroup("objects")
 _MANDATORY = ((0x1000, 0), (0x1001, 0), (0x1018, 1))
 _SHOWN = 5
 """Entries that a verdict names."""
@@ -28,14 +29,7 @@ def _named(entries: list[str]) -> str:
     return "; ".join(entries[:_SHOWN]) + more
 
 
-@conformance_point(
-    77,
-    "objects",
-    "read all",
-    "CiA 306-1, AccessType, DataType",
-    "every entry that can be read, in its length",
-    needs="eds",
-)
+@point(77, "read all", "CiA 306-1, AccessType, DataType", "every entry that can be read, in its length", needs="eds")
 def read_all(bench: Bench) -> None:
     """Every readable entry of the EDS: it is there, and as long as its type."""
     wrong = []
@@ -56,9 +50,7 @@ def read_all(bench: Bench) -> None:
         bench.deviates(_named(wrong))
 
 
-@conformance_point(
-    78, "objects", "write every ro", "CiA 306-1, AccessType", accepted_text(accepted.READ_ONLY), needs="eds"
-)
+@point(78, "write every ro", "CiA 306-1, AccessType", accepted_text(accepted.READ_ONLY), needs="eds")
 def write_every_read_only(bench: Bench) -> None:
     """Every ro and const entry of the EDS gets its own value: 1000h is point 10, the application area needs --write."""
     tried = 0
@@ -75,16 +67,10 @@ def write_every_read_only(bench: Bench) -> None:
         raise PointNotApplicable("the EDS describes no further entry as ro in the communication area")
 
 
-@conformance_point(
-    79,
-    "objects",
-    "sub-index FFh",
-    "CiA 301, structure of an object",
-    "four bytes, or " + accepted_text(accepted.NO_ENTRY),
-)
+@point(79, "sub-index FFh", "CiA 301, structure of an object", "four bytes, or " + accepted_text(accepted.NO_ENTRY))
 def structure(bench: Bench) -> None:
     """Sub-index FFh of the identity."""
-    answer = bench.ask(pack_request(0x40, 0x1018, 0xFF))
+    answer = bench.ask(pack_read(0x1018, 0xFF))
     if answer[0] == ABORT:
         bench.check_abort(answer, accepted.NO_ENTRY, "read of 1018h:FF")
     elif answer[0] not in (0x43, 0x42):
@@ -99,9 +85,7 @@ def _compared(bench: Bench) -> Iterator[tuple[DescribedEntry, int]]:
             yield entry, bench.device.number(*place)
 
 
-@conformance_point(
-    81, "objects", "defaults", "CiA 306-1, DefaultValue", "for information: what differs is noted", needs="eds"
-)
+@point(81, "defaults", "CiA 306-1, DefaultValue", "for information: what differs is noted", needs="eds")
 def defaults(bench: Bench) -> None:
     """Values that differ from the EDS: a device that was configured has others."""
     differing = [
@@ -116,14 +100,7 @@ def defaults(bench: Bench) -> None:
         bench.notes.append(_named(differing))
 
 
-@conformance_point(
-    82,
-    "objects",
-    "PDOs of the EDS",
-    "CiA 306-1; CiA 301, 14xxh 18xxh",
-    "those that the EDS names, and no others",
-    needs="eds",
-)
+@point(82, "PDOs of the EDS", "CiA 306-1; CiA 301, 14xxh 18xxh", "those that the EDS names, and no others", needs="eds")
 def pdos_of_the_eds(bench: Bench) -> None:
     """Each PDO that the EDS names is there; the one behind the last is not."""
     description = bench.device.description
@@ -135,10 +112,10 @@ def pdos_of_the_eds(bench: Bench) -> None:
                 if bench.device.described(*place) is not None and not bench.device.has(*place):
                     bench.deviates(f"the device has no {place_text(*place)}, which the EDS describes")
         beyond = area[max(numbers, default=0)]
-        bench.must_refuse(pack_request(0x40, beyond, 1), accepted.NO_OBJECT, f"read of {beyond:04X}h:01")
+        bench.must_refuse(pack_read(beyond, 1), accepted.NO_OBJECT, f"read of {beyond:04X}h:01")
 
 
-@conformance_point(86, "objects", "SYNC identifier", "CiA 301, 1005h", "080h, bit 30 as it may be")
+@point(86, "SYNC identifier", "CiA 301, 1005h", "080h, bit 30 as it may be")
 def sync_identifier(bench: Bench) -> None:
     """1005h names the identifier of SYNC."""
     bench.need((0x1005, 0), written=False)
@@ -148,9 +125,7 @@ def sync_identifier(bench: Bench) -> None:
         bench.notes.append(f"SYNC has identifier {value & 0x7FF:03X}h")
 
 
-@conformance_point(
-    87, "objects", "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE)
-)
+@point(87, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE))
 def restricted_identifiers(bench: Bench) -> None:
     """1005h, 1012h and 1014h with restricted identifiers; one that is accepted is put back."""
     found = False
@@ -165,9 +140,7 @@ def restricted_identifiers(bench: Bench) -> None:
         raise PointNotApplicable("none of 1005h, 1012h and 1014h can be written")
 
 
-@conformance_point(
-    90, "objects", "identity", "CiA 306-1, DeviceInfo; CiA 301, 1018h", "the numbers of the EDS", needs="eds"
-)
+@point(90, "identity", "CiA 306-1, DeviceInfo; CiA 301, 1018h", "the numbers of the EDS", needs="eds")
 def identity(bench: Bench) -> None:
     """1000h and 1018h:01 and :02 as the EDS names them; a revision that differs is noted."""
     for place in ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3)):
@@ -183,7 +156,7 @@ def identity(bench: Bench) -> None:
             bench.deviates(text)
 
 
-@conformance_point(92, "objects", "mandatory objects", "CiA 301, object dictionary", "1000h, 1001h, 1018h:01")
+@point(92, "mandatory objects", "CiA 301, object dictionary", "1000h, 1001h, 1018h:01")
 def mandatory_objects(bench: Bench) -> None:
     """The objects that every device has."""
     for place in _MANDATORY:

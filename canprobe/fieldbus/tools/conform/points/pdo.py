@@ -24,9 +24,10 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
     synchronous_tpdo,
     word_of,
 )
-from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
 
+point = PointGroup("pdo")
 TRANSMISSION = "CiA 301, PDO transmission types"
 _EVENT_MS, _INHIBIT_MS, _WATCHED_MS = 50, 100, 200
 _WINDOW_US = 100_000
@@ -50,7 +51,7 @@ def _start(bench: Bench) -> None:
     bench.pass_time(0.01)
 
 
-@conformance_point(30, "pdo", "type 1", TRANSMISSION, "one TPDO a SYNC, as long as its mapping", needs="nmt sync")
+@point(30, "type 1", TRANSMISSION, "one TPDO a SYNC, as long as its mapping", needs="nmt sync")
 def type_1(bench: Bench) -> None:
     """Five SYNCs bring five TPDOs."""
     cob_id = synchronous_tpdo(bench)
@@ -65,7 +66,7 @@ def type_1(bench: Bench) -> None:
         bench.deviates(f"the TPDO has {len(frame.data) if frame else 0} bytes, its mapping {length}")
 
 
-@conformance_point(30, "pdo", "type n", TRANSMISSION, "one TPDO at every n-th SYNC", needs="nmt sync")
+@point(30, "type n", TRANSMISSION, "one TPDO at every n-th SYNC", needs="nmt sync")
 def type_n(bench: Bench) -> None:
     """Type 3, nine SYNCs."""
     cob_id = synchronous_tpdo(bench, every=3)
@@ -75,7 +76,7 @@ def type_n(bench: Bench) -> None:
         bench.deviates(f"with type 3 nine SYNCs bring {found} TPDOs")
 
 
-@conformance_point(30, "pdo", "type 0", TRANSMISSION, "after an event one TPDO, at the next SYNC", needs="nmt sync eds")
+@point(30, "type 0", TRANSMISSION, "after an event one TPDO, at the next SYNC", needs="nmt sync eds")
 def type_0(bench: Bench) -> None:
     """An entry that the user lets be written changes between SYNCs."""
     entry, pdo = permitted_entry(bench, transmits=True), changeable_pdo(bench, TPDOS, mapping=True)
@@ -94,9 +95,7 @@ def type_0(bench: Bench) -> None:
         bench.deviates(f"two SYNCs, an event and two SYNCs bring {found} TPDOs, expected [0, 0, 1, 0]")
 
 
-@conformance_point(
-    30, "pdo", "type 255", TRANSMISSION, "an event brings a TPDO at once, SYNC brings none", needs="nmt sync eds"
-)
+@point(30, "type 255", TRANSMISSION, "an event brings a TPDO at once, SYNC brings none", needs="nmt sync eds")
 def type_255(bench: Bench) -> None:
     """An entry that the user lets be written changes; then a SYNC."""
     entry, pdo = permitted_entry(bench, transmits=True), changeable_pdo(bench, TPDOS, mapping=True)
@@ -115,9 +114,7 @@ def type_255(bench: Bench) -> None:
         raise PointNotApplicable(_NO_EVENT)
 
 
-@conformance_point(
-    30, "pdo", "remote request", TRANSMISSION, "type 253 answers a remote request, and no SYNC", needs="nmt"
-)
+@point(30, "remote request", TRANSMISSION, "type 253 answers a remote request, and no SYNC", needs="nmt")
 def remote_request(bench: Bench) -> None:
     """A remote request for a TPDO whose bit 30 permits it."""
     pdo = changeable_pdo(bench, TPDOS)
@@ -143,9 +140,7 @@ def _event_driven(bench: Bench, event_ms: int, inhibit: int = 0) -> list[int]:
     return [frame.t_ns for frame in bench.during(0.5, [cob_id])]
 
 
-@conformance_point(
-    31, "pdo", "event timer", "CiA 301, 18xxh:05", "the TPDO repeats within 10 % of its event time", needs="nmt"
-)
+@point(31, "event timer", "CiA 301, 18xxh:05", "the TPDO repeats within 10 % of its event time", needs="nmt")
 def event_timer(bench: Bench) -> None:
     """50 ms, for half a second: an event may bring more frames, none less."""
     times = _event_driven(bench, _EVENT_MS)
@@ -155,7 +150,7 @@ def event_timer(bench: Bench) -> None:
         bench.deviates(f"{len(times)} TPDOs in 0.5 s with an event time of {_EVENT_MS} ms{longest}")
 
 
-@conformance_point(31, "pdo", "inhibit time", "CiA 301, 18xxh:03", "no two TPDOs within the inhibit time", needs="nmt")
+@point(31, "inhibit time", "CiA 301, 18xxh:03", "no two TPDOs within the inhibit time", needs="nmt")
 def inhibit_time(bench: Bench) -> None:
     """An event time of 20 ms within an inhibit time of 100 ms."""
     times = _event_driven(bench, 20, inhibit=_INHIBIT_MS * 10)
@@ -166,13 +161,8 @@ def inhibit_time(bench: Bench) -> None:
         bench.deviates("no TPDOs come with an event time of 20 ms")
 
 
-@conformance_point(
-    32,
-    "pdo",
-    "synchronous RPDO",
-    "CiA 301, synchronous RPDO",
-    "applied at the next SYNC, not before",
-    needs="nmt sync eds",
+@point(
+    32, "synchronous RPDO", "CiA 301, synchronous RPDO", "applied at the next SYNC, not before", needs="nmt sync eds"
 )
 def synchronous_rpdo(bench: Bench) -> None:
     """An entry that the user lets be written, by an RPDO of type 1."""
@@ -196,7 +186,7 @@ def _send_value(bench: Bench, cob_id: int, value: int, bits: int) -> None:
     bench.pass_time(0.005)
 
 
-@conformance_point(33, "pdo", "short RPDO", "CiA 301, RPDO length", "EMCY 8210h", needs="nmt")
+@point(33, "short RPDO", "CiA 301, RPDO length", "EMCY 8210h", needs="nmt")
 def short_rpdo(bench: Bench) -> None:
     """A dummy RPDO without a byte; a whole one ends the error."""
     _, cob_id, length = rpdo_of_dummies(bench)
@@ -211,9 +201,7 @@ def short_rpdo(bench: Bench) -> None:
     bench.pass_time(bench.times.slack_s)
 
 
-@conformance_point(
-    33, "pdo", "short RPDO applied", "CiA 301, RPDO length", "a short RPDO is not applied", needs="nmt eds"
-)
+@point(33, "short RPDO applied", "CiA 301, RPDO length", "a short RPDO is not applied", needs="nmt eds")
 def short_rpdo_applied(bench: Bench) -> None:
     """An entry that the user lets be written keeps its value."""
     entry = permitted_entry(bench, transmits=False)
@@ -230,9 +218,7 @@ def short_rpdo_applied(bench: Bench) -> None:
     _send_value(bench, cob_id, before, entry.bits)
 
 
-@conformance_point(
-    34, "pdo", "long RPDO", "CiA 301, RPDO length", "its first bytes are used; EMCY 8220h is optional", needs="nmt eds"
-)
+@point(34, "long RPDO", "CiA 301, RPDO length", "its first bytes are used; EMCY 8220h is optional", needs="nmt eds")
 def long_rpdo(bench: Bench) -> None:
     """An entry that the user lets be written, by an RPDO with a byte too many."""
     entry = permitted_entry(bench, transmits=False)
@@ -248,14 +234,7 @@ def long_rpdo(bench: Bench) -> None:
     _send_value(bench, cob_id, before, entry.bits)
 
 
-@conformance_point(
-    35,
-    "pdo",
-    "RPDO event timer",
-    "CiA 301, 14xxh:05",
-    "EMCY 8250h after the time, not before the first RPDO",
-    needs="nmt",
-)
+@point(35, "RPDO event timer", "CiA 301, 14xxh:05", "EMCY 8250h after the time, not before the first RPDO", needs="nmt")
 def rpdo_event_timer(bench: Bench) -> None:
     """A dummy RPDO with 200 ms, sent twice and then no more."""
     pdo, cob_id, length = rpdo_of_dummies(bench)
@@ -277,9 +256,8 @@ def rpdo_event_timer(bench: Bench) -> None:
     bench.pass_time(bench.times.slack_s)
 
 
-@conformance_point(
+@point(
     36,
-    "pdo",
     "synchronous window",
     "CiA 301, 1007h",
     "an RPDO within the window is applied; one behind may be dropped",
@@ -307,9 +285,7 @@ def synchronous_window(bench: Bench) -> None:
         bench.notes.append("an RPDO behind the window is applied; it may be dropped")
 
 
-@conformance_point(
-    37, "pdo", "SYNC start value", "CiA 301, 18xxh:06", "the first TPDO at the SYNC with this counter", needs="nmt sync"
-)
+@point(37, "SYNC start value", "CiA 301, 18xxh:06", "the first TPDO at the SYNC with this counter", needs="nmt sync")
 def sync_start_value(bench: Bench) -> None:
     """Type 2 with start value 3, SYNC counters 1 to 8 with overflow 10."""
     pdo = changeable_pdo(bench, TPDOS)

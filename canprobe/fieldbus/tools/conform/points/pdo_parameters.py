@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.protocol.sdo import ABORT, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -18,10 +19,11 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
     switch_off,
     switch_on,
 )
-from canprobe.fieldbus.tools.conform.point import conformance_point
+from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_write
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
+point = PointGroup("pdo")
 MAPPING = "CiA 301, PDO mapping"
 _ABSENT_WORD, _IDENTITY_WORD, _DUMMY_WORD = 0x1FF00020, 0x10180120, 0x00070020
 _INHIBIT, _START = 3, 6
@@ -45,7 +47,7 @@ def _valid(bench: Bench, area: range, *, mapping: bool = False) -> int:
     return pdo
 
 
-@conformance_point(25, "pdo", "mapping while valid", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
+@point(25, "mapping while valid", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
 def mapping_while_valid(bench: Bench) -> None:
     """An entry of a PDO in use gets another value, and its count 0."""
     pdo = _valid(bench, TPDOS, mapping=True)
@@ -57,9 +59,8 @@ def mapping_while_valid(bench: Bench) -> None:
         bench.deviates("a mapping entry has changed although the write was refused")
 
 
-@conformance_point(
+@point(
     25,
-    "pdo",
     "count while valid",
     MAPPING,
     "the count stays, or is refused with " + accepted_text(accepted.MAPPING_LOCKED),
@@ -71,7 +72,7 @@ def count_while_valid(bench: Bench) -> None:
     bench.must_refuse(pack_write(pdo + 0x200, 0, b"\0"), accepted.MAPPING_LOCKED, "the count of a PDO in use")
 
 
-@conformance_point(25, "pdo", "mapping while counted", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
+@point(25, "mapping while counted", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
 def mapping_while_counted(bench: Bench) -> None:
     """An entry of a PDO out of use, whose count is not 0."""
     pdo = changeable_pdo(bench, TPDOS, mapping=True)
@@ -95,7 +96,7 @@ def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.A
     bench.deviates(f"{what}: all writes are accepted")
 
 
-@conformance_point(26, "pdo", "mapping too long", MAPPING, accepted_text(accepted.MAPPING_LENGTH), needs="nmt")
+@point(26, "mapping too long", MAPPING, accepted_text(accepted.MAPPING_LENGTH), needs="nmt")
 def mapping_too_long(bench: Bench) -> None:
     """More than eight bytes: the first entry of a TPDO again and again."""
     pdo = changeable_pdo(bench, TPDOS, mapping=True)
@@ -111,7 +112,7 @@ def mapping_too_long(bench: Bench) -> None:
         _refused_at_last(bench, pdo, [word] * count, accepted.MAPPING_LENGTH, f"{count} entries of {word & 0xFF} bits")
 
 
-@conformance_point(27, "pdo", "absent object", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+@point(27, "absent object", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
 def map_absent(bench: Bench) -> None:
     """An object that the device does not have."""
     pdo = changeable_pdo(bench, TPDOS, mapping=True)
@@ -119,7 +120,7 @@ def map_absent(bench: Bench) -> None:
     _refused_at_last(bench, pdo, [_ABSENT_WORD], accepted.NOT_MAPPABLE, "mapping of an absent object")
 
 
-@conformance_point(27, "pdo", "not mappable", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt eds")
+@point(27, "not mappable", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt eds")
 def map_unmappable(bench: Bench) -> None:
     """An entry that the EDS does not let be mapped, in a TPDO; one that is ro, in an RPDO."""
     tried = 0
@@ -147,9 +148,7 @@ def map_unmappable(bench: Bench) -> None:
         raise PointNotApplicable("no mapping can be changed, or the EDS lets everything be mapped")
 
 
-@conformance_point(
-    28, "pdo", "identifier while valid", "CiA 301, 14xxh 18xxh", accepted_text(accepted.PDO_LOCKED), needs="nmt"
-)
+@point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted_text(accepted.PDO_LOCKED), needs="nmt")
 def identifier_while_valid(bench: Bench) -> None:
     """Another identifier for a PDO in use."""
     for area in (RPDOS, TPDOS):
@@ -160,9 +159,7 @@ def identifier_while_valid(bench: Bench) -> None:
         bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
 
 
-@conformance_point(
-    28, "pdo", "times while valid", "CiA 301, 18xxh:03, :06", accepted_text(accepted.PDO_LOCKED), needs="nmt"
-)
+@point(28, "times while valid", "CiA 301, 18xxh:03, :06", accepted_text(accepted.PDO_LOCKED), needs="nmt")
 def times_while_valid(bench: Bench) -> None:
     """Inhibit time and SYNC start value of a TPDO in use."""
     pdo, tried = _valid(bench, TPDOS), 0
@@ -175,9 +172,7 @@ def times_while_valid(bench: Bench) -> None:
         raise PointNotApplicable("the TPDOs have neither inhibit time nor start value")
 
 
-@conformance_point(
-    28, "pdo", "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE), needs="nmt"
-)
+@point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE), needs="nmt")
 def restricted_identifiers_of_pdos(bench: Bench) -> None:
     """Restricted identifiers for a PDO out of use."""
     for area in (RPDOS, TPDOS):
@@ -190,9 +185,7 @@ def restricted_identifiers_of_pdos(bench: Bench) -> None:
             bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
 
 
-@conformance_point(
-    29, "pdo", "reserved types", "CiA 301, transmission type", accepted_text(accepted.VALUE), needs="nmt"
-)
+@point(29, "reserved types", "CiA 301, transmission type", accepted_text(accepted.VALUE), needs="nmt")
 def reserved_types(bench: Bench) -> None:
     """Reserved transmission types for a PDO out of use."""
     for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):
@@ -205,7 +198,7 @@ def reserved_types(bench: Bench) -> None:
             bench.must_refuse(pack_write(pdo, 2, bytes((kind,))), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
 
 
-@conformance_point(38, "pdo", "dummies", MAPPING, "an RPDO takes the dummies that the EDS allows", needs="nmt eds")
+@point(38, "dummies", MAPPING, "an RPDO takes the dummies that the EDS allows", needs="nmt eds")
 def dummies(bench: Bench) -> None:
     """A dummy entry in an RPDO."""
     description = bench.device.description
@@ -220,7 +213,7 @@ def dummies(bench: Bench) -> None:
     rpdo_of_dummies(bench)
 
 
-@conformance_point(38, "pdo", "dummies in a TPDO", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+@point(38, "dummies in a TPDO", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
 def dummies_in_tpdo(bench: Bench) -> None:
     """A dummy entry in a TPDO."""
     pdo = changeable_pdo(bench, TPDOS, mapping=True)
@@ -228,7 +221,7 @@ def dummies_in_tpdo(bench: Bench) -> None:
     _refused_at_last(bench, pdo, [_DUMMY_WORD], accepted.NOT_MAPPABLE, "a dummy in a TPDO")
 
 
-@conformance_point(83, "pdo", "mapped entries", MAPPING, "every mapped entry is there, in the mapped length")
+@point(83, "mapped entries", MAPPING, "every mapped entry is there, in the mapped length")
 def mapped_entries(bench: Bench) -> None:
     """Every entry of every mapping: it can be read, or the EDS says that it is wo."""
     for area in (RPDOS, TPDOS):
@@ -246,7 +239,7 @@ def mapped_entries(bench: Bench) -> None:
                     bench.deviates(f"{pdo:04X}h maps {bits} bits of {index:04X}h, which has {len(value)} bytes")
 
 
-@conformance_point(83, "pdo", "heard lengths", MAPPING, "every TPDO that comes is as long as its mapping")
+@point(83, "heard lengths", MAPPING, "every TPDO that comes is as long as its mapping")
 def heard_lengths(bench: Bench) -> None:
     """Every TPDO that was heard before, and that comes in operational by SYNC, request, event timer or by itself."""
     pdos = {cob_id: pdo for pdo in bench.device.pdos(TPDOS) if (cob_id := bench.device.cob_id(pdo)) is not None}
@@ -289,9 +282,7 @@ def _ask_for_tpdos(bench: Bench, pdos: Mapping[int, int]) -> None:
             request_pdo(bench, cob_id)
 
 
-@conformance_point(
-    84, "pdo", "mapped anew", MAPPING, "out of use, 0, entries, count, in use: all writes are accepted", needs="nmt"
-)
+@point(84, "mapped anew", MAPPING, "out of use, 0, entries, count, in use: all writes are accepted", needs="nmt")
 def mapped_anew(bench: Bench) -> None:
     """The own mapping of a TPDO, in the order that the standard demands."""
     pdo = changeable_pdo(bench, TPDOS, mapping=True)
@@ -303,9 +294,7 @@ def mapped_anew(bench: Bench) -> None:
         bench.deviates(f"the mapping is {found}, written was {words}")
 
 
-@conformance_point(
-    85, "pdo", "what the EDS lets map", MAPPING, "a ro entry in a TPDO, a wo or rww entry in an RPDO", needs="nmt eds"
-)
+@point(85, "what the EDS lets map", MAPPING, "a ro entry in a TPDO, a wo or rww entry in an RPDO", needs="nmt eds")
 def mappable(bench: Bench) -> None:
     """One entry of each access that the EDS lets be mapped."""
     for area, accesses in ((TPDOS, ("ro", "rw", "rwr")), (RPDOS, ("wo", "rw", "rww"))):

@@ -6,21 +6,21 @@ from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE
+from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.frame_text import place_text
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request, pack_write
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
+point = PointGroup("sdo")
 CODES = "CiA 301, SDO abort codes"
 _ABSENT = (0x1FF0, 0x5FFE, 0x9FFE)
 """Indices that hardly any device has, in three areas; they are read only."""
 
 
-@conformance_point(10, "sdo", "write ro", CODES, accepted_text(accepted.READ_ONLY))
+@point(10, "write ro", CODES, accepted_text(accepted.READ_ONLY))
 def write_read_only(bench: Bench) -> None:
     """1000h gets its own value."""
     bench.need((0x1000, 0), written=False)
@@ -28,41 +28,41 @@ def write_read_only(bench: Bench) -> None:
     bench.must_refuse(request, accepted.READ_ONLY, "write to 1000h")
 
 
-@conformance_point(11, "sdo", "read wo", CODES, accepted_text(accepted.WRITE_ONLY), needs="eds")
+@point(11, "read wo", CODES, accepted_text(accepted.WRITE_ONLY), needs="eds")
 def read_write_only(bench: Bench) -> None:
     """Every entry that the EDS describes as wo."""
     entries = [entry for entry in bench.device.entries() if not entry.readable]
     if not entries:
         raise PointNotApplicable("the EDS describes no entry as wo")
     for entry in entries:
-        request = pack_request(0x40, entry.index, entry.subindex)
+        request = pack_read(entry.index, entry.subindex)
         bench.must_refuse(request, accepted.WRITE_ONLY, f"read of {place_text(entry.index, entry.subindex)}")
 
 
-@conformance_point(12, "sdo", "absent object", CODES, accepted_text(accepted.NO_OBJECT))
+@point(12, "absent object", CODES, accepted_text(accepted.NO_OBJECT))
 def absent_object(bench: Bench) -> None:
     """Reads of indices that the device does not have."""
     for index in _ABSENT:
         if bench.device.described(index) is None:
-            bench.must_refuse(pack_request(0x40, index, 0), accepted.NO_OBJECT, f"read of {index:04X}h")
+            bench.must_refuse(pack_read(index), accepted.NO_OBJECT, f"read of {index:04X}h")
 
 
-@conformance_point(13, "sdo", "absent sub-index", CODES, accepted_text(accepted.NO_SUBINDEX))
+@point(13, "absent sub-index", CODES, accepted_text(accepted.NO_SUBINDEX))
 def absent_subindex(bench: Bench) -> None:
     """1018h beyond its highest sub-index: a read, and a write of zeros."""
     bench.need((0x1018, 0), written=False)
     beyond = bench.device.number(0x1018) + 1
-    bench.must_refuse(pack_request(0x40, 0x1018, beyond), accepted.NO_SUBINDEX, f"read of 1018h:{beyond:02X}")
+    bench.must_refuse(pack_read(0x1018, beyond), accepted.NO_SUBINDEX, f"read of 1018h:{beyond:02X}")
     bench.must_refuse(pack_write(0x1018, beyond, bytes(4)), accepted.NO_SUBINDEX, f"write to 1018h:{beyond:02X}")
 
 
-@conformance_point(14, "sdo", "unknown command", CODES, accepted_text(accepted.UNKNOWN_COMMAND))
+@point(14, "unknown command", CODES, accepted_text(accepted.UNKNOWN_COMMAND))
 def unknown_command(bench: Bench) -> None:
     """Command byte E0h."""
     bench.must_refuse(pack_request(0xE0, 0x1000, 0), accepted.UNKNOWN_COMMAND, "command E0h")
 
 
-@conformance_point(15, "sdo", "too long", CODES, accepted_text(accepted.TOO_LONG))
+@point(15, "too long", CODES, accepted_text(accepted.TOO_LONG))
 def too_long(bench: Bench) -> None:
     """1017h in four bytes."""
     bench.need((0x1017, 0))
@@ -70,7 +70,7 @@ def too_long(bench: Bench) -> None:
     bench.must_refuse(pack_write(0x1017, 0, value), accepted.TOO_LONG, "4 bytes for 1017h")
 
 
-@conformance_point(16, "sdo", "too short", CODES, accepted_text(accepted.TOO_SHORT))
+@point(16, "too short", CODES, accepted_text(accepted.TOO_SHORT))
 def too_short(bench: Bench) -> None:
     """1017h in one byte."""
     bench.need((0x1017, 0))
@@ -92,7 +92,7 @@ def _limited(bench: Bench) -> Iterator[tuple[DescribedEntry, int, bool]]:
                 yield entry, value, above
 
 
-@conformance_point(17, "sdo", "limits", CODES, "above 06090031h, below 06090032h, or 06090030h", needs="eds")
+@point(17, "limits", CODES, "above 06090031h, below 06090032h, or 06090030h", needs="eds")
 def limits(bench: Bench) -> None:
     """A value beyond each limit that the EDS states, for entries that may be written."""
     found = False
@@ -105,7 +105,7 @@ def limits(bench: Bench) -> None:
         raise PointNotApplicable("no entry that may be written has a limit; --write names more")
 
 
-@conformance_point(75, "sdo", "default channel", "CiA 301, 1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
+@point(75, "default channel", "CiA 301, 1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
 def default_channel(bench: Bench) -> None:
     """The identifiers of the default SDO server."""
     bench.need((0x1200, 1), (0x1200, 2), written=False)
@@ -114,19 +114,15 @@ def default_channel(bench: Bench) -> None:
             bench.deviates(f"1200h:{subindex:02X} is {found:08X}h, expected {base + bench.node_id:08X}h")
 
 
-@conformance_point(
-    76, "sdo", "further channels", "CiA 301, 1201h to 127Fh", accepted_text(accepted.NO_OBJECT), needs="eds"
-)
+@point(76, "further channels", "CiA 301, 1201h to 127Fh", accepted_text(accepted.NO_OBJECT), needs="eds")
 def further_channels(bench: Bench) -> None:
     """Channels that the EDS does not describe are not there."""
     for index in (0x1201, 0x1202, 0x1240, 0x127F):
         if bench.device.described(index) is None and bench.device.described(index, 1) is None:
-            bench.must_refuse(pack_request(0x40, index, 0), accepted.NO_OBJECT, f"read of {index:04X}h")
+            bench.must_refuse(pack_read(index), accepted.NO_OBJECT, f"read of {index:04X}h")
 
 
-@conformance_point(
-    24, "sdo", "two channels", "CiA 301, 1200h to 127Fh", "transfers on two channels do not disturb each other"
-)
+@point(24, "two channels", "CiA 301, 1200h to 127Fh", "transfers on two channels do not disturb each other")
 def two_channels(bench: Bench) -> None:
     """A segmented upload on the default channel, and an expedited one on 1201h within it."""
     bench.need((0x1201, 1), (0x1201, 2), written=False)
@@ -135,11 +131,11 @@ def two_channels(bench: Bench) -> None:
         raise PointNotApplicable("channel 1201h is not in use")
     name = bench.device.values.get((0x1008, 0), b"")
     answer = bench.request(0x40, 0x1008)
-    bench.send(request_id, pack_request(0x40, 0x1000, 0))
+    bench.send(request_id, pack_read(0x1000))
     frame = bench.next(answer_id, bench.times.sdo_s)
     if frame is None or frame.data != bench.first_answer:
         bench.deviates("no answer with 1000h on the channel of 1201h")
     segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]
     if segment and segment != name[:7].ljust(7, b"\0"):
         bench.deviates("a segment of 1008h is wrong after a transfer on the other channel")
-    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, 0x1008, 0, bytes.fromhex("00000008")))
+    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(0x1008, 0, 0x08000000))

@@ -8,13 +8,14 @@ from __future__ import annotations
 from binascii import crc_hqx
 
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
+from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_abort, pack_request
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import AbortSet, accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
+point = PointGroup("sdo")
 SEGMENTS = "CiA 301, SDO segmented transfer"
 BLOCKS = "CiA 301, SDO block transfer"
 _SERVER_TIMEOUT_S = 5.0
@@ -46,14 +47,14 @@ def _segment(value: bytes, toggle: int = 0, *, last: bool = True) -> bytes:
 
 def _abort(bench: Bench) -> None:
     """End the transfer from the client's side."""
-    bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, _HEARTBEAT, 0, bytes.fromhex("00000008")))
+    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(_HEARTBEAT, 0, 0x08000000))
 
 
 def _own_value(bench: Bench) -> bytes:
     return bench.device.values[_HEARTBEAT, 0]
 
 
-@conformance_point(18, "sdo", "toggle of a download", SEGMENTS, accepted_text(accepted.TOGGLE))
+@point(18, "toggle of a download", SEGMENTS, accepted_text(accepted.TOGGLE))
 def toggle_down(bench: Bench) -> None:
     """The first segment has toggle bit 1."""
     _segmented_download(bench)
@@ -61,7 +62,7 @@ def toggle_down(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(18, "sdo", "toggle of an upload", SEGMENTS, accepted_text(accepted.TOGGLE))
+@point(18, "toggle of an upload", SEGMENTS, accepted_text(accepted.TOGGLE))
 def toggle_up(bench: Bench) -> None:
     """The first request for a segment has toggle bit 1."""
     _segmented_upload(bench)
@@ -69,9 +70,7 @@ def toggle_up(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(
-    19, "sdo", "time-out", "CiA 301, SDO abort codes", "05040000h, or no time-out at all; then it serves again"
-)
+@point(19, "time-out", "CiA 301, SDO abort codes", "05040000h, or no time-out at all; then it serves again")
 def server_timeout(bench: Bench) -> None:
     """A download that is not continued: an abort, if one comes, is the time-out, and the server is free afterwards."""
     _segmented_download(bench)
@@ -84,14 +83,14 @@ def server_timeout(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(20, "sdo", "no transfer", SEGMENTS, accepted_text(accepted.UNKNOWN_COMMAND))
+@point(20, "no transfer", SEGMENTS, accepted_text(accepted.UNKNOWN_COMMAND))
 def no_transfer(bench: Bench) -> None:
     """Segments while no transfer is open."""
     for command, what in ((0x60, "a request for a segment"), (0x00, "a segment")):
         bench.must_refuse(bytes((command,)) + bytes(7), accepted.UNKNOWN_COMMAND, f"{what} without a transfer")
 
 
-@conformance_point(21, "sdo", "client's abort", "CiA 301, SDO abort", "no answer; the transfer is over")
+@point(21, "client's abort", "CiA 301, SDO abort", "no answer; the transfer is over")
 def client_abort(bench: Bench) -> None:
     """The client aborts a download."""
     _segmented_download(bench)
@@ -103,7 +102,7 @@ def client_abort(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(22, "sdo", "fewer than announced", SEGMENTS, accepted_text(accepted.TOO_SHORT))
+@point(22, "fewer than announced", SEGMENTS, accepted_text(accepted.TOO_SHORT))
 def fewer_than_announced(bench: Bench) -> None:
     """Two bytes are announced, one is sent."""
     _segmented_download(bench)
@@ -111,7 +110,7 @@ def fewer_than_announced(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(22, "sdo", "more than announced", SEGMENTS, accepted_text(accepted.TOO_LONG))
+@point(22, "more than announced", SEGMENTS, accepted_text(accepted.TOO_LONG))
 def more_than_announced(bench: Bench) -> None:
     """Two bytes are announced, three are sent."""
     _segmented_download(bench)
@@ -119,9 +118,7 @@ def more_than_announced(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(
-    23, "sdo", "expedited", "CiA 301, SDO expedited transfer", "1000h in four bytes; 1017h takes its own value"
-)
+@point(23, "expedited", "CiA 301, SDO expedited transfer", "1000h in four bytes; 1017h takes its own value")
 def expedited(bench: Bench) -> None:
     """An upload, and a download that is read back."""
     bench.need((0x1000, 0), written=False)
@@ -134,7 +131,7 @@ def expedited(bench: Bench) -> None:
             bench.deviates("1017h does not keep the value that was written")
 
 
-@conformance_point(23, "sdo", "segmented upload", SEGMENTS, "a text in segments, as long as announced")
+@point(23, "segmented upload", SEGMENTS, "a text in segments, as long as announced")
 def segmented_upload(bench: Bench) -> None:
     """A text in segments, twice the same."""
     _segmented_upload(bench)
@@ -145,7 +142,7 @@ def segmented_upload(bench: Bench) -> None:
             bench.deviates(f"{index:04X}h differs from one upload to the next")
 
 
-@conformance_point(23, "sdo", "segmented download", SEGMENTS, "1017h takes a value in a segment")
+@point(23, "segmented download", SEGMENTS, "1017h takes a value in a segment")
 def segmented_download(bench: Bench) -> None:
     """1017h gets another value in a segment."""
     _segmented_download(bench)
@@ -160,7 +157,7 @@ def segmented_download(bench: Bench) -> None:
 def _block_answer(bench: Bench, request: bytes) -> bytes:
     """Begin a block transfer; where the device has none, the point does not apply."""
     answer = bench.ask(request)
-    if answer[0] == ABORT and int.from_bytes(answer[4:], "little") == _COMMAND_UNSUPPORTED:
+    if answer[0] == ABORT and abort_code(answer) == _COMMAND_UNSUPPORTED:
         raise PointNotApplicable("the device has no block transfer (05040001h)")
     return answer
 
@@ -189,7 +186,7 @@ def _block_segments(bench: Bench, index: int) -> tuple[bytes, int, int]:
     return value, number, answer[0] & 4
 
 
-@conformance_point(23, "sdo", "block upload", BLOCKS, "the same bytes as in segments, with the right CRC")
+@point(23, "block upload", BLOCKS, "the same bytes as in segments, with the right CRC")
 def block_upload(bench: Bench) -> None:
     """A text in blocks of 127 segments."""
     index = _text_index(bench)
@@ -207,7 +204,7 @@ def block_upload(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(23, "sdo", "acknowledgement of 128", BLOCKS, accepted_text(accepted.SEQUENCE))
+@point(23, "acknowledgement of 128", BLOCKS, accepted_text(accepted.SEQUENCE))
 def acknowledgement_of_128(bench: Bench) -> None:
     """A block upload, of which more segments are acknowledged than a block can have."""
     index = _text_index(bench)
@@ -233,7 +230,7 @@ def _block_download(bench: Bench, value: bytes, *, number: int = 1, crc: int | N
     return bench.ask(bytes((0xC1 | (7 - len(value)) << 2,)) + crc.to_bytes(2, "little") + bytes(5))
 
 
-@conformance_point(23, "sdo", "block download", BLOCKS, "1017h takes a value in a block")
+@point(23, "block download", BLOCKS, "1017h takes a value in a block")
 def block_download(bench: Bench) -> None:
     """1017h gets another value in a block of one segment."""
     value = b"\x10\x27"
@@ -244,7 +241,7 @@ def block_download(bench: Bench) -> None:
         bench.deviates("1017h does not have the value of the block")
 
 
-@conformance_point(23, "sdo", "CRC of a block", BLOCKS, accepted_text(accepted.CRC))
+@point(23, "CRC of a block", BLOCKS, accepted_text(accepted.CRC))
 def block_crc(bench: Bench) -> None:
     """A wrong CRC, where the device announces that it checks it."""
     answer = _block_answer(bench, pack_request(0xC6, _HEARTBEAT, 0, bytes((2, 0, 0, 0))))
@@ -257,7 +254,7 @@ def block_crc(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(23, "sdo", "sequence of a block", BLOCKS, "05040003h, or the segment is not acknowledged")
+@point(23, "sequence of a block", BLOCKS, "05040003h, or the segment is not acknowledged")
 def block_sequence(bench: Bench) -> None:
     """A block that begins with segment 2: it is refused, or segment 0 is acknowledged, as one is lost."""
     answer = _block_download(bench, b"\x10\x27", number=2)
@@ -278,13 +275,13 @@ def _refuses_block_size(bench: Bench, size: int, codes: AbortSet) -> None:
     bench.serves("the transfer")
 
 
-@conformance_point(23, "sdo", "block of 0", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
+@point(23, "block of 0", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
 def block_of_0(bench: Bench) -> None:
     """An upload in blocks of no segment."""
     _refuses_block_size(bench, 0, accepted.BLOCK_SIZE)
 
 
-@conformance_point(23, "sdo", "block of 128", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
+@point(23, "block of 128", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
 def block_of_128(bench: Bench) -> None:
     """An upload in blocks of more than 127 segments."""
     _refuses_block_size(bench, 128, accepted.BLOCK_SIZE)

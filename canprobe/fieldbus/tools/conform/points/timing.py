@@ -6,11 +6,12 @@ from itertools import pairwise
 
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE, NmtCommand
 from canprobe.fieldbus.protocol.response_times import NS_PER_S
+from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
-from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import pack_request
+from canprobe.fieldbus.tools.conform.point import PointGroup
 
+point = PointGroup("timing")
 SDO_TIME, SYNC_TIME, HEARTBEAT_TIME = "SDO answer", "SYNC to TPDO", "heartbeat period"
 """Names of the distributions."""
 _SDO_COUNT, _SYNC_COUNT, _BEAT_COUNT = 100, 50, 20
@@ -30,7 +31,7 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     times: list[float] = []
     for _ in range(count):
         bench.taken(SDO_TX_BASE + bench.node_id)
-        t_ns = bench.send(SDO_RX_BASE + bench.node_id, pack_request(0x40, 0x1000, 0))
+        t_ns = bench.send(SDO_RX_BASE + bench.node_id, pack_read(0x1000))
         frame = bench.next(SDO_TX_BASE + bench.node_id, bench.times.sdo_s)
         if frame is None or frame.data != bench.first_answer:
             bench.deviates(f"read {len(times) + 1} of {count} of 1000h is not answered within {bench.times.sdo_s:g} s")
@@ -38,21 +39,14 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     return tuple(times)
 
 
-@conformance_point(
-    100, "timing", "SDO", "CiA 301, SDO time-out of the client", "each of 100 reads of 1000h is answered in time"
-)
+@point(100, "SDO", "CiA 301, SDO time-out of the client", "each of 100 reads of 1000h is answered in time")
 def sdo_time(bench: Bench) -> None:
     """Times of 100 reads, one after another."""
     bench.distributions[SDO_TIME] = _sdo_times(bench, _SDO_COUNT)
 
 
-@conformance_point(
-    101,
-    "timing",
-    "SYNC to TPDO",
-    "CiA 301, synchronous TPDO",
-    "one TPDO for each of 50 SYNCs, within 10 ms",
-    needs="nmt sync",
+@point(
+    101, "SYNC to TPDO", "CiA 301, synchronous TPDO", "one TPDO for each of 50 SYNCs, within 10 ms", needs="nmt sync"
 )
 def sync_time(bench: Bench) -> None:
     """Times from SYNC to a TPDO of type 1, at 100 Hz."""
@@ -70,7 +64,7 @@ def sync_time(bench: Bench) -> None:
     bench.distributions[SYNC_TIME] = tuple(times)
 
 
-@conformance_point(102, "timing", "heartbeat", "CiA 301, 1017h", "no period differs by more than 20 % from 1017h")
+@point(102, "heartbeat", "CiA 301, 1017h", "no period differs by more than 20 % from 1017h")
 def heartbeat_time(bench: Bench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
@@ -85,9 +79,8 @@ def heartbeat_time(bench: Bench) -> None:
         )
 
 
-@conformance_point(
+@point(
     103,
-    "timing",
     "under load",
     "CiA 301, SDO, heartbeat",
     "reads are answered and heartbeats come under half load",
