@@ -209,10 +209,15 @@ def test_a_skip_whose_reason_is_not_listed_is_a_failure_where_all_is_installed(
 
 
 STANDSTILL = """
+import ctypes
+
 import pytest
 
 pytestmark = pytest.mark.vcan
 tries = []
+
+def stand_still():
+    ctypes.PyDLL(None).usleep(400_000)  # no other thread runs meanwhile: PyDLL keeps the interpreter's lock
 
 @pytest.fixture(scope="module")
 def shared():
@@ -220,7 +225,7 @@ def shared():
 
 def test_in_which_the_machine_stood_still(vcan0, shared):
     if len(tries) == 1:
-        sum(range(20_000_000))  # in C from end to end: no other thread runs meanwhile
+        stand_still()
         pytest.fail("a time-out")
     assert tries == ["set up"] * 2, "made anew"
 
@@ -230,7 +235,7 @@ def test_that_fails_by_itself(vcan0, shared):
     assert False
 
 def test_that_fails_at_every_standstill(vcan0, shared):
-    sum(range(20_000_000))
+    stand_still()
     pytest.fail("a time-out")
 """
 
