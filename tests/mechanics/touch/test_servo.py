@@ -257,6 +257,27 @@ def test_follower_stays_on_the_curve_at_the_asked_step(name):
     assert path.max(axis=0) == pytest.approx(curve.max(axis=0), abs=0.7e-3)
 
 
+def test_a_straight_path_brakes_before_it_turns_back_and_the_others_keep_their_speed():
+    speed, ramp_s, dt = 25e-3, 0.05, 1.0 / 400
+    for name, sizes in SIZES.items():
+        follower = PathFollower(make_strategy(name, *sizes), speed * ramp_s / 2)
+        x = y = 0.0
+        velocities = []
+        for _ in range(2000):
+            pace = follower.pace
+            hx, hy = follower.step(x, y, pace * speed * dt)
+            x, y = x + hx * pace * speed * dt, y + hy * pace * speed * dt
+            velocities.append((hx * pace, hy * pace))
+        v = np.array(velocities)
+        if name == "straight":
+            jumps = np.linalg.norm(np.diff(v, axis=0), axis=1)
+            assert jumps.max() < 3.0 * dt / ramp_s  # at once it would be 2
+            assert (np.diff(np.sign(v[:, 0])) != 0.0).sum() == 4  # it turns back at each end
+            assert np.mean(np.linalg.norm(v, axis=1)) > 0.9
+        else:
+            assert np.linalg.norm(v, axis=1) == pytest.approx(1.0)
+
+
 def test_unknown_strategy_is_refused():
     with pytest.raises(KeyError):
         make_strategy("spiral", 0.01, 0.01)
