@@ -24,9 +24,8 @@ LAGS = 4.0
 """Stated lags before which a drive may have begun a motion: with 1.5 times the lag it has then followed to 97 %."""
 WHILES_S = (0.005, 0.02, 0.08, 0.32)
 """Whiles in which the motions are compared, s: a fast joint that stands shows in the first, a slow one in the last."""
-OVERSHOOT_SHARE, SWING_LAGS = 0.25, 8.0
-"""Share of a jump of the speed by which a drive overshoots it, 18 % on the dynamic plant; and stated lags after
-which it does so at the latest, with a damping of 0.5."""
+OVERSHOOT_SHARE = 0.25
+"""Share of a jump of the target's speed by which a drive overshoots it, 18 % on the dynamic plant."""
 MARGIN_RAD = 0.5e-3
 """Angle of a joint by which a motion may differ: rounding of target and position, noise of the encoder, friction."""
 LATE_PERIODS = 1.5
@@ -49,10 +48,9 @@ class Following:
         self._margins: list[float] = np.maximum(margins, MIN_MARGIN_COUNTS).tolist()
         self._period_ns = period_ns
         self._whiles = sorted({max(1, round(s * 1e9 / period_ns)) for s in WHILES_S})
-        lags, swing = (CYCLES_TO_EFFECT + int(-(-n * lag_s * 1e9 // period_ns)) for n in (LAGS, SWING_LAGS))
-        self._lags, self._delays = lags, range(1, swing + 1)
-        self._usual = 1 + lags // 2
-        size = self._whiles[-1] + swing + 1
+        self._delays = range(1, CYCLES_TO_EFFECT + 1 + int(-(-LAGS * lag_s * 1e9 // period_ns)))
+        self._usual = 1 + len(self._delays) // 2
+        size = self._whiles[-1] + len(self._delays) + 1
         self._cycles: deque[tuple[int, Sequence[int], Sequence[int | None], int]] = deque(maxlen=size)
         self._moving_before = False  # before the first of these cycles
 
@@ -105,6 +103,5 @@ class Following:
             uneven = (abs(t_ns - begin_ns - span * self._period_ns) + late_ns) / self._period_ns
             allowed = margin + OVERSHOOT_SHARE * (max(asks) - min(asks))
             allowed += uneven * max([abs(b - a) for a, b in pairwise((*starts, *ends))])
-            asks = asks[: self._lags]
             most = max(most, moved - max(asks) - allowed, min(asks) - allowed - moved)
         return most

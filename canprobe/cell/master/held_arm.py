@@ -12,21 +12,27 @@ THAW_NS = 50_000_000
 
 
 class HeldArm:
-    """Holds an arm where it is: its last targets lie ahead of it, and the drives that are heard would go on to them."""
+    """Holds an arm where it is: its last targets lie ahead of it, and the drives that are heard would go on to them.
+
+    In the first cycle of a hold they do: it is often the only one, and to stop and go on for it presses harder.
+    """
 
     def __init__(self) -> None:
+        self._holds = False
         self._frozen: Floats | None = None
         self._behind: Floats | None = None
         self._thawed_ns = 0
 
     def freeze(self, measurement: Measurement) -> Command:
-        """The command of a cycle of the hold: where the arm was in the first one."""
-        if self._frozen is None:
+        """The command of a cycle of the hold: from the second one on, where the arm was in that."""
+        if self._holds and self._frozen is None:
             self._frozen = measurement.q
+        self._holds = True
         return Command(self._frozen)
 
     def thaw(self, command: Command, measurement: Measurement) -> Command:
         """The controller's command; after a hold it makes up little by little for the way from there."""
+        self._holds = False
         if command.q_target is None or (self._frozen is None and self._behind is None):
             return command
         if self._frozen is not None:

@@ -73,8 +73,7 @@ def test_a_drive_with_any_lag_up_to_twice_the_stated_one_follows(what, lag_s):
     assert found(Motor(lag_s), motions()[what]) is None
 
 
-@pytest.mark.parametrize("damping", [0.5, 0.7])
-@pytest.mark.parametrize("lag_s", [0.5 * LAG_S, LAG_S])
+@pytest.mark.parametrize(("lag_s", "damping"), [(0.5 * LAG_S, 0.5), (0.5 * LAG_S, 0.7), (LAG_S, 0.7)])
 def test_a_drive_that_overshoots_a_sharp_turn_follows(lag_s, damping):
     """Of the targets of a straight stroke over a cylinder, which goes back at once with 1 rad/s."""
     targets = COUNTS_PER_RAD * np.abs(np.mod(np.arange(0.0, 1.0, PERIOD_NS * 1e-9), 0.4) - 0.2)
