@@ -183,7 +183,8 @@ def meant(words: list[str], line: str) -> Iterator[list[str]]:
             continue
         for one in hint.split(" or "):
             parts = {part for word in words for part in (word, *re.split(r"[=.]", word), *word.split("="))}
-            wrong = got or max(parts, key=lambda part: difflib.SequenceMatcher(None, part, one).ratio())
+            named = {part for part in parts - {one} if re.search(rf"(?<!\w){re.escape(part)}(?!\w)", line)}
+            wrong = got or max(named or parts, key=lambda part: difflib.SequenceMatcher(None, part, one).ratio())
             yield [re.sub(rf"(?<!\w){re.escape(wrong)}(?!\w)", one, word) for word in words]
 
 
