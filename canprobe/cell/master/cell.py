@@ -289,7 +289,6 @@ class Cell:
         with self._one_at_a_time(), self._naming_another_master():
             self._controller, self._retreats_for, self._remarks_noted = runs, None, 0
             self.stopped_by, self._held = None, HeldArm()
-            runs.array_alive = self.supervisor.array_alive
             if runs.reader is not None:
                 self._note_silent_taxels()
                 self._reader = runs.reader
@@ -516,6 +515,7 @@ class Cell:
             controller_state=self._port.state,
             log_failure=self._log_failure() or self.log.failure,
         )
+        self._controller.array_alive = self.supervisor.array_alive
 
     def _supervise_enabling(self) -> None:
         finding = self.supervisor.finding(enabling=True)

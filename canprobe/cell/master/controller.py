@@ -147,7 +147,7 @@ class Controller:
             goes on from where the arm stands, once motion is asked for. False, the default: a loss ends it.
         compares_motion: True: the controller itself compares the motion of the joints with what it has asked for, and
             names what is wrong; False, the default: the cell does.
-        array_alive: whether an image of the array has changed since bring-up; the cell sets it before the first step.
+        array_alive: whether an image of the array has changed since bring-up; the cell sets it before each step.
         array_blind: why the controller does not believe the array any more; None while it does.
     """
 
@@ -231,15 +231,13 @@ class WrappingController(Controller):
     """
 
     inner: Controller | None = None
-    _alive = False
 
     @property
     def array_alive(self) -> bool:
-        return self._alive if self.inner is None else self.inner.array_alive
+        return self.inner is not None and self.inner.array_alive
 
     @array_alive.setter
     def array_alive(self, alive: bool) -> None:
-        self._alive = alive
         if self.inner is not None:
             self.inner.array_alive = alive
 

@@ -32,13 +32,11 @@ class ImageWitness:
     """Looks at each image of a touch.
 
     Attributes:
-        seen_alive: whether an image has differed from the one before.
         dead_since_ns: time since which the images do not live, where that is certain; None otherwise.
         words: how that shows.
     """
 
     def __init__(self) -> None:
-        self.seen_alive = False
         self.dead_since_ns: int | None = None
         self.words = ""
         self._image: object = None
@@ -73,10 +71,9 @@ class ImageWitness:
             sigma: standard deviation of the centroid from image to image, m, as a calibration found it; None where
                 none states it.
         """
-        same = image == self._image
-        self.seen_alive |= not same and self._image is not None
         if centre is None:
             return
+        same = image == self._image
         if not same or not pressed or self._at is None:
             self._image, self._same_ns, self._at = image, t_ns, centre
         dead = pressed and (self._repeats(t_ns, highest, centre, sigma) or self._is_quiet(t_ns, uv, centre, sigma))

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from canprobe.cell.master.array import PatchReader, make_patch_reader
-from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample
+from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.position_track import rest_counts
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.model import Plan
@@ -77,7 +77,6 @@ class JointCheck(Controller):
         self.start: Floats | None = None
         self._quits = False
         self._force: float | None = None
-        self._sample: TactileSample | None = None
         self._pressed: str | None = None
         self._script: Generator[Command, Measurement, None] = self._all_joints()
         next(self._script)
@@ -255,11 +254,9 @@ class JointCheck(Controller):
 
     def _presses(self, joint: int, measurement: Measurement) -> bool:
         """Whether something presses on the array while a joint moves."""
-        before, sample = self._sample, measurement.tactile
+        sample = measurement.tactile
         if self._reader is None or sample is None:
             return False
-        self._sample = sample
-        self.array_alive = self.array_alive or (before is not None and sample.differs_from(before))
         force = self._reader.read(sample).force
         self._force = max(force, self._force or 0.0)
         if force > TOUCH_FORCE:

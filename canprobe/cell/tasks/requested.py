@@ -175,7 +175,6 @@ class RequestedTask(WrappingController):
         elif request.kind == "start":
             if self.inner is None and self._make is not None:
                 self.inner = self._make()
-                self.inner.array_alive = self._alive
         else:
             self._asked[request.kind] = request.value
 

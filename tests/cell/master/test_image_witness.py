@@ -56,11 +56,3 @@ def test_a_change_ends_it():
     assert look(witness, [b"same"] * 20, scatter=0.0) is not None
     look(witness, [b"other"], scatter=0.0)
     assert witness.dead_since_ns is None
-
-
-def test_alive_is_what_has_changed_once():
-    witness = ImageWitness()
-    look(witness, [b"zero"] * 10, pressed=False)
-    assert not witness.seen_alive
-    look(witness, [b"zero", b"finger"], pressed=False)
-    assert witness.seen_alive

@@ -118,6 +118,17 @@ def test_a_condition_that_does_not_stop_the_cell_is_noted_with_its_number_and_it
     assert run.supervisor.notes() == ["bus error frames: 5, the first in cycle 2"]
 
 
+def test_alive_is_what_has_changed_once():
+    run = Run(lambda sample: SimpleNamespace(force=sample))
+    for force in (0.0, 0.0, 0.0):
+        run.step(tactile=force)
+    assert not run.supervisor.array_alive
+    run.step(tactile=1.0)
+    assert run.supervisor.array_alive
+    run.step(tactile=1.0)
+    assert run.supervisor.array_alive
+
+
 def test_the_preload_is_the_highest_force_before_the_drives_are_enabled():
     run = Run(lambda sample: SimpleNamespace(force=sample))
     for force in (0.1, 0.4, 0.2):
