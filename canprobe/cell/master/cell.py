@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import repeat
+from itertools import chain, repeat
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -56,6 +56,8 @@ Result = TypeVar("Result")
 WARM_UP_S = 0.1
 """Time of cycles before the drives are enabled, s, until both sides run at their usual speed."""
 REST_TIMEOUT_S = 2.0
+REST_S = 0.05
+"""Time in which drives come to rest at their last targets before a quick stop, s: the longest usual lag."""
 SILENT_TAXELS = (
     ": interpolated; have the array repaired, or state the taxels as `dead` in [taxels] of its calibration file"
 )
@@ -557,26 +559,33 @@ class Cell:
         raise finding.error
 
     def _lift_off(self, error: BaseException) -> None:
-        """Lift the probe off its object, as far as the drives obey, before the cell is stopped for ``error``."""
+        """Lift the probe off before the cell is stopped for ``error``; where that is not possible, let it rest."""
         supervisor = self.supervisor
         if self.drives is None or self.tactile is None or not supervisor.pressing() or supervisor.must_stop():
             return
         lift = LiftOff(self._plan, self.drives, self.watch, error, self._controller.trail)
         t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
-        if not lift.possible:
+        commands: Iterator[Command] = iter(())
+        if lift.possible:
+            self._say("lift off with the drives that obey")
+            self.notes.add("lift off", t_s=t_s)
+            lift.begin()
+            commands = iter(lambda: lift.command(supervisor), None)
+        else:
             self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
-            return
-        self._say("lift off with the drives that obey")
-        self.notes.add("lift off", t_s=t_s)
-        lift.begin()
+        # In a quick stop each drive brakes on a ramp of its own, from the speed of its targets: off the path, and after
+        # a step of the target the wrong way (45 N at 25 mm/s). So all come to rest at their last targets before.
+        rest = repeat(Command(), round(REST_S * 1e9 / self._plan.sync.period_ns))
         assert self.cycle is not None
         try:
             if not self.cycle.begun:  # the controller's update failed: the commands of this cycle are out
                 self._look(self._begin_cycle())
-            while (command := lift.command(supervisor)) is not None:
+            for command in chain(commands, rest):
                 self.cycle.end(command)
                 self._record(supervisor.seen.measurement, command)
                 self._look(self._begin_cycle())
+                if supervisor.must_stop():
+                    break
         except CanprobeError as failure:
             self.notes.add(f"while lifting off: {failure}")
 

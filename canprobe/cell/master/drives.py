@@ -36,6 +36,9 @@ SYNCHRONOUS_MAX = 240
 COMMAND_REPEAT_NS = 100_000_000
 _FEEDBACK: tuple[Place, ...] = ((0x6041, 0), (0x6064, 0), (0x6077, 0))
 _TARGETS = frozenset(TARGETS.values())
+_UNTOLD = (None, DriveState.OPERATION_ENABLED)
+DOUBTED_CYCLES = 2
+"""TPDOs in a row whose statusword is not believed either, where their position cannot be: fewer than make a hold."""
 UNSTATED_LAG_S = 0.05
 """Longest usual lag of a drive without a feed-forward, s, where neither scene nor emulation states one."""
 CONTROLWORD, TARGET, CONSTANT = range(3)
@@ -251,7 +254,8 @@ class DriveGroup:
         """Take one TPDO that arrived at ``t_ns``.
 
         One from before the SYNC or after the collection window, or a second one for a SYNC, is late and not used; nor
-        is a shorter one. The position of one that an enabled drive cannot have reached is not used.
+        is a shorter one. One with a position that an enabled drive cannot have reached is not used, up to
+        `DOUBTED_CYCLES` in a row where its statusword says that the drive is in another state.
         """
         k, source = self._sources[can_id]
         if not self._open or t_ns < self._sync_ns or self._heard[k] == self._cycle:
@@ -275,18 +279,18 @@ class DriveGroup:
         self._heard[k] = self._cycle
         self._pending -= 1
         self.answer_ns = t_ns - self._sync_ns
+        word = self.statuswords[i] if source.word is None else values[source.word]
+        if source.counts is not None:
+            track, counts = self._tracks[i], values[source.counts]
+            doubtful = self._cycle - track.cycle <= DOUBTED_CYCLES or known_state(word) in _UNTOLD
+            enabled = self.statuswords[i] & _STATE_BITS == _ENABLED and doubtful
+            guarded = enabled and self._aimed is not None  # a log without targets does not say where it was to go
+            if not track.take(counts, self._cycle, self._deadline_ns, guarded=guarded):
+                self.implausible += 1
+                return  # nor is the rest of it believed
+        self.statuswords[i] = word
         if source.torque is not None:
             self.torque_permille[i] = values[source.torque]
-        enabled = self.statuswords[i] & _STATE_BITS == _ENABLED
-        if source.word is not None:
-            word = self.statuswords[i] = values[source.word]
-            enabled = enabled and word & _STATE_BITS == _ENABLED
-        if source.counts is None:
-            return
-        counts = values[source.counts]
-        guarded = enabled and self._aimed is not None  # a log without targets does not say where it was to go
-        if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=guarded):
-            self.implausible += 1
 
     def end_collect(self) -> None:
         """End the collection window of this cycle: a TPDO that has not come counts as missed."""
