@@ -265,3 +265,12 @@ def test_the_command_that_may_be_sent(plan, guard):
     assert (finding, seen.slowed, sent.columns) == (None, 1, {"mine": 1.0})
     sent, finding = supervisor.guard_target(replace(near, q_target=ELBOW_FORM + 9.0))
     assert sent.q_target is None and sent.columns == {"mine": 1.0} and finding.condition.key == "joint_stop"
+
+
+def test_half_of_the_speed_limits_is_half_of_the_way_in_a_cycle():
+    plan = canprobe.plan("free", {"limits.joint_speed_share": 0.5})
+    guard, q = JointGuard(plan), plan.setup.arm.q_start
+    at = Measurement(0, 0, q, (0,) * 6)
+    far = q + np.array([0.1, 0, 0, 0, 0, 0])
+    step = guard.command(far, at).q - q
+    np.testing.assert_allclose(step, [0.5 * plan.setup.arm.model.qd_max[0] * 2.5e-3, 0, 0, 0, 0, 0], atol=1e-12)

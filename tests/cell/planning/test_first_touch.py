@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.planning.first_touch import depth_at, first_shown_n, force_at
+from canprobe.cell.planning.first_touch import blind_s, depth_at, first_shown_n, force_at
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.pressure import PressureField
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
@@ -99,6 +99,12 @@ def test_a_first_touch_that_presses_too_hard_until_it_is_seen_is_refused_and_the
     slower = float(re.search(r"lower task.approach_mm_s to ([\d.]+)", said)[1])
     assert said.startswith("task.approach_mm_s = 4:") and 0.0 < slower < 4.0
     assert make_plan(resolve(replace(scene, task=replace(scene.task, approach_mm_s=slower))))
+
+
+def test_the_time_until_an_approach_ends_is_that_of_an_image_its_way_and_the_command():
+    """200 Hz: up to 5 ms to the next image, 5 ms until it is here, two cycles of 2.5 ms, and the lag of the drives."""
+    setup = resolve(canprobe.load_scene("press"))
+    assert blind_s(setup, setup.touch) == pytest.approx(5e-3 + 5e-3 + 2 * 2.5e-3 + 6.8e-3)
 
 
 def test_a_press_needs_two_taxels_under_the_patch_of_a_sphere():

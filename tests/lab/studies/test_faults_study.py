@@ -288,3 +288,13 @@ def test_vcan_belongs_to_faults_and_knows_no_seed(capsys):
     assert main(["study", "estimators", "--vcan"]) == 2
     assert main(["study", "faults", "--vcan", "--seed", "3"]) == 2
     assert "--vcan" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "kind"), [(2611, "wrong-data"), (644, "remapped")])
+def test_a_stop_in_a_motion_presses_no_harder_than_the_motion(number, kind):
+    """45.8 N: one step back had set the speed from which each drive then braked by itself. 13.1 N: a statusword that
+    stands beside an impossible position was believed, and the arm was stopped at once."""
+    case = FaultCase.of(number)
+    assert case.kind.name == kind, "the registry has changed: the numbers mean other runs"
+    run = run_case(case)
+    assert run["failures"] == [] and run["force_max_n"] < 3.0
