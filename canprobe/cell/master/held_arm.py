@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
+
+import numpy as np
 
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.mechanics.types import Floats
 
+KEPT = 40
+"""Targets that are kept: as many as an arm may lag behind."""
 THAW_NS = 50_000_000
 """Time in which the targets go on from where the arm was held to where its controller is."""
 
@@ -14,11 +19,13 @@ THAW_NS = 50_000_000
 class HeldArm:
     """Holds an arm where it is: its last targets lie ahead of it, and the drives that are heard would go on to them.
 
-    In the first cycle of a hold they do: it is often the only one, and to stop and go on for it presses harder.
+    In the first cycle of a hold they do: it is often the only one, and to stop and go on for it presses harder. Where
+    the arm is then says the target that the heard joints have come nearest to: the place of an unheard one is a guess.
     """
 
     def __init__(self) -> None:
         self._holds = False
+        self._sent: deque[Floats] = deque(maxlen=KEPT)
         self._frozen: Floats | None = None
         self._behind: Floats | None = None
         self._thawed_ns = 0
@@ -26,13 +33,22 @@ class HeldArm:
     def freeze(self, measurement: Measurement) -> Command:
         """The command of a cycle of the hold: from the second one on, where the arm was in that."""
         if self._holds and self._frozen is None:
-            self._frozen = measurement.q
+            self._frozen = self._place(measurement)
         self._holds = True
         return Command(self._frozen)
+
+    def _place(self, measurement: Measurement) -> Floats | None:
+        heard = [not age for age in measurement.q_age]
+        q = measurement.q
+        if q is None or all(heard) or not any(heard) or not self._sent:
+            return q
+        return min(self._sent, key=lambda target: float(np.abs(target - q)[heard].max()))
 
     def thaw(self, command: Command, measurement: Measurement) -> Command:
         """The controller's command; after a hold it makes up little by little for the way from there."""
         self._holds = False
+        if command.q_target is not None:
+            self._sent.append(np.asarray(command.q_target, dtype=float))
         if command.q_target is None or (self._frozen is None and self._behind is None):
             return command
         if self._frozen is not None:
