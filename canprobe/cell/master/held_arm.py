@@ -47,8 +47,8 @@ class HeldArm:
     def thaw(self, command: Command, measurement: Measurement) -> Command:
         """The controller's command; after a hold it makes up little by little for the way from there."""
         self._holds = False
-        if command.q_target is not None:
-            self._sent.append(np.asarray(command.q_target, dtype=float))
+        if isinstance(command.q_target, np.ndarray):  # another kind may be no target at all, which the guard refuses
+            self._sent.append(command.q_target)
         if command.q_target is None or (self._frozen is None and self._behind is None):
             return command
         if self._frozen is not None:
