@@ -21,11 +21,22 @@ from pathlib import Path
 from typing import Any
 
 from canprobe import __version__
-from canprobe.cell.scene.checks import MAX_NUMBER, MismatchError, Only, ScenePath, choices_of, conditions_of, convert
+from canprobe.cell.scene.checks import (
+    MAX_NUMBER,
+    MismatchError,
+    Only,
+    ScenePath,
+    annotations_of,
+    choices_of,
+    conditions_of,
+    convert,
+    values_of,
+)
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
 from canprobe.cell.scene.model import DEFAULT_ARRAY, RENAMED_KEYS, TOUCH_KINDS, ArrayFile, CellFile, Scene
 from canprobe.cell.scene.offers import find_offer, offers
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
+from canprobe.cell.scene.units import unit_of
 from canprobe.errors import PlanError, SceneError, UsageError, did_you_mean, regular_file
 from canprobe.mechanics.robot.urdf import from_urdf
 from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
@@ -46,53 +57,35 @@ MAX_BYTES, MAX_DEPTH = 64 << 20, 32
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
-_ANNOTATIONS: dict[type, Mapping[str, Any]] = {}
-
-
-def _annotations(cls: type[Any]) -> Mapping[str, Any]:
-    """The types of a dataclass's fields, evaluated once: that takes longer than to read a file."""
-    if cls not in _ANNOTATIONS:
-        _ANNOTATIONS[cls] = typing.get_type_hints(cls, include_extras=True)
-    return _ANNOTATIONS[cls]
-
-
 def dump_scene(scene: Scene | CellFile) -> str:
     """The scene as a TOML document that loads back equal, with every value that its kind uses.
 
     Args:
         scene: a scene as `load_scene` gave it, or a cell as `read_cell` gave it.
     """
-    tables = []
-    for name, part in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
-        if isinstance(part, Mapping):
-            tables += [(f"{name}.{toml_key(key)}", _values(section)) for key, section in part.items()]
-        elif part is not None:
-            tables.append((name, _values(part)))
+    tables: list[tuple[str, dict[str, Any]]] = []
+    for name, table in _document(scene).items():
+        named = isinstance(getattr(scene, name), Mapping)
+        tables += [(f"{name}.{toml_key(key)}", one) for key, one in table.items()] if named else [(name, table)]
     return "\n".join(
         f"[{name}]\n" + "".join(f"{key} = {toml_value(value)}\n" for key, value in table.items())
         for name, table in tables
     )
 
 
-def _document(scene: Scene) -> dict[str, Any]:
+def _document(scene: Scene | CellFile) -> dict[str, Any]:
     """The scene as `tomllib` reads what `dump_scene` writes."""
-    parts = ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene))
-    return {
-        name: {key: _values(section) for key, section in part.items()} if isinstance(part, Mapping) else _values(part)
-        for name, part in parts
-        if part is not None and part != {}
-    }
-
-
-def _values(section: Any) -> dict[str, Any]:
-    """The keys of a section that have a value and belong to the others."""
-    annotations, values = _annotations(type(section)), {}
-    for field in dataclasses.fields(section):
-        value = getattr(section, field.name)
-        only = conditions_of(annotations[field.name], Only)
-        if value is not None and all(getattr(section, one.key) in one.values for one in only):
-            values[field.name] = _as_toml(value)
-    return values
+    parts = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
+    document: dict[str, Any] = _as_toml(
+        {
+            name: {key: values_of(section) for key, section in part.items()}
+            if isinstance(part, Mapping)
+            else values_of(part)
+            for name, part in parts.items()
+            if part is not None and part != {}
+        }
+    )
+    return document
 
 
 def written_by_line() -> str:
@@ -150,7 +143,7 @@ def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     files: dict[str, bytes] = {}
 
     def beside(section: Any) -> Any:
-        annotations = _annotations(type(section))
+        annotations = annotations_of(type(section))
         names = {}
         for key in FILE_KEYS & set(annotations):
             value = getattr(section, key)
@@ -645,7 +638,7 @@ class Reader:
             document: the document as `tomllib` gives it.
             needed: sections that are read as empty ones where they are missing.
         """
-        sections, needed = _annotations(file), set(needed)
+        sections, needed = annotations_of(file), set(needed)
         for name in document:
             if name not in sections:
                 self.complain(name, f"unknown section{_did_you_mean_key(name, sections)}")
@@ -680,7 +673,7 @@ class Reader:
         """Read a section; a key that has a problem or is missing is None in it."""
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
-        annotations = _annotations(cls)
+        annotations = annotations_of(cls)
         for key in table:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
@@ -722,30 +715,15 @@ class Reader:
             self.complain(path, f'missing: {only.key} = "{actual}" needs it')
 
 
-_OTHER_UNITS = (
-    ("_mm", 1e3, "metres"),
-    ("_mm_s", 1e3, "m/s"),
-    ("_us", 1e6, "seconds"),
-    ("_ms", 1e3, "seconds"),
-    ("_s", 1e-3, "milliseconds"),
-    ("_kpa", 1e-3, "Pa"),
-    ("_n_m3", 1e9, "N/mm³"),
-    ("_hz", 1e3, "kHz"),
-    ("bitrate", 1e3, "kbit/s"),
-)
-"""End of a key, factor from another usual unit to that of the key, and that unit."""
-
-
 def _other_unit(path: str, raw: object, annotation: Any) -> str:
     """A hint where a number out of range would be one in another unit; else empty."""
-    if isinstance(raw, bool) or not isinstance(raw, int | float) or not abs(raw) < MAX_NUMBER:
+    other = unit_of(path.rpartition(".")[2]).other
+    if other is None or isinstance(raw, bool) or not isinstance(raw, int | float) or not abs(raw) < MAX_NUMBER:
         return ""
-    for end, factor, unit in _OTHER_UNITS:
-        value = float(f"{raw * factor:.12g}")
-        if re.search(f"(?<!_mm)(?<!_deg)(?<!_nm){end}$", path):
-            with contextlib.suppress(MismatchError):
-                convert(int(value) if value.is_integer() else value, annotation)
-                return f"; did you mean {value:g}, for {raw:g} {unit}?"
+    value = float(f"{raw * other[1]:.12g}")
+    with contextlib.suppress(MismatchError):
+        convert(int(value) if value.is_integer() else value, annotation)
+        return f"; did you mean {value:g}, for {raw:g} {other[0]}?"
     return ""
 
 
