@@ -8,8 +8,7 @@ import re
 import pytest
 
 import canprobe
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.verdict import verdict_text
+from canprobe.cell.planning.report import plan_text, verdict_text
 from canprobe.cell.planning.witnesses import witness_rows
 from canprobe.cell.scene.load import packaged_scenes
 from canprobe.cli import main

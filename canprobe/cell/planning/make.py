@@ -6,13 +6,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.abilities import Abilities, missing_bitrate, missing_objects
 from canprobe.cell.planning.array import array_problems, as_supported, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_setups
-from canprobe.cell.planning.demands import missing_bitrate, missing_objects
+from canprobe.cell.planning.free_parameters import at_rate, candidates, ways_out
 from canprobe.cell.planning.identifiers import identifier_problems, order_by_deadline
-from canprobe.cell.planning.interpolation_period import interpolations, period_problem
 from canprobe.cell.planning.left_out import left_out, outputs
 from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
@@ -28,15 +27,13 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.motion import check_motion
-from canprobe.cell.planning.open_keys import candidates
 from canprobe.cell.planning.operation import choose_mode, early_stops, operation_problems
 from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.cell.planning.raw_frames import plan_raw_frames, raw_frame_problems
-from canprobe.cell.planning.sync import plan_ratio, plan_sync
+from canprobe.cell.planning.sync import interpolations, period_problem, plan_ratio, plan_sync
 from canprobe.cell.planning.traffic import plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.planning.warnings import warnings
-from canprobe.cell.planning.ways_out import at_rate, ways_out
 from canprobe.cell.planning.window import cut_patch
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
