@@ -296,17 +296,12 @@ def load_cell(name_or_path: str | Path) -> dict[str, Any]:
     Raises:
         SceneError: the file has problems; the error has all of them.
     """
-    return _read_cell(name_or_path)[1]
+    return _read_hardware(name_or_path, "cell", CellFile)[1]
 
 
 def read_cell(name_or_path: str | Path) -> CellFile:
     """Read a cell file as `load_cell` does, as a dataclass."""
-    return _read_cell(name_or_path)[0]
-
-
-def _read_cell(name_or_path: str | Path) -> tuple[CellFile, dict[str, Any]]:
-    sections, document = _read_hardware(name_or_path, "cell", CellFile)
-    return CellFile(**sections), document
+    return CellFile(**_read_hardware(name_or_path, "cell", CellFile)[0])
 
 
 def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -384,24 +379,10 @@ def scenes_folder() -> Path:
     return Path(str(resources.files("canprobe"))) / "scenes"
 
 
-def packaged_scenes() -> list[tuple[str, str]]:
-    """Name and title of every packaged scene, by name."""
-    return _titles("scenes", "scene")
-
-
-def packaged_cells() -> list[tuple[str, str]]:
-    """Name and title of every packaged cell, by name."""
-    return _titles("cells", "cell")
-
-
-def packaged_arrays() -> list[tuple[str, str]]:
-    """Name and title of every packaged array, by name."""
-    return _titles("arrays", "array")
-
-
-def _titles(folder: str, section: str) -> list[tuple[str, str]]:
-    files = packaged_files(folder)
-    return [(name, read_toml(path, path.name)[section].get("title", "")) for name, path in files.items()]
+def packaged(kind: str) -> list[tuple[str, str]]:
+    """Name and title of every packaged "scene", "cell" or "array", by name."""
+    files = packaged_files(f"{kind}s")
+    return [(name, read_toml(path, path.name)[kind].get("title", "")) for name, path in files.items()]
 
 
 def offered(kind: str, warn: Callable[[str], None]) -> list[dict[str, str]]:
