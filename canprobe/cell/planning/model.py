@@ -26,6 +26,7 @@ EVERY_SYNC = 1
 
 NodeKind = Literal["drive", "tactile"]
 Direction = Literal["tpdo", "rpdo"]
+RawKind = Literal["image", "start", "stop", "poll"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +173,7 @@ class PlannedFrames:
 
     can_id: int
     channel: str
-    what: Literal["image", "start", "stop", "poll"]
+    what: RawKind
     sent: bool
     count: int
     length: int

@@ -24,7 +24,6 @@ from canprobe.cell.scene.model import (
     ShapeMethod,
     TaskKind,
 )
-from canprobe.cell.scene.rules import with_choices
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
@@ -481,7 +480,14 @@ class Setup:
         Args:
             choices: value by key path of the scene: `{"sensor.mode": "window"}`.
         """
-        return replace(self, scene=with_choices(self.scene, choices), saved=with_choices(self.saved, choices))
+
+        def chosen(scene: Scene) -> Scene:
+            for path, value in choices.items():
+                section, _, key = path.partition(".")
+                scene = replace(scene, **{section: replace(getattr(scene, section), **{key: value})})
+            return scene
+
+        return replace(self, scene=chosen(self.scene), saved=chosen(self.saved))
 
     @property
     def touch(self) -> Touch | Calibrate | None:
