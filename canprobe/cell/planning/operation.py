@@ -72,10 +72,10 @@ def follows_sync_period(device: Abilities) -> bool:
 
 def early_stops(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
     """Warnings for drives that by their EDS stop after fewer missed SYNCs than the scene says."""
-    arm = setup.arm
+    if (arm := setup.arm) is None:
+        return
     early: dict[tuple[str, int, int], list[int]] = {}
-    for node_id in arm.node_ids if arm is not None else ():
-        assert arm is not None
+    for node_id in arm.node_ids:
         device, index = devices[node_id], sync_patience(devices[node_id].od)
         entry = device.description.entry(index) if index is not None else None
         if (
@@ -87,7 +87,6 @@ def early_stops(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]
         if 0 < (held := device.number(index) or 0) < arm.missed_syncs:
             early.setdefault((device.eds, index, held), []).append(node_id)
     for (eds, index, held), node_ids in early.items():
-        assert arm is not None
         nodes, syncs = ", ".join(map(str, node_ids)), f"{held} missed SYNC{'s' * (held > 1)}"
         yield (
             f"arm.missed_syncs = {arm.missed_syncs}: by {index:04X}h of {eds} nodes {nodes} stop by themselves after"

@@ -151,11 +151,11 @@ class _SpeedLimit:
 
 def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
     """Problems of drives whose limit of speed is no more than the rounding of targets takes from cycle to cycle."""
-    arm = setup.arm
-    for axis, joint in enumerate(arm.model.joints) if arm is not None else ():
+    if (arm := setup.arm) is None:
+        return
+    for axis, joint in enumerate(arm.model.joints):
         lowest = _lowest_limit(setup, axis, devices, math.inf)
         if lowest.left <= 0.0:
-            assert arm is not None
             yield (
                 f"joints.{joint.name}: drive {arm.drives[axis].node_id} allows {lowest.most:.4g} units/s by its"
                 f" {lowest.index:04X}h, and whole targets differ by as much as {lowest.rounding:.4g} units/s at"
