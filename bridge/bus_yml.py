@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from canprobe.cell.planning.abilities import INVALID, MAPPING
 from canprobe.cell.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
+from canprobe.cell.planning.device_capabilities import INVALID, MAPPING
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,

@@ -18,7 +18,7 @@ from typing import Any
 
 from canopen import ObjectDictionary
 
-from canprobe.cell.planning.abilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, Abilities
+from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, DeviceCapabilities
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -122,7 +122,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class FixedEntry:
     """One entry that the device cannot change and the scene relies on.
 
     Attributes:
@@ -169,7 +169,7 @@ class NodeSetup:
     dictionary: ObjectDictionary
     identity: dict[int, int]
     writes: tuple[Write, ...]
-    given: tuple[Given, ...] = ()
+    given: tuple[FixedEntry, ...] = ()
     otherwise: tuple[tuple[Write, ...], ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     problems: tuple[str, ...] = ()
@@ -195,7 +195,7 @@ def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
 
 
 def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
-    device = Abilities(node.eds, Description(node.dictionary))
+    device = DeviceCapabilities(node.eds, Description(node.dictionary))
     arm = plan.setup.arm if node.kind == "drive" else None
     axis = arm.node_ids.index(node.node_id) if arm is not None else 0
     drive = arm.drives[axis] if arm is not None else None
@@ -226,7 +226,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     )
 
 
-def _possible(device: Abilities, writes: Iterable[Write]) -> tuple[list[Write], list[LeftOut], list[str]]:
+def _possible(device: DeviceCapabilities, writes: Iterable[Write]) -> tuple[list[Write], list[LeftOut], list[str]]:
     """The writes that a device can take by its EDS, the wished ones that it cannot, and why not a required one."""
     possible: list[Write] = []
     left_out: dict[tuple[int, int], LeftOut] = {}
@@ -242,7 +242,7 @@ def _possible(device: Abilities, writes: Iterable[Write]) -> tuple[list[Write], 
     return possible, [one for one in left_out.values() if one.why], problems
 
 
-def _excluded(device: Abilities, write: Write) -> str | None:
+def _excluded(device: DeviceCapabilities, write: Write) -> str | None:
     """Why a device cannot take a write; empty where the entry always holds the value, None where it can."""
     entry = device.description.entry(write.index, write.subindex)
     if entry is None or (write.purpose == _MISSED_SYNCS and not has_missed_syncs(device.od)):
@@ -263,7 +263,7 @@ def _ends(entry: DescribedEntry) -> str:
     return f"at least {entry.low}" if entry.high is None else f"{entry.low} to {entry.high}"
 
 
-def _pdo_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
+def _pdo_writes(plan: Plan, node: PlannedNode, device: DeviceCapabilities) -> list[Write]:
     writes = []
     if has_long_pdos(device.od):
         long = any(pdo.layout.length > CLASSIC_BYTES for pdo in plan.pdos_of(node.node_id, "tpdo"))
@@ -279,7 +279,7 @@ def _pdo_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]
     return writes
 
 
-def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
+def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> list[Write]:
     communication = COMMUNICATION[pdo.direction] + pdo.number - 1
     mapping = MAPPING[pdo.direction] + pdo.number - 1
     name, cob_id = f"{pdo.direction.upper()} {pdo.number}", pdo.cob_id | pdo.own_bits
@@ -306,7 +306,7 @@ def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
 _UNTIMED = "the device does not know how long a cycle is"
 
 
-def _common_writes(plan: Plan, device: Abilities) -> list[Write]:
+def _common_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
     counter = [
         Write(SYNC_PERIOD, 0, 0, "1019h may only change while this is 0", _UNTIMED),
         Write(0x1019, 0, plan.sync.overflow, "overflow of the SYNC counter"),
@@ -332,7 +332,7 @@ _MISSED_SYNCS = "SYNCs after which the drive stops by itself"
 _FAST = "the drive itself limits its speed as the device has it, or not at all"
 
 
-def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: Abilities) -> list[Write]:
+def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
     assert node.mode is not None
     model = arm.model
     low, high = software_limits(model)
@@ -361,7 +361,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: Ab
     ]
 
 
-def _homing_writes(arm: Arm, axis: int, device: Abilities) -> list[Write]:
+def _homing_writes(arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
     """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
     zero = arm.drives[axis].zero
     if zero is None:
@@ -388,7 +388,7 @@ def _home_units(arm: Arm, axis: int, zero: HomingParameters) -> float:
     return float(drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start)))
 
 
-def _unhomed(arm: Arm, axis: int, zero: HomingParameters, device: Abilities) -> Iterator[str]:
+def _unhomed(arm: Arm, axis: int, zero: HomingParameters, device: DeviceCapabilities) -> Iterator[str]:
     """Why a drive cannot be homed: its modes, joints on which its zero depends, or no 607Ch where home is not 0."""
     yield from homing_problems(device)
     joints, coupled = arm.model.joints, coupled_joints(arm.model, axis)
@@ -412,14 +412,14 @@ def _unhomed(arm: Arm, axis: int, zero: HomingParameters, device: Abilities) -> 
         yield f"{lack}: the drive counts 0 at home, and the cell {home:.0f}: set joints.{name}.zero_counts = {counts}"
 
 
-def _interpolation_writes(device: Abilities, time: Interpolation) -> list[Write]:
+def _interpolation_writes(device: DeviceCapabilities, time: Interpolation) -> list[Write]:
     """A device without 60C2h:02 counts in milliseconds."""
     unit = [Write(INTERPOLATION_TIME, 2, time.index, "unit of the interpolation time")]
     value = Write(INTERPOLATION_TIME, 1, time.value, "interpolation time")
     return [value, *(unit if device.has(INTERPOLATION_TIME, 2) else [])]
 
 
-def _array_writes(plan: Plan, device: Abilities) -> list[Write]:
+def _array_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
     array = plan.setup.array
     assert array is not None
     writes = [Write(0x2000, 0, TactileMode[array.mode.upper()], "what the array sends")]
@@ -431,7 +431,7 @@ def _array_writes(plan: Plan, device: Abilities) -> list[Write]:
     return writes
 
 
-def _drive_given(device: Abilities) -> tuple[Given, ...]:
+def _drive_given(device: DeviceCapabilities) -> tuple[FixedEntry, ...]:
     """The cell states in `sign` how a drive counts; 607Eh would turn that round. Speeds are written in unit 60A9h."""
     otherwise = {
         POLARITY: "it would count the other way round than the cell's sign says; set 607Eh back in the drive",
@@ -439,13 +439,13 @@ def _drive_given(device: Abilities) -> tuple[Given, ...]:
         " take the drive's value into the EDS",
     }
     return tuple(
-        Given(index, 0, device.number(index) or 0, "as its EDS says", text)
+        FixedEntry(index, 0, device.number(index) or 0, "as its EDS says", text)
         for index, text in otherwise.items()
         if device.has(index)
     )
 
 
-def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
+def _array_given(plan: Plan, dictionary: Any) -> tuple[FixedEntry, ...]:
     """The full scale that the array must hold: with another one the force would be wrong by their ratio."""
     array = plan.setup.array
     assert array is not None
@@ -454,4 +454,4 @@ def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
     pascals = round(array.full_scale)
     key = "sensor.full_scale_kpa"
     otherwise = f"force would be read wrong by their ratio; put right {key}"
-    return (Given(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)
+    return (FixedEntry(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)

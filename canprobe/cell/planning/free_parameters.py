@@ -31,7 +31,7 @@ MODES: dict[TactileModeName, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class _OpenKey:
+class _FreeParameter:
     """One key that may say "auto".
 
     Attributes:
@@ -89,12 +89,12 @@ _COB_IDS = (
     ("by_deadline", "priorities follow the deadlines"),
 )
 KEYS = (  # the last is varied first
-    _OpenKey("sensor.mode", "array", "mode", _modes),
-    _OpenKey("sensor.window", "array", "window", window_choices),
-    _OpenKey("sensor.channel", "array", "channel", _channels),
-    _OpenKey("bus.fd", "bus", "fd", lambda _: _FD),
-    _OpenKey("arm.grouped_rpdo", "arm", "grouped", lambda _: _GROUPED),
-    _OpenKey("bus.cob_ids", "bus", "cob_ids", lambda _: _COB_IDS),
+    _FreeParameter("sensor.mode", "array", "mode", _modes),
+    _FreeParameter("sensor.window", "array", "window", window_choices),
+    _FreeParameter("sensor.channel", "array", "channel", _channels),
+    _FreeParameter("bus.fd", "bus", "fd", lambda _: _FD),
+    _FreeParameter("arm.grouped_rpdo", "arm", "grouped", lambda _: _GROUPED),
+    _FreeParameter("bus.cob_ids", "bus", "cob_ids", lambda _: _COB_IDS),
 )
 
 
@@ -137,10 +137,10 @@ def wants_torque(setup: Setup) -> bool:
 
 FD_ARRAY = "tactile_array_fd.eds"
 Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
-"""Closes a changed setup, and gives it with the traffic of its fullest bus; None where it does not fit either."""
+"""Completes a modified setup. Returns it with the traffic of its busiest bus, or None if it does not fit."""
 
 
-def ways_out(setup: Setup, fit: Fit, sound: Callable[[Setup], bool]) -> list[str]:
+def suggested_changes(setup: Setup, fit: Fit, sound: Callable[[Setup], bool]) -> list[str]:
     """Changes each of which makes the scene fit its bus, with the load and the longest demand that it leaves.
 
     Args:

@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from canprobe.cell.planning.abilities import COMMUNICATION, INVALID, Abilities
+from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
 from canprobe.cell.planning.operation import TARGETS, Place, choose_mode
 from canprobe.cell.planning.traffic import SYNCHRONOUS
@@ -72,7 +72,7 @@ class PdoPlanning:
 
     setup: Setup
     sync: SyncPlan
-    devices: Mapping[int, Abilities]
+    devices: Mapping[int, DeviceCapabilities]
     channels: Mapping[int, str]
     pdos: list[PlannedPdo] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -168,7 +168,7 @@ class PdoPlanning:
         return (device.number(COMMUNICATION[direction] + number - 1, 1) or wanted) & 0x7FF
 
 
-def _exists(device: Abilities, entry: PdoEntry) -> bool:
+def _exists(device: DeviceCapabilities, entry: PdoEntry) -> bool:
     """Whether the object of a mapping is in the EDS, or is a dummy."""
     return entry.is_dummy or device.has(entry.index, entry.subindex)
 
@@ -177,7 +177,7 @@ def _places(chosen: ChosenPdo) -> set[Place]:
     return {(entry.index, entry.subindex) for entry in chosen.entries}
 
 
-def _offered(device: Abilities, direction: Direction, number: int, count: int) -> str:
+def _offered(device: DeviceCapabilities, direction: Direction, number: int, count: int) -> str:
     """Why a PDO does not carry the needed objects."""
     name = f"{direction.upper()}{number}"
     if not device.can_cycle(direction, number):
@@ -257,7 +257,7 @@ def _plan_commands(planning: PdoPlanning, node_id: int) -> None:
         planning.add(node_id, "rpdo", one.number, layout, constants=tuple(constants))
 
 
-def _ungrouped(device: Abilities) -> str | None:
+def _ungrouped(device: DeviceCapabilities) -> str | None:
     """Why a drive cannot share a target RPDO with another; None where it can."""
     if device.dummy(DUMMY_INTEGER32, 32) is None:
         return f"DummyUsage excludes {DUMMY_INTEGER32:04X}h"
@@ -364,7 +364,7 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
             planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
 
 
-def _lacking_words(device: Abilities, array: Array) -> str | None:
+def _lacking_words(device: DeviceCapabilities, array: Array) -> str | None:
     """Problem where the EDS has too few objects for the taxels of the array file; else None."""
     words, needed = device.number(IMAGE_TAXELS), image_words(array.pad.taxels)
     if words is None or words >= needed:  # one without the object cannot send images, which is said of each of them

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
     Interpolation,
@@ -80,7 +80,7 @@ class _Offer:
         return f"60C2h takes {values} · 10^{' or '.join(map(str, sorted(self.indices)))} s"
 
 
-def _offer(device: Abilities) -> _Offer:
+def _offer(device: DeviceCapabilities) -> _Offer:
     value, index = (device.description.entry(INTERPOLATION_TIME, sub) for sub in (1, 2))
     default = index.initial if index is not None and isinstance(index.initial, int) else TIME_INDICES[0]
     indices = [default]
@@ -99,7 +99,7 @@ def _values(entry: DescribedEntry | None) -> range:
     return range(max(1, low), min(most, high) + 1)
 
 
-def interpolations(device: Abilities, period_us: int) -> tuple[Interpolation, ...]:
+def interpolations(device: DeviceCapabilities, period_us: int) -> tuple[Interpolation, ...]:
     """A period as the 60C2h of a device may express it, the first choice first; empty where it cannot."""
     offer, found = _offer(device), []
     for index in offer.indices:
@@ -109,7 +109,7 @@ def interpolations(device: Abilities, period_us: int) -> tuple[Interpolation, ..
     return tuple(found)
 
 
-def _can_take(device: Abilities, period_us: int) -> bool:
+def _can_take(device: DeviceCapabilities, period_us: int) -> bool:
     """Whether a drive can be given a period, by 60C2h or else by 1006h."""
     if not follows_sync_period(device):
         return bool(interpolations(device, period_us))
@@ -118,7 +118,7 @@ def _can_take(device: Abilities, period_us: int) -> bool:
     return entry.allows(period_us) if entry.writable else entry.initial == period_us
 
 
-def _period_offer(device: Abilities) -> str:
+def _period_offer(device: DeviceCapabilities) -> str:
     """The periods that a drive takes, in words."""
     if not follows_sync_period(device):
         return str(_offer(device))
@@ -131,7 +131,7 @@ def _period_offer(device: Abilities) -> str:
 
 
 def period_problem(
-    rate_hz: float, period_us: int, exact: bool, devices: Iterable[Abilities]
+    rate_hz: float, period_us: int, exact: bool, devices: Iterable[DeviceCapabilities]
 ) -> tuple[str | None, list[float]]:
     """Why a rate cannot be set, and the nearest rates that every drive can, Hz; None and none where it can.
 
@@ -152,7 +152,7 @@ def period_problem(
     return what, near
 
 
-def _nearest_rates(period_us: float, devices: Sequence[Abilities]) -> list[float]:
+def _nearest_rates(period_us: float, devices: Sequence[DeviceCapabilities]) -> list[float]:
     """The rates next to a period that every device can express, Hz, ascending."""
     timed = [device for device in devices if not follows_sync_period(device)]
     if timed:
@@ -166,7 +166,7 @@ def _nearest_rates(period_us: float, devices: Sequence[Abilities]) -> list[float
     return [1e6 / us for us in (min(longer, default=0), max(shorter, default=0)) if us]
 
 
-def _periods(device: Abilities) -> set[int]:
+def _periods(device: DeviceCapabilities) -> set[int]:
     """Every period that 60C2h of a device can express, µs."""
     offer = _offer(device)
     return {value * 10 ** (index - FINEST) for index in offer.indices for value in offer.values}

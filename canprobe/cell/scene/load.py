@@ -130,7 +130,7 @@ def written_by_other(writer: object) -> str:
     return "" if writer == own else f": written by {writer or 'an earlier canprobe'}, this is {own}"
 
 
-def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
+def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     """A scene that names its EDS, URDF, calibration, surface and cell files as they stand beside it, and those files.
 
     A folder with these files, and the scene as `SAVED_AS`, loads as the scene, wherever the folder is moved. Packaged

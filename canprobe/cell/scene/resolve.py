@@ -12,7 +12,7 @@ from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_complia
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.cell.scene.hardware import MM, EmulateSettings
-from canprobe.cell.scene.load import gathered, read_cell
+from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
     LimitSettings,
@@ -78,7 +78,7 @@ def resolve(scene: Scene) -> Setup:
         PlanError: the scene describes an object without a surface.
         SceneError: a file that it names cannot be read.
     """
-    saved, files = gathered(scene)
+    saved, files = with_files(scene)
     arm, bodies = _arm(scene)
     settings = scene.probe or ProbeSettings()
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)

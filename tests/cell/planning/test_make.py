@@ -11,7 +11,7 @@ import pytest
 from scenes import change
 
 import canprobe
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.device_capabilities import Abilities
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.planning.report_json import plan_dict

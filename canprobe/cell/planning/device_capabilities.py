@@ -1,4 +1,4 @@
-"""Abilities of a device, read from its EDS: objects, PDOs, mapping, dummies, identity; and what it lacks as a node."""
+"""Capabilities of a device by its EDS: objects, PDOs, mapping, dummies, identity; and what it lacks as a node."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _IDENTIFIER = 0x7FF
 
 
 @dataclass(frozen=True, slots=True)
-class Abilities:
-    """Abilities of one device as a node of the cell, by its EDS.
+class DeviceCapabilities:
+    """Capabilities of one device as a node of the cell, by its EDS.
 
     Attributes:
         eds: its name or path, for messages.
@@ -37,7 +37,7 @@ class Abilities:
     description: Description
 
     @classmethod
-    def of(cls, eds: str, node_id: int) -> Abilities:
+    def of(cls, eds: str, node_id: int) -> DeviceCapabilities:
         """Read an EDS.
 
         Raises:
@@ -144,7 +144,7 @@ _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
 }
 
 
-def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
+def missing_objects(device: DeviceCapabilities, kind: NodeKind, setup: Setup) -> list[str]:
     """One line for every object that the EDS lacks."""
     needed = {**_EVERY_NODE, **_OF_KIND[kind]}
     section = "arm" if kind == "drive" else "sensor"
@@ -155,7 +155,7 @@ def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str
     ]
 
 
-def missing_bitrate(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
+def missing_bitrate(device: DeviceCapabilities, kind: NodeKind, setup: Setup) -> list[str]:
     """One line where the EDS lists bit rates and that of the bus is not among them."""
     bitrates = device.description.bitrates
     if not bitrates or setup.bus.bitrate in bitrates:

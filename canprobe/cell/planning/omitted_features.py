@@ -45,7 +45,7 @@ BUS_PARTS = "bus, bring-up by SDO and their log (bus.log)"
 TRUTH_PARTS = "truth and scores against it"
 
 
-def left_out(setup: Setup) -> tuple[tuple[str, str], ...]:
+def omitted_features(setup: Setup) -> tuple[tuple[str, str], ...]:
     """Everything that a closed setup leaves out, as (what, why)."""
     return *_not_sent(setup), *_not_computed(setup), *_not_emulated(setup), *_not_shown(setup)
 
