@@ -29,7 +29,7 @@ from canprobe.cell.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.cell.scene.load import MAX_BYTES
+from canprobe.cell.scene.toml_files import MAX_BYTES
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
 from canprobe.fieldbus.eds.device_info import commissioned_node

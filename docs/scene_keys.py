@@ -14,9 +14,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from canprobe.cell.scene.checks import Only, conditions_of, expected
-from canprobe.cell.scene.load import toml_value
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK
+from canprobe.cell.scene.toml_files import toml_value
 from canprobe.cell.scene.units import unit_of
 
 NEEDS = {"must": "required", "default": "default", "may": "optional", "never": "–"}

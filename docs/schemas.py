@@ -16,9 +16,9 @@ from typing import Any, Literal
 from scene_keys import meanings, section_class
 
 from canprobe.cell.scene.checks import MAX_NUMBER, Check, Only, conditions_of
-from canprobe.cell.scene.load import WRITTEN_BY_KEY
 from canprobe.cell.scene.model import ArrayFile, CellFile, Scene
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK
+from canprobe.cell.scene.toml_files import WRITTEN_BY_KEY
 from canprobe.cell.scene.units import unit_of
 
 FILES: Mapping[str, type[Any]] = {"scene": Scene, "cell": CellFile, "array": ArrayFile}

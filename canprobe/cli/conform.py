@@ -22,14 +22,7 @@ from canprobe.cli.argument_types import channel, seconds, whole, word
 from canprobe.cli.common_arguments import OPTIONS, add_verbosity
 from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.reports import (
-    add_report_options,
-    command_line,
-    eds_and_hash,
-    read_baseline,
-    versions,
-    write_report,
-)
+from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.port import nothing

@@ -8,10 +8,7 @@ from collections.abc import Container, Iterator
 from canprobe.cell.planning.array import support_of
 from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
-from canprobe.cell.planning.window import (
-    measured_share,
-    patch_across_taxels,
-)
+from canprobe.cell.planning.window import measured_share, patch_across_taxels
 from canprobe.cell.scene.setup import Setup, Touch, Touching
 from canprobe.errors import install_line
 

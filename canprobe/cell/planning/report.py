@@ -9,13 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from canprobe.cell.planning.array import array_text, support_of
 from canprobe.cell.planning.bridges import BRIDGES
-from canprobe.cell.planning.model import (
-    HEARTBEAT_CONSUMED_MS,
-    HEARTBEAT_PRODUCED_MS,
-    CycleBudget,
-    Plan,
-    Traffic,
-)
+from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, CycleBudget, Plan, Traffic
 from canprobe.cell.planning.timeline import timeline_rows
 from canprobe.cell.planning.witnesses import witness_rows
 from canprobe.cell.scene.setup import Setup

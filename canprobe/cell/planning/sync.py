@@ -9,11 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
-from canprobe.cell.planning.model import (
-    SYNC_OVERFLOW,
-    Interpolation,
-    SyncPlan,
-)
+from canprobe.cell.planning.model import SYNC_OVERFLOW, Interpolation, SyncPlan
 from canprobe.cell.planning.operation import (
     COARSEST,
     FINEST,

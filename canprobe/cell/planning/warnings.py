@@ -6,10 +6,7 @@ import ipaddress
 from collections.abc import Iterator, Sequence
 
 from canprobe.cell.planning.model import PlannedPdo
-from canprobe.cell.planning.window import (
-    TOLERATED_LOSS_SHARE,
-    cut_patch,
-)
+from canprobe.cell.planning.window import TOLERATED_LOSS_SHARE, cut_patch
 from canprobe.cell.scene.setup import Arm, Array, Setup
 from canprobe.cell.scene.surface_files import mesh_warnings
 from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP

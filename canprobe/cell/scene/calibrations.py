@@ -13,14 +13,9 @@ from pathlib import Path
 from typing import Annotated
 
 from canprobe.cell.scene.checks import OneOf, Range
-from canprobe.cell.scene.load import (
-    Reader,
-    find_file,
-    read_toml,
-    toml_value,
-    with_writer,
-    written_by_line,
-)
+from canprobe.cell.scene.load import find_file
+from canprobe.cell.scene.reader import Reader
+from canprobe.cell.scene.toml_files import read_toml, toml_value, with_writer, written_by_line
 from canprobe.cell.scene.units import in_si, in_units
 from canprobe.mechanics.touch import ArrayCalibration
 from canprobe.mechanics.touch.image.calibration import (

@@ -59,6 +59,8 @@ from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.stops import depth_on_plane
 from canprobe.mechanics.touch.strategies import Rectangle, make_strategy
 
+SEARCH = 8e-3
+"""Distance beyond the expected place at which an approach gives up, m."""
 LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
 EMULATED_ARRAY = "inch16"
@@ -265,6 +267,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
         return Listen(array, probe, settings.duration_s)
     assert arm is not None
     servo = scene.servo or ServoSettings()
+    pressed = depth_on_plane(scene.limits.force_max_n, probe.stiffness, probe.radius)  # a blind search goes no deeper
     touching: dict[str, Any] = {
         "arm": arm,
         "array": array,
@@ -275,7 +278,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             speed=settings.approach_mm_s * MM,
             clearance=settings.clearance_mm * MM,
             search=SEARCH if settings.search_mm is None else settings.search_mm * MM,
-            blind_search=_blind_search(scene, probe) if settings.search_mm is None else settings.search_mm * MM,
+            blind_search=min(SEARCH, pressed) if settings.search_mm is None else settings.search_mm * MM,
         ),
         "force": settings.force_n,
         "duration_s": settings.duration_s,
@@ -298,15 +301,6 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             shape = Shape(s.method, s.also, s.memory_mm * MM, s.every_ms * 1e-3, s.patch, s.revisit)
     gains = SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz)
     return Touch(**touching, gains=gains, scan=scan, shape=shape)
-
-
-SEARCH = 8e-3
-"""Distance beyond the expected place at which an approach gives up, m."""
-
-
-def _blind_search(scene: Scene, probe: Probe) -> float:
-    """Way beyond the expected place, m, on which a plane is pressed with the limit of the force and no more."""
-    return min(SEARCH, depth_on_plane(scene.limits.force_max_n, probe.stiffness, probe.radius))
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:

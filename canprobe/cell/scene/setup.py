@@ -18,12 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
-from canprobe.cell.scene.model import (
-    BridgeSettings,
-    Scene,
-    ShapeMethod,
-    TaskKind,
-)
+from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
