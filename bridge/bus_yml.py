@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from canprobe.cell.planning.abilities import INVALID, MAPPING
 from canprobe.cell.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
+from canprobe.cell.planning.device_capabilities import INVALID, MAPPING
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -29,7 +29,7 @@ from canprobe.cell.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.cell.scene.load import MAX_BYTES
+from canprobe.cell.scene.toml_files import MAX_BYTES
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
 from canprobe.fieldbus.eds.device_info import commissioned_node

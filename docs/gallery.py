@@ -12,7 +12,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image, ImageOps
 
 import canprobe
-from canprobe.cell.scene.load import packaged_scenes
+from canprobe.cell.scene.load import packaged
 
 FOLDER = Path(__file__).parent / "img" / "scenes"
 DPI = 100
@@ -43,6 +43,6 @@ def draw(name: str) -> Path:
 
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for scene, _ in packaged_scenes():
+    for scene, _ in packaged("scene"):
         if not sys.argv[1:] or scene in sys.argv[1:]:
             print(draw(scene), flush=True)

@@ -21,7 +21,7 @@ from scene_keys import scene_keys
 from schemas import FILES, schema_of
 
 from canprobe.cell.results.expected import FIGURES, expected_text, range_text, seeds_text
-from canprobe.cell.scene.load import packaged_scenes
+from canprobe.cell.scene.load import packaged
 from canprobe.fieldbus.tools.judge import RULES
 
 DOCS = Path(__file__).parent
@@ -148,7 +148,7 @@ def gallery(measured: Mapping[str, Any]) -> str:
     """The page of pictures; `python docs/gallery.py` draws them."""
     scenes = measured["scenes"]
     rows = [GALLERY, _source_of_scenes(scenes)]
-    for name, title in packaged_scenes():
+    for name, title in packaged("scene"):
         figures = expected_text(scenes[name]["figures"])
         rows += [f"## `{name}`", f"{title}.", *([f"To expect: {figures}."] if figures else [])]
         rows += [f"![A panel of the report of {name}](img/scenes/{name}.png)"]

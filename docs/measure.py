@@ -35,7 +35,7 @@ import canprobe
 from canprobe.cell.results.expected import figures_of
 from canprobe.cell.results.figures import draw_run
 from canprobe.cell.results.surface_figure import draw_surface
-from canprobe.cell.scene.load import packaged_scenes
+from canprobe.cell.scene.load import packaged
 from canprobe.lab.studies.result import processor
 from canprobe.lab.studies.sweep import STUDIES
 
@@ -410,7 +410,7 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
 
 def main(wanted: Sequence[str]) -> None:
     """Measure what is named, or all; the rest keeps its figures. The file is written after each."""
-    scenes = [name for name, _ in packaged_scenes()]
+    scenes = [name for name, _ in packaged("scene")]
     known = [*scenes, *OTHERS, *(name for name in STUDIES if name not in scenes), *FORMS]
     if unknown := set(wanted) - set(known):
         raise SystemExit(f"expected names among {', '.join(known)}; got {', '.join(sorted(unknown))}")

@@ -14,35 +14,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from canprobe.cell.scene.checks import Only, conditions_of, expected
-from canprobe.cell.scene.load import toml_value
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK
+from canprobe.cell.scene.toml_files import toml_value
+from canprobe.cell.scene.units import unit_of
 
-UNITS = {  # the longest suffix that fits
-    "bitrate": "bit/s",
-    "n_m3": "N/m³",
-    "kg_m2": "kg m²",
-    "nm_s": "N m s",
-    "n_s_m": "N s/m",
-    "deg_s2": "°/s²",
-    "mm_s2": "mm/s²",
-    "deg_s": "°/s",
-    "nm": "N m",
-    "counts": "units of the drive",
-    "mm_s": "mm/s",
-    "s_m": "s/m",
-    "percent": "%",
-    "permille": "‰",
-    "hz": "Hz",
-    "kpa": "kPa",
-    "deg": "°",
-    "kg": "kg",
-    "mm": "mm",
-    "ms": "ms",
-    "us": "µs",
-    "n": "N",
-    "s": "s",
-}
 NEEDS = {"must": "required", "default": "default", "may": "optional", "never": "–"}
 INTRODUCTION = """\
 # Scene keys
@@ -121,17 +97,12 @@ def _section(name: str, cls: type[Any]) -> Iterator[str]:
         cells = (
             f"`{field.name}`",
             expected(annotation),
-            unit_of(field.name),
+            unit_of(field.name).text,
             _default(field),
             " ".join([texts[field.name], *map(_condition, conditions_of(annotation, Only))]),
         )
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
     yield ""
-
-
-def unit_of(key: str) -> str:
-    """The unit of a key, from its suffix; empty for a number without one, and for what is no number."""
-    return next((unit for suffix, unit in UNITS.items() if f"_{key}".endswith(f"_{suffix}")), "")
 
 
 def _default(field: dataclasses.Field[Any]) -> str:

@@ -13,12 +13,13 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-from scene_keys import meanings, section_class, unit_of
+from scene_keys import meanings, section_class
 
 from canprobe.cell.scene.checks import MAX_NUMBER, Check, Only, conditions_of
-from canprobe.cell.scene.load import WRITTEN_BY_KEY
 from canprobe.cell.scene.model import ArrayFile, CellFile, Scene
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK
+from canprobe.cell.scene.toml_files import WRITTEN_BY_KEY
+from canprobe.cell.scene.units import unit_of
 
 FILES: Mapping[str, type[Any]] = {"scene": Scene, "cell": CellFile, "array": ArrayFile}
 WHOLE_SECTIONS = {
@@ -79,7 +80,7 @@ def section_schema(cls: type[Any], *, whole: bool) -> JsonSchema:
     properties, required, rules = {}, [], []
     for field in dataclasses.fields(cls):
         annotation = annotations[field.name]
-        unit = unit_of(field.name)
+        unit = unit_of(field.name).text
         about: JsonSchema = {"description": texts[field.name] + (f" Unit: {unit}." if unit else "")}
         if field.default is dataclasses.MISSING:
             required += [field.name] if whole else []

@@ -64,12 +64,21 @@ def number_of_32_bits(text: str) -> int:
 
 def seconds(text: str) -> float:
     """An argument type: a duration."""
+    return _above_zero(text, "seconds", math.inf)
+
+
+def positive(text: str) -> float:
+    """An argument type: a number above 0, below a million."""
+    return _above_zero(text, "a number", 1e6)
+
+
+def _above_zero(text: str, what: str, end: float) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
+    if not 0.0 < value < end:
+        raise argparse.ArgumentTypeError(f"expected {what} above 0, got {text!r}")
     return value
 
 

@@ -9,13 +9,12 @@ The result is a file for the key sensor.calibration.
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable
 from datetime import date
 
 from canprobe.cell.session.terminal import StepReport
-from canprobe.cli.argument_types import folder_path, word
+from canprobe.cli.argument_types import folder_path, positive, word
 from canprobe.cli.common_arguments import BUS, add_options, add_verbosity, seed
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Parser
@@ -30,16 +29,6 @@ examples:
 """
 
 
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
-    return value
-
-
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("kind", metavar="array", choices=["array"], help="what is calibrated")
     parser.add_argument("cell", metavar="CELL", type=word, help="name of a packaged cell, or path of a cell file")
@@ -51,21 +40,21 @@ def add_arguments(parser: Parser) -> None:
         " full scale of the array (unit), or nothing [none: nominal newtons]",
     )
     parser.add_argument(
-        "--sigma", metavar="PERCENT", type=_positive, default=1.0, help="standard deviation of that reference [1]"
+        "--sigma", metavar="PERCENT", type=positive, default=1.0, help="standard deviation of that reference [1]"
     )
     parser.add_argument(
         "--at", metavar=("X", "Y", "Z"), nargs=3, type=float,
         help="touched point in the base frame, mm [for a cell file: below the probe in its start posture]",
     )  # fmt: skip
-    parser.add_argument("--ball-radius", metavar="MM", type=_positive, default=25.0, help="radius of the ball [25]")
-    parser.add_argument("--rod-radius", metavar="MM", type=_positive, default=25.0, help="radius of the rod [25]")
+    parser.add_argument("--ball-radius", metavar="MM", type=positive, default=25.0, help="radius of the ball [25]")
+    parser.add_argument("--rod-radius", metavar="MM", type=positive, default=25.0, help="radius of the rod [25]")
     parser.add_argument(
         "--make",
         action="store_true",
         help="write a calibration for all arrays of this make, without the gains and dead taxels of this one",
     )
     parser.add_argument(
-        "--spread", metavar="PERCENT", type=_positive, default=5.0,
+        "--spread", metavar="PERCENT", type=positive, default=5.0,
         help="with --make: standard deviation of the force from array to array, by its data sheet [5]",
     )  # fmt: skip
     parser.add_argument("--yes", action="store_true", help="do not ask for objects; for an emulated cell only")

@@ -37,11 +37,8 @@ def run(args: argparse.Namespace) -> int:
     scene = scene_of(args)
 
     from canprobe import api
-    from canprobe.cli.output import print_json
+    from canprobe.cli.output import print_answer
 
     report = api.check(scene, seconds=args.seconds, say=args.report.say)
-    if args.json:
-        print_json(report.as_document())
-    else:
-        print(report.text())
+    print_answer(args, report.as_document(), report.text())
     return 0 if report.fit else 1

@@ -20,16 +20,9 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import channel, seconds, whole, word
 from canprobe.cli.common_arguments import OPTIONS, add_verbosity
-from canprobe.cli.output import print_json, print_table, say
+from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.reports import (
-    add_report_options,
-    command_line,
-    eds_and_hash,
-    read_baseline,
-    versions,
-    write_report,
-)
+from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.port import nothing
@@ -118,7 +111,9 @@ def run(args: argparse.Namespace) -> int:
         _confirm(args)
     with _port(args) as port:
         if args.restore is not None:
-            return _print_restored(args, restore_snapshot(port, args.node, args.restore, times))
+            restored = restore_snapshot(port, args.node, args.restore, times)
+            print_answer(args, {"restored": restored}, "\n".join(restored))
+            return 0
         virtual = args.bus == "lockstep"
         settings = ExaminationSettings(
             written=WriteList.parse(args.write),
@@ -264,25 +259,9 @@ def _ask(question: str) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def _print_restored(args: argparse.Namespace, lines: list[str]) -> int:
-    if args.json:
-        print_json({"restored": lines})
-    else:
-        print("\n".join(lines))
-    return 0
-
-
 def _list(args: argparse.Namespace) -> int:
-    points = _points(args)
-    if args.json:
-        print_json(
-            [
-                {"group": p.group, "number": p.number, "name": p.name, "clause": p.clause, "expected": p.expected}
-                | {"needs": sorted(p.needs)}
-                for p in points
-            ]
-        )
-        return 0
+    points, keys = _points(args), ("group", "number", "name", "clause", "expected")
+    document = [{key: getattr(one, key) for key in keys} | {"needs": sorted(one.needs)} for one in points]
     rows = [(point.group, point.title, point.clause, point.expected, " ".join(sorted(point.needs))) for point in points]
-    print_table([("group", "point", "clause", "accepted", "needs"), *rows])
+    print_answer(args, document, lambda: print_table([("group", "point", "clause", "accepted", "needs"), *rows]))
     return 0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import whole
 from canprobe.cli.common_arguments import add_options
-from canprobe.cli.output import print_json
+from canprobe.cli.output import print_answer
 from canprobe.cli.parser import Parser
 
 if TYPE_CHECKING:
@@ -71,10 +71,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.action == "path":
         print(eds_path(args.eds))
-    elif args.json:
-        print_json(list(eds_names()))
     else:
-        print("\n".join(eds_names()))
+        print_answer(args, list(eds_names()), "\n".join(eds_names()))
     return 0
 
 
@@ -83,12 +81,8 @@ def run_check(args: argparse.Namespace) -> int:
     from canprobe.fieldbus.eds.packaged import check_eds
 
     reading = check_eds(args.file, args.node_id)
-    if args.json:
-        print_json(_document(reading))
-    else:
-        for fault in reading.found:
-            print(f"{'fault' if fault.prevents else 'warning'}: {fault}")
-        print(f"{reading.path}: {_summary(reading)}")
+    found = [f"{'fault' if fault.prevents else 'warning'}: {fault}" for fault in reading.found]
+    print_answer(args, _document(reading), "\n".join([*found, f"{reading.path}: {_summary(reading)}"]))
     return 2 if reading.faults else 0
 
 
@@ -112,9 +106,4 @@ def _document(reading: Reading) -> dict[str, object]:
 
 
 def _row(fault: EdsFinding) -> dict[str, object]:
-    return {
-        "line": fault.line or None,
-        "section": fault.section or None,
-        "key": fault.key or None,
-        "text": fault.text,
-    }
+    return {key: getattr(fault, key) or None for key in ("line", "section", "key")} | {"text": fault.text}

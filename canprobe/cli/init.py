@@ -45,8 +45,8 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write cell.toml and first.toml, with the files that they name."""
-    from canprobe.cell.scene.load import written_by_line
     from canprobe.cell.scene.schemas import schema_line, schema_name, schema_text
+    from canprobe.cell.scene.toml_files import written_by_line
     from canprobe.cli.init_cell import template_cell, urdf_cell
     from canprobe.cli.init_scene import write_with_first_scene
     from canprobe.fieldbus.bus.files import write_text, writing

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from canprobe.cell.scene.geometry import transform
-from canprobe.cell.scene.load import packaged_files, toml_key
+from canprobe.cell.scene.load import packaged_files
+from canprobe.cell.scene.toml_files import toml_key
 from canprobe.cli.output import say
 from canprobe.errors import UsageError
 from canprobe.fieldbus.eds.description import Description

@@ -11,7 +11,7 @@ import argparse
 
 from canprobe.cli.argument_types import word
 from canprobe.cli.common_arguments import add_options, add_verbosity
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_answer, print_table
 from canprobe.cli.parser import Parser
 from canprobe.errors import UsageError
 
@@ -43,12 +43,8 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.fieldbus.tools.faults.control import request_faults
 
     done = request_faults(args.channel, args.faults, clear=args.clear)
-    if args.json:
-        print_json(done)
-    else:
-        for what, faults in done.items():
-            for fault in faults:
-                print(f"{what}: {fault}")
+    lines = [f"{what}: {fault}" for what, faults in done.items() for fault in faults]
+    print_answer(args, done, "\n".join(lines), end="\n" * bool(lines))
     return 0
 
 
@@ -56,7 +52,7 @@ def _list(args: argparse.Namespace) -> int:
     from canprobe.cell.emulated.array_faults import CELL_FAULTS
     from canprobe.fieldbus.tools.faults.fault import number_text
 
-    rows = [
+    document = [
         {
             "name": kind.name,
             "parameters": {
@@ -72,21 +68,9 @@ def _list(args: argparse.Namespace) -> int:
         }
         for kind in CELL_FAULTS.values()
     ]
-    if args.json:
-        print_json(rows)
-        return 0
-    print_table(
-        [
-            ("fault", "what happens", "clause", "expected reaction"),
-            *(
-                (
-                    " ".join([kind.name, *(number_text(name, one.default) for name, one in kind.parameters.items())]),
-                    kind.what,
-                    kind.clause,
-                    kind.reaction,
-                )
-                for kind in CELL_FAULTS.values()
-            ),
-        ]
-    )
+    rows = [("fault", "what happens", "clause", "expected reaction")]
+    for kind in CELL_FAULTS.values():
+        values = [number_text(name, one.default) for name, one in kind.parameters.items()]
+        rows.append((" ".join([kind.name, *values]), kind.what, kind.clause, kind.reaction))
+    print_answer(args, document, lambda: print_table(rows))
     return 0

@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from canprobe.fieldbus.bus.real.interrupts import TERMINATION_SIGNALS, Terminated, raise_terminated
 
 
 @contextlib.contextmanager
-def termination_interrupts() -> Iterator[None]:
-    """Within the block SIGTERM and SIGHUP raise `Terminated`; outside a main thread nothing changes."""
-    before = {number: signal.getsignal(number) for number in TERMINATION_SIGNALS}
+def _handlers(handlers: Mapping[int, Callable[..., None]]) -> Iterator[None]:
+    """Within the block signals have these handlers; outside a main thread nothing changes."""
+    before = {number: signal.getsignal(number) for number in handlers}
     try:
-        for number, handler in before.items():
-            if handler != signal.SIG_IGN:  # as nohup has it
-                signal.signal(number, raise_terminated)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     except ValueError:  # not the main thread, which alone receives signals
         yield
         return
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)
+
+
+def termination_interrupts() -> contextlib.AbstractContextManager[None]:
+    """Within the block SIGTERM and SIGHUP raise `Terminated`, but for one that is ignored, as under nohup."""
+    heeded = [number for number in TERMINATION_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    return _handlers(dict.fromkeys(heeded, raise_terminated))
 
 
 @contextlib.contextmanager
@@ -38,8 +43,7 @@ def left_by_ctrl_c() -> Iterator[None]:
         pass
 
 
-@contextlib.contextmanager
-def first_ctrl_c(asked: Callable[[], None]) -> Iterator[None]:
+def first_ctrl_c(asked: Callable[[], None]) -> contextlib.AbstractContextManager[None]:
     """Within the block the first Ctrl-C calls `asked`; the second one interrupts as usual."""
     before = signal.getsignal(signal.SIGINT)
 
@@ -47,12 +51,4 @@ def first_ctrl_c(asked: Callable[[], None]) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
         asked()
 
-    try:
-        signal.signal(signal.SIGINT, ask)
-    except ValueError:  # not the main thread, which alone receives signals
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+    return _handlers({signal.SIGINT: ask})

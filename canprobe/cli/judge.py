@@ -22,16 +22,9 @@ from canprobe.cli.argument_types import seconds
 from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_inject, add_options, add_scene, add_verbosity
 from canprobe.cli.emulate import eds_files, scene_target
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
-from canprobe.cli.output import print_json, print_table, say
+from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.reports import (
-    add_report_options,
-    command_line,
-    eds_and_hash,
-    read_baseline,
-    versions,
-    write_report,
-)
+from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
 from canprobe.cli.target import loaded, real_target
 from canprobe.errors import UsageError
 
@@ -299,10 +292,9 @@ def _print_finding(row: ReportRow) -> None:
 def _list(args: argparse.Namespace) -> int:
     from canprobe.fieldbus.tools.judge import RULES
 
-    if args.json:
-        keys = ("number", "name", "group", "severity", "source", "expected", "hint")
-        print_json([{key: getattr(rule, key) for key in keys} for rule in RULES])
-        return 0
+    keys = ("number", "name", "group", "severity", "source", "expected", "hint")
+    document = [{key: getattr(rule, key) for key in keys} for rule in RULES]
     rows = [(f"{r.number:02}", r.group, r.name, r.severity.value, r.expected) for r in RULES]
-    print_table([("rule", "family", "fault of a master", "severity", "what a good one does"), *rows])
+    head = ("rule", "family", "fault of a master", "severity", "what a good one does")
+    print_answer(args, document, lambda: print_table([head, *rows]))
     return 0

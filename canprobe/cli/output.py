@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import codecs
 import itertools
 import json
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from canprobe.cell.session.terminal import MARKED_WORDS, MIN_COLUMNS, columns, painted
 
@@ -26,6 +27,16 @@ def print_json(document: object) -> None:
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     ascii_only = codecs.lookup(encoding).name != "utf-8"
     print(json.dumps(document, indent=2, allow_nan=False, ensure_ascii=ascii_only))
+
+
+def print_answer(args: argparse.Namespace, document: object, text: str | Callable[[], None], end: str = "\n") -> None:
+    """Print the document where --json asks for it, else the text, or what a function prints in its place."""
+    if args.json:
+        print_json(document)
+    elif callable(text):
+        text()
+    else:
+        print(text, end=end)
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.session.terminal import columns
 from canprobe.cli.common_arguments import add_options, add_scene
-from canprobe.cli.output import print_json, say
+from canprobe.cli.output import print_answer, print_json, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, with_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
@@ -96,11 +96,10 @@ def _draw(plan: Plan, path: Path) -> Path:
 
 def run(args: argparse.Namespace) -> int:
     """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
+    from canprobe.cell.planning.free_parameters import opened
     from canprobe.cell.planning.make import make_plan
-    from canprobe.cell.planning.open_keys import opened
-    from canprobe.cell.planning.report import plan_text
+    from canprobe.cell.planning.report import plan_text, verdict_text
     from canprobe.cell.planning.report_json import plan_dict, refused_dict
-    from canprobe.cell.planning.verdict import verdict_text
     from canprobe.cell.scene.resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):
@@ -118,13 +117,10 @@ def run(args: argparse.Namespace) -> int:
         plan = replace(plan, warnings=tuple(with_scene(one, args) for one in plan.warnings))
         rehearsed = _rehearse(plan) if args.rehearse else None
     except PlanError as error:
-        if args.json:
-            print_json(refused_dict(scene.name, error.problems, error.ways_out))
-        else:
-            print(f"{scene.name}: does not fit")
+        print_answer(args, refused_dict(scene.name, error.problems, error.ways_out), f"{scene.name}: does not fit")
         raise
     if args.measured is not None:
-        return _compare(plan, args.measured, args.json)
+        return _compare(plan, args.measured, args)
     files = [] if args.figure is None else [_draw(plan, args.figure)]
     if args.export:
         from canprobe.lab.bridge.export import export_plan
@@ -170,16 +166,13 @@ def _scene_beside(log: Path) -> str | None:
         return None
 
 
-def _compare(plan: Plan, log: Path, as_json: bool) -> int:
+def _compare(plan: Plan, log: Path, args: argparse.Namespace) -> int:
     """Print the measured traffic of each bus; status 3 where it is not as planned."""
     if log.suffix == ".json":
         from canprobe.cell.results.device_times import read_device_times
 
         times = read_device_times(log, plan)
-        if as_json:
-            print_json(times.as_dict())
-        else:
-            print(times.text(), end="")
+        print_answer(args, times.as_dict(), times.text(), end="")
         return 0 if times.as_planned else 3
     from canprobe.cell.results.traffic import measure_traffic
 
@@ -187,8 +180,6 @@ def _compare(plan: Plan, log: Path, as_json: bool) -> int:
         say(f"canprobe: {log} is a run of scene {ran}, compared with the plan of {plan.scene.name}")
     several = len(plan.buses) > 1
     measured = {bus.channel: measure_traffic(log, plan, channel=bus.channel if several else None) for bus in plan.buses}
-    if as_json:
-        print_json({channel: one.as_dict() for channel, one in measured.items()})
-    else:
-        print("\n".join(f"bus {channel}, {one.text()}" for channel, one in measured.items()), end="")
+    text = "\n".join(f"bus {channel}, {one.text()}" for channel, one in measured.items())
+    print_answer(args, {channel: one.as_dict() for channel, one in measured.items()}, text, end="")
     return 0 if all(one.as_planned for one in measured.values()) else 3

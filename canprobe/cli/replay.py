@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.common_arguments import add_options, add_verbosity
-from canprobe.cli.output import print_json
+from canprobe.cli.output import print_answer
 from canprobe.cli.parser import Parser
 from canprobe.errors import ResultsError
 
@@ -48,10 +48,7 @@ def run(args: argparse.Namespace) -> int:
     result = recorded.replay(args.log, scene=args.scene, method=args.method)
     if args.out is not None:
         result.save(args.out)
-    if args.json:
-        print_json(result.summary)
-    else:
-        print(result.text())
+    print_answer(args, result.summary, result.text())
     return 0
 
 
@@ -63,13 +60,9 @@ def _run_into(args: argparse.Namespace) -> int:
     replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=args.report.say)
     if replayed.result is not None and args.out is not None:
         replayed.result.save(args.out)
-    if args.json:
-        summary = replayed.result.summary if replayed.result is not None else {}
-        print_json({**summary, "bridges": replayed.bridges})
-    else:
-        if replayed.result is not None:
-            print(replayed.result.text())
-        print("\n".join(bridge_lines(replayed.bridges)))
+    summary, texts = ({}, []) if replayed.result is None else (replayed.result.summary, [replayed.result.text()])
+    text = "\n".join([*texts, *bridge_lines(replayed.bridges)])
+    print_answer(args, {**summary, "bridges": replayed.bridges}, text)
     for name, status in replayed.bridges.items():
         if status["error"] is not None:
             raise ResultsError(f"bridge {name}: {status['error']}")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.argument_types import channel, number_of_32_bits, seconds, whole
 from canprobe.cli.common_arguments import OPTIONS, add_options, add_scene, add_verbosity
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_answer, print_table
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, real_target
 from canprobe.errors import UsageError
@@ -92,10 +92,7 @@ def run(args: argparse.Namespace) -> int:
     target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
     if not args.lss:
         nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
-        if args.json:
-            print_json(nodes)
-        else:
-            _print_nodes(nodes, target.channel)
+        print_answer(args, nodes, lambda: _print_nodes(nodes, target.channel))
         return 0
     scene = None if args.scene is None else loaded(args)
     done = api.commission(
@@ -106,10 +103,7 @@ def run(args: argparse.Namespace) -> int:
         timeout_s=args.timeout,
         say=args.report.say,
     )
-    if args.json:
-        print_json(done.as_document())
-    else:
-        _print_commissioned(done, target.channel)
+    print_answer(args, done.as_document(), lambda: _print_commissioned(done, target.channel))
     return 0
 
 

@@ -44,19 +44,12 @@ def print_packaged(
         expected: expected figures from `read_expected`.
     """
     from canprobe.cell.results.expected import LISTED_FIGURES, expected_text, seeds_text
-    from canprobe.cell.scene.load import (
-        offered,
-        packaged_arrays,
-        packaged_cells,
-        packaged_files,
-        packaged_scenes,
-    )
+    from canprobe.cell.scene.load import offered, packaged, packaged_files
     from canprobe.cell.scene.offers import offers
 
-    titles = {"scene": packaged_scenes, "cell": packaged_cells, "array": packaged_arrays}
     document: list[dict[str, Any]] = []
     for kind, then in advice.items():
-        found, paths, others = titles[kind](), packaged_files(f"{kind}s"), offered(kind, args.report.say)
+        found, paths, others = packaged(kind), packaged_files(f"{kind}s"), offered(kind, args.report.say)
         if args.json:
             for name, title in found:
                 figures = {} if expected is None else {"expected": expected["scenes"].get(name, {})}

@@ -13,7 +13,7 @@ from typing import Any
 
 from canprobe.cli.argument_types import whole
 from canprobe.cli.common_arguments import add_options, add_verbosity
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_answer, print_json, print_table
 from canprobe.cli.parser import Parser
 from canprobe.errors import did_you_mean
 from canprobe.fieldbus.bus.real.interrupts import interrupts_repeated
@@ -108,10 +108,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.list:
         described = {**STUDIES, **{typed: words for typed, (_, words) in FORMS.items()}}
-        if args.json:
-            print_json(described)
-        else:
-            print_table(list(described.items()))
+        print_answer(args, described, lambda: print_table(list(described.items())))
         return 0
     typed = " ".join([args.name or "", *(f"--{form}" for form in FORM_OPTIONS if getattr(args, form))])
     _refuse_wrong(args, typed, STUDIES, FORMS)
@@ -132,10 +129,7 @@ def run(args: argparse.Namespace) -> int:
         raise
     with interrupts_repeated():
         paths = write_study(result, out)
-    if args.json:
-        print_json(as_document(result))
-    else:
-        print(text_of(result), end="")
+    print_answer(args, as_document(result), text_of(result), end="")
     args.report.say("wrote " + ", ".join(map(str, paths)))
     return 0
 

@@ -15,7 +15,7 @@ import canprobe
 from canprobe import api
 from canprobe.cell.master.monitor import Monitor
 from canprobe.cell.results import text
-from canprobe.cell.scene.load import load_scene, packaged_scenes
+from canprobe.cell.scene.load import load_scene, packaged
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.argument_types import channel, node_ids
 from canprobe.cli.interrupts import termination_interrupts
@@ -372,12 +372,12 @@ def test_scan_prints_a_table_or_json(calls, capsys):
 def test_scenes(capsys):
     assert main(["scenes"]) == 0
     *lines, figures, last = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [n for n, _ in packaged_scenes()]
+    assert [line.split()[0] for line in lines] == [n for n, _ in packaged("scene")]
     assert figures.startswith("figures: ")
     folder = Path(last.removeprefix("in ").partition(";")[0])
     assert main(["scenes", "--json"]) == 0
     scenes = json.loads(capsys.readouterr().out)
-    assert [scene["name"] for scene in scenes] == [n for n, _ in packaged_scenes()]
+    assert [scene["name"] for scene in scenes] == [n for n, _ in packaged("scene")]
     for scene in scenes:
         path = Path(scene["path"])
         assert path.parent == folder and load_scene(path) == load_scene(scene["name"])

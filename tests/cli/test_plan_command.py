@@ -8,10 +8,9 @@ import re
 import pytest
 
 import canprobe
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.verdict import verdict_text
+from canprobe.cell.planning.report import plan_text, verdict_text
 from canprobe.cell.planning.witnesses import witness_rows
-from canprobe.cell.scene.load import packaged_scenes
+from canprobe.cell.scene.load import packaged
 from canprobe.cli import main
 
 
@@ -92,7 +91,7 @@ def test_a_way_out_of_a_fast_cycle_keeps_the_images(capsys):
 
 @pytest.mark.parametrize("width", [40, 80, 100])
 def test_tables_keep_to_the_width(width):
-    for name, _ in packaged_scenes()[:4]:
+    for name, _ in packaged("scene")[:4]:
         plan = canprobe.plan(name)
         assert max(map(len, plan_text(plan, width).splitlines())) <= width
         words = plan_text(plan).split()

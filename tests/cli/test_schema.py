@@ -12,8 +12,9 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from canprobe.cell.scene.load import load_array, load_cell, load_scene, packaged_files, toml_key, toml_value
+from canprobe.cell.scene.load import load_array, load_cell, load_scene, packaged_files
 from canprobe.cell.scene.schemas import KINDS, schema_line, schema_name, schema_text
+from canprobe.cell.scene.toml_files import toml_key, toml_value
 from canprobe.cli import main
 from canprobe.errors import SceneError
 

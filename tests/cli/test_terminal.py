@@ -11,7 +11,7 @@ import pytest
 
 from canprobe import api
 from canprobe.cell.results.expected import expected_text, figures_of, read_expected
-from canprobe.cell.scene.load import packaged_scenes
+from canprobe.cell.scene.load import packaged
 from canprobe.cell.session.terminal import StepReport, painted
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.output import print_summary, print_table
@@ -143,7 +143,7 @@ def _interleaved(shown):
 
 def test_every_packaged_scene_has_figures_to_expect_and_the_list_shows_them(capsys):
     scenes = read_expected()["scenes"]
-    assert set(scenes) == {name for name, _ in packaged_scenes()}
+    assert set(scenes) == {name for name, _ in packaged("scene")}
     for figures in scenes.values():
         assert all(0 <= low <= high for low, high in figures.values())
     assert main(["scenes"]) == 0

@@ -27,8 +27,8 @@ import numpy as np
 from makes import MAKES, Entry, Make, changed, write_eds
 
 import canprobe
-from canprobe.cell.scene.load import toml_key
 from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.toml_files import toml_key
 from canprobe.errors import CanprobeError, PlanError
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian

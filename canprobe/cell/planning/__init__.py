@@ -3,18 +3,19 @@
 What comes in is a `Setup`; what goes out is a frozen `Plan`, or a `PlanError` with every reason at once and the
 changes that would fit. Nothing is opened or sent here.
 
-1. `abilities` reads what each device can from its EDS file: objects, PDOs, mappings, bit rates; `demands` names what a
-   device cannot take its part without. `operation` finds the mode of each drive, `interpolation_period` the period as
-   its 60C2h can express it, `sync` the SYNC period and the trigger of the array. `units` compares counts, `pdos` and
-   `raw_frames` find the messages that carry what is needed, `identifiers` gives them their order, and `configuration`
-   has what is written. What a device lacks and what cannot be done without is a reason; what can be done without is
-   listed as not available, with what that means.
-2. `open_keys` closes what the setup leaves open ("auto"). What costs least is tried first: other mappings and
+1. `device_capabilities` reads what each device can from its EDS file (objects, PDOs, mappings, bit rates), and names
+   what a device cannot take its part without. `operation` finds the mode of each drive, `sync` the SYNC period, the
+   period as each drive takes it and the trigger of the array. `units` compares counts, `pdos` and `raw_frames` find the
+   messages that carry what is needed, `identifiers` gives them their order, and `configuration` has what is written.
+   What a device lacks and what cannot be done without is a reason; what can be done without is listed as not
+   available, with what that means.
+2. `free_parameters` closes what the setup leaves open ("auto"). What costs least is tried first: other mappings and
    priorities before other hardware (CAN FD, a second bus), and less from the array last of all. What a scene writes is
-   kept. `ways_out` names what would make a scene fit, `left_out` what it does not need, `warnings` what is carried out
-   and yet said first. For each candidate `make` plans PDOs and identifiers; `wire_time` gives the time of a PDO on the
-   wire, and `traffic` checks SYNC, load, the peak behind one SYNC and the worst-case response time of every message.
-   `array` states what the taxels support, and `window` compares the window of the array with the contact patch.
+   kept. It also suggests changes that would make a scene fit. `omitted_features` names what a scene does not need,
+   `warnings` what is carried out and yet said first. For each candidate `make` plans PDOs and identifiers; `wire_time`
+   gives the time of a PDO on the wire, and `traffic` checks SYNC, load, the peak behind one SYNC and the worst-case
+   response time of every message. `array` states what the taxels support, and `window` compares the window of the
+   array with the contact patch.
 3. `surface_path` lays the task's path over the object; `motion` follows it with the arm: reach, stops, speeds.
    `contact` reckons there with the layer: whether the joints' counts hold the force, and whether the array shows it.
 4. `make.make_plan` puts the answer together: `model.Plan` carries the closed setup, nodes, PDOs, buses, choices, what

@@ -9,13 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from canprobe.cell.planning.window import patch_radius_m
 from canprobe.cell.scene.setup import Array, Calibrate, Setup, Touch
 from canprobe.errors import UsageError, at_most
 
-What = Literal["image", "start", "stop", "poll"]
 PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16
 """Taxels under the patch from which a press finds the normal of a sphere, there is a centroid, and second moments."""
 COARSE_SHARE = 0.1

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from canopen import ObjectDictionary
 
-from canprobe.cell.planning.abilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, Abilities
+from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, DeviceCapabilities
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -41,6 +41,7 @@ from canprobe.cell.planning.units import (
     speed_unit,
     turn_units,
 )
+from canprobe.cell.scene.setup import Arm, HomingParameters
 from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.packaged import (
     FULL_SCALE,
@@ -121,7 +122,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class FixedEntry:
     """One entry that the device cannot change and the scene relies on.
 
     Attributes:
@@ -168,7 +169,7 @@ class NodeSetup:
     dictionary: ObjectDictionary
     identity: dict[int, int]
     writes: tuple[Write, ...]
-    given: tuple[Given, ...] = ()
+    given: tuple[FixedEntry, ...] = ()
     otherwise: tuple[tuple[Write, ...], ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     problems: tuple[str, ...] = ()
@@ -194,20 +195,18 @@ def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
 
 
 def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
-    device = Abilities(node.eds, Description(node.dictionary))
-    of_kind = _drive_writes if node.kind == "drive" else _array_writes
+    device = DeviceCapabilities(node.eds, Description(node.dictionary))
+    arm = plan.setup.arm if node.kind == "drive" else None
+    axis = arm.node_ids.index(node.node_id) if arm is not None else 0
+    drive = arm.drives[axis] if arm is not None else None
+    own = _array_writes(plan, device) if arm is None else _drive_writes(plan, node, arm, axis, device)
     writes, left_out, problems = _possible(
-        device, [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *of_kind(plan, node, device)]
+        device, [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *own]
     )
-    arm = plan.setup.arm
-    drive = arm.drives[arm.node_ids.index(node.node_id)] if arm is not None and node.kind == "drive" else None
     times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
-    homing, not_homing, no_homing = _possible(device, _homing_writes(plan, node, device))
-    no_homing += (
-        [*homing_problems(device), *_coupling_problems(plan, node), *_offset_problems(plan, node, device)]
-        if homing
-        else []
-    )
+    homing, not_homing, no_homing = _possible(device, _homing_writes(arm, axis, device) if arm is not None else ())
+    if homing and arm is not None and drive is not None and drive.zero is not None:
+        no_homing += _unhomed(arm, axis, drive.zero, device)
     return NodeSetup(
         node_id=node.node_id,
         name=node.role,
@@ -227,7 +226,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     )
 
 
-def _possible(device: Abilities, writes: Iterable[Write]) -> tuple[list[Write], list[LeftOut], list[str]]:
+def _possible(device: DeviceCapabilities, writes: Iterable[Write]) -> tuple[list[Write], list[LeftOut], list[str]]:
     """The writes that a device can take by its EDS, the wished ones that it cannot, and why not a required one."""
     possible: list[Write] = []
     left_out: dict[tuple[int, int], LeftOut] = {}
@@ -243,7 +242,7 @@ def _possible(device: Abilities, writes: Iterable[Write]) -> tuple[list[Write], 
     return possible, [one for one in left_out.values() if one.why], problems
 
 
-def _excluded(device: Abilities, write: Write) -> str | None:
+def _excluded(device: DeviceCapabilities, write: Write) -> str | None:
     """Why a device cannot take a write; empty where the entry always holds the value, None where it can."""
     entry = device.description.entry(write.index, write.subindex)
     if entry is None or (write.purpose == _MISSED_SYNCS and not has_missed_syncs(device.od)):
@@ -264,7 +263,7 @@ def _ends(entry: DescribedEntry) -> str:
     return f"at least {entry.low}" if entry.high is None else f"{entry.low} to {entry.high}"
 
 
-def _pdo_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
+def _pdo_writes(plan: Plan, node: PlannedNode, device: DeviceCapabilities) -> list[Write]:
     writes = []
     if has_long_pdos(device.od):
         long = any(pdo.layout.length > CLASSIC_BYTES for pdo in plan.pdos_of(node.node_id, "tpdo"))
@@ -280,7 +279,7 @@ def _pdo_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]
     return writes
 
 
-def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
+def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> list[Write]:
     communication = COMMUNICATION[pdo.direction] + pdo.number - 1
     mapping = MAPPING[pdo.direction] + pdo.number - 1
     name, cob_id = f"{pdo.direction.upper()} {pdo.number}", pdo.cob_id | pdo.own_bits
@@ -307,11 +306,13 @@ def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
 _UNTIMED = "the device does not know how long a cycle is"
 
 
-def _common_writes(plan: Plan, device: Abilities) -> list[Write]:
+def _common_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
     counter = [
         Write(SYNC_PERIOD, 0, 0, "1019h may only change while this is 0", _UNTIMED),
         Write(0x1019, 0, plan.sync.overflow, "overflow of the SYNC counter"),
     ]
+    value, others = (device.number(STARTUP) or 0) | NOT_BY_ITSELF, 0xFFFFFFFF & ~NOT_BY_ITSELF
+    waits = Write(STARTUP, 0, value, "the node waits for its start", _SELF_STARTING, own_bits=others)
     return [
         *(counter if plan.sync.overflow else []),
         Write(SYNC_PERIOD, 0, plan.sync.period_us, "period of SYNC", None if follows_sync_period(device) else _UNTIMED),
@@ -319,16 +320,8 @@ def _common_writes(plan: Plan, device: Abilities) -> list[Write]:
         Write(0x1017, 0, HEARTBEAT_PRODUCED_MS, "period of the node's heartbeat"),
         Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS, "the node notices a dead master", _DEAF),
         Write(0x1029, 1, GO_PRE_OPERATIONAL, "NMT state of a node that has lost its master", _BY_DEFAULT),
-        *_startup_writes(device),
+        *([waits] if device.has(STARTUP) else []),  # a device without it is not asked
     ]
-
-
-def _startup_writes(device: Abilities) -> list[Write]:
-    """A device that does not start by itself sends no PDOs before it is configured; one without 1F80h is not asked."""
-    if not device.has(STARTUP):
-        return []
-    value, others = (device.number(STARTUP) or 0) | NOT_BY_ITSELF, 0xFFFFFFFF & ~NOT_BY_ITSELF
-    return [Write(STARTUP, 0, value, "the node waits for its start", _SELF_STARTING, own_bits=others)]
 
 
 _EMERGENCIES = "a faulty device may fill the bus with emergencies"
@@ -339,12 +332,11 @@ _MISSED_SYNCS = "SYNCs after which the drive stops by itself"
 _FAST = "the drive itself limits its speed as the device has it, or not at all"
 
 
-def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
-    setup, arm = plan.setup, plan.setup.arm
-    assert arm is not None and node.mode is not None
-    model, axis = arm.model, arm.node_ids.index(node.node_id)
+def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
+    assert node.mode is not None
+    model = arm.model
     low, high = software_limits(model)
-    limit = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
+    limit = motor_speed_limit(model, axis, plan.setup.limits.speed_share, plan.sync.period_ns)
     unit = speed_unit(device, arm.drives[axis], VELOCITY_UNIT_INDEX)
     fastest = "highest speed of the motor"
     speed = [Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), fastest, _FAST)] if unit else []
@@ -369,14 +361,11 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     ]
 
 
-def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
+def _homing_writes(arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
     """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
-    arm = plan.setup.arm
-    axis = arm.node_ids.index(node.node_id) if arm is not None and node.kind == "drive" else None
-    zero = arm.drives[axis].zero if arm is not None and axis is not None else None
-    if arm is None or axis is None or zero is None:
+    zero = arm.drives[axis].zero
+    if zero is None:
         return []
-    home = drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start))
     units = abs(float(arm.model.units_per_q[axis, axis]))
     speed, acceleration = (
         units / (speed_unit(device, arm.drives[axis], index) or 1.0)
@@ -384,60 +373,53 @@ def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Wri
     )
     ramp = "homing accelerates as the device has it"
     still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
+    offset = -round(_home_units(arm, axis, zero))
     return [
         Write(0x6098, 0, zero.method, "homing method"),
         Write(0x6099, 1, max(1, round(zero.speed * speed)), "speed of the search for the switch", still),
         Write(0x6099, 2, max(1, round(zero.zero_speed * speed)), "speed of the search for the zero", still),
         Write(0x609A, 0, max(1, round(zero.acceleration * acceleration)), "acceleration in homing", ramp),
-        *([Write(HOME_OFFSET, 0, -round(home), "home offset")] if device.has(HOME_OFFSET) else []),
+        *([Write(HOME_OFFSET, 0, offset, "home offset")] if device.has(HOME_OFFSET) else []),
     ]
 
 
-def _offset_problems(plan: Plan, node: PlannedNode, device: Abilities) -> list[str]:
-    """Problems of a drive without 607Ch, which counts 0 at home, where the cell expects another number."""
-    arm = plan.setup.arm
-    assert arm is not None
-    axis = arm.node_ids.index(node.node_id)
-    model, zero = arm.model, arm.drives[axis].zero
-    if zero is None or device.has(HOME_OFFSET):
-        return []
-    name, lack = model.joints[axis].name, f"{device.eds}: no such object: 607Ch (home offset)"
-    if coupled_joints(model, axis):
-        return [f"{lack}, and what the motor of {name} counts at home depends on other joints: it cannot be homed"]
-    home = drive_position_at(model, axis, zero.home, joints_to_units(model, arm.q_start))
-    if not round(home):
-        return []
-    counts = round(model.zero_units[axis] - home)
-    return [f"{lack}: the drive counts 0 at home, and the cell {home:.0f}: set joints.{name}.zero_counts = {counts}"]
+def _home_units(arm: Arm, axis: int, zero: HomingParameters) -> float:
+    """Position of a drive at home, units, with the other joints in the start posture."""
+    return float(drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start)))
 
 
-def _coupling_problems(plan: Plan, node: PlannedNode) -> list[str]:
-    """Problems where a drive is homed before joints on which its zero depends."""
-    arm = plan.setup.arm
-    assert arm is not None
-    axis = arm.node_ids.index(node.node_id)
-    own, joints, problems = arm.drives[axis].zero, arm.model.joints, []
-    for other in sorted(coupled_joints(arm.model, axis)):
-        zero, name = arm.drives[other].zero, joints[other].name
-        if own is None or zero is None or (zero.order, other) < (own.order, axis):
+def _unhomed(arm: Arm, axis: int, zero: HomingParameters, device: DeviceCapabilities) -> Iterator[str]:
+    """Why a drive cannot be homed: its modes, joints on which its zero depends, or no 607Ch where home is not 0."""
+    yield from homing_problems(device)
+    joints, coupled = arm.model.joints, coupled_joints(arm.model, axis)
+    for other in sorted(coupled):
+        its, name = arm.drives[other].zero, joints[other].name
+        if its is None or (its.order, other) < (zero.order, axis):
             continue
         way = (
             "each depends on the other: one of them needs an absolute encoder"
             if axis in coupled_joints(arm.model, other)
-            else f"joints.{name}.homing_order must be lower than {own.order}"
+            else f"joints.{name}.homing_order must be lower than {zero.order}"
         )
-        problems.append(f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}")
-    return problems
+        yield f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}"
+    if device.has(HOME_OFFSET):
+        return
+    name, lack = joints[axis].name, f"{device.eds}: no such object: 607Ch (home offset)"
+    if coupled:
+        yield f"{lack}, and what the motor of {name} counts at home depends on other joints: it cannot be homed"
+    elif round(home := _home_units(arm, axis, zero)):
+        counts = round(arm.model.zero_units[axis] - home)
+        yield f"{lack}: the drive counts 0 at home, and the cell {home:.0f}: set joints.{name}.zero_counts = {counts}"
 
 
-def _interpolation_writes(device: Abilities, time: Interpolation) -> list[Write]:
+def _interpolation_writes(device: DeviceCapabilities, time: Interpolation) -> list[Write]:
     """A device without 60C2h:02 counts in milliseconds."""
     unit = [Write(INTERPOLATION_TIME, 2, time.index, "unit of the interpolation time")]
     value = Write(INTERPOLATION_TIME, 1, time.value, "interpolation time")
     return [value, *(unit if device.has(INTERPOLATION_TIME, 2) else [])]
 
 
-def _array_writes(plan: Plan, _: PlannedNode, device: Abilities) -> list[Write]:
+def _array_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
     array = plan.setup.array
     assert array is not None
     writes = [Write(0x2000, 0, TactileMode[array.mode.upper()], "what the array sends")]
@@ -449,7 +431,7 @@ def _array_writes(plan: Plan, _: PlannedNode, device: Abilities) -> list[Write]:
     return writes
 
 
-def _drive_given(device: Abilities) -> tuple[Given, ...]:
+def _drive_given(device: DeviceCapabilities) -> tuple[FixedEntry, ...]:
     """The cell states in `sign` how a drive counts; 607Eh would turn that round. Speeds are written in unit 60A9h."""
     otherwise = {
         POLARITY: "it would count the other way round than the cell's sign says; set 607Eh back in the drive",
@@ -457,13 +439,13 @@ def _drive_given(device: Abilities) -> tuple[Given, ...]:
         " take the drive's value into the EDS",
     }
     return tuple(
-        Given(index, 0, device.number(index) or 0, "as its EDS says", text)
+        FixedEntry(index, 0, device.number(index) or 0, "as its EDS says", text)
         for index, text in otherwise.items()
         if device.has(index)
     )
 
 
-def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
+def _array_given(plan: Plan, dictionary: Any) -> tuple[FixedEntry, ...]:
     """The full scale that the array must hold: with another one the force would be wrong by their ratio."""
     array = plan.setup.array
     assert array is not None
@@ -472,4 +454,4 @@ def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
     pascals = round(array.full_scale)
     key = "sensor.full_scale_kpa"
     otherwise = f"force would be read wrong by their ratio; put right {key}"
-    return (Given(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)
+    return (FixedEntry(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)

@@ -61,10 +61,20 @@ def pressed(force_n: float, probe: Probe, array: Array, kappa: Sequence[float]) 
         array: the array under the layer.
         kappa: (2,) principal curvatures of the object, above -1/R, 1/m.
     """
-    a, b = (0.5 * (1.0 / probe.radius + one) for one in kappa)
-    depth = math.sqrt(2.0 * force_n * math.sqrt(a * b) / (math.pi * probe.stiffness))
+    (a, b), depth = half_curvatures(probe, kappa), layer_depth(force_n, probe, kappa)
     shown = probe.stiffness * (depth - (a + b) * _blur_m(array) ** 2)
     return Pressed(depth, math.sqrt(depth / min(a, b)), shown)
+
+
+def half_curvatures(probe: Probe, kappa: Sequence[float]) -> tuple[float, float]:
+    """A and B, 1/m, of the probe on an object of principal curvatures (2,), 1/m."""
+    return 0.5 * (1.0 / probe.radius + kappa[0]), 0.5 * (1.0 / probe.radius + kappa[1])
+
+
+def layer_depth(force_n: float, probe: Probe, kappa: Sequence[float]) -> float:
+    """Depth δ of the layer, m, under a force, N, on an object of principal curvatures (2,), 1/m."""
+    a, b = half_curvatures(probe, kappa)
+    return math.sqrt(2.0 * force_n * math.sqrt(a * b) / (math.pi * probe.stiffness))
 
 
 def _blur_m(array: Array) -> float:

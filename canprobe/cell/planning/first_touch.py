@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from canprobe.cell.planning.contact import BLUR_TAXELS
+from canprobe.cell.planning.contact import BLUR_TAXELS, half_curvatures, layer_depth
 from canprobe.cell.planning.force import highest_known_force
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
@@ -40,18 +40,13 @@ def first_shown_n(array: Array) -> float:
 
 def force_at(depth: float, probe: Probe, array: Array, kappa: Sequence[float]) -> float:
     """Force (N) that presses the layer in by a depth (m) on an object of principal curvatures (2,), 1/m."""
-    a, b = (0.5 * (1.0 / probe.radius + one) for one in kappa)
-    area = float(array.pad.areas.sum())
+    (a, b), area = half_curvatures(probe, kappa), float(array.pad.areas.sum())
     return probe.stiffness * depth * min(math.pi * depth / (2.0 * math.sqrt(a * b)), area)
 
 
 def depth_at(force_n: float, probe: Probe, array: Array, kappa: Sequence[float]) -> float:
     """Depth (m) of the layer under a force: the inverse of `force_at`."""
-    a, b = (0.5 * (1.0 / probe.radius + one) for one in kappa)
-    area = float(array.pad.areas.sum())
-    return max(
-        math.sqrt(2.0 * force_n * math.sqrt(a * b) / (math.pi * probe.stiffness)), force_n / (probe.stiffness * area)
-    )
+    return max(layer_depth(force_n, probe, kappa), force_n / (probe.stiffness * float(array.pad.areas.sum())))
 
 
 def blind_s(setup: Setup, task: Touch | Calibrate) -> float:

@@ -6,13 +6,13 @@ its first touch, when creep is not yet what it was in the calibration, and at it
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
 from canprobe.errors import at_least, at_most
 from canprobe.mechanics.touch.image.force_creep import decades_after, late_decades_after
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
+from canprobe.mechanics.touch.stops import depth_on_plane
 
 _ROUNDS = 5
 
@@ -28,7 +28,7 @@ def force_sigma_of(array: Array, probe: Probe, force: float, seconds: float) -> 
     """
     errors, calibration = array.calibration.force, array.calibration
     # pressure k δ on a plane; a flat array has no such layer, and its light touches are not known
-    peak_pa = probe.stiffness * math.sqrt(force / (math.pi * probe.stiffness * probe.radius))
+    peak_pa = probe.stiffness * depth_on_plane(force, probe.stiffness, probe.radius)
     return errors.sigma(
         force,
         array.pad.lightness(peak_pa),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.fieldbus.protocol.frames import is_restricted
 from canprobe.fieldbus.protocol.pdo import PdoLayout
@@ -18,7 +18,7 @@ _POOL = range(0x181, 0x580)
 """Identifiers below SYNC, emergencies and TIME and above SDO and heartbeats; restricted ones are left out."""
 
 
-def order_by_deadline(pdos: Sequence[PlannedPdo], devices: Iterable[Abilities] = ()) -> list[PlannedPdo]:
+def order_by_deadline(pdos: Sequence[PlannedPdo], devices: Iterable[DeviceCapabilities] = ()) -> list[PlannedPdo]:
     """The same PDOs with identifiers in the order of their deadlines.
 
     At equal deadlines feedback has priority over commands; otherwise the order stays. An RPDO that several drives read

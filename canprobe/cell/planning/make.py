@@ -6,14 +6,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from canprobe.cell.planning.abilities import Abilities
 from canprobe.cell.planning.array import array_problems, as_supported, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_setups
-from canprobe.cell.planning.demands import missing_bitrate, missing_objects
+from canprobe.cell.planning.device_capabilities import DeviceCapabilities, missing_bitrate, missing_objects
+from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes
 from canprobe.cell.planning.identifiers import identifier_problems, order_by_deadline
-from canprobe.cell.planning.interpolation_period import interpolations, period_problem
-from canprobe.cell.planning.left_out import left_out, outputs
 from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
     Choice,
@@ -28,15 +26,14 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.motion import check_motion
-from canprobe.cell.planning.open_keys import candidates
+from canprobe.cell.planning.omitted_features import omitted_features, outputs
 from canprobe.cell.planning.operation import choose_mode, early_stops, operation_problems
 from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.cell.planning.raw_frames import plan_raw_frames, raw_frame_problems
-from canprobe.cell.planning.sync import plan_ratio, plan_sync
+from canprobe.cell.planning.sync import interpolations, period_problem, plan_ratio, plan_sync
 from canprobe.cell.planning.traffic import plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.planning.warnings import warnings
-from canprobe.cell.planning.ways_out import at_rate, ways_out
 from canprobe.cell.planning.window import cut_patch
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
@@ -86,7 +83,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
     chosen = {choice.key: choice.value for choice in bus.choices}
     setup = setup.with_choices(chosen)
-    absent = left_out(setup)
+    absent = omitted_features(setup)
     plan = Plan(
         setup=setup,
         nodes=_nodes(setup, devices, bus.pdos, bus.sync),
@@ -113,7 +110,7 @@ def _ways_out(bus: _BusPlan) -> list[str]:
             return True
         return elsewhere.issuperset(_problems_beside_bus(closed))
 
-    return ways_out(setup, lambda changed: _fits(changed, known), sound)
+    return suggested_changes(setup, lambda changed: _fits(changed, known), sound)
 
 
 def _images(setup: Setup) -> tuple[object, ...]:
@@ -181,8 +178,8 @@ class _BusPlan:
     untaken: list[tuple[str, list[tuple[str, Setup]]]]
 
     @property
-    def misfit(self) -> tuple[int, float]:
-        """Distance from fitting: number of problems, then the largest load of a bus, or of a trigger's time."""
+    def rank(self) -> tuple[int, float]:
+        """Sort key of a candidate: number of problems, then the largest share of bus or trigger time used."""
         shares = [bus.traffic.load for bus in self.buses]
         shares += [demand.used_ns / demand.available_ns for bus in self.buses for demand in bus.traffic.demands]
         return len(self.problems), max(shares)
@@ -193,7 +190,7 @@ def device_problems(setup: Setup) -> list[str]:
     return _devices(setup)[1]
 
 
-def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str]) -> _BusPlan:
+def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: list[str]) -> _BusPlan:
     """The first candidate that fits; else the nearest to fitting, whose problems are added."""
     found: list[_BusPlan] = []
     for candidate, choices in candidates(setup):
@@ -203,7 +200,7 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
         found.append(bus)
     wanted = setup.arm is None or setup.arm.torque
     found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque == wanted]
-    nearest = min(found, key=lambda bus: bus.misfit)
+    nearest = min(found, key=lambda bus: bus.rank)
     if len(found) > 1:
         chosen = ", ".join(f"{choice.key} = {choice.written}" for choice in nearest.choices)
         problems.append(f"none of {len(found)} ways to fill what is left open fits; the nearest: {chosen}")
@@ -211,7 +208,7 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
     return nearest
 
 
-def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
+def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
     sync, exact = plan_sync(setup)
     drives = [devices[node_id] for node_id in setup.arm.node_ids] if setup.arm is not None else []
     unset, periods = period_problem(setup.rate_hz, sync.period_us, exact, drives)
@@ -257,7 +254,7 @@ def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Cho
 _OFFERED_RATES, _TRIED_RATES = 2, 12
 
 
-def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, Abilities]) -> str:
+def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, DeviceCapabilities]) -> str:
     """A problem of a bus; one with a rate is followed by the first rates to take in its place that fit."""
     changes = dict(bus.untaken).get(problem)
     if not changes:
@@ -275,13 +272,13 @@ def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, Abilities]) -
     return f"{problem}; take {' or '.join(offered)}{unit}{none_fits}"
 
 
-def _counts_syncs(device: Abilities) -> bool:
+def _counts_syncs(device: DeviceCapabilities) -> bool:
     """Whether a device can take a SYNC with our counter."""
     entry = device.description.entry(SYNC_COUNTER)
     return entry is not None and (entry.initial == SYNC_OVERFLOW or (entry.writable and entry.allows(SYNC_OVERFLOW)))
 
 
-def _unused_axes(setup: Setup, devices: Mapping[int, Abilities]) -> list[tuple[str, str]]:
+def _unused_axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> list[tuple[str, str]]:
     """The axes of drives of several axes that the cell does not drive, as (what, why)."""
     unused = []
     for kind, role, node in _roles(setup):
@@ -329,16 +326,16 @@ def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
     return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]
 
 
-def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
-    """Abilities of each node by its EDS, and what it lacks, once for a file that several nodes share."""
+def _devices(setup: Setup) -> tuple[dict[int, DeviceCapabilities], list[str]]:
+    """Capabilities of each node by its EDS, and what it lacks, once for a file that several nodes share."""
     seen: set[tuple[NodeKind, str]] = set()
-    devices: dict[int, Abilities] = {}
+    devices: dict[int, DeviceCapabilities] = {}
     problems: list[str] = []
     for kind, _, node in _roles(setup):
         first = (kind, node.eds) not in seen
         seen.add((kind, node.eds))
         try:
-            device = devices[node.node_id] = Abilities.of(node.eds, node.node_id)
+            device = devices[node.node_id] = DeviceCapabilities.of(node.eds, node.node_id)
         except EdsError as error:
             problems += [f"{'arm' if kind == 'drive' else 'sensor'}.eds: {error}"] if first else []
             continue
@@ -349,7 +346,7 @@ def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
 
 
 def _nodes(
-    setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
+    setup: Setup, devices: Mapping[int, DeviceCapabilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
 ) -> tuple[PlannedNode, ...]:
     nodes = [
         PlannedNode(
@@ -370,7 +367,9 @@ def _nodes(
     return tuple(sorted(nodes, key=lambda node: node.node_id))
 
 
-def _switched_off(node_id: int, device: Abilities, pdos: tuple[PlannedPdo, ...]) -> tuple[tuple[Direction, int], ...]:
+def _switched_off(
+    node_id: int, device: DeviceCapabilities, pdos: tuple[PlannedPdo, ...]
+) -> tuple[tuple[Direction, int], ...]:
     """PDOs that the device has, that the scene does not need and that can be switched off."""
     used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node_id}
     directions: tuple[Direction, ...] = ("rpdo", "tpdo")

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from canprobe.cell.scene.load import SAVED_AS, dump_scene, toml_value, written_by_line
+from canprobe.cell.scene.load import SAVED_AS, dump_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
+from canprobe.cell.scene.toml_files import toml_value, written_by_line
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 
@@ -26,6 +27,7 @@ EVERY_SYNC = 1
 
 NodeKind = Literal["drive", "tactile"]
 Direction = Literal["tpdo", "rpdo"]
+RawKind = Literal["image", "start", "stop", "poll"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +174,7 @@ class PlannedFrames:
 
     can_id: int
     channel: str
-    what: Literal["image", "start", "stop", "poll"]
+    what: RawKind
     sent: bool
     count: int
     length: int

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, sync_patience
 from canprobe.fieldbus.protocol.cia402 import OperationMode
@@ -42,7 +42,7 @@ FINEST, COARSEST = -6, 0
 MAX_TIME_UNITS = 0xFFFF
 
 
-def choose_mode(device: Abilities) -> OperationMode | None:
+def choose_mode(device: DeviceCapabilities) -> OperationMode | None:
     """The best mode in which the cell can command a device; None where there is none.
 
     Where 6502h does not list the modes, the objects decide; bring-up confirms the mode in 6061h.
@@ -54,7 +54,7 @@ def choose_mode(device: Abilities) -> OperationMode | None:
     return None
 
 
-def operation_problems(device: Abilities) -> list[str]:
+def operation_problems(device: DeviceCapabilities) -> list[str]:
     """Why a device cannot be driven in the cycle, whatever the rate."""
     problems = []
     if choose_mode(device) is None:
@@ -65,17 +65,17 @@ def operation_problems(device: Abilities) -> list[str]:
     return problems
 
 
-def follows_sync_period(device: Abilities) -> bool:
+def follows_sync_period(device: DeviceCapabilities) -> bool:
     """Whether a drive knows the period of its targets only by 1006h."""
     return not device.has(INTERPOLATION_TIME, 1) and device.has(SYNC_PERIOD)
 
 
-def early_stops(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
+def early_stops(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> Iterator[str]:
     """Warnings for drives that by their EDS stop after fewer missed SYNCs than the scene says."""
-    arm = setup.arm
+    if (arm := setup.arm) is None:
+        return
     early: dict[tuple[str, int, int], list[int]] = {}
-    for node_id in arm.node_ids if arm is not None else ():
-        assert arm is not None
+    for node_id in arm.node_ids:
         device, index = devices[node_id], sync_patience(devices[node_id].od)
         entry = device.description.entry(index) if index is not None else None
         if (
@@ -87,7 +87,6 @@ def early_stops(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]
         if 0 < (held := device.number(index) or 0) < arm.missed_syncs:
             early.setdefault((device.eds, index, held), []).append(node_id)
     for (eds, index, held), node_ids in early.items():
-        assert arm is not None
         nodes, syncs = ", ".join(map(str, node_ids)), f"{held} missed SYNC{'s' * (held > 1)}"
         yield (
             f"arm.missed_syncs = {arm.missed_syncs}: by {index:04X}h of {eds} nodes {nodes} stop by themselves after"
@@ -96,7 +95,7 @@ def early_stops(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]
         )
 
 
-def homing_problems(device: Abilities) -> list[str]:
+def homing_problems(device: DeviceCapabilities) -> list[str]:
     """Why a device cannot be homed, whatever the method."""
     listed = device.description.modes
     if listed is None or OperationMode.HOMING in listed:
@@ -105,7 +104,7 @@ def homing_problems(device: Abilities) -> list[str]:
     return [f"{device.eds}: its modes (6502h) are {names}; needed: {_mode_text(OperationMode.HOMING)}"]
 
 
-def _modes_offered(device: Abilities) -> str:
+def _modes_offered(device: DeviceCapabilities) -> str:
     listed = device.description.modes
     lacking = [f"{index:04X}h:{sub:02X}" for mode, (index, sub) in TARGETS.items() if listed is None or mode in listed]
     if lacking:

@@ -8,10 +8,10 @@ cannot be switched off is planned as traffic.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from canprobe.cell.planning.abilities import COMMUNICATION, INVALID, Abilities
+from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
 from canprobe.cell.planning.operation import TARGETS, Place, choose_mode
 from canprobe.cell.planning.traffic import SYNCHRONOUS
@@ -72,7 +72,7 @@ class PdoPlanning:
 
     setup: Setup
     sync: SyncPlan
-    devices: Mapping[int, Abilities]
+    devices: Mapping[int, DeviceCapabilities]
     channels: Mapping[int, str]
     pdos: list[PlannedPdo] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -80,15 +80,18 @@ class PdoPlanning:
 
     def entries(self, node_id: int, direction: Direction, *objects: tuple[int, int]) -> list[PdoEntry]:
         """The objects as entries; what the device cannot map becomes a problem."""
-        device, found = self.devices[node_id], []
-        for index, subindex in objects:
-            entry = device.entry(index, subindex, direction)
-            if entry is None:
-                why = f"is not mappable to a {direction.upper()}" if device.has(index, subindex) else "is missing"
-                self.problems.append(f"node {node_id}: {device.eds}: object {index:04X}h:{subindex:02X} {why}")
-            else:
-                found.append(entry)
-        return found
+        device = self.devices[node_id]
+        found = {place: device.entry(*place, direction) for place in objects}
+        for index, subindex in (place for place, entry in found.items() if entry is None):
+            why = f"is not mappable to a {direction.upper()}" if device.has(index, subindex) else "is missing"
+            self.problems.append(f"node {node_id}: {device.eds}: object {index:04X}h:{subindex:02X} {why}")
+        return [entry for entry in found.values() if entry is not None]
+
+    def unmapped(self, node_id: int, why: str, places: Iterable[Place]) -> None:
+        """A problem of a node whose PDOs do not carry some objects."""
+        wanted = ", ".join(f"{index:04X}h:{subindex:02X}" for index, subindex in places)
+        end = f"needed: {wanted}; use a device or an EDS that can map it"
+        self.problems.append(f"node {node_id}: {self.devices[node_id].eds} {why}; {end}")
 
     def add(
         self,
@@ -132,8 +135,7 @@ class PdoPlanning:
         """
         device = self.devices[node_id]
         numbers = [number for number in device.pdo_numbers(direction) if device.can_cycle(direction, number)]
-        entries = [device.entry(index, subindex, direction) for index, subindex in needed]
-        mapped = tuple(entry for entry in entries if entry is not None)
+        mapped = tuple(entry for place in needed if (entry := device.entry(*place, direction)) is not None)
         alone: list[tuple[bool, ChosenPdo]] = []
         fixed: list[ChosenPdo] = []
         for number in numbers:
@@ -152,17 +154,9 @@ class PdoPlanning:
         several = {place: next((one for one in fixed if place in _places(one)), None) for place in needed}
         if None not in several.values():
             return sorted({one.number: one for one in several.values() if one}.values(), key=lambda one: one.number)
-        missing = [place for place, entry in zip(needed, entries, strict=True) if entry is None]
-        for index, subindex in missing:
-            why = f"is not mappable to a {direction.upper()}" if device.has(index, subindex) else "is missing"
-            self.problems.append(f"node {node_id}: {device.eds}: object {index:04X}h:{subindex:02X} {why}")
-        if not missing:
-            wanted = ", ".join(f"{index:04X}h:{subindex:02X}" for index, subindex in needed)
+        if len(self.entries(node_id, direction, *needed)) == len(needed):
             offered = "; ".join(_offered(device, direction, n, len(needed)) for n in device.pdo_numbers(direction))
-            self.problems.append(
-                f"node {node_id}: {device.eds} {offered or f'has no {direction.upper()}'}; needed: {wanted};"
-                " use a device or an EDS that can map it"
-            )
+            self.unmapped(node_id, offered or f"has no {direction.upper()}", needed)
         return []
 
     def cob_id(self, node_id: int, direction: Direction, number: int, wanted: int) -> int:
@@ -174,7 +168,7 @@ class PdoPlanning:
         return (device.number(COMMUNICATION[direction] + number - 1, 1) or wanted) & 0x7FF
 
 
-def _exists(device: Abilities, entry: PdoEntry) -> bool:
+def _exists(device: DeviceCapabilities, entry: PdoEntry) -> bool:
     """Whether the object of a mapping is in the EDS, or is a dummy."""
     return entry.is_dummy or device.has(entry.index, entry.subindex)
 
@@ -183,7 +177,7 @@ def _places(chosen: ChosenPdo) -> set[Place]:
     return {(entry.index, entry.subindex) for entry in chosen.entries}
 
 
-def _offered(device: Abilities, direction: Direction, number: int, count: int) -> str:
+def _offered(device: DeviceCapabilities, direction: Direction, number: int, count: int) -> str:
     """Why a PDO does not carry the needed objects."""
     name = f"{direction.upper()}{number}"
     if not device.can_cycle(direction, number):
@@ -263,7 +257,7 @@ def _plan_commands(planning: PdoPlanning, node_id: int) -> None:
         planning.add(node_id, "rpdo", one.number, layout, constants=tuple(constants))
 
 
-def _ungrouped(device: Abilities) -> str | None:
+def _ungrouped(device: DeviceCapabilities) -> str | None:
     """Why a drive cannot share a target RPDO with another; None where it can."""
     if device.dummy(DUMMY_INTEGER32, 32) is None:
         return f"DummyUsage excludes {DUMMY_INTEGER32:04X}h"
@@ -370,7 +364,7 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
             planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
 
 
-def _lacking_words(device: Abilities, array: Array) -> str | None:
+def _lacking_words(device: DeviceCapabilities, array: Array) -> str | None:
     """Problem where the EDS has too few objects for the taxels of the array file; else None."""
     words, needed = device.number(IMAGE_TAXELS), image_words(array.pad.taxels)
     if words is None or words >= needed:  # one without the object cannot send images, which is said of each of them
@@ -403,10 +397,7 @@ def _maps(planning: PdoPlanning, node_id: int, number: int, entries: Sequence[Pd
         return True
     else:
         problem = _offered(device, "tpdo", number, len(words))
-    wanted = ", ".join(f"{entry.index:04X}h:{entry.subindex:02X}" for entry in entries)
-    planning.problems.append(
-        f"node {node_id}: {device.eds} {problem}; needed: {wanted}; use a device or an EDS that can map it"
-    )
+    planning.unmapped(node_id, problem, ((entry.index, entry.subindex) for entry in entries))
     return False
 
 

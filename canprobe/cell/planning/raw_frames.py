@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from canprobe.cell.planning.array import What
-from canprobe.cell.planning.model import MASTER_NODE_ID, PlannedFrames, PlannedPdo
+from canprobe.cell.planning.model import MASTER_NODE_ID, PlannedFrames, PlannedPdo, RawKind
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.protocol.frames import (
@@ -26,13 +25,13 @@ def plan_raw_frames(setup: Setup) -> tuple[PlannedFrames, ...]:
         return ()
     raw, channel = array.raw, array.channel
 
-    def planned(what: What, can_id: int, lengths: list[int], rate_hz: float, *, sent: bool) -> PlannedFrames:
+    def planned(what: RawKind, can_id: int, lengths: list[int], rate_hz: float, *, sent: bool) -> PlannedFrames:
         bits = sum(frame_bits(length, setup.bus) for length in lengths)
         return PlannedFrames(can_id, channel, what, sent, len(lengths), max(lengths), rate_hz, bits)
 
     lengths = [frame.length for frame in raw.image.frames]
     found = [planned("image", can_id, lengths, array.rate_hz, sent=False) for can_id in raw.image.ids]
-    commands: tuple[tuple[What, tuple[Frame, ...], float], ...] = (
+    commands: tuple[tuple[RawKind, tuple[Frame, ...], float], ...] = (
         ("start", raw.start, 0.0),
         ("stop", raw.stop, 0.0),
         ("poll", raw.poll, array.rate_hz),

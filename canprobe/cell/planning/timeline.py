@@ -12,11 +12,7 @@ from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from typing import Literal
 
-from canprobe.cell.planning.model import (
-    Plan,
-    PlannedBus,
-    PlannedPdo,
-)
+from canprobe.cell.planning.model import Plan, PlannedBus, PlannedPdo
 from canprobe.cell.planning.traffic import SYNC_BITS, SYNCHRONOUS, on_the_wire, wire_ns
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 

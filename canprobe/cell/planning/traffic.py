@@ -29,10 +29,7 @@ from canprobe.cell.planning.model import (
 )
 from canprobe.cell.scene.hardware import BusSettings
 from canprobe.fieldbus.protocol.fifo_response_times import worst_case_response_fifo
-from canprobe.fieldbus.protocol.frame_bits import (
-    best_case_bits,
-    worst_case_bits,
-)
+from canprobe.fieldbus.protocol.frame_bits import best_case_bits, worst_case_bits
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.response_times import BusAnalysis, Message, Response, worst_case_response
 

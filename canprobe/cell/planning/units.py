@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
 from canprobe.fieldbus.protocol.si_unit import VELOCITY_UNIT_INDEX, rate_unit
 from canprobe.mechanics.robot.model import ArmModel
@@ -72,7 +72,7 @@ class TurnUnits:
         )
 
 
-def turn_units(device: Abilities, units: float | None, gear: float) -> TurnUnits | None:
+def turn_units(device: DeviceCapabilities, units: float | None, gear: float) -> TurnUnits | None:
     """The units to compare with a device; None where the device states none, or the cell counts no turns.
 
     Args:
@@ -88,7 +88,7 @@ def turn_units(device: Abilities, units: float | None, gear: float) -> TurnUnits
     return TurnUnits(units, gear, FEED, GEAR_RATIO if whole[GEAR_RATIO] else None)
 
 
-def speed_unit(device: Abilities, drive: Drive, index: int) -> float | None:
+def speed_unit(device: DeviceCapabilities, drive: Drive, index: int) -> float | None:
     """Position units/s in one velocity unit (60A9h) of a device, or /s² in one acceleration unit (60AAh).
 
     None where its EDS names a unit that the cell's data cannot express.
@@ -97,7 +97,7 @@ def speed_unit(device: Abilities, drive: Drive, index: int) -> float | None:
     return rate_unit(device.number(index) or 0, turn=turn and turn * ratio, metre=drive.metre_units)
 
 
-def _motor_turn(device: Abilities, drive: Drive) -> tuple[float | None, float]:
+def _motor_turn(device: DeviceCapabilities, drive: Drive) -> tuple[float | None, float]:
     """Position units of a motor turn, None where neither states them; and motor turns per turn of the shaft."""
     feed = _quotient(device, FEED)
     ratio = (_quotient(device, GEAR_RATIO) or 1.0) if feed else 1.0
@@ -107,7 +107,7 @@ def _motor_turn(device: Abilities, drive: Drive) -> tuple[float | None, float]:
     return (feed / ratio if feed and lines else lines), ratio
 
 
-def _quotient(device: Abilities, index: int) -> float | None:
+def _quotient(device: DeviceCapabilities, index: int) -> float | None:
     """Quotient of :01 and :02 by the EDS; None where the device has none."""
     over, under = device.number(index, 1), device.number(index, 2)
     return over / (under or 1) if over else None
@@ -149,13 +149,13 @@ class _SpeedLimit:
         return self.most - self.rounding
 
 
-def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
+def speed_problems(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> Iterator[str]:
     """Problems of drives whose limit of speed is no more than the rounding of targets takes from cycle to cycle."""
-    arm = setup.arm
-    for axis, joint in enumerate(arm.model.joints) if arm is not None else ():
+    if (arm := setup.arm) is None:
+        return
+    for axis, joint in enumerate(arm.model.joints):
         lowest = _lowest_limit(setup, axis, devices, math.inf)
         if lowest.left <= 0.0:
-            assert arm is not None
             yield (
                 f"joints.{joint.name}: drive {arm.drives[axis].node_id} allows {lowest.most:.4g} units/s by its"
                 f" {lowest.index:04X}h, and whole targets differ by as much as {lowest.rounding:.4g} units/s at"
@@ -183,7 +183,7 @@ def software_limits(model: ArmModel) -> tuple[Floats, Floats]:
     return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)
 
 
-def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:
     """The setup with joints kept within positions and speeds of their drives, and warnings where that is less."""
     if setup.arm is None:
         return setup, ()
@@ -193,7 +193,7 @@ def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup
     return setup, (*ranges, *speeds)
 
 
-def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:
     """Keep joints within 607Fh, 6080h and 6065h of their drives, beyond which a drive faults."""
     model, share = arm.model, setup.limits.speed_share
     slowest, objects = np.ones(model.n), set()
@@ -222,7 +222,7 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> 
     return setup.changed("arm", model=replace(model, joints=tuple(limits))), (warning,)
 
 
-def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, Abilities], wanted: float) -> _SpeedLimit:
+def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, DeviceCapabilities], wanted: float) -> _SpeedLimit:
     """The lowest limit in the drive of an axis, where a speed of `wanted` position units/s is needed."""
     arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
     assert arm is not None
@@ -250,7 +250,7 @@ def following_window(model: ArmModel, axis: int) -> int:
     return round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * math.radians(FOLLOWING_WINDOW_DEG))
 
 
-def _fixed_window(device: Abilities, wanted: int) -> int | None:
+def _fixed_window(device: DeviceCapabilities, wanted: int) -> int | None:
     """Value of 6065h, units, where it cannot be the wanted one; None where it can, or the drive watches no error."""
     entry = device.description.entry(FOLLOWING_WINDOW)
     if entry is None or (entry.writable and entry.allows(wanted)):
@@ -266,7 +266,7 @@ def lag_s(setup: Setup) -> float:
     return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
 
 
-def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:
     """Keep joints within 607Dh of their drives, beyond which a drive faults.
 
     A drive that moves with several joints is left out.
@@ -291,7 +291,7 @@ def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> 
     return setup.changed("arm", model=replace(arm.model, joints=tuple(joints))), (warning,)
 
 
-def _guarded(device: Abilities, low: float, high: float) -> tuple[float, float]:
+def _guarded(device: DeviceCapabilities, low: float, high: float) -> tuple[float, float]:
     """The part of a range of positions that a drive's 607Dh can allow."""
     lowest, highest = (device.description.entry(POSITION_LIMITS, subindex) for subindex in (1, 2))
     if lowest is None or highest is None:

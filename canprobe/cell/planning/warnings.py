@@ -5,20 +5,19 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterator, Sequence
 
-from canprobe.cell.planning.left_out import held_rows, long_waits
 from canprobe.cell.planning.model import PlannedPdo
-from canprobe.cell.planning.window import (
-    TOLERATED_LOSS_SHARE,
-    cut_patch,
-)
-from canprobe.cell.scene.setup import Array, Setup
+from canprobe.cell.planning.window import TOLERATED_LOSS_SHARE, cut_patch
+from canprobe.cell.scene.setup import Arm, Array, Setup
 from canprobe.cell.scene.surface_files import mesh_warnings
 from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
-from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
+from canprobe.mechanics.robot.inverse import FIXED_POLE, FULL_POSE, rolls_last, task_rows
 from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.image.force_errors import UNSTATED
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
+
+MISSED_SYNCS_REAL = 10
+"""SYNC periods for which real drives and their master may wait for each other without a warning."""
 
 
 def _open_to_others(setup: Setup) -> Iterator[str]:
@@ -78,7 +77,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     if isinstance(setup.truth.object, MeshHeights):
         yield from mesh_warnings(setup.truth.object.fit)
     if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
-        yield from long_waits(setup.arm.missed_syncs, setup.rate_hz)
+        yield from _long_waits(setup.arm.missed_syncs, setup.rate_hz)
     if setup.array is not None and setup.array.newtons == NO_FORCE_REFERENCE:
         yield (
             "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
@@ -92,7 +91,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
     if setup.arm is not None and setup.touch is not None and task_rows(setup.arm.model) < FULL_POSE:
-        yield held_rows(setup.arm)
+        yield _held_rows(setup.arm)
     if bus.bit_error_rate > 0 and pdos:
         longest = max(pdo.bits_worst for pdo in pdos)
         lost = 1.0 - (1.0 - bus.bit_error_rate) ** longest
@@ -101,3 +100,27 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
             f"bus.bit_error_rate = {bus.bit_error_rate:g}: response times hold for a wire without errors; each error "
             f"adds up to {each_us:.0f} µs, and up to {100 * lost:.2g} % of the frames have one"
         )
+
+
+def _long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
+    """Warning for real drives that wait long for a SYNC."""
+    if missed_syncs <= MISSED_SYNCS_REAL:
+        return
+    waited_ms = 1e3 * missed_syncs / rate_hz
+    yield (
+        f"arm.missed_syncs = {missed_syncs}: real drives stay enabled for {waited_ms:g} ms after the last SYNC of"
+        " a master that stalls or dies, and a drive that falls silent is waited for as long: an object that moves is"
+        f" pressed without supervision until then; leave it at {MISSED_SYNCS_REAL} or below, more is for emulated nodes"
+    )
+
+
+def _held_rows(arm: Arm) -> str:
+    name = f"the {arm.model.name} arm of {arm.model.n} joints"
+    if task_rows(arm.model) == FIXED_POLE:
+        rolls = arm.model.n > FIXED_POLE and rolls_last(arm.model)
+        last = f"; joint {arm.model.n} only turns the probe about its pole, and stays where it starts"
+        return (
+            f"{name} holds the place of the probe, not its tilt: task.rolling_share is 1, and the contact wanders "
+            f"on the array{last * rolls}"
+        )
+    return f"{name} holds position and pole of the probe and leaves the turn about the pole free"

@@ -22,6 +22,7 @@ import numpy as np
 
 from canprobe.cell.scene.setup import Array, Probe, Setup
 from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
+from canprobe.mechanics.touch.stops import depth_on_plane
 
 FOLLOWING_TAXELS = 0.75
 """Distance of the contact's centroid from the middle of the window at which the window moves."""
@@ -37,8 +38,7 @@ _HALVINGS = 40
 
 def patch_radius_m(force_n: float, probe: Probe) -> float:
     """Radius of the contact patch on a plane, m."""
-    depth = math.sqrt(force_n / (math.pi * probe.stiffness * probe.radius))
-    return math.sqrt(2.0 * probe.radius * depth)
+    return math.sqrt(2.0 * probe.radius * depth_on_plane(force_n, probe.stiffness, probe.radius))
 
 
 def patch_across_taxels(force_n: float, probe: Probe, pitch_m: float) -> float:

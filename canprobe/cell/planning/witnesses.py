@@ -39,7 +39,9 @@ def witness_rows(plan: Plan) -> list[tuple[str, str]]:
     if touch is None:
         return []
     within = "0.4 s, on the move only" if touch.array.calibration.noise.assumed else "0.2 s"
-    margin = _depth(probe, limits.force_max) - _depth(probe, touch.force)
+    margin = depth_on_plane(limits.force_max, probe.stiffness, probe.radius) - depth_on_plane(
+        touch.force, probe.stiffness, probe.radius
+    )
     speed = touch.scan.speed if isinstance(touch, Touch) and touch.scan is not None else 0.0
     error = CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * speed)
     known = f"{touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm"
@@ -72,14 +74,9 @@ def _torques(plan: Plan, touch: Touch | Calibrate) -> str:
     return "a push that the array does not measure, beyond 4σ of what friction may hide"
 
 
-def _depth(probe: Probe, force: float) -> float:
-    """Depth at a force, N, on a plane at the stated stiffness, m."""
-    return depth_on_plane(force, probe.stiffness, probe.radius)
-
-
 def _force(probe: Probe, depth: float) -> float:
     """Force at a depth, m, on a plane at the stated stiffness, N."""
-    return (depth / _depth(probe, 1.0)) ** 2
+    return (depth / depth_on_plane(1.0, probe.stiffness, probe.radius)) ** 2
 
 
 def _fastest(margin: float) -> float:

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from canprobe.cell.emulated.truth_columns import with_present_names
 from canprobe.cell.npz import read_npz
 from canprobe.cell.rows import ROWS_FOLDER, read_left_rows
-from canprobe.cell.scene.load import SAVED_AS, load_scene, written_by_other
+from canprobe.cell.scene.load import SAVED_AS, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
+from canprobe.cell.scene.toml_files import written_by_other
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import SceneError, UsageError, check_schema, regular_file
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball
-from canprobe.cell.scene.load import Reader, read_toml, with_writer, written_by_line
 from canprobe.cell.scene.model import PlantSettings, ProbeSettings, Scene
+from canprobe.cell.scene.reader import Reader
+from canprobe.cell.scene.toml_files import read_toml, with_writer, written_by_line
 from canprobe.errors import SceneError
 from canprobe.mechanics.robot.tool_calibration import ToolEstimate
 from canprobe.mechanics.types import Floats

@@ -10,8 +10,9 @@ whole for its task).
   below. `checks` has the checks, `rules` what goes together across keys, and which sections a task needs.
 - `hardware` has sections of a cell file: bus, bring-up, chain, joints and drives, emulated difficulties. A scene
   names a cell and takes from it what it does not say itself; a scene with a section `[cell]` is whole.
-- `load` reads a file and reports every mistake at once; `dump_scene` writes a scene back. Scenes cross processes as
-  text.
+- `load` reads a scene with the files that it names, and writes one back: scenes cross processes as text. `reader`
+  checks section by section and reports every mistake at once; `toml_files` has the text of TOML; `units` says what the
+  end of a key means, on the page of keys, in hints and in SI.
 - `resolve` is the only place where millimetres, degrees and kilopascals become SI and defaults become values. `setup`
   is its result; `arms` makes chain, joints and drive units. Planning, cell, tasks and emulator read a `Setup` and
   never a `Scene`.

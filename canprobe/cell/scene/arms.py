@@ -15,6 +15,7 @@ import numpy as np
 from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.hardware import MM, ArmSettings, JointSettings
 from canprobe.cell.scene.setup import HomingParameters
+from canprobe.cell.scene.units import in_si
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
 from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
@@ -25,25 +26,18 @@ Bodies = tuple[Body | None, ...] | None
 MIN_SPEED_RAD_S, MIN_SPEED_M_S = math.radians(0.01), 1e-5
 """Speed limits below which a joint of a URDF practically stands: a degree takes it longer than a minute and a half."""
 
-_OF_REVOLUTE = {
-    "q_min": ("min_deg", math.radians(1)),
-    "q_max": ("max_deg", math.radians(1)),
-    "qd_max": ("speed_deg_s", math.radians(1)),
-    "rated_torque": ("rated_torque_nm", 1.0),
-    "rotor_inertia": ("rotor_inertia_kg_m2", 1.0),
-    "coulomb": ("coulomb_nm", 1.0),
-    "viscous": ("viscous_nm_s", 1.0),
+_FIELDS = {
+    "min": "q_min",
+    "max": "q_max",
+    "speed": "qd_max",
+    "rated_torque": "rated_torque",
+    "rated_force": "rated_torque",
+    "rotor_inertia": "rotor_inertia",
+    "rotor_mass": "rotor_inertia",
+    "coulomb": "coulomb",
+    "viscous": "viscous",
 }
-_OF_PRISMATIC = {
-    "q_min": ("min_mm", MM),
-    "q_max": ("max_mm", MM),
-    "qd_max": ("speed_mm_s", MM),
-    "rated_torque": ("rated_force_n", 1.0),
-    "rotor_inertia": ("rotor_mass_kg", 1.0),
-    "coulomb": ("coulomb_n", 1.0),
-    "viscous": ("viscous_n_s_m", 1.0),
-}
-"""Field of a `Joint` → key of a section, and its unit in SI."""
+"""Field of a `Joint` by the key of a section without its unit."""
 _PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 20.0, "viscous": 20.0}
 
 
@@ -73,13 +67,11 @@ def arm_model(
         settled = {
             limit_warning(arm.urdf, joint)
             for joint, section in zip(found.joints, sections.values(), strict=True)
-            if any(stop is not None for stop in _stops(joint, section))
+            if {"min", "max"} & set(in_si(section))
         }
         warnings = tuple(warning for warning in found.warnings if warning not in settled)
     else:
-        rows = [
-            (s.a_mm * MM, math.radians(s.alpha_deg), s.d_mm * MM, math.radians(s.theta_deg)) for s in sections.values()
-        ]
+        rows = [tuple(s[name] for name in ("a", "alpha", "d", "theta")) for s in map(in_si, sections.values())]
         slides = [section.kind == "prismatic" for section in sections.values()]
         chain = from_dh(
             rows,
@@ -121,20 +113,16 @@ def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str
         " of a delta, has no drive, and its arm is no serial one"
         for joint, section in zip(joints, sections.values(), strict=True)
         for slowest, unit in [(MIN_SPEED_M_S, "m") if joint.prismatic else (MIN_SPEED_RAD_S, "rad")]
-        if (section.speed_mm_s if joint.prismatic else section.speed_deg_s) is None and not joint.qd_max >= slowest
+        if "speed" not in in_si(section) and not joint.qd_max >= slowest
     ]
     problems += [
         f"{urdf}: joint {joint.name}: expected lower below upper in its <limit>, got {joint.q_min:g} and "
         f"{joint.q_max:g}; put it right there, or set joints.{joint.name}.min_{joint.unit} and max_{joint.unit}"
         for joint, section in zip(joints, sections.values(), strict=True)
-        if not joint.q_min < joint.q_max and None in _stops(joint, section)
+        if not joint.q_min < joint.q_max and not {"min", "max"} <= set(in_si(section))
     ]
     if problems:
         raise PlanError(problems)
-
-
-def _stops(joint: Joint, section: JointSettings) -> tuple[float | None, float | None]:
-    return (section.min_mm, section.max_mm) if joint.prismatic else (section.min_deg, section.max_deg)
 
 
 def _bare(name: str, section: JointSettings) -> Joint:
@@ -143,9 +131,7 @@ def _bare(name: str, section: JointSettings) -> Joint:
 
 
 def _joint(section: JointSettings, joint: Joint) -> Joint:
-    keys = _OF_PRISMATIC if joint.prismatic else _OF_REVOLUTE
-    given = {field: (getattr(section, key), unit) for field, (key, unit) in keys.items()}
-    return replace(joint, **{field: value * unit for field, (value, unit) in given.items() if value is not None})
+    return replace(joint, **{_FIELDS[name]: value for name, value in in_si(section).items() if name in _FIELDS})
 
 
 def _units_per_q(sections: Mapping[str, JointSettings]) -> Floats:
@@ -188,34 +174,26 @@ def _body(section: JointSettings, row: tuple[float, float, float, float], arm: A
 
 def joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
     """(n,) compliance of the joints, rad/(N m) or m/N; None where all are rigid."""
-    stiffness = [s.stiffness_n_m if s.kind == "prismatic" else s.stiffness_nm_rad for s in sections.values()]
+    stiffness = [in_si(section).get("stiffness") for section in sections.values()]
     return np.array([0.0 if k is None else 1.0 / k for k in stiffness]) if any(stiffness) else None
 
 
 def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Floats:
     """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
-    return np.array(
-        [
-            getattr(s, f"{key}_mm") * MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
-            for s in sections.values()
-        ]
-    )
+    return np.array([in_si(section)[key] for section in sections.values()])
 
 
 def homing_of(section: JointSettings, number: int) -> HomingParameters | None:
     """Parameters of homing of a joint, by its number from 1; None where its encoder is absolute."""
     if section.zero == "absolute":
         return None
-    slides = section.kind == "prismatic"
-    assert section.homing_method is not None
+    its = in_si(section)
     return HomingParameters(
-        section.homing_method,
+        its["homing_method"],
         section.homing_order or number,
-        home=(section.home_mm or 0.0) * MM if slides else math.radians(section.home_deg or 0.0),
-        speed=section.homing_speed_mm_s * MM if slides else math.radians(section.homing_speed_deg_s),
-        zero_speed=section.homing_zero_speed_mm_s * MM if slides else math.radians(section.homing_zero_speed_deg_s),
-        acceleration=section.homing_acceleration_mm_s2 * MM
-        if slides
-        else math.radians(section.homing_acceleration_deg_s2),
+        home=its.get("home", 0.0),
+        speed=its["homing_speed"],
+        zero_speed=its["homing_zero_speed"],
+        acceleration=its["homing_acceleration"],
         timeout_s=section.homing_timeout_s,
     )

@@ -13,14 +13,10 @@ from pathlib import Path
 from typing import Annotated
 
 from canprobe.cell.scene.checks import OneOf, Range
-from canprobe.cell.scene.load import (
-    Reader,
-    find_file,
-    read_toml,
-    toml_value,
-    with_writer,
-    written_by_line,
-)
+from canprobe.cell.scene.load import find_file
+from canprobe.cell.scene.reader import Reader
+from canprobe.cell.scene.toml_files import read_toml, toml_value, with_writer, written_by_line
+from canprobe.cell.scene.units import in_si, in_units
 from canprobe.mechanics.touch import ArrayCalibration
 from canprobe.mechanics.touch.image.calibration import (
     CentroidDelays,
@@ -38,8 +34,10 @@ SCHEMA = 1
 Share = Annotated[float, Range(0, 1)]
 Percent = Annotated[float, Range(0, 1000)]
 Stiffness = Annotated[float, Range(1e5, 1e12)]
-ASSUMED_NOISE = (25.0, 0.8, 12.0)
-"""`slow_um`, `correlation_mm` and `height_um` of a file that does not state them."""
+ASSUMED_NOISE = (25e-6, 0.8e-3, 12e-6)
+"""`slow`, `slow_way` and `height` of `ContactNoise`, m, where an earlier form of the file does not state them."""
+MAX_LATENCY_SIGMA_S = 1e3
+"""Largest standard deviation of the latency that a file states, s: a calibration may know nothing of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,141 +214,76 @@ def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
 
 def _calibration(file: CalibrationFile) -> ArrayCalibration:
     """The calibration of a file in SI units."""
-    about, image, moments, centroid = file.calibration, file.image, file.moments, file.centroid
-    variance = (1e-2 * moments.sigma_percent) ** 2
-    k = image.stiffness_n_m3
+    about, image, residuals = in_si(file.calibration), in_si(file.image), in_si(file.residuals)
+    moments, centroid, stiffness = in_si(file.moments), in_si(file.centroid), in_si(file.stiffness)
+    variance, k = moments["sigma"] ** 2, image["stiffness"]
+    assumed = not {"slow", "height"} <= set(centroid)
+    slow_way_height: tuple[float, float, float] = (
+        ASSUMED_NOISE if assumed else (centroid["slow"], centroid["correlation"], centroid["height"])
+    )
+    del about["schema"]
     return ArrayCalibration(
-        array=about.array,
-        date=about.date,
-        made_on=about.made_on,
-        force_reference=about.force_reference,
-        force_sigma=_share(about.force_sigma_percent),
-        full_scale=1e3 * about.full_scale_kpa,
-        image=ImageParameters(k, image.scale, 1e-3 * image.blur_mm, image.crosstalk, image.memory),
-        moments=MomentErrors(
-            variance, moments.both * variance, (1e-2 * moments.shear_percent) ** 2, 1e-2 * moments.frame_percent
-        ),
-        noise=_noise(centroid),
+        **{"force_sigma": math.nan, **about, **in_si(file.taxels)},
+        image=ImageParameters(**image),
+        moments=MomentErrors(variance, moments["both"] * variance, moments["shear"] ** 2, moments["frame"]),
+        noise=ContactNoise(centroid["sigma"], centroid["power"], *slow_way_height, assumed=assumed),
         centroid=CentroidDelays(
-            1e-3 * centroid.latency_ms,
-            1e-3 * centroid.latency_sigma_ms,
-            Lag(1e-6 * centroid.lag_um, 1e-6 * centroid.lag_way_um),
+            centroid["latency"], centroid["latency_sigma"], Lag(centroid["lag"], centroid["lag_way"])
         ),
         stiffness=StiffnessSources(
             k,
-            k * 1e-2 * file.stiffness.moments_sigma_percent,
-            _or_nan(file.stiffness.depth_n_m3),
-            _or_nan(file.stiffness.depth_n_m3) * _share(file.stiffness.depth_sigma_percent),
-            1e-6 * _or_nan(file.stiffness.arm_compliance_um_n),
-            1e-6 * _or_nan(file.stiffness.arm_compliance_sigma_um_n),
+            k * stiffness["moments_sigma"],
+            depth := stiffness.get("depth", math.nan),
+            depth * stiffness.get("depth_sigma", math.nan),
+            stiffness.get("arm_compliance", math.nan),
+            stiffness.get("arm_compliance_sigma", math.nan),
         ),
-        residuals=Residuals(
-            file.residuals.touches,
-            _share(file.residuals.force_percent),
-            1e-2 * file.residuals.moments_percent,
-            1e-2 * file.residuals.curvature_percent,
-            _share(file.residuals.rod_curvature_percent),
-        ),
-        force=UNSTATED if file.force is None else _force_errors(file.force),
-        gains=file.taxels.gains,
-        dead=file.taxels.dead,
+        residuals=Residuals(**{"force": math.nan, "rod_curvature": math.nan, **residuals}),
+        force=UNSTATED if file.force is None else ForceErrors(**in_si(file.force)),
     )
-
-
-def _force_errors(keys: ForceKeys) -> ForceErrors:
-    return ForceErrors(
-        creep=1e-2 * keys.creep_percent,
-        creep_sigma=1e-2 * keys.creep_sigma_percent,
-        creep_decades=keys.creep_decades,
-        array=1e-2 * keys.array_percent,
-        spread=1e-2 * keys.spread_percent,
-    )
-
-
-def _noise(centroid: CentroidKeys) -> ContactNoise:
-    """The noise of contacts; what a file of an earlier form does not state is assumed."""
-    assumed = centroid.slow_um is None or centroid.height_um is None
-    slow_um, way_mm, height_um = (
-        ASSUMED_NOISE if assumed else (centroid.slow_um, centroid.correlation_mm, centroid.height_um)
-    )
-    return ContactNoise(
-        1e-6 * centroid.sigma_um,
-        centroid.power,
-        1e-6 * _or_nan(slow_um),
-        1e-3 * _or_nan(way_mm),
-        1e-6 * _or_nan(height_um),
-        assumed=assumed,
-    )
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _share(percent: float | None) -> float:
-    return 1e-2 * _or_nan(percent)
 
 
 def dump_calibration(calibration: ArrayCalibration) -> str:
     """The calibration as a TOML document; `load_calibration` reads it back, to the digits that it shows."""
-    c = calibration
-    sigma = math.sqrt(c.moments.moment)
+    c, whole = calibration, dataclasses.asdict(calibration)
+    moments, centroid, stiffness = c.moments, c.centroid, c.stiffness
     values = CalibrationFile(
-        About(
-            SCHEMA,
-            c.array,
-            c.date,
-            c.made_on,
-            c.force_reference,
-            _rounded(1e-3 * c.full_scale),
-            None if c.nominal else _rounded(1e2 * c.force_sigma),
+        in_units(About, {"schema": SCHEMA, **whole}),
+        in_units(ImageKeys, whole["image"]),
+        in_units(
+            MomentKeys,
+            {
+                "sigma": math.sqrt(moments.moment),
+                "both": moments.both / moments.moment,
+                "shear": math.sqrt(moments.shear),
+                "frame": moments.frame_sigma,
+            },
         ),
-        ImageKeys(
-            _rounded(c.image.stiffness),
-            _rounded(c.image.scale),
-            _rounded(1e3 * c.image.blur),
-            _rounded(c.image.crosstalk),
-            _rounded(c.image.memory),
+        in_units(
+            CentroidKeys,
+            {
+                "sigma": c.noise.scale,
+                "power": c.noise.power,
+                "correlation": c.noise.slow_way,
+                "latency": centroid.latency_s,
+                "latency_sigma": min(centroid.latency_sigma_s, MAX_LATENCY_SIGMA_S),
+                "lag": centroid.lag.most,
+                "lag_way": centroid.lag.reach,
+                "slow": c.noise.slow,
+                "height": c.noise.height,
+            },
         ),
-        MomentKeys(
-            _rounded(1e2 * sigma),
-            _rounded(c.moments.both / c.moments.moment),
-            _rounded(1e2 * math.sqrt(c.moments.shear)),
-            _rounded(1e2 * c.moments.frame_sigma),
+        in_units(
+            StiffnessKeys,
+            {
+                **whole["stiffness"],
+                "moments_sigma": stiffness.moments_sigma / stiffness.moments,
+                "depth_sigma": stiffness.depth_sigma / stiffness.depth,
+            },
         ),
-        CentroidKeys(
-            _rounded(1e6 * c.noise.scale),
-            _rounded(c.noise.power),
-            _rounded(1e3 * c.noise.slow_way),
-            _rounded(1e3 * c.centroid.latency_s),
-            _rounded(min(1e3 * c.centroid.latency_sigma_s, 1e6)),
-            _rounded(1e6 * c.centroid.lag.most),
-            _rounded(1e6 * c.centroid.lag.reach),
-            _rounded(1e6 * c.noise.slow),
-            _rounded(1e6 * c.noise.height),
-        ),
-        StiffnessKeys(
-            _rounded(1e2 * c.stiffness.moments_sigma / c.stiffness.moments),
-            _known(c.stiffness.depth),
-            _known(1e2 * c.stiffness.depth_sigma / c.stiffness.depth),
-            _known(1e6 * c.stiffness.arm_compliance),
-            _known(1e6 * c.stiffness.arm_compliance_sigma),
-        ),
-        ResidualKeys(
-            c.residuals.touches,
-            _rounded(1e2 * c.residuals.moments),
-            _rounded(1e2 * c.residuals.curvature),
-            _known(1e2 * c.residuals.force),
-            _known(1e2 * c.residuals.rod_curvature),
-        ),
-        TaxelKeys(c.dead, c.gains),
-        ForceKeys(
-            _rounded(1e2 * c.force.array),
-            _rounded(1e2 * c.force.creep),
-            _rounded(1e2 * c.force.creep_sigma),
-            _rounded(c.force.creep_decades),
-            _rounded(1e2 * c.force.spread),
-        ),
+        in_units(ResidualKeys, whole["residuals"]),
+        in_units(TaxelKeys, whole),
+        in_units(ForceKeys, whole["force"]),
     )
     sections = []
     for section in dataclasses.fields(values):
@@ -370,12 +303,3 @@ def _value(value: object) -> str:
         return toml_value(value)
     assert isinstance(value, tuple)
     return "[\n" + "".join(f"    {toml_value(row)},\n" for row in value) + "]"
-
-
-def _rounded(value: float) -> float:
-    """Five digits: more than any calibration is worth."""
-    return float(f"{value:.5g}")
-
-
-def _known(value: float) -> float | None:
-    return _rounded(value) if math.isfinite(value) else None

@@ -180,3 +180,24 @@ def choices_of(annotation: Any) -> tuple[str, ...]:
 def conditions_of(annotation: Any, kind: type[Any]) -> list[Any]:
     """The conditions of one kind in an annotation: `Check`, `Only` or `ScenePath`."""
     return [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, kind)]
+
+
+_ANNOTATIONS: dict[type, Mapping[str, Any]] = {}
+
+
+def annotations_of(cls: type[Any]) -> Mapping[str, Any]:
+    """The types of a section's keys, evaluated once: that takes longer than to read a file."""
+    if cls not in _ANNOTATIONS:
+        _ANNOTATIONS[cls] = typing.get_type_hints(cls, include_extras=True)
+    return _ANNOTATIONS[cls]
+
+
+def values_of(section: Any) -> dict[str, Any]:
+    """The keys of a section that have a value and belong to the others."""
+    values = {key: getattr(section, key) for key in annotations_of(type(section))}
+    return {
+        key: value
+        for key, value in values.items()
+        if value is not None
+        and all(values[only.key] in only.values for only in conditions_of(annotations_of(type(section))[key], Only))
+    }

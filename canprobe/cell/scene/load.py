@@ -1,8 +1,7 @@
-"""Read a scene: TOML text → checked `Scene`, all problems at once; and the way back.
+"""Read a scene: a file and those that it names → checked `Scene`, all problems at once; and the way back.
 
-`Reader` knows no key by name. A file is a dataclass whose fields are sections: `Section`, `Section | None`, or
-`Mapping[str, Section]` for named tables (`[section.NAME]`). A section is a dataclass whose fields are keys, with type,
-checks and default (`canprobe.cell.scene.model`). What goes together across keys stands in `canprobe.cell.scene.rules`.
+`canprobe.cell.scene.reader` checks section by section; what goes together across keys stands in
+`canprobe.cell.scene.rules`.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ import contextlib
 import dataclasses
 import re
 import tomllib
-import typing
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
@@ -20,13 +17,22 @@ from os.path import isdir, isfile  # False where the system refuses a name, as `
 from pathlib import Path
 from typing import Any
 
-from canprobe import __version__
-from canprobe.cell.scene.checks import MAX_NUMBER, MismatchError, Only, ScenePath, choices_of, conditions_of, convert
+from canprobe.cell.scene.checks import annotations_of, values_of
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
-from canprobe.cell.scene.model import DEFAULT_ARRAY, RENAMED_KEYS, TOUCH_KINDS, ArrayFile, CellFile, Scene
+from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, CellFile, Scene
 from canprobe.cell.scene.offers import find_offer, offers
+from canprobe.cell.scene.reader import Reader
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
-from canprobe.errors import PlanError, SceneError, UsageError, did_you_mean, regular_file
+from canprobe.cell.scene.toml_files import (
+    parse_toml,
+    read_toml,
+    refuse_deep,
+    toml_key,
+    toml_value,
+    with_writer,
+    written_by_line,
+)
+from canprobe.errors import PlanError, SceneError, UsageError, did_you_mean
 from canprobe.mechanics.robot.urdf import from_urdf
 from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
@@ -39,21 +45,6 @@ FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
-WRITTEN_BY_KEY = "written_by"
-"""Key above the sections of a file that canprobe wrote; its value names the version."""
-MAX_BYTES, MAX_DEPTH = 64 << 20, 32
-"""Largest size of a TOML file, and deepest nesting of its tables and lists."""
-_ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
-
-
-_ANNOTATIONS: dict[type, Mapping[str, Any]] = {}
-
-
-def _annotations(cls: type[Any]) -> Mapping[str, Any]:
-    """The types of a dataclass's fields, evaluated once: that takes longer than to read a file."""
-    if cls not in _ANNOTATIONS:
-        _ANNOTATIONS[cls] = typing.get_type_hints(cls, include_extras=True)
-    return _ANNOTATIONS[cls]
 
 
 def dump_scene(scene: Scene | CellFile) -> str:
@@ -62,82 +53,32 @@ def dump_scene(scene: Scene | CellFile) -> str:
     Args:
         scene: a scene as `load_scene` gave it, or a cell as `read_cell` gave it.
     """
-    tables = []
-    for name, part in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
-        if isinstance(part, Mapping):
-            tables += [(f"{name}.{toml_key(key)}", _values(section)) for key, section in part.items()]
-        elif part is not None:
-            tables.append((name, _values(part)))
+    tables: list[tuple[str, dict[str, Any]]] = []
+    for name, table in _document(scene).items():
+        named = isinstance(getattr(scene, name), Mapping)
+        tables += [(f"{name}.{toml_key(key)}", one) for key, one in table.items()] if named else [(name, table)]
     return "\n".join(
         f"[{name}]\n" + "".join(f"{key} = {toml_value(value)}\n" for key, value in table.items())
         for name, table in tables
     )
 
 
-def _document(scene: Scene) -> dict[str, Any]:
+def _document(scene: Scene | CellFile) -> dict[str, Any]:
     """The scene as `tomllib` reads what `dump_scene` writes."""
-    parts = ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene))
-    return {
-        name: {key: _values(section) for key, section in part.items()} if isinstance(part, Mapping) else _values(part)
-        for name, part in parts
-        if part is not None and part != {}
-    }
-
-
-def _values(section: Any) -> dict[str, Any]:
-    """The keys of a section that have a value and belong to the others."""
-    annotations, values = _annotations(type(section)), {}
-    for field in dataclasses.fields(section):
-        value = getattr(section, field.name)
-        only = conditions_of(annotations[field.name], Only)
-        if value is not None and all(getattr(section, one.key) in one.values for one in only):
-            values[field.name] = _as_toml(value)
-    return values
-
-
-def written_by_line() -> str:
-    """The first line of a file that this canprobe writes."""
-    return f"{WRITTEN_BY_KEY} = {toml_value(f'canprobe {__version__}')}\n"
-
-
-def with_writer(document: Mapping[str, Any], file: str) -> tuple[dict[str, Any], str]:
-    """A document with present keys without `WRITTEN_BY_KEY`, and the name of its file in messages, with its writer.
-
-    Raises:
-        SceneError: the writer is no text, or a key stands under its former name and its present one.
-    """
-    writer = document.get(WRITTEN_BY_KEY, f"canprobe {__version__}")
-    if not isinstance(writer, str):
-        raise SceneError([f"{file}: {WRITTEN_BY_KEY}: expected text, got {toml_value(writer)}; remove the line"])
-    rest = {name: value for name, value in document.items() if name != WRITTEN_BY_KEY}
-    for (section, former), present in RENAMED_KEYS.items():
-        table, where = rest.get(section), f"{file}: {section}"
-        if section == "joints" and isinstance(table, dict):
-            rest[section] = {name: _renamed(one, former, present, f"{where}.{name}") for name, one in table.items()}
-        elif section in rest:
-            rest[section] = _renamed(table, former, present, where)
-    return rest, f"{file}{written_by_other(writer)}"
-
-
-def _renamed(table: object, former: str, present: str, where: str) -> object:
-    """A table with a key under its present name, with a warning."""
-    if not isinstance(table, dict) or former not in table:
-        return table
-    if present in table:
-        raise SceneError([f"{where}.{former}: it is now {present}, which stands there too; remove {former}"])
-    warnings.warn(
-        f"{where}.{former} is now {present}; the next minor version refuses {former}", FutureWarning, stacklevel=2
+    parts = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
+    document: dict[str, Any] = _as_toml(
+        {
+            name: {key: values_of(section) for key, section in part.items()}
+            if isinstance(part, Mapping)
+            else values_of(part)
+            for name, part in parts.items()
+            if part is not None and part != {}
+        }
     )
-    return {present if key == former else key: value for key, value in table.items()}
+    return document
 
 
-def written_by_other(writer: object) -> str:
-    """`: written by canprobe …` for messages about a file of another version; empty for one of this version."""
-    own = f"canprobe {__version__}"
-    return "" if writer == own else f": written by {writer or 'an earlier canprobe'}, this is {own}"
-
-
-def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
+def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     """A scene that names its EDS, URDF, calibration, surface and cell files as they stand beside it, and those files.
 
     A folder with these files, and the scene as `SAVED_AS`, loads as the scene, wherever the folder is moved. Packaged
@@ -150,7 +91,7 @@ def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     files: dict[str, bytes] = {}
 
     def beside(section: Any) -> Any:
-        annotations = _annotations(type(section))
+        annotations = annotations_of(type(section))
         names = {}
         for key in FILE_KEYS & set(annotations):
             value = getattr(section, key)
@@ -182,30 +123,6 @@ def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
         return dataclasses.replace(whole, **changed)
 
     return moved(scene), files
-
-
-def toml_key(key: str) -> str:
-    """One key as TOML writes it."""
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
-
-
-def toml_value(value: object) -> str:
-    """One value as TOML writes it."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return f'"{"".join(map(_escaped, value))}"'
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(toml_value, value))}]"
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{toml_key(key)} = {toml_value(item)}' for key, item in value.items())}}}"
-    return repr(value) if isinstance(value, int | float) else str(value)
-
-
-def _escaped(character: str) -> str:
-    if character in _ESCAPES:
-        return _ESCAPES[character]
-    return f"\\u{ord(character):04X}" if ord(character) < 0x20 or ord(character) == 0x7F else character
 
 
 def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
@@ -240,7 +157,7 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
     if overrides:
         own, file = _with_overrides(own, overrides, file), f"{file} as changed"
-        _refuse_deep(own, file)
+        refuse_deep(own, file)
     return _scene(own, file, folder, whole=whole)
 
 
@@ -303,17 +220,12 @@ def load_cell(name_or_path: str | Path) -> dict[str, Any]:
     Raises:
         SceneError: the file has problems; the error has all of them.
     """
-    return _read_cell(name_or_path)[1]
+    return _read_hardware(name_or_path, "cell", CellFile)[1]
 
 
 def read_cell(name_or_path: str | Path) -> CellFile:
     """Read a cell file as `load_cell` does, as a dataclass."""
-    return _read_cell(name_or_path)[0]
-
-
-def _read_cell(name_or_path: str | Path) -> tuple[CellFile, dict[str, Any]]:
-    sections, document = _read_hardware(name_or_path, "cell", CellFile)
-    return CellFile(**sections), document
+    return CellFile(**_read_hardware(name_or_path, "cell", CellFile)[0])
 
 
 def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -391,24 +303,10 @@ def scenes_folder() -> Path:
     return Path(str(resources.files("canprobe"))) / "scenes"
 
 
-def packaged_scenes() -> list[tuple[str, str]]:
-    """Name and title of every packaged scene, by name."""
-    return _titles("scenes", "scene")
-
-
-def packaged_cells() -> list[tuple[str, str]]:
-    """Name and title of every packaged cell, by name."""
-    return _titles("cells", "cell")
-
-
-def packaged_arrays() -> list[tuple[str, str]]:
-    """Name and title of every packaged array, by name."""
-    return _titles("arrays", "array")
-
-
-def _titles(folder: str, section: str) -> list[tuple[str, str]]:
-    files = packaged_files(folder)
-    return [(name, read_toml(path, path.name)[section].get("title", "")) for name, path in files.items()]
+def packaged(kind: str) -> list[tuple[str, str]]:
+    """Name and title of every packaged "scene", "cell" or "array", by name."""
+    files = packaged_files(f"{kind}s")
+    return [(name, read_toml(path, path.name)[kind].get("title", "")) for name, path in files.items()]
 
 
 def offered(kind: str, warn: Callable[[str], None]) -> list[dict[str, str]]:
@@ -452,59 +350,6 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
         SceneError: the text has problems; the error has all of them.
     """
     return _scene(parse_toml(text, file), file, folder)
-
-
-def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
-    """The document of a TOML file, whose messages call it `file`; `else_what` ends that of a file that is missing.
-
-    Raises:
-        SceneError: the file cannot be read, or is not TOML.
-    """
-    try:
-        text = regular_file(path, MAX_BYTES).read_text(
-            encoding="utf-8-sig"
-        )  # some editors begin with a byte order mark
-    except OSError as error:
-        hint = else_what if isinstance(error, FileNotFoundError) else ""
-        raise SceneError([f"{file}: cannot be read: {error.strerror}{hint}"]) from error
-    except UnicodeDecodeError as error:
-        raise SceneError([f"{file}: not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"]) from error
-    return parse_toml(text, file)
-
-
-def parse_toml(text: str, file: str) -> dict[str, Any]:
-    """The document in a TOML text, with the errors of `read_toml`."""
-    try:
-        document = tomllib.loads(text)
-    except ValueError as error:  # an integer of thousands of digits is no TOMLDecodeError
-        raise SceneError([f"{file}: not valid TOML: {error}"]) from error
-    except RecursionError:
-        raise _too_deep(file) from None
-    _refuse_deep(document, file)
-    return document
-
-
-_NAMED_LEVELS = 3
-"""Levels of the key that a message about deep nesting names; a scene has as many, such as joints.joint_1.gear."""
-
-
-def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
-    """Raise SceneError for tables and lists nested deeper than in any scene; other code visits them by recursion."""
-    values: list[tuple[str, Any]] = [("", document)]
-    for level in range(MAX_DEPTH):
-        inner = [
-            (f"{path}{key}." if isinstance(value, Mapping) and level < _NAMED_LEVELS else path, item)
-            for path, value in values
-            for key, item in (value.items() if isinstance(value, Mapping) else enumerate(value))
-        ]
-        values = [(path, item) for path, item in inner if isinstance(item, Mapping | list | tuple)]
-        if not values:
-            return
-    raise _too_deep(f"{file}: {values[0][0].removesuffix('.')}")
-
-
-def _too_deep(where: str) -> SceneError:
-    return SceneError([f"{where}: expected tables and lists of at most {MAX_DEPTH} levels, got more of them"])
 
 
 def _scene(own: dict[str, Any], file: str, folder: Path | None, *, whole: bool = False) -> Scene:
@@ -606,161 +451,3 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 def _are_tables(*values: object) -> bool:
     return all(isinstance(value, dict) for value in values)
-
-
-class Reader:
-    """Reads tables as the dataclasses that describe them, and collects what is wrong.
-
-    Attributes:
-        problems: each with its key path.
-        bad: the key paths that have one.
-        paths: files that were found beside the file, by key path.
-    """
-
-    def __init__(self, folder: Path | None = None) -> None:
-        self.problems: list[str] = []
-        self.bad: set[str] = set()
-        self.paths: dict[str, str] = {}
-        self._folder = folder
-
-    def complain(self, path: str, message: str) -> None:
-        """Add a problem."""
-        self.bad.add(path)
-        self.problems.append(f"{path}: {message}")
-
-    def refuse(self, file: str) -> None:
-        """Raise an error with all problems, if there are any.
-
-        Raises:
-            SceneError: there are problems; the error has all of them.
-        """
-        if self.problems:
-            raise SceneError([f"{file}: {problem}" for problem in self.problems])
-
-    def read(self, file: type[Any], document: Mapping[str, Any], needed: Iterable[str] = ()) -> dict[str, Any]:
-        """The sections of a file, by name.
-
-        Args:
-            file: dataclass of the sections.
-            document: the document as `tomllib` gives it.
-            needed: sections that are read as empty ones where they are missing.
-        """
-        sections, needed = _annotations(file), set(needed)
-        for name in document:
-            if name not in sections:
-                self.complain(name, f"unknown section{_did_you_mean_key(name, sections)}")
-        return {
-            name: self._named(hint, document.get(name, {}), name)
-            if typing.get_origin(hint) is Mapping
-            else self.section(next(iter(typing.get_args(hint)), hint), document.get(name, {}), name)
-            for name, hint in sections.items()
-            if name in document or name in needed
-        }
-
-    def with_paths(self, table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-        """A table that was read, with the paths that were found in the place of names."""
-        return {
-            key: self.with_paths(value, f"{prefix}{toml_key(key)}.")
-            if isinstance(value, dict)
-            else self.paths.get(prefix + key, value)
-            for key, value in table.items()
-        }
-
-    def _named(self, hint: Any, tables: Any, name: str) -> dict[str, Any]:
-        if not isinstance(tables, dict):
-            self.complain(name, f"expected sections [{name}.NAME], got {toml_value(tables)}")
-            return {}
-        cls = typing.get_args(hint)[1]
-        read = {key: self.section(cls, table, f"{name}.{toml_key(key)}") for key, table in tables.items()}
-        if None in read.values():
-            self.bad.add(name)
-        return read
-
-    def section(self, cls: type[Any], table: Any, name: str) -> Any:
-        """Read a section; a key that has a problem or is missing is None in it."""
-        if not isinstance(table, dict):
-            return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
-        annotations = _annotations(cls)
-        for key in table:
-            if key not in annotations:
-                above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
-                hint = above or did_you_mean(key, _keys_that_belong(cls, annotations, table))
-                self.complain(f"{name}.{key}", f"unknown key{hint}")
-        values: dict[str, Any] = {}
-        for field in dataclasses.fields(cls):
-            path, annotation = f"{name}.{field.name}", annotations[field.name]
-            if field.name in table:
-                values[field.name] = self._value(table[field.name], annotation, path)
-            elif field.default is not dataclasses.MISSING:
-                values[field.name] = field.default
-            else:
-                words = choices_of(annotation)
-                self.complain(path, f"missing: one of {', '.join(words)}" if words else "missing")
-                values[field.name] = None
-        for key, annotation in annotations.items():
-            for only in conditions_of(annotation, Only):
-                self._check_condition(f"{name}.{key}", key in table, only, values[only.key])
-        return cls(**values)
-
-    def _value(self, raw: object, annotation: Any, path: str) -> Any:
-        try:
-            value = convert(raw, annotation)
-        except MismatchError as mismatch:
-            words = choices_of(annotation)
-            hint = did_you_mean(raw, words) if isinstance(raw, str) else _other_unit(path, raw, annotation)
-            return self.complain(path, f"expected {mismatch}, got {toml_value(raw)}{hint}")
-        if conditions_of(annotation, ScenePath) and self._folder and isfile(self._folder / value):
-            value = self.paths[path] = str((self._folder / value).resolve())
-        return value
-
-    def _check_condition(self, path: str, given: bool, only: Only, actual: Any) -> None:
-        """Complain of a key that stands where it does not belong, or is missing where it must be given."""
-        if given and actual is not None and actual not in only.values:
-            needed = " or ".join(f'"{value}"' for value in only.values)
-            self.complain(path, f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
-        elif not given and only.required and actual in only.values:
-            self.complain(path, f'missing: {only.key} = "{actual}" needs it')
-
-
-_OTHER_UNITS = (
-    ("_mm", 1e3, "metres"),
-    ("_mm_s", 1e3, "m/s"),
-    ("_us", 1e6, "seconds"),
-    ("_ms", 1e3, "seconds"),
-    ("_s", 1e-3, "milliseconds"),
-    ("_kpa", 1e-3, "Pa"),
-    ("_n_m3", 1e9, "N/mm³"),
-    ("_hz", 1e3, "kHz"),
-    ("bitrate", 1e3, "kbit/s"),
-)
-"""End of a key, factor from another usual unit to that of the key, and that unit."""
-
-
-def _other_unit(path: str, raw: object, annotation: Any) -> str:
-    """A hint where a number out of range would be one in another unit; else empty."""
-    if isinstance(raw, bool) or not isinstance(raw, int | float) or not abs(raw) < MAX_NUMBER:
-        return ""
-    for end, factor, unit in _OTHER_UNITS:
-        value = float(f"{raw * factor:.12g}")
-        if re.search(f"(?<!_mm)(?<!_deg)(?<!_nm){end}$", path):
-            with contextlib.suppress(MismatchError):
-                convert(int(value) if value.is_integer() else value, annotation)
-                return f"; did you mean {value:g}, for {raw:g} {unit}?"
-    return ""
-
-
-def _keys_that_belong(cls: type[Any], annotations: Mapping[str, Any], table: Mapping[str, Any]) -> list[str]:
-    """The keys of a section whose conditions hold in it."""
-    values = {field.name: field.default for field in dataclasses.fields(cls)} | dict(table)
-    return [
-        key
-        for key, annotation in annotations.items()
-        if all(values[only.key] in only.values for only in conditions_of(annotation, Only))
-    ]
-
-
-def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:
-    """A hint for an unknown section: the section that has a key of that name, or the nearest section."""
-    classes = {name: next(iter(typing.get_args(hint)), hint) for name, hint in sections.items()}
-    keys = [f"{name}.{got}" for name, cls in classes.items() if got in getattr(cls, "__dataclass_fields__", {})]
-    return f"; did you mean {' or '.join(keys)}?" if keys else did_you_mean(got, sections)

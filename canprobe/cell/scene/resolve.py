@@ -12,7 +12,7 @@ from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_complia
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.cell.scene.hardware import MM, EmulateSettings
-from canprobe.cell.scene.load import gathered, read_cell
+from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
     LimitSettings,
@@ -59,6 +59,8 @@ from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.stops import depth_on_plane
 from canprobe.mechanics.touch.strategies import Rectangle, make_strategy
 
+SEARCH = 8e-3
+"""Distance beyond the expected place at which an approach gives up, m."""
 LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
 EMULATED_ARRAY = "inch16"
@@ -78,7 +80,7 @@ def resolve(scene: Scene) -> Setup:
         PlanError: the scene describes an object without a surface.
         SceneError: a file that it names cannot be read.
     """
-    saved, files = gathered(scene)
+    saved, files = with_files(scene)
     arm, bodies = _arm(scene)
     settings = scene.probe or ProbeSettings()
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
@@ -265,6 +267,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
         return Listen(array, probe, settings.duration_s)
     assert arm is not None
     servo = scene.servo or ServoSettings()
+    pressed = depth_on_plane(scene.limits.force_max_n, probe.stiffness, probe.radius)  # a blind search goes no deeper
     touching: dict[str, Any] = {
         "arm": arm,
         "array": array,
@@ -275,7 +278,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             speed=settings.approach_mm_s * MM,
             clearance=settings.clearance_mm * MM,
             search=SEARCH if settings.search_mm is None else settings.search_mm * MM,
-            blind_search=_blind_search(scene, probe) if settings.search_mm is None else settings.search_mm * MM,
+            blind_search=min(SEARCH, pressed) if settings.search_mm is None else settings.search_mm * MM,
         ),
         "force": settings.force_n,
         "duration_s": settings.duration_s,
@@ -298,15 +301,6 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             shape = Shape(s.method, s.also, s.memory_mm * MM, s.every_ms * 1e-3, s.patch, s.revisit)
     gains = SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz)
     return Touch(**touching, gains=gains, scan=scan, shape=shape)
-
-
-SEARCH = 8e-3
-"""Distance beyond the expected place at which an approach gives up, m."""
-
-
-def _blind_search(scene: Scene, probe: Probe) -> float:
-    """Way beyond the expected place, m, on which a plane is pressed with the limit of the force and no more."""
-    return min(SEARCH, depth_on_plane(scene.limits.force_max_n, probe.stiffness, probe.radius))
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:

@@ -1,14 +1,13 @@
-"""Rules of what goes together in a scene: sections and kinds of task, keys across sections, choices of a plan."""
+"""Rules of what goes together in a scene: sections and kinds of task, keys across sections."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from canprobe.cell.scene.hardware import JointSettings, Vec3
-from canprobe.cell.scene.model import TOUCH_KINDS, Scene, WireSettings
+from canprobe.cell.scene.model import TOUCH_KINDS, WireSettings
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageFormat
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE, WINDOW_SIZES
@@ -317,16 +316,3 @@ def broken_rules(lookup: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
             continue
         if all(value is not None or key.endswith("?") for key, value in zip(keys, values, strict=True)):
             yield from rule(*values)
-
-
-def with_choices(scene: Scene, choices: Mapping[str, object]) -> Scene:
-    """A scene with the choices of the plan in the place of its "auto".
-
-    Args:
-        scene: scene with open keys.
-        choices: value by key path: `{"sensor.mode": "window"}`.
-    """
-    for path, value in choices.items():
-        section, _, key = path.partition(".")
-        scene = replace(scene, **{section: replace(getattr(scene, section), **{key: value})})
-    return scene

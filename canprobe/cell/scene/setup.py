@@ -18,13 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
-from canprobe.cell.scene.model import (
-    BridgeSettings,
-    Scene,
-    ShapeMethod,
-    TaskKind,
-)
-from canprobe.cell.scene.rules import with_choices
+from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
@@ -481,7 +475,14 @@ class Setup:
         Args:
             choices: value by key path of the scene: `{"sensor.mode": "window"}`.
         """
-        return replace(self, scene=with_choices(self.scene, choices), saved=with_choices(self.saved, choices))
+
+        def chosen(scene: Scene) -> Scene:
+            for path, value in choices.items():
+                section, _, key = path.partition(".")
+                scene = replace(scene, **{section: replace(getattr(scene, section), **{key: value})})
+            return scene
+
+        return replace(self, scene=chosen(self.scene), saved=chosen(self.saved))
 
     @property
     def touch(self) -> Touch | Calibrate | None:

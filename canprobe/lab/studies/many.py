@@ -24,7 +24,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.files import unit_of
 from canprobe.cell.results.result import RunResult
-from canprobe.cell.scene.load import dump_scene, gathered, load_scene, parse_scene
+from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene, with_files
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.target import VIRTUAL, Target
@@ -204,7 +204,7 @@ def _seeds(scene: Scene, seeds: SupportsIndex | Iterable[SupportsIndex] | None) 
 
 def _with_own_files(scene: Scene, folder: Path) -> tuple[str, str]:
     """The scene as TOML that names copies of its files in a folder, and the digest of their contents."""
-    saved, files = gathered(scene)
+    saved, files = with_files(scene)
     digest = hashlib.sha256(b"".join(name.encode() + files[name] for name in sorted(files))).hexdigest()[:16]
     if not files:
         return dump_scene(scene), digest

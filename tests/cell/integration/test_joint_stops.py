@@ -14,7 +14,8 @@ pytest.importorskip("pinocchio", reason="the URDFs come with pin")
 from combinations import ARMS, _task_of, draw_posture, robots
 
 import canprobe
-from canprobe.cell.scene.load import load_scene, toml_key
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.toml_files import toml_key
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.urdf import from_urdf
 

@@ -9,9 +9,9 @@ import pytest
 from scenes import change, refused
 
 import canprobe
+from canprobe.cell.planning.free_parameters import opened, second_channel
 from canprobe.cell.planning.identifiers import order_by_deadline
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.open_keys import opened, second_channel
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.planning.report_json import plan_dict
 from canprobe.cell.planning.warnings import LOCAL_GROUP

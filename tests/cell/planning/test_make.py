@@ -11,11 +11,11 @@ import pytest
 from scenes import change
 
 import canprobe
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.device_capabilities import Abilities
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.planning.report_json import plan_dict
-from canprobe.cell.scene.load import load_scene, packaged_scenes
+from canprobe.cell.scene.load import load_scene, packaged
 from canprobe.cell.scene.resolve import resolve
 
 
@@ -101,7 +101,7 @@ def packaged_plan(name):
     return canprobe.plan(load_scene(name))
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
 def test_json_says_what_the_plan_says(name):
     plan = packaged_plan(name)
     document = json.loads(json.dumps(plan_dict(plan), allow_nan=False))
@@ -112,7 +112,7 @@ def test_json_says_what_the_plan_says(name):
     assert len(document["left_out"]) == len(plan.left_out)
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
 def test_text_shows_every_node_pdo_and_omission(name):
     plan = packaged_plan(name)
     text = plan_text(plan)

@@ -11,7 +11,7 @@ from scenes import change, reasons, with_joints
 import canprobe
 from canprobe.cell.planning.surface_path import surface_path
 from canprobe.cell.scene.geometry import true_object
-from canprobe.cell.scene.load import load_scene, packaged_scenes
+from canprobe.cell.scene.load import load_scene, packaged
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.resolve import resolve
 from canprobe.mechanics.robot.chain import forward
@@ -23,7 +23,7 @@ def cylinder():
     return load_scene("cylinder")
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
 def test_packaged_scenes_fit(name):
     plan = canprobe.plan(load_scene(name))
     if plan.joint_speeds is not None:

@@ -10,7 +10,7 @@ from makes import write_eds
 from scenes import change, reasons, refused, ways_out, with_joints, without_torque
 
 import canprobe
-from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.device_capabilities import Abilities
 from canprobe.cell.planning.identifiers import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages

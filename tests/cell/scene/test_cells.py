@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from canprobe.cell.scene.arms import arm_model
-from canprobe.cell.scene.load import dump_scene, load_cell, load_scene, packaged_cells, packaged_scenes, parse_scene
+from canprobe.cell.scene.load import dump_scene, load_cell, load_scene, packaged, parse_scene
 from canprobe.errors import PlanError, SceneError
 
 FREE = '[scene]\nname = "mine"\n[task]\nkind = "free"\n'
-CELLS = [name for name, _ in packaged_cells()]
+CELLS = [name for name, _ in packaged("cell")]
 GANTRY = """
 [cell]
 name = "two"
@@ -32,7 +32,7 @@ counts_per_turn = 4096
 
 def test_packaged_cells_have_titles():
     assert {"puma260", "puma260-unimate", "puma560", "seven-axis", "gantry", "prbt"} <= set(CELLS)
-    assert all(title for _, title in packaged_cells())
+    assert all(title for _, title in packaged("cell"))
 
 
 def test_a_scene_without_a_cell_has_the_default_cell():
@@ -130,7 +130,7 @@ def test_mistakes_in_a_cell_name_the_cell_file(tmp_path):
 
 
 def test_all_packaged_scenes_name_cells_that_are_there():
-    assert all(load_scene(name).cell.name for name, _ in packaged_scenes())
+    assert all(load_scene(name).cell.name for name, _ in packaged("scene"))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import canprobe
 from canprobe.cell.scene.hardware import ArmSettings, BringUpSettings, JointSettings
-from canprobe.cell.scene.load import dump_scene, load_scene, packaged_scenes, parse_scene
+from canprobe.cell.scene.load import dump_scene, load_scene, packaged, parse_scene
 from canprobe.cell.scene.model import (
     LimitSettings,
     ProbeSettings,
@@ -182,7 +182,7 @@ def test_unknown_scene_suggests_and_lists():
         load_scene("cilinder")
     (problem,) = caught.value.problems
     assert "did you mean cylinder?" in problem
-    assert all(name in problem for name, _ in packaged_scenes())
+    assert all(name in problem for name, _ in packaged("scene"))
 
 
 def test_missing_file_and_binary_file(tmp_path):
@@ -203,7 +203,7 @@ def test_eds_beside_the_scene_is_found_from_anywhere(tmp_path, monkeypatch):
     assert scene.arm.eds == str(tmp_path / "mine.eds")
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
 def test_packaged_scenes_load_and_survive_the_way_back(name):
     scene = load_scene(name)
     assert scene.name == name
@@ -211,7 +211,7 @@ def test_packaged_scenes_load_and_survive_the_way_back(name):
     assert parse_scene(dump_scene(scene)) == scene
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
 def test_packaged_scenes_carry_the_limits_of_hardware(name):
     """None is widened for a machine that is slow: who runs on such a one says so."""
     scene = load_scene(name)
@@ -221,7 +221,7 @@ def test_packaged_scenes_carry_the_limits_of_hardware(name):
 
 
 def test_packaged_scenes_are_the_promised_ones():
-    assert {"cylinder", "sphere", "plane", "saddle", "press", "listen", "free"} <= {n for n, _ in packaged_scenes()}
+    assert {"cylinder", "sphere", "plane", "saddle", "press", "listen", "free"} <= {n for n, _ in packaged("scene")}
 
 
 def test_default_scene_is_the_papers_experiment():

@@ -2,7 +2,7 @@
 
 from raw_formats import FORMATS
 
-from canprobe.cell.scene.load import load_array, packaged_arrays
+from canprobe.cell.scene.load import load_array, packaged
 from canprobe.cell.scene.model import WireSettings
 from canprobe.cell.scene.rules import image_format
 
@@ -13,6 +13,6 @@ def format_of(file):
 
 
 def test_every_packaged_array_of_raw_frames_has_the_format_of_its_maker():
-    files = {name: load_array(name) for name, _ in packaged_arrays()}
+    files = {name: load_array(name) for name, _ in packaged("array")}
     raw = {name: format_of(file) for name, file in files.items() if file["wire"]["kind"] == "frames"}
     assert raw == FORMATS

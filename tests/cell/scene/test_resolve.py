@@ -12,7 +12,7 @@ import pytest
 from scenes import change
 
 import canprobe
-from canprobe.cell.scene.load import load_scene, packaged_scenes
+from canprobe.cell.scene.load import load_scene, packaged
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Calibrate, Free, Listen, Touch
@@ -46,7 +46,7 @@ def test_millimetres_degrees_and_kilopascals_become_si():
     assert setup.compute_ns == 150_000
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
 def test_a_task_holds_the_hardware_of_its_setup(name):
     setup = resolve(load_scene(name))
     for part in ("arm", "array", "probe"):

@@ -7,7 +7,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.controller import Command
-from canprobe.cell.scene.load import packaged_scenes
+from canprobe.cell.scene.load import packaged
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import up
 from canprobe.cell.tasks.from_plan import make_task
@@ -69,7 +69,7 @@ OTHERS = pytest.mark.slow(reason="each packaged scene, on two buses")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[OTHERS] * (name not in FEW)) for name, _ in packaged_scenes()]
+    "name", [pytest.param(name, marks=[OTHERS] * (name not in FEW)) for name, _ in packaged("scene")]
 )
 def test_every_packaged_scene_begins_as_on_an_untimed_lockstep_bus(name):
     direct, lockstep = on_both(loaded(name), the_beginning)

@@ -1,12 +1,14 @@
-"""Abilities of a device, read from its EDS: objects, PDOs, mapping, dummies, identity."""
+"""Capabilities of a device by its EDS: objects, PDOs, mapping, dummies, identity; and what it lacks as a node."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from canprobe.cell.planning.model import EVERY_SYNC, Direction, Identity
+from canprobe.cell.planning.model import EVERY_SYNC, Direction, Identity, NodeKind
+from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.protocol.pdo import PdoEntry
@@ -23,8 +25,8 @@ _IDENTIFIER = 0x7FF
 
 
 @dataclass(frozen=True, slots=True)
-class Abilities:
-    """Abilities of one device as a node of the cell, by its EDS.
+class DeviceCapabilities:
+    """Capabilities of one device as a node of the cell, by its EDS.
 
     Attributes:
         eds: its name or path, for messages.
@@ -35,7 +37,7 @@ class Abilities:
     description: Description
 
     @classmethod
-    def of(cls, eds: str, node_id: int) -> Abilities:
+    def of(cls, eds: str, node_id: int) -> DeviceCapabilities:
         """Read an EDS.
 
         Raises:
@@ -122,3 +124,42 @@ class Abilities:
     def own_bits(self, direction: Direction, number: int) -> int:
         """Bits 29 and 30 of the COB-ID of a PDO."""
         return (self.number(COMMUNICATION[direction] + number - 1, 1) or 0) & OWN_BITS
+
+
+_EVERY_NODE: Mapping[int, str] = {
+    0x1000: "device type",
+    0x1005: "COB-ID of SYNC",
+    0x1017: "producer heartbeat",
+    0x1018: "identity",
+}
+_OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
+    "drive": {
+        0x6040: "controlword",
+        0x6041: "statusword",
+        0x6060: "modes of operation",
+        0x6061: "modes of operation display",
+        0x6064: "position actual value",
+    },
+    "tactile": {0x2000: "tactile mode"},
+}
+
+
+def missing_objects(device: DeviceCapabilities, kind: NodeKind, setup: Setup) -> list[str]:
+    """One line for every object that the EDS lacks."""
+    needed = {**_EVERY_NODE, **_OF_KIND[kind]}
+    section = "arm" if kind == "drive" else "sensor"
+    return [
+        f"{section}.eds = {device.eds}: object {index:04X}h ({what}) is missing; scene {setup.name} needs it"
+        for index, what in needed.items()
+        if index not in device.od.indices
+    ]
+
+
+def missing_bitrate(device: DeviceCapabilities, kind: NodeKind, setup: Setup) -> list[str]:
+    """One line where the EDS lists bit rates and that of the bus is not among them."""
+    bitrates = device.description.bitrates
+    if not bitrates or setup.bus.bitrate in bitrates:
+        return []
+    section = "arm" if kind == "drive" else "sensor"
+    has = ", ".join(map(str, bitrates))
+    return [f"bus.bitrate = {setup.bus.bitrate}: {section}.eds = {device.eds} has {has} bit/s"]

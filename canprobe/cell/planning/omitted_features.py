@@ -7,14 +7,10 @@ from collections.abc import Container, Iterator
 
 from canprobe.cell.planning.array import support_of
 from canprobe.cell.planning.bridges import bridge_outputs
-from canprobe.cell.planning.open_keys import MODES
-from canprobe.cell.planning.window import (
-    measured_share,
-    patch_across_taxels,
-)
-from canprobe.cell.scene.setup import Arm, Setup, Touch, Touching
+from canprobe.cell.planning.free_parameters import MODES
+from canprobe.cell.planning.window import measured_share, patch_across_taxels
+from canprobe.cell.scene.setup import Setup, Touch, Touching
 from canprobe.errors import install_line
-from canprobe.mechanics.robot.inverse import FIXED_POLE, rolls_last, task_rows
 
 _NO_SHAPE = {
     "press": "one touch without motion shows no shape",
@@ -46,7 +42,7 @@ BUS_PARTS = "bus, bring-up by SDO and their log (bus.log)"
 TRUTH_PARTS = "truth and scores against it"
 
 
-def left_out(setup: Setup) -> tuple[tuple[str, str], ...]:
+def omitted_features(setup: Setup) -> tuple[tuple[str, str], ...]:
     """Everything that a closed setup leaves out, as (what, why)."""
     return *_not_sent(setup), *_not_computed(setup), *_not_emulated(setup), *_not_shown(setup)
 
@@ -140,31 +136,3 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
         "surface.png": FIGURE not in absent and ESTIMATOR not in absent,
     }
     return (*(file for file, is_written in written.items() if is_written), *bridge_outputs(setup))
-
-
-def long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
-    """Warning for real drives that wait long for a SYNC."""
-    if missed_syncs <= MISSED_SYNCS_REAL:
-        return
-    waited_ms = 1e3 * missed_syncs / rate_hz
-    yield (
-        f"arm.missed_syncs = {missed_syncs}: real drives stay enabled for {waited_ms:g} ms after the last SYNC of"
-        " a master that stalls or dies, and a drive that falls silent is waited for as long: an object that moves is"
-        f" pressed without supervision until then; leave it at {MISSED_SYNCS_REAL} or below, more is for emulated nodes"
-    )
-
-
-def held_rows(arm: Arm) -> str:
-    name = f"the {arm.model.name} arm of {arm.model.n} joints"
-    if task_rows(arm.model) == FIXED_POLE:
-        rolls = arm.model.n > FIXED_POLE and rolls_last(arm.model)
-        last = f"; joint {arm.model.n} only turns the probe about its pole, and stays where it starts"
-        return (
-            f"{name} holds the place of the probe, not its tilt: task.rolling_share is 1, and the contact wanders "
-            f"on the array{last * rolls}"
-        )
-    return f"{name} holds position and pole of the probe and leaves the turn about the pole free"
-
-
-MISSED_SYNCS_REAL = 10
-"""SYNC periods for which real drives and their master may wait for each other without a warning."""
