@@ -221,11 +221,6 @@ def test_a_window_that_cuts_the_patch_is_a_warning_with_numbers():
     assert plan_dict(small)["warnings"] == [warning]
 
 
-@pytest.mark.parametrize("name", ["cylinder", "foam", "steel", "calibrate", "listen", "free", "miscalibrated"])
-def test_packaged_scenes_have_nothing_to_warn_of(name):
-    assert canprobe.plan(load_scene(name)).warnings == ()
-
-
 def test_more_than_the_force_limit_unfelt_is_refused(tmp_path, capsys):
     foam = change(load_scene("foam"), sensor={"window": 4})
     error = refused(foam)
