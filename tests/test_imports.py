@@ -270,6 +270,7 @@ def test_no_class_has_the_name_of_another():
 def test_every_public_name_of_a_door_can_be_had(door):
     module = importlib.import_module(door)
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
+    assert not hasattr(module, "no_such_name")
 
 
 def test_only_declared_packages_are_imported():

@@ -284,7 +284,7 @@ def test_errors_on_the_wire_are_a_warning():
 @pytest.mark.parametrize(("emulated", "missed_syncs", "warned"), [(False, 10, 0), (False, 11, 1), (True, 250, 0)])
 def test_real_drives_that_wait_long_for_their_master_are_a_warning(emulated, missed_syncs, warned):
     plan = canprobe.plan(change(load_scene("free"), arm={"emulated": emulated, "missed_syncs": missed_syncs}))
-    found = [warning for warning in plan.warnings if warning.startswith("arm.missed_syncs = 11: real drives")]
+    found = [one for one in plan.warnings if one.startswith(f"arm.missed_syncs = {missed_syncs}: real drives")]
     assert len(found) == warned
     assert all(f"stay enabled for {11 / plan.setup.rate_hz * 1e3:g} ms after" in warning for warning in found)
 
