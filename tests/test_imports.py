@@ -9,6 +9,7 @@
 """
 
 import ast
+import functools
 import glob
 import importlib
 import sys
@@ -128,6 +129,9 @@ NEVER_IN_PURE = EDGE_ONLY | {
 PURE_LAYERS = {"protocol", "types", "robot", "touch", "plant"}
 
 
+NAMING = "import_module"
+
+
 def layer_of(parts):
     """The room of a module, from the parts of its path or dotted name below the package."""
     top = parts[0] if parts else "package"
@@ -136,33 +140,41 @@ def layer_of(parts):
     return "package" if top in ("__init__", "__main__") else top
 
 
-def type_checking_nodes(tree):
-    """Statements under `if TYPE_CHECKING:`, which no program runs."""
-    guarded = [n for n in ast.walk(tree) if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.dump(n.test)]
-    return {inner for node in guarded for statement in node.body for inner in ast.walk(statement)}
+@functools.cache
+def read(path):
+    """What the tests here ask of a module, parsed once: imports, those for types alone, `import_module`s, classes.
+
+    Whole names that `import_module` gets; one that is put together is what a user asks for, such as a command.
+    """
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    guarded = [n for n in nodes if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.unparse(n.test)]
+    for_types = {inner for node in guarded for statement in node.body for inner in ast.walk(statement)}
+    calls = [
+        n for n in nodes if isinstance(n, ast.Call) and getattr(n.func, "attr", getattr(n.func, "id", "")) == NAMING
+    ]
+    by_name = [arg.value for call in calls for arg in call.args if isinstance(arg, ast.Constant)]
+    classes = [node.name for node in nodes if isinstance(node, ast.ClassDef)]
+    return imports, for_types.intersection(imports), by_name, classes
 
 
 def imports_of(path, relative, *, typed=False):
     """Dotted names that a module imports, absolute, with the line; `typed`: those for types alone, too."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    skipped = set() if typed else type_checking_nodes(tree)
+    imports, for_types, *_ = read(path)
     package = ["canprobe", *relative.parent.parts]
-    for node in ast.walk(tree):
-        if node in skipped:
+    for node in imports:
+        if node in for_types and not typed:
             continue
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno, None) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             base = package[: len(package) - node.level + 1] if node.level else []
             module = ".".join([*base, *([node.module] if node.module else [])])
             yield from ((_resolved(module, alias.name), node.lineno, alias.name) for alias in node.names)
 
 
-def imported_by_name(source):
-    """Whole names that `import_module` gets; one that is put together is what a user asks for, such as a command."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
-            yield from (arg.value for arg in node.args if isinstance(arg, ast.Constant))
+def imported_by_name(path):
+    return read(path)[2]
 
 
 def _resolved(module, name):
@@ -237,7 +249,7 @@ def test_no_modules_import_each_other_in_a_circle(typed):
     graph = {}
     for path, name in names.items():
         targets = {target for target, _, _ in imports_of(path, MODULES[path], typed=typed)} & known
-        targets |= {*imported_by_name(path.read_text(encoding="utf-8"))} & known
+        targets |= {*imported_by_name(path)} & known
         graph[name] = targets - {name, "canprobe"}
     while leaves := {name for name, targets in graph.items() if not targets & set(graph)}:
         graph = {name: targets for name, targets in graph.items() if name not in leaves}
@@ -249,9 +261,8 @@ def test_no_modules_import_each_other_in_a_circle(typed):
 def test_no_class_has_the_name_of_another():
     places = {}
     for path, relative in MODULES.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef):
-                places.setdefault(node.name, []).append(str(relative))
+        for name in read(path)[3]:
+            places.setdefault(name, []).append(str(relative))
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
@@ -259,6 +270,7 @@ def test_no_class_has_the_name_of_another():
 def test_every_public_name_of_a_door_can_be_had(door):
     module = importlib.import_module(door)
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
+    assert not hasattr(module, "no_such_name")
 
 
 def test_only_declared_packages_are_imported():
@@ -299,5 +311,7 @@ def test_the_reader_of_imports_sees_every_form(tmp_path, source, names):
         ("import_module(f'canprobe.cli.{name}').run", []),
     ],
 )
-def test_the_reader_of_imports_sees_those_by_name(source, names):
-    assert list(imported_by_name(source)) == names
+def test_the_reader_of_imports_sees_those_by_name(tmp_path, source, names):
+    path = tmp_path / "module.py"
+    path.write_text(source)
+    assert imported_by_name(path) == names

@@ -23,6 +23,7 @@ def test_without_a_configuration_there_is_no_bus(bare, capsys):
     assert "names no interface; set CAN_INTERFACE" in capsys.readouterr().err
 
 
+@pytest.mark.realtime
 def test_nodes_of_a_bus_yml_are_scanned_over_multicast(group, tmp_path, capsys):
     """Emulator and scan both find their bus in python-can's environment."""
     assert main(["plan", "listen", "--export", "bus.yml", "--out", str(tmp_path)]) == 0

@@ -104,6 +104,7 @@ def test_wrong_usage(words, told, capsys):
     assert told in capsys.readouterr().err
 
 
+@pytest.mark.realtime
 def test_a_command_is_started_and_judged(group, tmp_path, capsys):
     words = ["--passive", "--output", str(tmp_path / "out.txt"), "--log", str(tmp_path / "bus.log"), "--json"]
     assert main(["judge", *NODE, *words, "--seconds", "600", "--", sys.executable, str(SMALL), "1"]) == 1
@@ -114,6 +115,7 @@ def test_a_command_is_started_and_judged(group, tmp_path, capsys):
     assert main(["judge", *NODE, "--record", str(tmp_path / "bus.log")]) == 1
 
 
+@pytest.mark.realtime
 def test_a_command_that_fails_and_one_that_never_ends(group, tmp_path, capsys):
     out = ("--passive", "--output", str(tmp_path / "out.txt"))
     assert main(["judge", *NODE, *out, "--", "sh", "-c", "echo no adapter; exit 7"]) == 3
@@ -125,6 +127,7 @@ def test_a_command_that_fails_and_one_that_never_ends(group, tmp_path, capsys):
     assert "/nowhere/master: cannot be started: No such file" in capsys.readouterr().err
 
 
+@pytest.mark.realtime
 def test_ctrl_c_ends_the_command_while_the_nodes_are_served(group, tmp_path, capsys):
     master = "import can, time\nbus = can.Bus()\nbus.send(can.Message(arbitration_id=0x80, is_extended_id=False))\n"
     master += (
@@ -141,6 +144,7 @@ def test_ctrl_c_ends_the_command_while_the_nodes_are_served(group, tmp_path, cap
     assert "in order" in out.read_text() and "KeyboardInterrupt" in out.read_text()
 
 
+@pytest.mark.realtime
 def test_the_nodes_of_a_scene_are_served(group, capsys):
     assert main(["judge", "free", "--passive", "--seconds", "0.3", "-v"]) == 3
     told = capsys.readouterr()

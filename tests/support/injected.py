@@ -22,7 +22,7 @@ from canprobe.fieldbus.tools.faults.fault import Effect
 
 FREE_CYCLE = 80
 """A cycle in which the arm of `free` moves."""
-HOLD_CYCLE = 700
+HOLD_CYCLE = 480
 """A cycle in which `press` holds its force."""
 
 

@@ -13,6 +13,9 @@ import pytest
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 SUPPORT = CONFTEST.parent / "support"
 WORKERS = ("-n", "2", "--dist", "loadfile")
+TWO_WORKERS = pytest.mark.slow(reason="the same with two workers, three more sessions of pytest")
+ONE_SESSION = pytest.mark.slow(reason="the same without workers, another session of pytest")
+ALLOWED = pytest.mark.slow(reason="another session of pytest, for skips that are allowed")
 
 ADDED = """
 _has_interface = lambda: False
@@ -104,7 +107,7 @@ def counts(output: str) -> dict[str, int]:
     return {word.rstrip("s"): int(number) for number, word in re.findall(r"(\d+) ([a-z]+)", last)}
 
 
-@pytest.mark.parametrize("workers", [(), WORKERS], ids=["one session", "workers"])
+@pytest.mark.parametrize("workers", [pytest.param((), marks=ONE_SESSION), WORKERS], ids=["one session", "workers"])
 def test_outcomes_and_texts_come_back(project: Path, workers: tuple[str, ...]) -> None:
     status, output = run(project, *workers, STAND_IN="runs", CANPROBE_INSTALL="1")
     assert status == 1
@@ -151,9 +154,13 @@ def test_one_that_hangs_fails_by_the_timer_where_the_vcan_is_and_the_next_goes_o
 
 
 @pytest.mark.parametrize(
-    ("required", "expected"), [("", {"passed": 1, "skipped": 9}), ("1", {"passed": 1, "error": 9})]
+    ("required", "expected", "workers"),
+    [
+        ("", {"passed": 1, "skipped": 9}, ()),
+        pytest.param("1", {"passed": 1, "error": 9}, WORKERS, marks=TWO_WORKERS),
+    ],
+    ids=["one session", "workers"],
 )
-@pytest.mark.parametrize("workers", [(), WORKERS], ids=["one session", "workers"])
 def test_without_a_vcan_they_are_skipped_loudly_or_fail(
     project: Path, required: str, expected: dict[str, int], workers: tuple[str, ...]
 ) -> None:
@@ -190,10 +197,18 @@ def test_expected():
 @pytest.mark.parametrize(
     ("strict", "workers", "status", "expected"),
     [
-        ("", (), 0, {"passed": 1, "skipped": 6, "xfailed": 1}),
-        ("1", WORKERS, 1, {"passed": 1, "skipped": 2, "xfailed": 1, "failed": 1, "error": 3}),
+        pytest.param("", (), 0, {"passed": 1, "skipped": 6, "xfailed": 1}, marks=ALLOWED),
+        (
+            "1",
+            ("--continue-on-collection-errors",),
+            1,
+            {"passed": 1, "skipped": 2, "xfailed": 1, "failed": 1, "error": 3},
+        ),
+        pytest.param(
+            *("1", WORKERS, 1, {"passed": 1, "skipped": 2, "xfailed": 1, "failed": 1, "error": 3}), marks=TWO_WORKERS
+        ),
     ],
-    ids=["allowed", "workers"],
+    ids=["allowed", "one session", "workers"],
 )
 def test_a_skip_whose_reason_is_not_listed_is_a_failure_where_all_is_installed(
     project: Path, strict: str, workers: tuple[str, ...], status: int, expected: dict[str, int]
@@ -241,7 +256,11 @@ def test_that_fails_at_every_standstill(vcan0, shared):
 
 
 @pytest.mark.parametrize(
-    ("ci", "expected"), [({}, {"passed": 1, "failed": 1, "skipped": 1}), ({"CI": "1"}, {"passed": 1, "failed": 2})]
+    ("ci", "expected"),
+    [
+        ({}, {"passed": 1, "failed": 1, "skipped": 1}),
+        pytest.param({"CI": "1"}, {"passed": 1, "failed": 2}, marks=pytest.mark.slow(reason="as CI judges it")),
+    ],
 )
 def test_a_failure_in_a_standstill_is_tried_once_more_and_told(
     project: Path, ci: dict[str, str], expected: dict[str, int]

@@ -170,20 +170,26 @@ def test_a_flat_array_is_no_probe(kind):
 
 
 @pytest.mark.parametrize(
-    ("sensor", "curvature"), [("rows = 8\ncolumns = 8\npitch_mm = 3", False), (FREE, True)], ids=["canopen", "free"]
+    ("sensor", "curvature", "bus"),
+    [("rows = 8\ncolumns = 8\npitch_mm = 3", False, "direct"), (FREE, True, "lockstep")],
+    ids=["canopen", "free"],
 )
-def test_arrays_of_other_sizes_scan(sensor, curvature):
+def test_arrays_of_other_sizes_scan(sensor, curvature, bus):
     scene = touch(sensor)
     plan = plan_of(scene)
     assert plan.setup.shape.patch is curvature
     assert curvature or "no curvature: fewer than 16 taxels" in dict(plan.left_out)["curvature from the patch"]
-    summary = canprobe.run(scene, files=False, duration_s=2.0).summary  # a coarse array needs more path than 20 mm
+    summary = canprobe.run(
+        scene, bus=bus, files=False, duration_s=2.0
+    ).summary  # a coarse array needs more path than 20 mm
     assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.2
     assert summary["shape"]["kappa_est_per_m"][0] == pytest.approx(1 / 0.036, abs=3.0)
 
 
 def test_a_node_of_another_size_computes_features():
-    summary = canprobe.run(touch('rows = 10\ncolumns = 12\npitch_mm = 2\nmode = "features"', "press")).summary
+    summary = canprobe.run(
+        touch('rows = 10\ncolumns = 12\npitch_mm = 2\nmode = "features"', "press"), bus="direct"
+    ).summary
     assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.3
 
 

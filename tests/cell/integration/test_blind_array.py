@@ -3,6 +3,8 @@
 The limit is 5 N everywhere. The truth is the emulator's; what the operator reads names the array.
 """
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from canprobe.errors import SafetyStop
 LIMIT_N = 5.0
 
 
+@functools.cache
 def run(scene, text, phase, after_s, **changes):
     """Throw a fault some time into a phase; highest true force, N, what stopped the cell, and the session."""
     overrides = {"task.duration_s": 3.0, "task.clearance_mm": 1.0} | {

@@ -103,7 +103,7 @@ def test_a_ball_that_is_not_there_is_told():
     x, y, z = scene.object.position_mm
     scene = replace(scene, object=replace(scene.object, position_mm=(x, y, z - 4.0)))
     with pytest.raises(SafetyStop, match="touch 1: no ball found up to 1 mm beyond the expected place"):
-        canprobe.run(scene, files=False)
+        canprobe.run(scene, bus="direct", files=False)
 
 
 def test_the_plan_refuses_a_side_that_the_arm_cannot_reach():

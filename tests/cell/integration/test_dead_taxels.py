@@ -8,7 +8,7 @@ from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.supervision import Reaction
 from canprobe.errors import PlanError, SafetyStop
 
-SCAN = {"task.duration_s": 2.0}
+SCAN = {"task.duration_s": 2.0, "bus.interface": "direct"}
 
 
 COLUMNS = pytest.mark.slow(reason="a row is like a column")

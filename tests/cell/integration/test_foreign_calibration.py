@@ -85,6 +85,7 @@ def test_a_doubted_array_has_wider_regions():
     assert b.covariance == pytest.approx(4.0 * a.covariance) and pytest.approx(a.K) == b.K
 
 
+@pytest.mark.slow(reason="a scan of which the default has others, that end without a fault")
 def test_its_own_calibration_is_not_doubted():
     result = canprobe.run(load_scene("cylinder", SCAN), files=False)
     assert said(result.summary["faults"]) == []

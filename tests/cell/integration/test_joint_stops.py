@@ -70,7 +70,7 @@ OTHERS = pytest.mark.slow(reason="the stops of other arms")
 )
 def test_a_stop_on_the_way_of_the_run_is_refused_and_one_beyond_it_is_not(tmp_path, urdf, kind):
     scene = scene_of(tmp_path, urdf, kind)
-    run = canprobe.run(scene, files=False)
+    run = canprobe.run(scene, bus="direct", files=False)
     model, limits = run.plan.setup.arm.model, run.plan.setup.limits
     columns = [run.log[key] for key in ("q_target_rad", "q_target_m", "q_target") if key in run.log]
     q = columns[0] if len(columns) == 1 else np.where(np.isfinite(columns[0]), columns[0], columns[1])

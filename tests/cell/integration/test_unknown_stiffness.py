@@ -38,7 +38,7 @@ def test_force_is_kept_without_retuning(share, fidelity, seconds, rms_percent, m
     scene = replace(scene, plant=plant, shape=replace(scene.shape, also=()))
     highest = []
     for seed in range(3 if fidelity == "dynamic" else 1):
-        result = canprobe.run(scene, files=False, duration_s=seconds, seed=seed)
+        result = canprobe.run(scene, bus="direct", files=False, duration_s=seconds, seed=seed)
         contact = result.summary["contact"]
         assert contact["contact_fraction"] == 1.0
         assert 100 * contact["force_rms_error_n"] / 2.0 < rms_percent
@@ -58,5 +58,5 @@ def test_the_first_answer_of_the_estimator_does_not_jerk_a_stiff_arm():
         task=replace(scene.task, clearance_mm=0.5),
         bus=replace(scene.bus, timed=False),
     )
-    result = canprobe.run(scene, files=False, duration_s=1.0)
+    result = canprobe.run(scene, bus="direct", files=False, duration_s=1.0)
     assert result.truth["force_n"].max() < 3.0

@@ -21,6 +21,7 @@ from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import NMT_ID, SYNC_ID
 
+SHORT = {"task.duration_s": 0.2, "task.clearance_mm": 0.5}
 HOUR_NS = 3_600_000_000_000
 WALL_NS = 1_700_000_000_000_000_000
 
@@ -74,7 +75,7 @@ def run_with(monkeypatch, tmp_path) -> Callable:
                 return port
 
             monkeypatch.setattr(LockstepBus, "port", stamped)
-            result = undrawn_run(canprobe.load_scene("press", {"task.duration_s": 0.3}), out=tmp_path / name)
+            result = undrawn_run(canprobe.load_scene("press", SHORT), out=tmp_path / name)
             return read_npz(tmp_path / name / "log.npz"), result.summary, sent
 
         yield run

@@ -102,6 +102,19 @@ def packaged_plan(name):
 
 
 @pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
+def test_packaged_scenes_fit(name):
+    plan = packaged_plan(name)
+    if plan.joint_speeds is not None:
+        pairs = zip(plan.joint_speeds.needed, plan.joint_speeds.limit, strict=True)
+        assert all(needed <= 0.6 * limit for needed, limit in pairs), "a packaged scene keeps clear of the limits"
+
+
+@pytest.mark.parametrize("name", ["cylinder", "foam", "steel", "calibrate", "listen", "free", "miscalibrated"])
+def test_packaged_scenes_have_nothing_to_warn_of(name):
+    assert packaged_plan(name).warnings == ()
+
+
+@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
 def test_json_says_what_the_plan_says(name):
     plan = packaged_plan(name)
     document = json.loads(json.dumps(plan_dict(plan), allow_nan=False))

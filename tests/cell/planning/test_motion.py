@@ -10,25 +10,19 @@ from scenes import change, reasons, with_joints
 
 import canprobe
 from canprobe.cell.planning.surface_path import surface_path
+from canprobe.cell.planning.task_way import over_path
 from canprobe.cell.scene.geometry import true_object
-from canprobe.cell.scene.load import load_scene, packaged
+from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.resolve import resolve
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, LineMotion, ProbePose
 
 
 @pytest.fixture(scope="module")
 def cylinder():
     return load_scene("cylinder")
-
-
-@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
-def test_packaged_scenes_fit(name):
-    plan = canprobe.plan(load_scene(name))
-    if plan.joint_speeds is not None:
-        pairs = zip(plan.joint_speeds.needed, plan.joint_speeds.limit, strict=True)
-        assert all(needed <= 0.6 * limit for needed, limit in pairs), "a packaged scene keeps clear of the limits"
 
 
 @pytest.mark.parametrize(
@@ -264,3 +258,19 @@ def test_an_approach_beyond_the_joints_is_refused_with_a_speed_that_fits():
     (problem, *_) = reasons(slow)
     fitting = float(problem.split("task.approach_mm_s to ")[1])
     assert canprobe.plan(change(slow, task={"approach_mm_s": fitting}))
+
+
+def test_the_way_of_a_touch_goes_over_the_approach_to_the_first_contact():
+    """In steps of which none is faster than a move of minimum jerk at its fastest."""
+    setup = resolve(load_scene("press"))
+    task = setup.task
+    above = task.approach.start + (task.approach.clearance + task.probe.radius) * task.approach.normal
+    start = ProbePose(above + np.array([0.1, 0.0, 0.05]), -task.approach.normal)
+    way = [(start, 0.0), *over_path(task, surface_path(task, setup.truth.object), start)]
+    away = [float(np.linalg.norm(pose.centre - above)) for pose, _ in way]
+    last = int(np.argmin(away))
+    assert away[last] == pytest.approx(0.0, abs=1e-9) and away[: last + 1] == sorted(away[: last + 1], reverse=True)
+    seconds = [seconds for _, seconds in way[1 : last + 1]]
+    assert sum(seconds) == pytest.approx(LineMotion(start, ProbePose(above, start.pole), MOVE_SPEED_M_S).duration)
+    speeds = -np.diff(away[: last + 1]) / seconds
+    assert last > 3 and speeds.max() <= 15 / 8 * MOVE_SPEED_M_S

@@ -88,12 +88,15 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
     assert str(error).splitlines()[-1] == f"  {error.ways_out[-1]}"
 
 
+OTHER_REFUSALS = pytest.mark.slow(reason="other refusals; tests/cli/test_advice.py types what drawn ones advise")
+
+
 @pytest.mark.parametrize(
     "sections",
     [
         {"sensor": {"mode": "image"}},
-        {"bus": {"transmit_queue": "fifo"}},
-        {"cycle": {"rate_hz": 500.0}, "sensor": {"rate_hz": 250.0}},
+        pytest.param({"bus": {"transmit_queue": "fifo"}}, marks=OTHER_REFUSALS),
+        pytest.param({"cycle": {"rate_hz": 500.0}, "sensor": {"rate_hz": 250.0}}, marks=OTHER_REFUSALS),
     ],
 )
 def test_ways_out_written_into_the_scene_file_make_it_fit(cylinder, sections):

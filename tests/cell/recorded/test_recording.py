@@ -64,12 +64,15 @@ def undisturbed(lockstep_run):
     )
 
 
+OTHER_STEPS = pytest.mark.slow(reason="other steps of the same clock")
+
+
 @pytest.mark.parametrize(
     "steps_us",
     [
         (-5_000,),
-        (-20_000,),
-        (-3_600_000_000,),
+        pytest.param((-20_000,), marks=OTHER_STEPS),
+        pytest.param((-3_600_000_000,), marks=OTHER_STEPS),
         (86_400_000_000,),
         (-2_000_000, -7_000_000),
     ],
@@ -95,7 +98,7 @@ def test_a_clock_that_was_set_changes_no_estimate_and_no_load(lockstep_run, undi
     assert measured.as_planned and f"line {first}: the stamps of can0 step" in measured.text()
 
 
-@pytest.mark.parametrize("step_us", [-5_000_000, -3_600_000_000])
+@pytest.mark.parametrize("step_us", [-5_000_000, pytest.param(-3_600_000_000, marks=OTHER_STEPS)])
 def test_a_clock_that_was_set_back_before_the_first_sync_changes_no_estimate(
     lockstep_run, undisturbed, tmp_path, step_us
 ):

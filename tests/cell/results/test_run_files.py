@@ -15,7 +15,7 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.emulated.truth_columns import NAMES, with_units
+from canprobe.cell.emulated.truth_columns import NAMES, with_present_names, with_units
 from canprobe.cell.npz import read_npz
 from canprobe.cell.results.run_files import read_truth
 from canprobe.cli import main
@@ -185,6 +185,13 @@ def test_a_truth_under_its_former_names_is_read_with_one_warning(
     with pytest.warns(FutureWarning) as told:
         assert main(["replay", str(folder), "--json"]) == 0
     assert len(told) == 1 and capsys.readouterr().out == replayed
+
+
+def test_joints_of_a_former_file_are_renamed_where_it_is_known_which_slide(tmp_path: Path) -> None:
+    columns = {"q": np.array([[1.0, 0.2]])}
+    with pytest.warns(FutureWarning, match="columns without units, of an earlier canprobe: q;"):
+        assert with_present_names(columns, (False, True), tmp_path).keys() == {"q_rad", "q_m"}
+    assert with_present_names(columns, None, tmp_path) == columns
 
 
 def test_a_former_name_of_the_truth_gives_its_column_with_one_warning() -> None:

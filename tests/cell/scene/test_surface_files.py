@@ -161,7 +161,16 @@ def damaged(content, rng):
     return bytes(whole)
 
 
-@pytest.mark.parametrize("name", ["a.stl", "b.stl", "a.obj", "a.ply", "b.ply", "a.npy", "a.npz", "a.csv", "a.txt"])
+BINARY = pytest.mark.slow(reason="the binary form of the same kind")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("a.stl", "a.obj", "a.ply", "a.npy", "a.npz", "a.csv", "a.txt"),
+        *(pytest.param(name, marks=BINARY) for name in ("b.stl", "b.ply")),
+    ],
+)
 def test_of_thirty_damaged_files_each_is_read_or_named(name, tmp_path):
     if name.startswith("b") or not name.endswith(("npy", "npz", "csv", "txt")):
         trimesh = pytest.importorskip("trimesh")

@@ -35,7 +35,13 @@ def plan_of(known):
     )
 
 
-@pytest.mark.parametrize("known", [KnownObject("ball", 0.025), KnownObject("plane", math.inf)])
+@pytest.mark.parametrize(
+    "known",
+    [
+        KnownObject("ball", 0.025),
+        pytest.param(KnownObject("plane", math.inf), marks=pytest.mark.slow(reason="a second object")),
+    ],
+)
 def test_a_touch_rolls_over_the_pad_and_is_recorded_with_its_reference_force(known):
     presses = (Press(1.0, (1.5e-3, -1e-3), seconds=1.5, hz=(1.0,)), Press(2.0, seconds=1.0, hz=(1.0,)))
     dwells, unloaded = touch_object(

@@ -74,6 +74,7 @@ def test_a_node_that_does_not_boot_in_time_is_named_with_the_way_out(tmp_path: P
         await_boot_ups(tmp_path, 1.0, silent=4)
 
 
+@pytest.mark.realtime
 def test_in_the_background_of_a_script_it_ends_at_once_too(tmp_path: Path) -> None:
     """A shell without job control starts there with SIGINT ignored, and the nodes' process inherits it."""
     free = canprobe.load_scene("free")

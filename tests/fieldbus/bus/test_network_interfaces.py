@@ -30,6 +30,7 @@ def frames_of(port, count, clock):
     return [frame[:2] for frame in found]
 
 
+@pytest.mark.realtime
 def test_multicast_ports_hear_each_other_and_never_themselves(group):
     clock = MonotonicClock()
     one, two = (open_port("udp_multicast", group, 1_000_000, clock) for _ in range(2))
@@ -83,6 +84,7 @@ class Socketcand(threading.Thread):
             connection.sendall(b"< ok >")
 
 
+@pytest.mark.realtime
 def test_socketcand_with_its_host_from_python_cans_file(monkeypatch, tmp_path):
     server = Socketcand()
     server.start()

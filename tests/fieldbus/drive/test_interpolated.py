@@ -156,3 +156,14 @@ def test_cia402_59_74_records_that_are_missing(master):
 def test_cia402_74_60c0_is_linear_or_a_makers(master):
     assert master.bench.write(0x60C0, 0, -1, 2) == 0
     assert master.bench.write(0x60C0, 0, 1, 2) in (0x06090030, 0x06090031)
+
+
+def test_cia402_74_a_halt_of_the_time_before_is_over(master):
+    master.cycle(0, ACTIVE)
+    master.cycle(0, HALTED)
+    master.cycle(0, 0x07)
+    for word in (ENABLED, ENABLED, ACTIVE):
+        master.cycle(0, word)
+    master.cycle(1000)
+    master.cycle(2000)
+    assert master.half() == pytest.approx(500)

@@ -369,6 +369,9 @@ def test_what_links_look_like_and_where_their_meshes_are(tmp_path):
     again = visuals_of(copy)
     assert [find_mesh(copy, v.mesh) for v in (again[0], again[2])] == [find_mesh(urdf, v.mesh) for v in (stl, obj)]
     assert with_meshes_found(copy) == copy.read_bytes()
+    (tmp_path / "lab/meshes/a.stl").unlink()
+    copy.write_text(SHOWN.replace("b %2F.obj", "no.obj"))
+    assert with_meshes_found(copy) == copy.read_bytes(), "names of meshes that are missing stay"
 
 
 def test_a_solid_without_its_numbers_is_refused():

@@ -202,7 +202,7 @@ def test_the_spacing_that_is_chosen_or_named_has_the_curvature_of_a_coarse_ball(
         assert worst(exact, usual)[2] > 1.5 * worst(exact, chosen)[2]
 
 
-@pytest.mark.parametrize("edge", [5e-4, 1e-3])
+@pytest.mark.parametrize("edge", [pytest.param(5e-4, marks=pytest.mark.slow(reason="four times the facets")), 1e-3])
 def test_the_error_of_a_measured_mesh_is_stated_and_a_wider_spacing_found(edge):
     """Vertices with a scatter of 10 µm."""
     params, height = BODIES["sphere"]

@@ -435,8 +435,20 @@ FILLETS = {
 }
 
 
-@pytest.mark.parametrize("sigma", [SIGMA, (1e-4, 4e-3)], ids=["sigmas as they are", "sigmas of the loop"])
-@pytest.mark.parametrize("row", FILLETS)
+LOOP_SIGMA = (1e-4, 4e-3)
+OTHER_FILLETS = pytest.mark.slow(reason="other fillets with the sigmas of the loop")
+
+
+@pytest.mark.parametrize(
+    ("row", "sigma"),
+    [
+        *(pytest.param(row, SIGMA, id=f"{row}, sigmas as they are") for row in FILLETS),
+        *(
+            pytest.param(row, LOOP_SIGMA, id=f"{row}, sigmas of the loop", marks=[OTHER_FILLETS] * bool(n))
+            for n, row in enumerate(FILLETS)
+        ),
+    ],
+)
 def test_fillet(row, sigma, truth):
     """From 5 mm past a jump of curvature on, the RMS error along the path is below 5 % (on a plane below 1 per m).
 

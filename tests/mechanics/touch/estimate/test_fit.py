@@ -47,9 +47,15 @@ def test_ml_is_exact_on_any_quadric(name, truth):
     assert np.allclose(estimate.normal, path.normals[-1], atol=1e-9)
 
 
+OTHER_PATHS = pytest.mark.slow(reason="other paths over the same patch")
+
+
 # The table of the method comparison: against the bound, RMS error and runs of 40 (16) that a 95 % region may miss.
 @pytest.mark.parametrize(("method", "seeds", "largest", "missed"), [("ml", 40, 1.25, 7), ("recursive", 16, 1.4, 3)])
-@pytest.mark.parametrize(("sigma_point", "sigma_normal"), [(2e-5, 1e-3), (5e-5, 3e-3)])
+@pytest.mark.parametrize(
+    ("sigma_point", "sigma_normal"),
+    [(2e-5, 1e-3), pytest.param(5e-5, 3e-3, marks=pytest.mark.slow(reason="more noise, against the same bound"))],
+)
 @pytest.mark.parametrize("name", ["plane", "cylinder", "sphere", "ellipsoid", "hyperboloid", "saddle"])
 def test_it_reaches_the_bound_and_covers(  # noqa: PLR0917
     name, sigma_point, sigma_normal, method, seeds, largest, missed, truth
@@ -168,7 +174,9 @@ def long_path(kind, size):
     return size * np.interp(at, s, x), size * np.interp(at, s, y)
 
 
-@pytest.mark.parametrize("kind", ["zigzag", "spiral", "circles", "dwell"])
+@pytest.mark.parametrize(
+    "kind", ["zigzag", "dwell", *(pytest.param(kind, marks=OTHER_PATHS) for kind in ("spiral", "circles"))]
+)
 @pytest.mark.parametrize(
     ("radius", "K"), [(5e-3, [[1, 0], [0, 1]]), (0.05, [[1, 0], [0, 0]]), (10.0, [[1, 0], [0, -0.5]])]
 )
