@@ -43,7 +43,7 @@ def home(scene: Scene, *, operator: Operator | None = None, say: Say = quiet) ->
             else:
                 operator.ask(homing.question(axis))
                 while (answer := operator.answer()) is None:
-                    homing.keep_alive()
+                    homing.link.keep_alive()
             if answer is Answer.QUIT:
                 return
             say(homing.home(axis) if answer is Answer.YES else f"joint {axis + 1} is left as it is")
