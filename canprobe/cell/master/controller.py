@@ -91,6 +91,10 @@ class Command:
     estimate: SurfaceEstimate | None = None
 
 
+OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
+"""Columns of the cell in the log; a controller's `Command.columns` have other names."""
+
+
 def check_command(command: Command, *, arm: bool) -> None:
     """Check what a controller returned, but for the joint target of an arm: the supervision checks that.
 
@@ -99,8 +103,10 @@ def check_command(command: Command, *, arm: bool) -> None:
         arm: the scene has one.
 
     Raises:
-        UsageError: a field of the command has the wrong type.
+        UsageError: it is no command, a field of it has the wrong type, or a column has a name of the cell's.
     """
+    if not isinstance(command, Command):
+        raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
     if not isinstance(command.done, bool | np.bool_):
         raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
     if command.stop_reason is not None and not (isinstance(command.stop_reason, str) and command.stop_reason.strip()):
@@ -120,6 +126,9 @@ def check_command(command: Command, *, arm: bool) -> None:
 
         if not isinstance(command.estimate, SurfaceEstimate):
             raise UsageError(f"controller: expected estimate to be a SurfaceEstimate, got {command.estimate!r}")
+    if not OWN_COLUMNS.isdisjoint(command.columns):
+        taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
+        raise UsageError(f"controller: expected other columns than the cell's, got {taken}")
 
 
 class SampleReader(Protocol):

@@ -85,8 +85,8 @@ class Homing:
         setups: tuple[NodeSetup, ...],
         network: PumpedNetwork,
         watch: NodeWatch,
-        *,
         supervise: Callable[[], None],
+        *,
         record: Path | None,
         say: Callable[[str], None],
     ) -> None:

@@ -224,7 +224,7 @@ class OpenCell:
         self, log: dict[str, Floats], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
     ) -> RunData:
         """The data of the run with the estimator in the loop, scored by the plan that it ran with."""
-        record, start_s, setup = record_of(self._last), self.cell.start_ns * 1e-9, self.plan.setup
+        record, start_s, setup = record_of(self._last), self.cell.cycles.start_ns * 1e-9, self.plan.setup
         estimates: dict[str, list[ShapeRecord]] = {}
         if record.shape is not None and setup.shape is not None:
             estimates[setup.shape.method] = record.shape.records

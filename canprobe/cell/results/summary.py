@@ -101,7 +101,7 @@ def summarise(
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
         "bridges": bridges,
-        "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
+        "faults": [*cell.notes.lines(), *(session.observers.faults if session.observers is not None else ())],
     }
     if record.explored is not None:
         summary["explore"] = record.explored.summarised()
@@ -308,8 +308,8 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
         "stale_frames": tactile.stale if tactile is not None else 0,
         "unplaced_contacts": record.unplaced,
         "slowed_cycles": record.slowed,
-        "dropped_frames": cell.counters.overruns,
-        "clock_steps": cell.counters.clock_steps,
+        "dropped_frames": cell.port.counters.overruns,
+        "clock_steps": cell.port.counters.clock_steps,
         "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
         "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
         "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),

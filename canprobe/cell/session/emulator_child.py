@@ -19,7 +19,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.child_process import ChildProcess
 from canprobe.errors import BusError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.fieldbus.bus.port import Port, TimedFrame
+from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE
 
 REPORT_EVERY_S = 10.0
@@ -76,14 +76,14 @@ class EmulatorChild(ChildProcess):
         self,
         port: Port,
         say: Callable[[str], None] = lambda _: None,
-        hear: Callable[[list[TimedFrame]], None] = lambda _: None,
+        hear: Callable[[int, bytes, int], object] = nothing,
     ) -> None:
         """Wait until it serves, and for the boot-up of each of its nodes, as long as the scene allows.
 
         Args:
             port: port on the nodes' buses.
             say: called every 10 s with how long it has taken.
-            hear: gets all frames meanwhile: another master may begin, or a node report an error.
+            hear: gets each frame meanwhile: another master may begin, or a node report an error.
 
         Raises:
             BusError: when the process ended; with its last message.
@@ -103,9 +103,8 @@ class EmulatorChild(ChildProcess):
                 say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
                 report += round(REPORT_EVERY_S * 1e9)
             port.wait(min(deadline, now + 50_000_000))
-            frames = port.drain()
-            hear(frames)
-            for can_id, data, _ in frames:
+            for can_id, data, t_ns in port.drain():
+                hear(can_id, data, t_ns)
                 if data == b"\0":
                     waiting.discard(can_id - HEARTBEAT_BASE)
 

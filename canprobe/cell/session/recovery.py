@@ -177,7 +177,7 @@ class Recovery:
 
     def _run_s(self, cell: Cell) -> float:
         """Time on the run's clock, s."""
-        return (cell.start_ns + cell.supervisor.seen.measurement.t_ns) * 1e-9
+        return cell.cycles.run_s(cell.supervisor.seen.measurement)
 
     def _note_resumed(self) -> None:
         self._say("motion goes on")

@@ -399,7 +399,7 @@ class Session:
         """Get ready for real time: start the emulated nodes, rehearse, reserve memory, ask for priority."""
         child = None
         if self.plan.setup.emulates:
-            self.cell.listen()  # they would boot beside those of another master
+            self.cell.bring_up.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
             channels = list(self.plan.emulated_channels)
             child = EmulatorChild(self.plan, self.out, channels, truth=self.keeps_all, origin_ns=self.record.origin_ns)
@@ -410,7 +410,7 @@ class Session:
         rehearse(self.plan)
         reserve_memory(self.plan.cycles if self.keeps_all else self.options.rows_kept)
         if child is not None:
-            child.await_boot_ups(port, self._say, self.cell.hear)
+            child.await_boot_ups(port, self._say, self.cell.watch.push)
         if self.scene.cycle.realtime:
             self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
 

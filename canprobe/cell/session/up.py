@@ -86,5 +86,5 @@ def reporting_notes(session: Session, say: Say) -> Iterator[Callable[[Measuremen
         with session:
             yield report_news
     finally:
-        for line in session.cell.faults if session.started else ():
+        for line in session.cell.notes.lines() if session.started else ():
             say(f"noted: {line}")

@@ -75,7 +75,7 @@ class Soaker(Controller):
 
     def _look(self, t_s: float) -> None:
         cell = self._session.cell
-        cycle, drives, counters = cell.cycle, cell.drives, cell.counters
+        cycle, drives, counters = cell.cycle, cell.drives, cell.port.counters
         assert cycle is not None and drives is not None
         counted, packets = counters.sent + counters.received, packets_on(CHANNEL)
         if not self.samples:

@@ -72,7 +72,7 @@ def test_a_blind_array_presses_no_harder(scene, text, phase, after_s, words):
 
 def test_what_it_is_left_with_is_said_to_be_unknown():
     _, _, session = run("press", "node 16: stuck-image", Phase.SCAN, 0.3)
-    (note,) = [line for line in session.cell.faults if "left pressing" in line]
+    (note,) = [line for line in session.cell.notes.lines() if "left pressing" in line]
     assert "with an unknown force: the array is not believed, as the array has sent the same image" in note
 
 

@@ -59,7 +59,7 @@ def test_a_harder_layer_is_said_once_and_widens_the_force_alone():
 
 def test_images_that_contradict_the_motion_are_left_out(blurred):
     session, task = blurred
-    (line,) = said(session.cell.faults)
+    (line,) = said(session.cell.notes.lines())
     assert re.search(r"blurred by 1\.[5-8]. mm", line)
     assert ": forces and regions are stated wider from here on" in line
     answers = [record.estimate for record in task.shape.records]
@@ -102,7 +102,7 @@ def test_its_own_calibration_is_not_doubted():
 )
 def test_another_array_is_noticed(config, pad, sign):
     session, _ = scan(pad, **config)
-    (line,) = said(session.cell.faults)
+    (line,) = said(session.cell.notes.lines())
     assert re.search(sign, line)
 
 

@@ -65,7 +65,7 @@ def test_the_probe_is_taken_off(what):
     assert 0.95 * WAY_BACK < back < 1.2 * WAY_BACK and aside < 0.05 * WAY_BACK, (
         "without a sensor the task begins to retreat by itself"
     )
-    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.notes.lines())
     if what.startswith("joint"):
         lost = int(what.split()[1]) - 1
         assert turned(run)[lost] < 30, "it stood still"
@@ -86,7 +86,7 @@ def pressed_on(run, told):
     run.assert_drives_off()
     assert run.session.truth["force_n"][-1] == pytest.approx(2.0, abs=0.3)
     assert abs(lifted(run)[0]) < 0.1 * WAY_BACK
-    assert any(told in fault for fault in (str(run.error), *run.session.cell.faults))
+    assert any(told in fault for fault in (str(run.error), *run.session.cell.notes.lines()))
 
 
 def test_a_drive_that_tells_what_cannot_be_may_be_moving():
@@ -102,7 +102,7 @@ def test_with_another_master_nothing_moves():
     assert 1.8 < force < 2.2
     assert any(
         fault.endswith("free it; a run does not begin while the array measures a force")
-        for fault in run.session.cell.faults
+        for fault in run.session.cell.notes.lines()
     )
 
 
@@ -111,7 +111,7 @@ def test_with_a_node_that_another_master_took_nothing_moves(command):
     """The node has left operation, for which the others would lift."""
     run = Injected("press", HOLD_CYCLE, lambda r: send(r, pack_nmt(command, 16)))
     pressed_on(run, "another master is on the bus: an NMT command")
-    assert not any("lift off" in fault for fault in run.session.cell.faults)
+    assert not any("lift off" in fault for fault in run.session.cell.notes.lines())
 
 
 @pytest.mark.parametrize("other", ["bus-off", "a jump"])
@@ -121,13 +121,13 @@ def test_nothing_lifts_where_another_condition_says_stop(other):
     def both(run):
         run.inject("node 3: reboot for 1 ms")
         if other == "bus-off":
-            run.session.cell._port.state = ControllerState.BUS_OFF
+            run.session.cell.port.state = ControllerState.BUS_OFF
         else:
             run.session.cell.supervisor._guard.measure = lambda _: "joint 2 reports a motion"
 
     run = Injected("press", HOLD_CYCLE, both)
     pressed_on(run, "node 3: left operation")
-    assert not any("lift off" in fault for fault in run.session.cell.faults)
+    assert not any("lift off" in fault for fault in run.session.cell.notes.lines())
 
 
 def interrupted(number):
@@ -164,7 +164,7 @@ def master_heard(run):
 
 
 def bus_off(run):
-    run.session.cell._port.state = ControllerState.BUS_OFF
+    run.session.cell.port.state = ControllerState.BUS_OFF
 
 
 def drive_fault(run):
@@ -191,7 +191,7 @@ def test_a_lift_off_does_not_go_on_when_something_else_comes(second, cycles):
     assert 20 <= run.lifting <= 20 + cycles
     assert 0.2 * WAY_BACK < lifted(run)[0] < 0.5 * WAY_BACK, "as far as it was, and what is left of the motion"
     if second is master_heard:
-        assert "another master is on the bus: SYNC from another master" in run.session.cell.faults
+        assert "another master is on the bus: SYNC from another master" in run.session.cell.notes.lines()
 
 
 def test_a_disabled_drive_stands_still_and_the_others_lift():
@@ -236,7 +236,7 @@ def test_a_drive_that_left_operation_beside_the_one_that_is_named_does_not_lift(
 
 def left_pressing(session):
     """The forces that the user is told to free, N."""
-    return [float(fault.split(" N")[0].split()[-1]) for fault in session.cell.faults if "left pressing" in fault]
+    return [float(fault.split(" N")[0].split()[-1]) for fault in session.cell.notes.lines() if "left pressing" in fault]
 
 
 def test_a_light_press_after_a_strong_one_is_told():
@@ -275,7 +275,7 @@ def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
 
 def test_after_bus_off_nothing_can_be_sent():
     def off(run):
-        run.session.cell._port.state = ControllerState.BUS_OFF
+        run.session.cell.port.state = ControllerState.BUS_OFF
 
     pressed_on(Injected("press", HOLD_CYCLE, off), "left pressing")
 
@@ -295,8 +295,8 @@ def test_whoever_ends_the_run_the_probe_is_taken_off(what):
     run = Injected("press", HOLD_CYCLE, action)
     run.assert_within("interrupt").assert_drives_off()
     assert type(run.error) is kind
-    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
-    assert not any("left pressing" in fault for fault in run.session.cell.faults)
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.notes.lines())
+    assert not any("left pressing" in fault for fault in run.session.cell.notes.lines())
     assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
     assert run.session.truth["force_n"][-1] == 0.0
     back, aside = lifted(run)
@@ -330,7 +330,7 @@ def test_nobody_need_listen():
     run.assert_drives_off()
     assert run.session.truth["force_n"][-1] == 0.0
     assert {node.node.core.state for node in run.nodes.values()} == {NmtState.PRE_OPERATIONAL}
-    assert any("BrokenPipeError" in fault for fault in run.session.cell.faults)
+    assert any("BrokenPipeError" in fault for fault in run.session.cell.notes.lines())
 
 
 def test_a_second_interrupt_stops_at_once():

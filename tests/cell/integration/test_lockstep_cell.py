@@ -53,7 +53,7 @@ def test_scene_runs_to_its_end_and_leaves_the_cell_safe(name):
     controller = make_task(session.plan)
     with session:
         session.run(controller)
-    assert session.cell.faults == []
+    assert session.cell.notes.lines() == []
     assert session.cell.cycle.statistics.overruns == 0
     assert_safe(session)
 
@@ -134,7 +134,7 @@ def test_a_drive_fault_stops_the_cell_and_names_it():
 
     with pytest.raises(NodeError, match=r"node 2: .*(4210|temperature)"), session:
         session.run(_once(fault))
-    assert any("4210h" in fault for fault in session.cell.faults)
+    assert any("4210h" in fault for fault in session.cell.notes.lines())
     assert_safe(session)
 
 

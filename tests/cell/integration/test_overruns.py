@@ -60,7 +60,7 @@ def test_the_nodes_say_that_sync_was_late_and_it_is_told_in_one_line(stalled: tu
     """1.5 periods (1006h) after a SYNC its absence is an EMCY 8100h; the next SYNC ends that error (1001h)."""
     session, controller = stalled
     overruns = summarise(session, controller.record(), {}, None)["cycle"]["overruns"]
-    (told,) = session.cell.faults
+    (told,) = session.cell.notes.lines()
     what = r"nodes 1-6, 16: EMCY 8100h, communication \(no SYNC in time\)"
     times = re.fullmatch(what + r", (\d+) times, first at [\d.]+ s, last at [\d.]+ s", told)
     assert times is not None and int(times[1]) == session.cell.supervisor.counts["emcy_communication"]

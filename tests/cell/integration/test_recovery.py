@@ -121,7 +121,7 @@ def cut_for(seconds, *, replugged=False, opened=None):
     """Take the interface away for a time; one that was replugged is another one, which has to be opened."""
 
     def cut(run):
-        port, until_ns = run.session.cell._port, run.now() + round(seconds * 1e9)
+        port, until_ns = run.session.cell.port, run.now() + round(seconds * 1e9)
         opened_ns = [] if opened is None else opened
 
         def failing(method):

@@ -71,9 +71,9 @@ def test_an_emcy_of_the_sensor():
 def test_an_emcy_about_communication_is_noted():
     run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
     run.assert_counted("emcy_communication")
-    at_s = run.session.cell.start_ns * 1e-9 + FREE_CYCLE * 0.0025
+    at_s = run.session.cell.cycles.start_ns * 1e-9 + FREE_CYCLE * 0.0025
     told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {at_s:.2f} s"
-    assert run.session.cell.faults == [told]
+    assert run.session.cell.notes.lines() == [told]
 
 
 def test_another_master():
@@ -113,7 +113,7 @@ def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
         if text != "enable the drives":
             return
         if what == "bus-off":
-            session.cell._port.state = ControllerState.BUS_OFF
+            session.cell.port.state = ControllerState.BUS_OFF
         else:
             session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
 
@@ -245,7 +245,7 @@ def test_a_drive_that_is_late_makes_all_of_them_hold():
     log = run.session.cell.log.arrays()
     assert np.isnan(log["q_target_rad"][noticed]).all(), "no new ones"
     assert (log["q_target_rad"][noticed + 1] == log["q_rad"][noticed + 1]).all()
-    assert any("node 5: no usable TPDO for 3 cycles: hold" in fault for fault in run.session.cell.faults)
+    assert any("node 5: no usable TPDO for 3 cycles: hold" in fault for fault in run.session.cell.notes.lines())
 
 
 def test_a_wrong_position_is_not_believed():
@@ -270,15 +270,15 @@ def test_a_wrong_position_is_not_believed():
 
 def test_error_frames_dropped_frames_and_a_wall_clock_that_is_set_are_noted():
     def count(run):
-        run.session.cell._port.counters.error_frames += 3
-        run.session.cell._port.counters.overruns += 2
-        run.session.cell._port.counters.clock_steps += 1
+        run.session.cell.port.counters.error_frames += 3
+        run.session.cell.port.counters.overruns += 2
+        run.session.cell.port.counters.clock_steps += 1
 
     run = Injected("free", FREE_CYCLE, count, until=10)
     run.assert_counted("error_frames").assert_counted("frames_dropped").assert_counted("clock_step")
-    assert f"wall clock set: 1, the first in cycle {FREE_CYCLE + 1}" in run.session.cell.faults
-    assert any("bus error frames: 3" in fault for fault in run.session.cell.faults)
-    assert any("dropped by the kernel or the controller: 2" in fault for fault in run.session.cell.faults)
+    assert f"wall clock set: 1, the first in cycle {FREE_CYCLE + 1}" in run.session.cell.notes.lines()
+    assert any("bus error frames: 3" in fault for fault in run.session.cell.notes.lines())
+    assert any("dropped by the kernel or the controller: 2" in fault for fault in run.session.cell.notes.lines())
 
 
 class Passive(Injected):
@@ -288,11 +288,11 @@ class Passive(Injected):
 
     def after(self, measurement):
         if measurement.cycle == self.at + self.for_cycles:
-            self.session.cell._port.state = ControllerState.ACTIVE
+            self.session.cell.port.state = ControllerState.ACTIVE
 
 
 def passive(run):
-    run.session.cell._port.state = ControllerState.PASSIVE
+    run.session.cell.port.state = ControllerState.PASSIVE
 
 
 def test_error_passive_holds_until_it_is_over():
@@ -302,7 +302,7 @@ def test_error_passive_holds_until_it_is_over():
     stands = (np.diff(targets, axis=0) == 0.0).all(axis=1)
     assert stands[run.at + 2 : run.at + run.for_cycles].all()
     assert not stands[run.at - 20 : run.at].any() and not stands[run.at + run.for_cycles + 2 : run.until - 1].any()
-    assert any("error-passive: hold" in fault for fault in run.session.cell.faults)
+    assert any("error-passive: hold" in fault for fault in run.session.cell.notes.lines())
 
 
 def test_error_passive_for_long_makes_the_probe_retreat():
@@ -314,7 +314,7 @@ def test_error_passive_for_long_makes_the_probe_retreat():
 
 def test_bus_off():
     def off(run):
-        run.session.cell._port.state = ControllerState.BUS_OFF
+        run.session.cell.port.state = ControllerState.BUS_OFF
 
     run = Injected("free", FREE_CYCLE, off)
     run.assert_within("bus_off").assert_drives_off()
@@ -324,7 +324,7 @@ def test_bus_off():
 @pytest.mark.parametrize("back_after_ns", [None, 100_000_000])
 def test_the_interface_is_removed_and_the_drives_stop_by_themselves(back_after_ns):
     def remove(run):
-        port = run.session.cell._port
+        port = run.session.cell.port
         bus, counters = run.session.lockstep, port.counters
         gone_ns = run.now()
 
@@ -354,12 +354,12 @@ def test_the_interface_is_removed_and_the_drives_stop_by_themselves(back_after_n
                 port.close()
 
         cell = run.session.cell
-        cell._port = cell.cycle._port = cell._network.port = Gone()
+        cell.port = cell.cycles.port = cell.cycle._port = cell._network.port = Gone()
 
     run = Injected("free", FREE_CYCLE, remove)
     run.assert_within("interface").assert_drives_off()
     assert isinstance(run.error, InterfaceError) and "interface lost" in str(run.error)
-    assert any("while stopping" in fault for fault in run.session.cell.faults) is (back_after_ns is None)
+    assert any("while stopping" in fault for fault in run.session.cell.notes.lines()) is (back_after_ns is None)
 
 
 # time
@@ -512,7 +512,7 @@ def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stop
     run.assert_within("drive_fault").assert_drives_off()
     told = "node 3: (joint 3) left operation enabled: in no CiA 402 state (statusword 0x0601)"
     assert str(run.error) == told
-    assert run.session.cell.faults == ["while stopping: node 3 did not confirm that it is disabled"]
+    assert run.session.cell.notes.lines() == ["while stopping: node 3 did not confirm that it is disabled"]
 
 
 def test_a_drive_that_is_never_in_a_state_is_not_enabled():
@@ -537,7 +537,7 @@ def test_a_measured_jump_that_no_joint_can_make():
 
     class Unguarded(Injected):
         def after(self, measurement):
-            self.session.cell._controller.compares_motion = True
+            self.session.cell.cycles.controller.compares_motion = True
             for track in self.session.cell.drives._tracks:
                 track._asked = 1e9
 
@@ -564,7 +564,7 @@ def test_an_estimator_that_diverges_starts_afresh():
     run = Injected("cylinder", 620, diverge, until=200, shape={"also": ()})
     assert run.error is None
     assert run.session.cell.supervisor.counts["estimator"] == run.task.shape.restarts == 1
-    assert any("estimator diverges: 1" in fault for fault in run.session.cell.faults)
+    assert any("estimator diverges: 1" in fault for fault in run.session.cell.notes.lines())
     assert max(float(np.abs(r.estimate.kappa[0])) for r in run.task.shape.records if r.estimate.observed[0]) < 100
 
 

@@ -21,7 +21,7 @@ class Working(Controller):
 
     def _note(self, what):
         cell = self._session.cell
-        self.calls.append((what, cell.cycle.number, cell._port.counters.sent))
+        self.calls.append((what, cell.cycle.number, cell.port.counters.sent))
 
     def step(self, measurement):
         self._note("step")

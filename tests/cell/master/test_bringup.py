@@ -218,7 +218,7 @@ def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(
 
     with open_session(tmp_path, change=change) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
-    assert session.cell.faults == []
+    assert session.cell.notes.lines() == []
     remarks = [line for line in session.said if "left as the device has it" in line]
     assert remarks == [
         "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as"
@@ -363,7 +363,7 @@ def test_a_kept_configuration_is_not_written_again(tmp_path):
             kept.append(["kept" in done for done in done_to(session)])
         nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
         logs.append(frames(tmp_path))
-        assert session.cell.faults == [], run
+        assert session.cell.notes.lines() == [], run
     assert kept == [[False] * 7, [True] * 7]
     assert len(writes_to(logs[0], 2)) > 25 and writes_to(logs[1], 2) == [(0x1016, 1)]  # the heartbeat consumer's end
     assert writes_to(logs[1], 16) == [(0x2003, 0), (0x1016, 1)]  # and the tare, which is a command

@@ -134,7 +134,7 @@ def test_a_bus_with_delays_and_overruns_is_replayed_to_the_last_bit(delayed_run)
     result = canprobe.replay(folder)
     assert result.summary["driven_by"] == "task"
     assert_same(result.tracker.records, task.shape.records)
-    assert_same(result.estimates["recursive"], task.shape.records, cell.start_ns)
+    assert_same(result.estimates["recursive"], task.shape.records, cell.cycles.start_ns)
 
 
 def test_another_tools_log_of_that_bus_gives_the_shape(delayed_run, tmp_path):

@@ -33,7 +33,7 @@ def assert_same(direct, lockstep):
         assert ours.keys() == theirs.keys()
         assert [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()] == []
     assert len(direct.truth["t_s"]) == len(direct.cell.log) > 30
-    assert direct.cell.faults == lockstep.cell.faults == []
+    assert direct.cell.notes.lines() == lockstep.cell.notes.lines() == []
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_drive_that_fails_stops_the_cell_with_the_words_of_a_bus():
 
         with pytest.raises(NodeError) as stopped, session:
             session.run(fail)
-        words.append((str(stopped.value), session.cell.faults))
+        words.append((str(stopped.value), session.cell.notes.lines()))
     assert words[0] == words[1]
     assert "node 3: EMCY 7500h" in words[0][0]
 

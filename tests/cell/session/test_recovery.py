@@ -34,7 +34,7 @@ class Nodes:
         )
         self.bring_up = SimpleNamespace(booted_again=lambda: set(booted), released=set())
         self.supervisor = SimpleNamespace(seen=seen)
-        self.drives, self.start_ns = None, 0
+        self.drives, self.cycles = None, SimpleNamespace(run_s=lambda _: 0.0)
         self.notes = SimpleNamespace(add=lambda *_, **__: None, add_error=lambda *_: None)
 
 

@@ -353,7 +353,7 @@ def test_an_exchanged_drive_is_noticed_once_the_nodes_are_up(cell, state, checke
         pass
     (line,) = [line for line in said if line.startswith("warning: whether")]
     assert "joint 5 was checked with another drive (1018h:04); before the first contact type" in line
-    assert line.removeprefix("warning: ") in session.cell.faults
+    assert line.removeprefix("warning: ") in session.cell.notes.lines()
 
 
 def test_a_joint_that_is_found_wrong_is_forgotten(cell, state, checked):
@@ -468,7 +468,8 @@ def test_each_kind_is_told_when_it_comes_and_counted_at_the_end():
         assert len(lines) == 1, "the second of the same kind is no news"
     what = "noted: node 4: EMCY 8210h, PDO not processed due to length error, "
     told = [re.findall(r"at ([\d.]+) s", line) for line in lines]
-    first, last = (session.cell.start_ns * 1e-9 + cycle * 0.0025 for cycle in (60, 70))  # on the clock of bus.log
+    start_s = session.cell.cycles.start_ns * 1e-9  # on the clock of bus.log
+    first, last = (start_s + cycle * 0.0025 for cycle in (60, 70))
     assert [float(t) for times in told for t in times] == pytest.approx([first, first, last], abs=0.01)
     (one,), (start, end) = told
     assert lines == [what + f"at {one} s", what + f"2 times, first at {start} s, last at {end} s"]
