@@ -193,11 +193,12 @@ class OpenCell:
             self._bridges.end(None)
 
     def _conclude(self, failure: BaseException | None) -> None:
+        folder, cell = self.session.folder, self.cell
         with interrupts_held():
-            log, tactile = self.session.keep(LOG, self.cell.log), self.session.keep(TACTILE, self.cell.tactile_log)
+            log, tactile = folder.keep(LOG, cell.log), folder.keep(TACTILE, cell.tactile_log)
             data = self._score(log, tactile, failure)
             self._result.complete(data)
-            summary, lines = data.summary, self.session.unwritten
+            summary, lines = data.summary, folder.unwritten
             if isinstance(failure, CanprobeError):
                 failure.summary = summary
             self._write(lambda out: write_files(data, out))
@@ -210,7 +211,7 @@ class OpenCell:
             for name, draw in _drawings(data, self._out).items():
                 self._say(f"draw {name}")
                 if (why := _draw(name, draw)) is not None:
-                    self.session.note_unwritten(why)
+                    folder.note_unwritten(why)
         summary["faults"] += [line for line in lines if line not in summary["faults"]]
         if lines and failure is None:
             unwritten = ResultsError("\n".join(lines))
@@ -242,7 +243,7 @@ class OpenCell:
             plan=self.plan,
             summary=summary,
             log=log,
-            truth=self.session.truth,
+            truth=self.session.buses.truth,
             estimates={name: on_run_clock(records, start_s) for name, records in estimates.items()},
             taxels=record.taxels,
             tactile=tactile,
@@ -275,8 +276,8 @@ class OpenCell:
                 write(self._out)
         except ResultsError as error:
             for line in str(error).splitlines():
-                if line not in self.session.unwritten:  # the summary is written twice
-                    self.session.note_unwritten(line)
+                if line not in self.session.folder.unwritten:  # the summary is written twice
+                    self.session.folder.note_unwritten(line)
 
     def _mapped(self, tracker: ShapeTracker | None) -> tuple[SurfaceMap | None, dict[str, Any] | None]:
         """The surface map of a scan, and its section of the summary."""

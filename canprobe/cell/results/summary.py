@@ -135,8 +135,8 @@ def _traffic(session: Session) -> dict[str, Any]:
         return {channel: meter.report().as_dict() for channel, meter in session.record.meters.items()}
     plan = session.plan
     with contextlib.suppress(UsageError):
-        if session.out is not None:
-            log = session.out / LOG
+        if session.options.out is not None:
+            log = session.options.out / LOG
             return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
     errors = {channel: counter.error_frames for channel, counter in session.record.traffic.items()}
     return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
@@ -144,11 +144,11 @@ def _traffic(session: Session) -> dict[str, Any]:
 
 def truth_of(session: Session) -> dict[str, Floats]:
     """The plant's truth; empty where nothing was emulated, or nothing happened."""
-    return session.truth if "force_n" in session.truth else {}
+    return session.buses.truth if "force_n" in session.buses.truth else {}
 
 
 def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) -> dict[str, Any]:
-    task, scan = session.scene.task, record.scan_cycles if session.keeps_all else None
+    task, scan = session.scene.task, record.scan_cycles if session.options.rows_kept is None else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)

@@ -7,13 +7,13 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
 
     session         one cell from bring-up to safe stop
     target          the bus of a run or a command: interface, channels and bit rate, put into a scene by one function
-    buses           ports, buses in virtual time, routes between several buses, counters of their frames
+    buses           the three kinds of bus, with what is on their other side: no bus, virtual, real
     links           check of the interfaces' settings before anything is sent
     link_faults     faults in the setting of one interface
-    folder          the folder of a run before its first frame, and the files of what a cell keeps
+    folder          the folder of a run, and the files of what a cell keeps
     direct          a cell without a bus
     rehearsal       the scene of a short run in lockstep, before a real one
-    bus_record      record of its buses
+    bus_record      record of its buses, and counters of their frames
     child_process   a process beside the master
     emulator_child  the process of the emulated nodes
     children        the processes of the bridges to other tools

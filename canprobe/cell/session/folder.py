@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from numpy.typing import NDArray
+
+from canprobe.cell.npz import read_npz, write_npz
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.rows import ROWS_FOLDER
+from canprobe.cell.rows import ROWS_FOLDER, RowFiles
 from canprobe.cell.scene.setup import Arm
+from canprobe.errors import ResultsError
 from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
+from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 
 STEPS = "steps.log"
 """File of the steps of a run that comes back from losses."""
@@ -19,6 +26,47 @@ LEFT_BY_RUNS = (
     *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
 )
 """Files of a run's folder besides ``bus.log``."""
+
+
+class RunFolder:
+    """The folder of a run, and what could not be written into it.
+
+    Args:
+        out: the folder; None: nothing is written.
+        note: called with each fault.
+
+    Attributes:
+        note: that function.
+        unwritten: files that could not be written, each with the reason; the cell's notes list them too.
+    """
+
+    def __init__(self, out: Path | None, note: Callable[[str], None]) -> None:
+        self.note = note
+        self.unwritten: list[str] = []
+        self._out = out
+
+    def note_unwritten(self, failure: str | None) -> None:
+        """Note that a file could not be written, and why; None notes nothing."""
+        if failure is not None:
+            self.unwritten.append(failure)
+            self.note(failure)
+
+    def keep(self, name: str, rows: RowFiles) -> dict[str, NDArray[Any]]:
+        """Write the columns of rows into a file of the folder, and read them back: large ones are mapped.
+
+        A failure is noted, and the files of the rows stay. The columns then are in memory, as without a folder.
+        """
+        columns = rows.columns()
+        if self._out is None or not columns:
+            return dict(columns)
+        try:
+            with interrupts_held():
+                write_npz(self._out / name, columns)
+        except ResultsError as error:
+            self.note_unwritten(str(error))
+            return dict(columns)
+        rows.remove()
+        return read_npz(self._out / name)
 
 
 def prepare_folder(plan: Plan, out: Path) -> None:

@@ -124,7 +124,7 @@ def measure(case: SurfaceCase) -> dict[str, Any]:
             except SafetyStop as error:  # a scan that ends early has shown less
                 stopped = error.reason
         first, last = controller.scan_cycles
-        scored = score_contact(session.truth, first, last, touch.force)
+        scored = score_contact(session.buses.truth, first, last, touch.force)
         samples = list(controller.shape.samples)
         # an exploration lays its rectangle round the end of the approach, a curve lies round the first contact
         middle = touch.approach.start if case.strategy == "explore" else samples[0].p_base

@@ -25,7 +25,7 @@ def scan(pad=None, **config):
     """A scan of a cylinder of 36 mm with an array that has the calibration of another one."""
     plan = make_plan(resolve(load_scene("cylinder", SCAN)))
     session, task = Session(plan), make_task(plan)
-    session.world.plant.array = TaxelArray(TaxelConfig(**config), np.random.default_rng(3), pad=pad or Pad())
+    session.buses.world.plant.array = TaxelArray(TaxelConfig(**config), np.random.default_rng(3), pad=pad or Pad())
     with session:
         session.run(task)
     return session, task
@@ -117,7 +117,7 @@ def test_the_monitor_shows_the_blur():
             views.append(monitor.view(observation.t_ns).array)
 
     session, task = Session(plan, RunOptions(observers=(watch,))), make_task(plan)
-    session.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3))
+    session.buses.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3))
     with session:
         session.run(task)
     assert views[0] is None and views[-1].startswith(f"{SAID}: its images are blurred by")

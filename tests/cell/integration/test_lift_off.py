@@ -28,7 +28,7 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 def lifted(run):
     """How far the probe's centre went back along its pole after the fault, m, and how far to the side."""
-    truth = run.session.truth
+    truth = run.session.buses.truth
     way = truth["probe_centre_m"][-1] - truth["probe_centre_m"][run.at]
     back = -float(way @ truth["pole"][run.at])
     return back, float(np.linalg.norm(way + back * truth["pole"][run.at]))
@@ -36,7 +36,7 @@ def lifted(run):
 
 def turned(run):
     """How far each motor turned after the fault, counts."""
-    return np.ptp(run.session.truth["q_rad"][run.at :] @ run.session.cell.drives._model.units_per_q.T, axis=0)
+    return np.ptp(run.session.buses.truth["q_rad"][run.at :] @ run.session.cell.drives._model.units_per_q.T, axis=0)
 
 
 def mute(node_id):
@@ -59,8 +59,8 @@ def test_the_probe_is_taken_off(what):
     key, action = LOST[what]
     run = Injected("press", HOLD_CYCLE, action)
     run.assert_within(key).assert_drives_off(but=(6,) if "frozen" in what else ())
-    assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     back, aside = lifted(run)
     assert 0.95 * WAY_BACK < back < 1.2 * WAY_BACK and aside < 0.05 * WAY_BACK, (
         "without a sensor the task begins to retreat by itself"
@@ -79,12 +79,12 @@ def test_two_lost_drives_leave_four():
 
     run = Injected("press", HOLD_CYCLE, both)
     run.assert_within("drive_silent").assert_drives_off()
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def pressed_on(run, told):
     run.assert_drives_off()
-    assert run.session.truth["force_n"][-1] == pytest.approx(2.0, abs=0.3)
+    assert run.session.buses.truth["force_n"][-1] == pytest.approx(2.0, abs=0.3)
     assert abs(lifted(run)[0]) < 0.1 * WAY_BACK
     assert any(told in fault for fault in (str(run.error), *run.session.cell.notes.lines()))
 
@@ -203,7 +203,7 @@ def test_a_disabled_drive_stands_still_and_the_others_lift():
 
     run = Injected("press", HOLD_CYCLE, both)
     assert "node 16: left operation" in str(run.error)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert turned(run)[1] < 30 and turned(run).max() > 100
 
 
@@ -215,7 +215,7 @@ def test_a_drive_with_an_alarm_stands_still_also_where_another_one_had_one_befor
 
     run = Injected("press", HOLD_CYCLE, alarms)
     assert run.error.node_id == 1
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert turned(run)[1] < 30 and turned(run).max() > 100
     words = run.session.cell.log.arrays()["statusword"][run.at + 60].astype(int).tolist()
     assert [state_of(word) is DriveState.OPERATION_ENABLED for word in words] == [False, False, True, True, True, True]
@@ -230,7 +230,7 @@ def test_a_drive_that_left_operation_beside_the_one_that_is_named_does_not_lift(
 
     run = Injected("press", HOLD_CYCLE, left)
     assert "node 3: left operation" in str(run.error)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert max(turned(run)[2], turned(run)[4]) < 30 and turned(run).max() > 100
 
 
@@ -248,8 +248,8 @@ def test_a_light_press_after_a_strong_one_is_told():
             return command
 
     run = Softer("press", HOLD_CYCLE + 200, lambda r: send(r, (SYNC_ID, b"")))
-    assert run.session.truth["force_n"].max() > 1.8 and 0.15 < run.session.truth["force_n"][-1] < 0.5
-    assert left_pressing(run.session) == [pytest.approx(run.session.truth["force_n"][-1], abs=0.15)]
+    assert run.session.buses.truth["force_n"].max() > 1.8 and 0.15 < run.session.buses.truth["force_n"][-1] < 0.5
+    assert left_pressing(run.session) == [pytest.approx(run.session.buses.truth["force_n"][-1], abs=0.15)]
 
 
 @pytest.mark.slow(reason="12 s of a press")
@@ -268,8 +268,8 @@ def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
                 session.run(lambda m, step=task.step: replace(step(m), done=task.phase is Phase.SCAN))  # noqa: B023
         told = left_pressing(session)
         # the drives stop a count or two from where the last image was taken: 0.6 N a count of joint 3 at this force
-        assert told == ([pytest.approx(session.truth["force_n"][-1], abs=0.6)] if pressed_again else [])
-        assert bool(session.truth["force_n"][-1] > 4.0) is pressed_again
+        assert told == ([pytest.approx(session.buses.truth["force_n"][-1], abs=0.6)] if pressed_again else [])
+        assert bool(session.buses.truth["force_n"][-1] > 4.0) is pressed_again
     assert min(remembered) > TOUCH_FORCE, "by its size it could be a press"
 
 
@@ -297,8 +297,8 @@ def test_whoever_ends_the_run_the_probe_is_taken_off(what):
     assert type(run.error) is kind
     assert any(fault.startswith("lift off, at ") for fault in run.session.cell.notes.lines())
     assert not any("left pressing" in fault for fault in run.session.cell.notes.lines())
-    assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     back, aside = lifted(run)
     assert 0.95 * WAY_BACK < back < 1.05 * WAY_BACK and aside < 0.05 * WAY_BACK
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
@@ -312,8 +312,8 @@ def test_a_controller_that_returns_no_command_is_told_so_off_the_object():
     run = Forgetful("press", HOLD_CYCLE, lambda _: None)
     run.assert_within("interrupt").assert_drives_off()
     assert str(run.error) == "controller: expected its step to return a Command, got None"
-    assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def test_nobody_need_listen():
@@ -328,7 +328,7 @@ def test_nobody_need_listen():
     run = Unheard("press", HOLD_CYCLE, interrupted(signal.SIGINT))
     assert isinstance(run.error, KeyboardInterrupt)
     run.assert_drives_off()
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert {node.node.core.state for node in run.nodes.values()} == {NmtState.PRE_OPERATIONAL}
     assert any("BrokenPipeError" in fault for fault in run.session.cell.notes.lines())
 
@@ -373,5 +373,5 @@ def test_an_own_controller_that_cannot_retreat_is_taken_off_at_the_force_limit()
     run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 2.5})
     assert isinstance(run.error, SafetyStop) and "above the limit of 2.50 N" in str(run.error)
     run.assert_drives_off()
-    assert 2.0 < run.session.truth["force_n"].max() < 3.2
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert 2.0 < run.session.buses.truth["force_n"].max() < 3.2
+    assert run.session.buses.truth["force_n"][-1] == 0.0

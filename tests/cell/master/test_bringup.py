@@ -34,7 +34,7 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     said = []
     session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), RunOptions(tmp_path, said.append))
     session.said = said
-    world = session.world
+    world = session.buses.world
     for node in world.nodes:
         if nodes is not None:
             if node.node_id in nodes:
@@ -346,11 +346,11 @@ def test_a_drive_that_changes_its_mode_late_is_waited_for(tmp_path):
             node.dictionary.on_read(0x6061, lambda _: node.dictionary.put(0x6061, 0, answer(right)))
 
     def answer(right):
-        answers.append(right if session.lockstep.clock.now_ns() > began + 200 * MS else 1)
+        answers.append(right if session.buses.lockstep.clock.now_ns() > began + 200 * MS else 1)
         return 8 if answers[-1] != 1 else 1
 
     with open_session(tmp_path, change=change, enable_s=0.3) as session:
-        began = session.lockstep.clock.now_ns()
+        began = session.buses.lockstep.clock.now_ns()
         session.cell.run(lambda _: Command(done=True))
     assert answers.count(1) == len(answers) - 1 > 3
 
@@ -667,7 +667,7 @@ def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
     """The scene names each drive's serial number; the nodes have others."""
     session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
     swapped = Session(with_joints(session.scene, serial_number=(1001, 1002, 1004, 1003, 1005, 1006)))
-    swapped.world.participants[:] = session.world.participants
+    swapped.buses.world.participants[:] = session.buses.world.participants
     with (
         pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; node 4: ") as failed,
         swapped,

@@ -266,7 +266,7 @@ def silent_bus(ip, monkeypatch):
     bus = LockstepBus(VirtualClock())
     monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
     monkeypatch.setattr("canprobe.fieldbus.bus.clock.MonotonicClock", lambda: bus.clock)
-    monkeypatch.setattr("canprobe.cell.session.session.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.cell.session.buses.MonotonicClock", lambda: bus.clock)
     return bus
 
 
