@@ -27,7 +27,7 @@ from canprobe.cell.results.picture import (
     sheet,
 )
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.results.surface_panels import MapPlane, add_sheet, map_surface, true_surface
+from canprobe.cell.results.surface_figure import MapPlane, add_sheet, map_surface, true_surface
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError

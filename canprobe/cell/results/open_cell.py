@@ -193,12 +193,12 @@ class OpenCell:
             self._bridges.end(None)
 
     def _conclude(self, failure: BaseException | None) -> None:
-        folder, cell = self.session.folder, self.cell
+        files, cell = self.session.files, self.cell
         with interrupts_held():
-            log, tactile = folder.keep(LOG, cell.log), folder.keep(TACTILE, cell.tactile_log)
+            log, tactile = files.keep(LOG, cell.log), files.keep(TACTILE, cell.tactile_log)
             data = self._score(log, tactile, failure)
             self._result.complete(data)
-            summary, lines = data.summary, folder.unwritten
+            summary, lines = data.summary, files.unwritten
             if isinstance(failure, CanprobeError):
                 failure.summary = summary
             self._write(lambda out: write_files(data, out))
@@ -211,7 +211,7 @@ class OpenCell:
             for name, draw in _drawings(data, self._out).items():
                 self._say(f"draw {name}")
                 if (why := _draw(name, draw)) is not None:
-                    folder.note_unwritten(why)
+                    files.note_unwritten(why)
         summary["faults"] += [line for line in lines if line not in summary["faults"]]
         if lines and failure is None:
             unwritten = ResultsError("\n".join(lines))
@@ -276,14 +276,14 @@ class OpenCell:
                 write(self._out)
         except ResultsError as error:
             for line in str(error).splitlines():
-                if line not in self.session.folder.unwritten:  # the summary is written twice
-                    self.session.folder.note_unwritten(line)
+                if line not in self.session.files.unwritten:  # the summary is written twice
+                    self.session.files.note_unwritten(line)
 
     def _mapped(self, tracker: ShapeTracker | None) -> tuple[SurfaceMap | None, dict[str, Any] | None]:
         """The surface map of a scan, and its section of the summary."""
         if tracker is None or tracker.surface_map is None:
             return None, None
-        from canprobe.cell.results.map_score import summarise_map
+        from canprobe.cell.results.scores import summarise_map
 
         shape = self.plan.setup.truth.object if truth_of(self.session) else None
         return tracker.surface_map, summarise_map(tracker.surface_map, shape)

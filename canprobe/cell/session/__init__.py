@@ -8,21 +8,17 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     session         one cell from bring-up to safe stop
     target          the bus of a run or a command: interface, channels and bit rate, put into a scene by one function
     buses           the three kinds of bus, with what is on their other side: no bus, virtual, real
-    links           check of the interfaces' settings before anything is sent
-    link_faults     faults in the setting of one interface
-    folder          the folder of a run, and the files of what a cell keeps
+    links           check of the interfaces' settings, and of their controllers, before anything is sent
+    folder          the folder of a run, the file of its steps, and the files of what a cell keeps
     direct          a cell without a bus
-    rehearsal       the scene of a short run in lockstep, before a real one
     bus_record      record of its buses, and counters of their frames
     child_process   a process beside the master
     emulator_child  the process of the emulated nodes
     children        the processes of the bridges to other tools
     recovery        a cell that comes back after a node or the bus was lost
-    step_log        the steps of such a run in a file
-    up              a cell that holds its position for days
+    up              a cell that holds its position for days; its joints one after the other: which is which, their zeros
     check           a verdict on link and machine before motion
     first_second    the same verdict on the first second of a run
-    check_joints, home   the joints of a cell, one after the other: which is which, and their zeros
     joint_record    what a check of the joints has shown, for later runs
     looking         a bus without a cell: scan, node ids, monitor
     emulation       emulated nodes for other masters

@@ -17,9 +17,8 @@ from canprobe.cell.scene.hardware import DIRECT
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.bus_record import BusRecord
 from canprobe.cell.session.emulator_child import EmulatorChild
-from canprobe.cell.session.folder import RunFolder, prepare_folder
-from canprobe.cell.session.link_faults import data_bitrate, expected_of
-from canprobe.cell.session.links import check_links
+from canprobe.cell.session.folder import KeptFiles, prepare_folder
+from canprobe.cell.session.links import check_links, data_bitrate, expected_of
 from canprobe.cell.session.target import LOCKSTEP
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import RecordingPort
@@ -42,7 +41,7 @@ class SessionBuses(ABC):
     Args:
         plan: plan of the cell.
         options: options of the run.
-        folder: folder of the run.
+        files: files of the run's folder.
         stack: the way out of the session.
 
     Attributes:
@@ -52,13 +51,13 @@ class SessionBuses(ABC):
         truth: the plant's true values, at the end; empty where nothing was emulated.
     """
 
-    def __init__(self, plan: Plan, options: RunOptions, folder: RunFolder, stack: ExitStack) -> None:
+    def __init__(self, plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitStack) -> None:
         self.ports: dict[str, Port] = {}
         self.lockstep: LockstepBus | None = None
         self.make_cycle: Callable[..., Cycle] | None = None
         self.truth: dict[str, Floats] = {}
         self._child: EmulatorChild | None = None
-        self._plan, self._options, self._folder, self._stack = plan, options, folder, stack
+        self._plan, self._options, self._files, self._stack = plan, options, files, stack
 
     @cached_property
     def world(self) -> World:
@@ -100,7 +99,7 @@ class SessionBuses(ABC):
 
     def _keep_truth(self) -> None:
         if self.world.recorder is not None:
-            self.truth = TruthColumns(self._folder.keep("truth.npz", self.world.recorder))
+            self.truth = TruthColumns(self._files.keep("truth.npz", self.world.recorder))
 
     def _joined(self, ports: dict[str, Port]) -> Port:
         if len(ports) == 1:
@@ -160,8 +159,8 @@ class VirtualBuses(SessionBuses):
 class RealBuses(SessionBuses):
     """Real interfaces, with the emulated nodes in a process of their own."""
 
-    def __init__(self, plan: Plan, options: RunOptions, folder: RunFolder, stack: ExitStack) -> None:
-        super().__init__(plan, options, folder, stack)
+    def __init__(self, plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitStack) -> None:
+        super().__init__(plan, options, files, stack)
         self._open_ports = stack.enter_context(ExitStack())  # left last, also those that were opened again
         self._record: BusRecord | None = None
 
@@ -187,7 +186,7 @@ class RealBuses(SessionBuses):
         before = self.ports
         for port in before.values():
             port.close()
-        ports = open_ports(self._plan, clock, lambda name: Reports(record.error_writer(name), self._folder.note))
+        ports = open_ports(self._plan, clock, lambda name: Reports(record.error_writer(name), self._files.note))
         self.ports = self._open_ports.enter_context(ports)
         for name, port in before.items():
             self.ports[name].counters.add(port.counters)
@@ -212,13 +211,13 @@ class RealBuses(SessionBuses):
 
     def _end_nodes(self, child: EmulatorChild) -> None:
         self.truth = child.end()
-        self._folder.note_unwritten(child.unwritten)
+        self._files.note_unwritten(child.unwritten)
 
 
-def make_buses(plan: Plan, options: RunOptions, folder: RunFolder, stack: ExitStack) -> SessionBuses:
+def make_buses(plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitStack) -> SessionBuses:
     """The buses of a plan, not open yet; for the arguments see `SessionBuses`."""
     kinds = {DIRECT: NoBus, LOCKSTEP: VirtualBuses}
-    return kinds.get(plan.scene.bus.interface, RealBuses)(plan, options, folder, stack)
+    return kinds.get(plan.scene.bus.interface, RealBuses)(plan, options, files, stack)
 
 
 @contextmanager

@@ -18,8 +18,7 @@ from canprobe.cell.planning.warnings import bus_open_to_others
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.link_faults import ExpectedLink, data_bitrate
-from canprobe.cell.session.links import check_links
+from canprobe.cell.session.links import ExpectedLink, check_links, data_bitrate
 from canprobe.cell.session.session import rehearse
 from canprobe.cell.session.target import Target
 from canprobe.errors import NodeError, ResultsError, UsageError

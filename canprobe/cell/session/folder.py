@@ -1,4 +1,4 @@
-"""The folder of a run before its first frame, and the files of what a cell keeps from one run to the next."""
+"""The folder of a run and the file of its steps, and the files of what a cell keeps from one run to the next."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from canprobe.cell.master.options import Say
 from canprobe.cell.npz import read_npz, write_npz
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.rows import ROWS_FOLDER, RowFiles
@@ -28,8 +29,8 @@ LEFT_BY_RUNS = (
 """Files of a run's folder besides ``bus.log``."""
 
 
-class RunFolder:
-    """The folder of a run, and what could not be written into it.
+class KeptFiles:
+    """The files of a run's folder, and those that could not be written.
 
     Args:
         out: the folder; None: nothing is written.
@@ -106,3 +107,39 @@ def record_file(kind: str, arm: Arm) -> Path:
     """File of a record of an arm's drives, in the user's state folder."""
     folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
     return Path(folder).expanduser() / "canprobe" / f"{kind}-{arm.model.name}.json"
+
+
+class StepLog:
+    """Reports each step to the user, and appends it to a file with its time on the run's clock.
+
+    Args:
+        say: called with each step.
+        path: path of the file; None writes none.
+
+    Attributes:
+        time_s: function that gives the time on the run's clock, s; None before the bus is open. What is said before
+            then is written as soon as it is.
+        failure: why a line could not be written; None while all could.
+    """
+
+    def __init__(self, say: Say, path: Path | None) -> None:
+        self._say, self._path = say, path
+        self.time_s: Callable[[], float] | None = None
+        self.failure: str | None = None
+        self._waiting: list[str] = []
+
+    def __call__(self, text: str) -> None:
+        """Report a step."""
+        if self._path is not None and self.failure is None:
+            self._waiting.append(f"{self.time_s() if self.time_s is not None else 0.0:12.4f}  {text}\n")
+            if self.time_s is not None:
+                self._write(self._path)
+        self._say(text)
+
+    def _write(self, path: Path) -> None:
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.writelines(self._waiting)
+        except OSError as error:
+            self.failure = f"{path}: cannot be written: {error.strerror}"
+        self._waiting.clear()

@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from canprobe.cell.master.commission import Commissioned, wanted_by
+from canprobe.cell.master.commission import Commissioned, Wanted, wanted_by
 from canprobe.cell.master.commission import commission as commission_nodes
-from canprobe.cell.master.id_assignment import Wanted
 from canprobe.cell.master.monitor import CellView, Monitor
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.master.scan import scan_nodes
@@ -18,8 +17,7 @@ from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import open_ports
-from canprobe.cell.session.link_faults import ExpectedLink, expected_of
-from canprobe.cell.session.links import check_links, need_controllers
+from canprobe.cell.session.links import ExpectedLink, check_links, expected_of, need_controllers
 from canprobe.cell.session.target import Target, need_real_bus
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.clock import MonotonicClock

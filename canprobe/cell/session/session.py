@@ -25,13 +25,11 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.bus_record import BusRecord
 from canprobe.cell.session.buses import RealBuses, make_buses
 from canprobe.cell.session.first_second import FirstSecond
-from canprobe.cell.session.folder import STEPS, RunFolder, zeros_file
+from canprobe.cell.session.folder import STEPS, KeptFiles, StepLog, zeros_file
 from canprobe.cell.session.joint_record import exchanged
 from canprobe.cell.session.links import need_controllers
 from canprobe.cell.session.recovery import VIRTUAL_WAIT_S, Recovery
-from canprobe.cell.session.rehearsal import shortened
-from canprobe.cell.session.step_log import StepLog
-from canprobe.cell.session.target import VIRTUAL
+from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns
@@ -63,7 +61,7 @@ class Session:
 
     Attributes:
         buses: its buses, with the emulated nodes: `world`, `lockstep` and, at the end, `truth`.
-        folder: its folder, with the files that could not be written.
+        files: files of its folder, and those that could not be written.
         record: record of the buses, from the entry on; every time in the files of the run counts from its `origin_ns`.
         around: puts something round the cell's port, such as a meter; set before the session is entered.
     """
@@ -75,11 +73,11 @@ class Session:
         self.scene = self.plan.scene
         self.started_ns = 0
         self.wall_ns = 0
-        self.folder = RunFolder(options.out, self._note)
+        self.files = KeptFiles(options.out, self._note)
         self.observers = Observers(options.observers) if options.observers else None
         self.around: Callable[[Port], Port] = lambda port: port
         self._stack = ExitStack()
-        self.buses = make_buses(self.plan, options, self.folder, self._stack)
+        self.buses = make_buses(self.plan, options, self.files, self._stack)
         self._entered = self._left = False
         self._cell: Cell | None = None
         self._recovery: Recovery | None = None
@@ -229,8 +227,8 @@ class Session:
         finally:
             self._left = True
             self.wall_ns = elapsed_ns() - self.started_ns
-            self.folder.note_unwritten(self.record.failure())
-            self.folder.note_unwritten(self.steps.failure)
+            self.files.note_unwritten(self.record.failure())
+            self.files.note_unwritten(self.steps.failure)
 
     def _note(self, fault: str) -> None:
         if self._cell is not None:
@@ -276,3 +274,28 @@ def run_beginning(plan: Plan) -> Session:
     with Session(shortened(plan.scene)) as session:
         session.run(make_task(session.plan))
     return session
+
+
+REHEARSED_S = 0.3
+"""Length of the scene's phase in a rehearsal, s: an estimator answers several times in it."""
+CLEARANCE_MM = 0.5
+"""Longest way to the object, mm: its cycles are all alike."""
+MAX_TOUCHES = 2
+
+
+def shortened(scene: Scene) -> Scene:
+    """The scene on a lockstep bus without bit times, with all parts of its cycles in as few cycles as possible."""
+    task = replace(
+        scene.task,
+        duration_s=min(scene.task.duration_s, REHEARSED_S),
+        clearance_mm=min(scene.task.clearance_mm, CLEARANCE_MM),
+        touches=min(scene.task.touches, MAX_TOUCHES),
+    )
+    return replace(
+        scene,
+        bus=replace(scene.bus, interface=LOCKSTEP, timed=False, bit_error_rate=0.0),
+        task=task,
+        arm=replace(scene.arm, emulated=True) if scene.arm is not None else None,
+        joints={name: replace(joint, emulated=None) for name, joint in scene.joints.items()},
+        sensor=replace(scene.sensor, emulated=True) if scene.sensor is not None else None,
+    )

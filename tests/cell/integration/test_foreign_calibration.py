@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.master.monitor import Monitor
-from canprobe.cell.master.monitor_text import lines
+from canprobe.cell.master.monitor import Monitor, lines
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig

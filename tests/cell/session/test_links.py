@@ -10,8 +10,7 @@ import pytest
 
 import canprobe
 import canprobe.cli
-from canprobe.cell.session.link_faults import ExpectedLink, check_link, expected_of
-from canprobe.cell.session.links import check_links
+from canprobe.cell.session.links import ExpectedLink, check_link, check_links, expected_of
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ControllerState

@@ -10,8 +10,7 @@ import pytest
 import canprobe
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.rehearsal import shortened
-from canprobe.cell.session.session import Session, rehearse, run_beginning
+from canprobe.cell.session.session import Session, rehearse, run_beginning, shortened
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
 from canprobe.fieldbus.eds.packaged import eds_path

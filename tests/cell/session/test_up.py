@@ -15,7 +15,7 @@ import canprobe.api
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.session import check_joints as joint_report
+from canprobe.cell.session import up as joint_report
 from canprobe.cell.session.buses import SessionBuses
 from canprobe.cell.session.joint_record import JointRecord, warned
 from canprobe.cell.session.session import Session
@@ -349,7 +349,7 @@ def test_an_exchanged_drive_is_noticed_once_the_nodes_are_up(cell, state, checke
     state.write_text(checked.replace('"serial": 5', '"serial": 55'))
     assert warning(real) is None, "no cell file says which it has"
     session = Session(canprobe.plan(real), RunOptions(say=said.append))
-    vars(session)["world"] = true_world(real)
+    vars(session.buses)["world"] = true_world(real)
     with session:
         pass
     (line,) = [line for line in said if line.startswith("warning: whether")]
