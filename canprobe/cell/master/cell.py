@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from types import TracebackType
@@ -27,7 +28,6 @@ from canprobe.cell.master.homing import Homing
 from canprobe.cell.master.lift_off import LiftOff
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
-from canprobe.cell.master.raw_array_start import RawArrayStart
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.master.supervision import Condition, Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.watch import NodeWatch
@@ -119,11 +119,6 @@ class Cell:
         self._stopped = False
         self._before = before
         self._power = ArmPower(plan, self.drives, self.cycles, self.bring_up) if self.drives is not None else None
-        self._raw_array = (
-            RawArrayStart(self.tactile, self._network, setup.bring_up.boot_up_s, self._say)
-            if isinstance(self.tactile, RawReceiver)
-            else None
-        )
         self.homing = (
             Homing(plan, setups, self._network, self.watch, self._supervise_homing, record=zeros, say=self._say)
             if any(one.homing for one in setups)
@@ -157,8 +152,8 @@ class Cell:
                 self.bring_up.listen()
                 self.found.look()
             self.bring_up.run()
-            if self._raw_array is not None:
-                self._raw_array.start()
+            if isinstance(self.tactile, RawReceiver):
+                self.tactile.start(self._network, self._plan.setup.bring_up.boot_up_s, self._say)
             self.cycle = self._make_cycle(
                 self.port,
                 self._plan,
@@ -406,8 +401,8 @@ class Cell:
         if self._power is not None and self.cycle is not None:
             self._try(self._power.disable)
         self.cycles.note_pressing()
-        if self._raw_array is not None:
-            self._try(self._raw_array.stop)
+        if isinstance(self.tactile, RawReceiver):
+            self._try(partial(self.tactile.stop, self.port))
         if self.homing is not None:
             self._try(self.homing.keep)
         self._try(self.bring_up.release)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +13,9 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
+    from canprobe.cell.master.array import PatchReader
     from canprobe.cell.master.trail import TakenWay
-    from canprobe.mechanics.touch import Patch, SurfaceEstimate
+    from canprobe.mechanics.touch import SurfaceEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,21 +132,6 @@ def check_command(command: Command, *, arm: bool) -> None:
         raise UsageError(f"controller: expected other columns than the cell's, got {taken}")
 
 
-class SampleReader(Protocol):
-    """Makes the patch of each tactile sample, once, and finds taxels that do not measure (`array.PatchReader`)."""
-
-    def read(self, sample: TactileSample) -> Patch:
-        """The patch of a sample; samples come in the order of their times."""
-
-    @property
-    def found(self) -> int:
-        """Number of taxels that were found not to measure."""
-
-    @property
-    def faults(self) -> str:
-        """Taxels that do not measure, in words; empty where none was found."""
-
-
 class Controller:
     """Base of everything that a cell can run: `step` decides a cycle, the other methods do nothing by default.
 
@@ -167,7 +153,7 @@ class Controller:
     array_blind: str | None = None
 
     @property
-    def reader(self) -> SampleReader | None:
+    def reader(self) -> PatchReader | None:
         """The reader of its tactile samples, which the supervision uses too; None: the cell has its own."""
         return None
 
@@ -260,7 +246,7 @@ class WrappingController(Controller):
             self.inner.array_blind = why
 
     @property
-    def reader(self) -> SampleReader | None:
+    def reader(self) -> PatchReader | None:
         return None if self.inner is None else self.inner.reader
 
     @property

@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from canprobe.cell.master.array import make_patch_reader
-from canprobe.cell.master.controller import Command, Controller, Measurement, SampleReader, TactileSample
+from canprobe.cell.master.array import PatchReader, make_patch_reader
+from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.joint_columns import joint_columns
 from canprobe.cell.master.log import RunLog, TactileLog
@@ -65,7 +65,7 @@ class SupervisedCycle:
         self.say: Say = self.notes.saying(options.say)
         self.cycle: Cycle | None = None
         self.controller = Controller()
-        self.reader: SampleReader | None = make_patch_reader(plan.setup)
+        self.reader: PatchReader | None = make_patch_reader(plan.setup)
         self.start_ns = 0
         self.port = port
         self.recorded = seen.measurement
