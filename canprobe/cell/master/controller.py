@@ -144,6 +144,7 @@ class Controller:
             names what is wrong; False, the default: the cell does.
         array_alive: whether an image of the array has changed since bring-up; the cell sets it before each step.
         array_blind: why the controller does not believe the array any more; None while it does.
+        remarks: what the controller has found to be wrong with the cell, a line each; more come, and none goes.
     """
 
     lets_go: bool = False
@@ -151,6 +152,7 @@ class Controller:
     compares_motion: bool = False
     array_alive: bool = False
     array_blind: str | None = None
+    remarks: Sequence[str] = ()
 
     @property
     def reader(self) -> PatchReader | None:
@@ -212,11 +214,6 @@ class Controller:
         """How often the estimator of this controller diverged and started again."""
         return 0
 
-    @property
-    def remarks(self) -> Sequence[str]:
-        """What the controller has found to be wrong with the cell, a line each; more come, and none goes."""
-        return ()
-
 
 class WrappingController(Controller):
     """Base of controllers that step another one: what it and the cell tell each other of the array passes through.
@@ -250,7 +247,7 @@ class WrappingController(Controller):
         return None if self.inner is None else self.inner.reader
 
     @property
-    def remarks(self) -> Sequence[str]:
+    def remarks(self) -> Sequence[str]:  # type: ignore[override]
         return () if self.inner is None else self.inner.remarks
 
     @property

@@ -241,7 +241,7 @@ def run_touch(session: Session, task: TouchTask, force_n: float, late_ms: float 
 
 def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple[float | None, float | None]:
     """RMS error and standard deviation of the true force, second half of the hold, percent of the target."""
-    cycles, truth = task.scan_cycles, session.buses.truth
+    cycles, truth = task.record().scan_cycles, session.buses.truth
     if cycles is None or "force_n" not in truth:
         return None, None
     half = truth["force_n"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / force_n

@@ -244,7 +244,7 @@ def test_a_light_press_after_a_strong_one_is_told():
         def command(self, measurement, command):
             share = np.clip((self.at - measurement.cycle) / 200.0, 0.0, 1.0)
             if share < 1.0:
-                self.task.set_target("target_force_n", 0.4 + 1.6 * float(share))
+                self.task.targets["target_force_n"] = 0.4 + 1.6 * float(share)
             return command
 
     run = Softer("press", HOLD_CYCLE + 200, lambda r: send(r, (SYNC_ID, b"")))
@@ -367,7 +367,7 @@ def test_a_way_back_on_which_the_force_grows_ends():
 def test_an_own_controller_that_cannot_retreat_is_taken_off_at_the_force_limit():
     class Pressing(Injected):
         def command(self, measurement, command):
-            self.task.set_target("target_force_n", 4.0)
+            self.task.targets["target_force_n"] = 4.0
             return self.task.step(measurement) if measurement.cycle < self.at else Command()
 
     run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 2.5})

@@ -72,8 +72,8 @@ def test_the_nodes_say_that_sync_was_late_and_it_is_told_in_one_line(stalled: tu
 
 def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Stalls]) -> None:
     session, controller = stalled
-    assert controller.task.scan_cycles is not None
-    first, last = controller.task.scan_cycles
+    assert controller.task.record().scan_cycles is not None
+    first, last = controller.task.record().scan_cycles
     contact = summarise(session, controller.record(), {}, None)["contact"]
     assert contact["contact_fraction"] == 1.0
     assert contact["force_max_n"] < 3.0

@@ -46,7 +46,7 @@ def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
 def test_the_first_answer_gives_the_force_no_knock(axial):
     """The patch tells the curvature, and with it the depth for 2 N, in one instant."""
     session, controller = axial
-    first, last = controller.scan_cycles
+    first, last = controller.record().scan_cycles
     assert session.buses.truth["force_n"][first:last].max() < 2.35
 
 

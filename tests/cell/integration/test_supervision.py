@@ -387,7 +387,7 @@ def test_the_overrun_budget_makes_the_probe_retreat():
 
 def test_force_above_the_limit_makes_the_probe_retreat():
     def squeeze(run):
-        run.task.set_target("target_force_n", 4.0)
+        run.task.targets["target_force_n"] = 4.0
 
     run = Injected("press", HOLD_CYCLE, squeeze, limits={"force_max_n": 3.0})
     assert "above the limit of 3.00 N" in str(run.error)
@@ -571,7 +571,7 @@ def test_an_estimator_that_diverges_starts_afresh():
 def test_an_own_controller_is_stopped_at_the_force_limit():
     class Pressing(Injected):
         def command(self, measurement, command):
-            self.task.set_target("target_force_n", 4.0)
+            self.task.targets["target_force_n"] = 4.0
             return self.task.step(measurement) if measurement.cycle < self.at else Command()
 
     run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 2.5})

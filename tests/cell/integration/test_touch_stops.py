@@ -14,7 +14,7 @@ from canprobe.errors import SafetyStop
 def run_until_stopped(session, at_cycle=None, action=None, target_n=None):
     controller = make_task(session.plan)
     if target_n is not None:
-        controller.set_target("target_force_n", target_n)
+        controller.targets["target_force_n"] = target_n
 
     def step(measurement):
         if measurement.cycle == at_cycle:

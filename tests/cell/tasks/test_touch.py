@@ -91,7 +91,7 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
     target = log["target_force_n"][np.isfinite(log["target_force_n"])]
     assert target[-1] == 3.0
     assert np.abs(np.diff(target)).max() == pytest.approx(FORCE_RATE * 2.5e-3)  # no step
-    first, last = task.scan_cycles
+    first, last = task.record().scan_cycles
     assert last - first == pytest.approx(480, abs=2)
     assert log["force_n"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.1)
     assert press.buses.truth["force_n"][last - 60 : last].mean() == pytest.approx(3.0, rel=1 / 12)
