@@ -177,25 +177,26 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     machine = {} if session.virtual else machine_facts(plan.buses[0].channel)
     with session:
         cell, meter = session.cell, meters[0]
+        assert cell.cycle is not None
+        lateness_ns, first, full, torn = cell.cycle.statistics.period_error_ns, 0, 0, 0
         session.options.say(f"measure for {seconds:g} s, with the drives disabled")
         try:
             cell.idle(SETTLE_S)
-            first, full, torn = _lateness_count(cell), meter.counters.transmit_full, _torn(cell)
+            first, full, torn = len(lateness_ns), meter.counters.transmit_full, _torn(cell)
             meter.begin()
             cell.idle(seconds)
         except InterfaceError as error:
             failure = str(error)
         meter.end()
-        assert cell.cycle is not None
-        counters = meter.counters
+        counters, load = meter.counters, meter.load(plan.setup.bus.bitrate)
         figures = LinkFigures(
             period_ns=plan.sync.period_ns,
-            lateness_ns=sorted(list(cell.cycle.statistics.period_error_ns)[first:]),
+            lateness_ns=sorted(list(lateness_ns)[first:]),
             wait_ns=plan.traffic.budget.looks_ns[-1],
             answers=meter.answers(),
             torn=None if cell.tactile is None else _torn(cell) - torn,
             array_silent=_is_silent(cell),
-            load=_per_bus(meter.load(plan.setup.bus.bitrate), plan),
+            load=None if load is None else load / len(plan.buses),
             planned_load=max(bus.traffic.load for bus in plan.buses),
             foreign_hz=meter.foreign / max(meter.seconds, 1e-9),
             queue_full=counters.transmit_full - full,
@@ -244,11 +245,6 @@ def _traffic(plan: Plan) -> dict[str, Any]:
     return {"wait_ns": plan.traffic.budget.looks_ns[-1], "answers": answers, "known": known}
 
 
-def _lateness_count(cell: Cell) -> int:
-    assert cell.cycle is not None
-    return len(cell.cycle.statistics.period_error_ns)
-
-
 def _torn(cell: Cell) -> int:
     """Images that did not come, or not whole."""
     return cell.tactile.unusable + cell.tactile.lost if cell.tactile is not None else 0
@@ -260,7 +256,3 @@ def _is_silent(cell: Cell) -> bool:
         return False
     age = cell.cycle.number - (cell.tactile.newest_cycle or 0)
     return age > cell.supervisor.seen.limits.tactile_timeout
-
-
-def _per_bus(load: float | None, plan: Plan) -> float | None:
-    return None if load is None else load / len(plan.buses)
