@@ -12,7 +12,6 @@ from types import TracebackType
 
 from canprobe.cell.master.arm_power import ArmPower
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
-from canprobe.cell.master.as_found import FoundNodes
 from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.controller import (
     Command,
@@ -28,6 +27,7 @@ from canprobe.cell.master.homing import Homing
 from canprobe.cell.master.lift_off import LiftOff
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
+from canprobe.cell.master.restore_nodes import FoundNodes
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.master.supervision import Condition, Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.watch import NodeWatch

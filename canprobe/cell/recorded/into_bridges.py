@@ -136,7 +136,7 @@ def _observations_of(
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
     """The answers of the scene's estimator, by the cycle's time since the first, ns."""
-    return {} if result is None else {round(r.told_s * 1e9): r.estimate for r in result.tracker.records}
+    return {} if result is None else {round(r.reported_s * 1e9): r.estimate for r in result.tracker.records}
 
 
 def frames_by_sync(path: Path, first: str, plan: Plan) -> Iterator[list[TimedFrame]]:

@@ -20,7 +20,7 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     check           a verdict on link and machine before motion
     first_second    the same verdict on the first second of a run
     joint_record    what a check of the joints has shown, for later runs
-    looking         a bus without a cell: scan, node ids, monitor
+    bus_tools       a bus without a cell: scan, node ids, monitor
     emulation       emulated nodes for other masters
     array_calibration    touches of known objects, visit by visit, and the fit
     terminal        steps and a progress bar on a terminal

@@ -26,7 +26,7 @@ from canprobe.cell.master.options import Say
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, make_setups
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan
-from canprobe.cell.tasks.held import HeldTask, LastPlace
+from canprobe.cell.tasks.paused import LastPlace, PausedController
 from canprobe.errors import BusError, CanprobeError, InterfaceError, NodeError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.presence import answering_nodes
@@ -115,13 +115,13 @@ class Recovery:
             if self._lost is None and (error := self._attempt(lambda: self.cell.start(runs))) is not None:
                 self._lose(error)
             if self._lost is not None:
-                self._come_back(HeldTask(runs, self._place, None))
+                self._come_back(PausedController(runs, self._place, None))
                 self._report_back("")
             while (error := self._attempt(lambda: self.cell.advance(None, progress))) is not None:
                 self._lose(error)
                 if not runs.can_go_on:
                     raise error
-                self._come_back(HeldTask(runs, self._place, lambda: self._asked, self._note_resumed))
+                self._come_back(PausedController(runs, self._place, lambda: self._asked, self._note_resumed))
                 self._asked = False
                 self._report_back(" and holds; motion goes on when it is asked for (resume)")
         finally:

@@ -80,6 +80,6 @@ def test_a_task_in_a_controller_that_never_updates_it_moves_and_answers_alike():
     """Whoever wraps a task's `step` alone has its estimates none the less, and the same."""
     (answers, targets), (wrapped, wrapped_targets) = scanned(lambda task: task), scanned(lambda task: task.step)
     assert len(answers) > 5
-    assert [a.told_s for a in answers] == [w.told_s for w in wrapped]
+    assert [a.reported_s for a in answers] == [w.reported_s for w in wrapped]
     np.testing.assert_array_equal([a.estimate.K for a in answers], [w.estimate.K for w in wrapped])
     np.testing.assert_array_equal(targets, wrapped_targets)

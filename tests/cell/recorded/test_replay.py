@@ -109,7 +109,7 @@ def test_all_files_of_a_run_count_from_the_instant_that_is_0_in_its_bus_log(lock
     wire = syncs[: len(log["t_s"])] - log["t_s"]
     assert wire.min() > 0 and wire.max() < 200e-6  # the frame, and one that was under way at the deadline
     answers = lockstep_run.estimates["recursive"]
-    told = np.array([record.told_s for record in answers])
+    told = np.array([record.reported_s for record in answers])
     rows = [int(np.abs(log["t_s"] - t_s).argmin()) for t_s in told]
     np.testing.assert_allclose(log["t_s"][rows], told, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(log["K_per_m"][rows], [record.estimate.K for record in answers])
