@@ -43,7 +43,7 @@ MASTER_MODULES = ("lift_off", "supervisor", "conditions", "drives", "bringup", "
 MODULES = {
     **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
     "recovery": "canprobe/cell/session/recovery.py",
-    "held": "canprobe/cell/tasks/held.py",
+    "held": "canprobe/cell/tasks/paused.py",
 }
 INTEGRATION = (
     "lift_off",
@@ -56,7 +56,7 @@ INTEGRATION = (
     "two_buses",
 )
 TESTS = (
-    *("tests/cell/master", "tests/cell/tasks/test_held.py"),
+    *("tests/cell/master", "tests/cell/tasks/test_paused.py"),
     *("tests/cell/session/test_up.py", "tests/cell/session/test_recovery.py"),
     *(f"tests/cell/integration/test_{name}.py" for name in INTEGRATION),
 )

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from canprobe.cell.master.controller import TactileSample
-from canprobe.cell.master.tactile_frame import TactileFrame, decode
+from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample, decode
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Array, RawWire, Setup
 from canprobe.errors import BusError

@@ -7,7 +7,7 @@
    device must hold by itself, the writes with read-back, and where asked for storage.
 4. Start all nodes and wait for their heartbeats.
 
-The drives are enabled afterwards, in the cycle, once each has confirmed its mode: see `canprobe.cell.master.power`.
+The drives are enabled afterwards, in the cycle, once each has confirmed its mode: see `canprobe.cell.master.arm_power`.
 
 Source: CiA 302-2 (boot-up procedure).
 """

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.cell.master.tactile_frame import TactileFrame
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
 
@@ -16,32 +16,6 @@ if TYPE_CHECKING:
     from canprobe.cell.master.array import PatchReader
     from canprobe.cell.master.trail import TakenWay
     from canprobe.mechanics.touch import SurfaceEstimate
-
-
-@dataclass(frozen=True, slots=True)
-class TactileSample:
-    """A whole tactile frame with its place in time.
-
-    Attributes:
-        frame: the frame, complete and with the right CRC.
-        t_sample_ns: instant at which the array was sampled, in the time of the cycle.
-        cycle: the cycle whose SYNC triggered it, or the last one before it was sampled.
-        t_sigma_s: standard deviation of that instant, s; 0 where a SYNC triggers the sample.
-    """
-
-    frame: TactileFrame
-    t_sample_ns: int
-    cycle: int
-    t_sigma_s: float = 0.0
-
-    @property
-    def image(self) -> object:
-        """The content of the frame, to be compared: what repeats where the array has stopped measuring."""
-        return self.frame.features or self.frame.taxels.tobytes()
-
-    def differs_from(self, other: TactileSample) -> bool:
-        """Whether the array shows something else than in another sample."""
-        return self.image != other.image
 
 
 @dataclass(frozen=True, slots=True)

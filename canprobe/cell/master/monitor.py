@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.array import make_patch_reader, make_tactile
-from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.drives import drive_axes, feedback_frames
 from canprobe.cell.master.notes import nodes_text
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.bus.port import TimedFrame

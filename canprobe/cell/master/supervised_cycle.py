@@ -10,16 +10,16 @@ from collections.abc import Callable
 import numpy as np
 
 from canprobe.cell.master.array import PatchReader, make_patch_reader
-from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample
+from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle
-from canprobe.cell.master.joint_columns import joint_columns
-from canprobe.cell.master.log import RunLog, TactileLog
+from canprobe.cell.master.log import RunLog, TactileLog, joint_columns
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.master.push_witness import PushWitness
 from canprobe.cell.master.supervision import Seen
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import Port
 from canprobe.mechanics.touch import Patch

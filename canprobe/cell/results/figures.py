@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure, SubFigure
 
-from canprobe.cell.master.joint_columns import joint_positions
+from canprobe.cell.master.log import joint_positions
 from canprobe.cell.results.picture import (
     BLUE,
     GREEN,

@@ -13,10 +13,11 @@ import numpy.typing as npt
 
 from canprobe.cell.master.array import PatchReader, make_patch_reader
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
+from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData

@@ -2,7 +2,7 @@
 
 `session.Session` is the only place, besides studies and tests, that sees both sides of the bus. Entered, it plans,
 opens the buses, starts recording, makes the cell and, where nodes are emulated, their world: in the same process on a
-lockstep bus or without a bus, in a child (`emulator_child`) on a real one. It listens before it starts a child. Left,
+lockstep bus or without a bus, in a child (`child_process`) on a real one. It listens before it starts a child. Left,
 it stops everything in the reverse order: drives disabled, logs flushed, bus closed, children ended, truth kept.
 
     session         one cell from bring-up to safe stop
@@ -12,8 +12,7 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     folder          the folder of a run, the file of its steps, and the files of what a cell keeps
     direct          a cell without a bus
     bus_record      record of its buses, and counters of their frames
-    child_process   a process beside the master
-    emulator_child  the process of the emulated nodes
+    child_process   a process beside the master, and that of the emulated nodes
     children        the processes of the bridges to other tools
     recovery        a cell that comes back after a node or the bus was lost
     up              a cell that holds its position for days; its joints one after the other: which is which, their zeros

@@ -16,7 +16,7 @@ from canprobe.cell.planning.wire_time import exact_frame_bits
 from canprobe.cell.scene.hardware import DIRECT
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.bus_record import BusRecord
-from canprobe.cell.session.emulator_child import EmulatorChild
+from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.cell.session.folder import KeptFiles, prepare_folder
 from canprobe.cell.session.links import check_links, data_bitrate, expected_of
 from canprobe.cell.session.target import LOCKSTEP

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
@@ -37,8 +37,11 @@ from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 
-if TYPE_CHECKING:
-    pass
+REHEARSED_S = 0.3
+"""Length of the scene's phase in a rehearsal, s: an estimator answers several times in it."""
+CLEARANCE_MM = 0.5
+"""Longest way to the object, mm: its cycles are all alike."""
+MAX_TOUCHES = 2
 
 
 def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
@@ -174,19 +177,16 @@ class Session:
                 f"the cell was stopped for safety: {self._stopped_for}; nothing moves again by itself: look at the arm,"
                 " then call resume() before the next run"
             )
-        first_second = None if self.virtual else FirstSecond(self.cell, self.plan, self.steps)
+        after, runner = progress, self.cell if self._recovery is None else self._recovery
+        if not self.virtual:
+            first_second = FirstSecond(self.cell, self.plan, self.steps)
 
-        def after_cycle(measurement: Measurement) -> None:
-            if first_second is not None:
+            def after(measurement: Measurement) -> None:
                 first_second(measurement)
-            progress(measurement)
+                progress(measurement)
 
-        after = progress if first_second is None else after_cycle
         try:
-            if self._recovery is not None:
-                self._recovery.run(controller, after)
-            else:
-                self.cell.run(controller, after)
+            runner.run(controller, after)
         except CanprobeError as error:
             passing = self._recovery is not None and self._recovery.lost
             if isinstance(error, SafetyStop) or (self.cell.stopped_by is not None and not passing):
@@ -253,10 +253,11 @@ class Session:
 
 
 def rehearse(plan: Plan) -> None:
-    """Run the beginning of a plan with every node emulated; its errors are ignored.
+    """Run the beginning of a plan in lockstep, with every node emulated, before a real bus; its errors are ignored.
 
-    Args:
-        plan: the plan that is about to run on a real bus.
+    No real cycle makes a first call then. A first call is slow: libraries are paged in, tables filled, the interpreter
+    specialises its code. On a slow processor first cycles took 3 to 10 ms each, and the drives stopped by themselves
+    because SYNCs were missing.
     """
     with contextlib.suppress(CanprobeError):
         run_beginning(plan)
@@ -274,13 +275,6 @@ def run_beginning(plan: Plan) -> Session:
     with Session(shortened(plan.scene)) as session:
         session.run(make_task(session.plan))
     return session
-
-
-REHEARSED_S = 0.3
-"""Length of the scene's phase in a rehearsal, s: an estimator answers several times in it."""
-CLEARANCE_MM = 0.5
-"""Longest way to the object, mm: its cycles are all alike."""
-MAX_TOUCHES = 2
 
 
 def shortened(scene: Scene) -> Scene:

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.regain import SEARCH_SPEED, Search

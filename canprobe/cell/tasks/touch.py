@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from canprobe.cell.master.conditions import touch_finding
-from canprobe.cell.master.controller import Command, Measurement, TactileSample
+from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import Reaction
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.cell.tasks.contact_learning import ContactLearning

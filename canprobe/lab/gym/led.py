@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker

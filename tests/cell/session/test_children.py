@@ -12,7 +12,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.session.emulator_child import END_TIMEOUT_S, EmulatorChild
+from canprobe.cell.session.child_process import END_TIMEOUT_S, EmulatorChild
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
 from canprobe.fieldbus.bus.port import Port, nothing
