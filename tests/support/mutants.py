@@ -39,7 +39,10 @@ import scipy.spatial  # noqa: F401
 from reach import Reach
 
 ROOT = Path(__file__).resolve().parents[2]
-MASTER_MODULES = ("lift_off", "supervisor", "conditions", "drives", "bringup", "homing", "watch", "cycle")
+MASTER_MODULES = (
+    *("lift_off", "supervisor", "conditions", "drives", "bringup", "node_bringup", "entries", "homing", "led_drive"),
+    *("watch", "cycle", "supervised_cycle", "arm_power", "cell"),
+)
 MODULES = {
     **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
     "recovery": "canprobe/cell/session/recovery.py",

@@ -16,8 +16,7 @@ from canprobe.cell.master.options import Say
 from canprobe.cell.planning.bridges import BRIDGES, check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.recorded.cycles import LogCycles
-from canprobe.cell.recorded.recording import read_recording
+from canprobe.cell.recorded.recording import LogCycles, read_recording
 from canprobe.cell.recorded.reestimate import ReplayResult, find_log, replay, scene_of
 from canprobe.cell.recorded.run_folder import RunFolder, read_run
 from canprobe.cell.scene.model import BridgeSettings, Scene

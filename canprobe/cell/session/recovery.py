@@ -26,6 +26,7 @@ from canprobe.cell.master.options import Say
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, make_setups
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan
+from canprobe.cell.session.buses import SessionBuses
 from canprobe.cell.tasks.paused import LastPlace, PausedController
 from canprobe.errors import BusError, CanprobeError, InterfaceError, NodeError
 from canprobe.fieldbus.bus.port import Port
@@ -62,8 +63,7 @@ class Recovery:
         cell: the cell, brought up.
         port: its port.
         make_cell: makes the next cell on a port, after a stopped one.
-        reopen: closes the ports and opens them again.
-        alive: raises the error of a process that the cell cannot do without.
+        buses: its buses, which are opened again after a loss.
         say: called with each step.
         longest_s: longest wait for the nodes, s.
 
@@ -78,14 +78,13 @@ class Recovery:
         port: Port,
         *,
         make_cell: Callable[[Port, Cell], Cell],
-        reopen: Callable[[], Port],
-        alive: Callable[[], None],
+        buses: SessionBuses,
         say: Say,
         longest_s: float,
     ) -> None:
         self.cell = cell
         self._plan, self._port, self._say = plan, port, say
-        self._make_cell, self._reopen, self._alive = make_cell, reopen, alive
+        self._make_cell, self._buses = make_cell, buses
         self._longest_s = longest_s
         self._lost: CanprobeError | None = None
         self._lost_ns = self._back_ns = self._tries = 0
@@ -226,7 +225,7 @@ class Recovery:
         clock, seen = self._port.clock, _Wait(self._plan, self.cell.watch.foreign is not None)
         end_ns, said = clock.now_ns() + self._longest_s * 1e9, ""
         while True:
-            self._alive()
+            self._buses.raise_ended()
             try:
                 why = seen.look(self._port, self._must_boot)
                 if why is None:
@@ -244,7 +243,7 @@ class Recovery:
     def _reopened(self) -> str | None:
         """Open the interfaces again; why that failed, None where it did not."""
         try:
-            self._port = self._reopen()
+            self._port = self._buses.reopen(self._port)
         except InterfaceError as error:
             return str(error)
         return None

@@ -137,8 +137,7 @@ class Session:
                     self._cell,
                     port,
                     make_cell=self._make_cell,
-                    reopen=lambda: self.buses.reopen(port),
-                    alive=self.buses.raise_ended,
+                    buses=self.buses,
                     say=self.steps,
                     longest_s=VIRTUAL_WAIT_S if self.virtual else math.inf,
                 )

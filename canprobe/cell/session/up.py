@@ -14,7 +14,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.joint_record import JointRecord, warned
 from canprobe.cell.session.session import Session, with_bridges
-from canprobe.cell.session.target import need_real_bus
+from canprobe.cell.session.target import refuse_virtual
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.joint_check import JointCheck
 from canprobe.cell.tasks.joint_finding import Answer, SeenWay
@@ -54,7 +54,7 @@ def up(
         UsageError: when the scene does not fit or is on a lockstep bus.
         BusError, SafetyStop: as in :func:`canprobe.run`.
     """
-    need_real_bus(scene, "up")
+    refuse_virtual(scene.bus.interface, "up")
     plan = warned(make_plan(resolve(with_bridges(scene, bridge))))
     with Bridges(plan, None, virtual=False, say=say) as bridges:
         session = Session(plan, RunOptions(None, say, bridges.observers, ROWS_OF_UP, recover=recover))

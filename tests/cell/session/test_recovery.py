@@ -105,8 +105,7 @@ class Bench:
             self.cells[0],
             self,
             make_cell=lambda *_: next(left),
-            reopen=self.reopen,
-            alive=lambda: None,
+            buses=self,
             say=self.said.append,
             longest_s=60.0,
         )
@@ -114,7 +113,10 @@ class Bench:
     def now_ns(self):
         return self.now
 
-    def reopen(self):
+    def raise_ended(self):
+        pass
+
+    def reopen(self, port):
         self.opened += 1
         return self
 
