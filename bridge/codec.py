@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from canprobe.cell.master.controller import Measurement, TactileSample
+from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.observers import Observation
-from canprobe.cell.master.tactile_frame import TactileFrame
+from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 from canprobe.lab.bridge.sample import SurfacePatch

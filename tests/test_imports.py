@@ -102,9 +102,7 @@ EXTRAS = {
     "lab/studies/many.py": {"pandas", "xarray"},
     "cell/results/figures.py": {"matplotlib"},
     "cell/results/plan_figure.py": {"matplotlib"},
-    "cell/results/surface_panels.py": {"matplotlib", "mpl_toolkits"},
     "cell/results/surface_figure.py": {"matplotlib", "mpl_toolkits"},  # of the same distribution
-    "cell/results/surface_sheet.py": {"matplotlib"},
     "lab/gym/__init__.py": {"gymnasium"},
     "lab/gym/env.py": {"gymnasium"},
     "lab/examples/learn_touch_scan.py": {"gymnasium"},

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.joint_columns import joint_positions
+from canprobe.cell.master.log import joint_positions
 from canprobe.cell.results.run_files import (
     LOG,
     TACTILE,

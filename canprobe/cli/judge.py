@@ -178,11 +178,11 @@ def _server(
         target = real_target(args.bus, channels[0][1], args.bitrate)
         files = eds_files(args, "judge")
         positions = [start_position(node) for node in nodes.values()]
-        return target, lambda: api.emulate_eds(files, target, positions=positions, onlooker=bench, say=args.report.say)
+        return target, lambda: api.emulate_eds(files, target, positions=positions, observer=bench, say=args.report.say)
     scene = loaded(args)
     target = scene_target(args, scene)
     node_ids = (*scene.drives, *([scene.sensor.node_id] if scene.sensor and scene.array_is_node else ()))
-    return target, lambda: api.emulate(scene, target, node_ids=node_ids, onlooker=bench, say=args.report.say)
+    return target, lambda: api.emulate(scene, target, node_ids=node_ids, observer=bench, say=args.report.say)
 
 
 def _status_of_command(bench: MasterBench) -> int:

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     scene = target_of(args, scene).applied_to(scene)
 
     from canprobe import api
-    from canprobe.cell.master.monitor_text import lines, screen
+    from canprobe.cell.master.monitor import lines, screen
 
     on_terminal = sys.stdout.isatty() and not args.json
     duration_s = args.duration if args.duration is not None or on_terminal else 1.0

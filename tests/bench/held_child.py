@@ -14,8 +14,7 @@ from time import process_time
 
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement
-from canprobe.cell.master.monitor import Monitor
-from canprobe.cell.master.monitor_text import lines
+from canprobe.cell.master.monitor import Monitor, lines
 from canprobe.cell.master.observers import Observation
 from canprobe.cell.master.options import RunOptions, quiet
 from canprobe.cell.session.session import Session

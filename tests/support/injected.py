@@ -37,7 +37,7 @@ class Injected:
         self.frames = []
         self.session = Session(scene, RunOptions(say=self._say, observers=(self._hear,)))
         self.limits = limits_of(self.session.plan)
-        self.faulty = self.session.world.make_faulty()
+        self.faulty = self.session.buses.world.make_faulty()
         self.nodes = {node.node_id: node for node in self.faulty.nodes}
         self.task = make_task(self.session.plan)
         self.at, self.action, self.until, self.own = at, action, at + until, own
@@ -53,7 +53,7 @@ class Injected:
         self.frames += observation.frames
 
     def now(self):
-        return self.session.lockstep.clock.now_ns()
+        return self.session.buses.lockstep.clock.now_ns()
 
     def inject(self, text):
         self.faulty.inject(text, self.now())
@@ -118,7 +118,7 @@ class Injected:
 
 def send(run, frame):
     """A frame from somebody who is no node of the cell."""
-    run.session.lockstep.port().send_batch([frame])
+    run.session.buses.lockstep.port().send_batch([frame])
 
 
 def altered(node, can_id, change):

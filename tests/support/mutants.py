@@ -39,11 +39,14 @@ import scipy.spatial  # noqa: F401
 from reach import Reach
 
 ROOT = Path(__file__).resolve().parents[2]
-MASTER_MODULES = ("lift_off", "supervisor", "conditions", "drives", "bringup", "homing", "watch", "cycle")
+MASTER_MODULES = (
+    *("lift_off", "supervisor", "conditions", "drives", "bringup", "node_bringup", "entries", "homing", "led_drive"),
+    *("watch", "cycle", "supervised_cycle", "arm_power", "cell"),
+)
 MODULES = {
     **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
     "recovery": "canprobe/cell/session/recovery.py",
-    "held": "canprobe/cell/tasks/held.py",
+    "held": "canprobe/cell/tasks/paused.py",
 }
 INTEGRATION = (
     "lift_off",
@@ -56,7 +59,7 @@ INTEGRATION = (
     "two_buses",
 )
 TESTS = (
-    *("tests/cell/master", "tests/cell/tasks/test_held.py"),
+    *("tests/cell/master", "tests/cell/tasks/test_paused.py"),
     *("tests/cell/session/test_up.py", "tests/cell/session/test_recovery.py"),
     *(f"tests/cell/integration/test_{name}.py" for name in INTEGRATION),
 )

@@ -81,10 +81,10 @@ class Returning:
         scene = canprobe.load_scene(scene, {"bus.timed": False, "scene.figures": False})
         self.opened = canprobe.open_cell(scene, say=self.say, recover=True, **options)
         self.session = self.opened.session
-        self.faulty = self.session.world.make_faulty()
+        self.faulty = self.session.buses.world.make_faulty()
         self.nodes = {node.node_id: node.node for node in self.faulty.nodes}
-        self.enabled = Enabled(self.session.world.nodes)
-        self.session.world.participants.append(self.enabled)
+        self.enabled = Enabled(self.session.buses.world.nodes)
+        self.session.buses.world.participants.append(self.enabled)
         self._action, self._first, self._held = action, None, 0
         self.held_targets = []
         with self.opened:
@@ -101,7 +101,7 @@ class Returning:
         self.said.append(text)
 
     def now(self):
-        return self.session.lockstep.clock.now_ns()
+        return self.session.buses.lockstep.clock.now_ns()
 
     def inject(self, text):
         for one in text.split(";"):

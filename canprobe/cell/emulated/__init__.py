@@ -2,7 +2,7 @@
 
 - `world` makes the nodes from a plan, with a recorder of the truth.
 - `truth_columns` has the names of the columns of `truth.npz`.
-- `array` is the tactile node of a CANopen array, `raw_array` an array that knows no CANopen.
+- `array` is the tactile node of a CANopen array, and an array that knows no CANopen.
 - `array_faults` are the faults of the array, beside those of `canprobe.fieldbus.tools.faults`.
 - `image_processing` is the processing of a raw image in the sensor before it is sent.
 

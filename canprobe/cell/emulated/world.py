@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.emulated.array import make_tactile_node
+from canprobe.cell.emulated.array import RawArray, make_tactile_node
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
-from canprobe.cell.emulated.raw_array import RawArray
 from canprobe.cell.emulated.truth_columns import with_units
 from canprobe.cell.planning.model import Plan, PlannedNode
 from canprobe.cell.planning.motion import parked_posture

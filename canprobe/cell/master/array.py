@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from canprobe.cell.master.controller import TactileSample
-from canprobe.cell.master.tactile_frame import TactileFrame, decode
+from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample, decode
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Array, RawWire, Setup
+from canprobe.errors import BusError
+from canprobe.fieldbus.bus.joined import send_on
+from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.period import PeriodFit
 from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
@@ -175,7 +178,7 @@ class TactileReceiver(ArrayReceiver):
 
 
 class RawReceiver(ArrayReceiver):
-    """Collects the raw frames of a device that knows no CANopen.
+    """Starts a device of raw frames, which knows no CANopen and has no NMT state, and collects its frames.
 
     The normal pressure of each taxel becomes a count as a CANopen array sends it: 0 without load, 255 at full scale.
     An image was sampled at the arrival of its first frame less the latency, as stated and as calibrated; the arrivals
@@ -204,15 +207,53 @@ class RawReceiver(ArrayReceiver):
             self._unloaded = np.full(array.pad.shape, float(self.wire.unloaded))
         self._taring: list[Floats] = []
         self._complete: list[tuple[TactileFrame, int, float]] = []
+        self._started = False
 
     @property
     def images(self) -> int:
         """Count of whole images so far."""
         return self.assembler.frames
 
-    def has(self, images: int) -> bool:
-        """Whether so many whole images have come."""
-        return self.images >= images
+    def start(self, network: PumpedNetwork, boot_up_s: float, say: Callable[[str], None]) -> None:
+        """Start the array, and wait for as many images as its tare takes, at least one.
+
+        Args:
+            network: network by which its frames arrive.
+            boot_up_s: time for it to start.
+            say: called with each step.
+
+        Raises:
+            BusError: they do not come.
+        """
+        wire, port, clock = self.wire, network.port, network.port.clock
+        say(f"start the array on {self.channel}")
+        self._started = True
+        send_on(port, self.channel, wire.start)
+        if wire.sampling == "sync":
+            return  # its images begin with the cycle
+        if wire.tare_images:
+            say(f"tare the array: {wire.tare_images} images, with nothing on it")
+        needed, period_s = max(1, wire.tare_images), 1.0 / self.rate_hz
+        end_ns = clock.now_ns() + round(1e9 * (boot_up_s + 2.0 * needed * period_s))
+        while self.images < needed:
+            if clock.now_ns() >= end_ns:
+                first, last = min(self.cob_ids), max(self.cob_ids)
+                ids = f"{first:03X}h" if first == last else f"{first:03X}h-{last:03X}h"
+                raise BusError(
+                    f"{self.channel}: the array sent {self.images} of {needed} images of its frames {ids} in time"
+                    f" ({self.torn} were not whole); check its power, its channel (sensor.channel), and wire.ids,"
+                    " wire.frames and wire.start of its array file"
+                )
+            if wire.poll:
+                send_on(port, self.channel, wire.poll)
+            before = self.images
+            network.pump_until(lambda: self.images > before, 1.5 * period_s)  # noqa: B023 - called before the next
+
+    def stop(self, port: Port) -> None:
+        """Stop the array if it was started."""
+        if self._started:
+            self._started = False
+            send_on(port, self.channel, self.wire.stop)
 
     def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
         """Take one frame; the image that it completes, once the array is tared."""
@@ -250,12 +291,10 @@ class RawReceiver(ArrayReceiver):
 
     @property
     def torn(self) -> int:
-        """Count of images that were dropped incomplete."""
         return self.assembler.torn
 
     @property
     def unusable(self) -> int:
-        """Count of images that were dropped incomplete."""
         return self.assembler.torn
 
     def _frame(self, image: RawImage) -> TactileFrame | None:

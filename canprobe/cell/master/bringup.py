@@ -3,84 +3,35 @@
 1. Listen: where another master is at work nothing is sent.
 2. Reset all nodes, of drives that are homed only the communication, and wait for their boot-ups. The reset takes the
    nodes over: before it no way out sends anything, after it every way out leaves them pre-operational.
-3. Identify and configure all nodes side by side, each in its own order (`BringUp._configure`): identity, what the
+3. Identify and configure all nodes side by side, each in its own order (`NodeBringUp.configure`): identity, what the
    device must hold by itself, the writes with read-back, and where asked for storage.
 4. Start all nodes and wait for their heartbeats.
 
-The drives are enabled afterwards, in the cycle, once each has confirmed its mode: see
-`canprobe.cell.master.cell.Cell.run`.
+The drives are enabled afterwards, in the cycle, once each has confirmed its mode: see `canprobe.cell.master.arm_power`.
 
-Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100Ah.
+Source: CiA 302-2 (boot-up procedure).
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
 
-from canopen.objectdictionary import ODVariable
-from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
-
+from canprobe.cell.master.entries import read_entry, write_entry
+from canprobe.cell.master.node_bringup import IDENTITY, NodeBringUp
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, Write
-from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import DEVICE_TYPE_REQUEST, SECOND_ANSWER_S
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.bus.sdo import (
-    Dialogue,
-    Dialogues,
-    SdoTimeoutError,
-    decode_text,
-    download,
-    hold_dialogues,
-    read_value,
-    upload,
-)
-from canprobe.fieldbus.protocol.emcy import describe, is_no_error
+from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues, hold_dialogues
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, pack_nmt
 
-ERROR_HISTORY = 0x1003
-SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
-SAVE_SIGNATURE = int.from_bytes(b"save", "little")
-HEARTBEAT_CONSUMER = 0x1016
-PDO_PARAMETERS = range(0x1400, 0x1C00)
-MODE_DISPLAY = 0x6061
-REVISION_SUBINDEX = 3
-IDENTITY, SERIAL_SUBINDEX = 0x1018, 4
-IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
+HEARTBEAT_CONSUMER, MODE_DISPLAY = 0x1016, 0x6061
+SERIAL_SUBINDEX = 4
 RELEASE_S = 0.1
 """Longest time to an answer of a node that is released."""
-
-
-@dataclass(slots=True)
-class NodeReport:
-    """The result of bring-up for a node.
-
-    Attributes:
-        setup: configuration of the node.
-        software: its version by 100Ah; None where the node does not report it.
-        kept: its configuration was there already, by 1020h.
-        repeated: requests that were sent again.
-        remarks: accepted differences of the device from its EDS or from the wished configuration.
-        failure: error of this node; None without one.
-    """
-
-    setup: NodeSetup
-    software: str | None = None
-    kept: bool = False
-    repeated: int = 0
-    remarks: list[str] = field(default_factory=list)
-    failure: NodeError | None = None
-
-    def __str__(self) -> str:
-        did = "configuration kept" if self.kept else "configured"
-        software = f", software {self.software}" if self.software else ""
-        again = f", {self.repeated} requests repeated" if self.repeated else ""
-        return f"node {self.setup.node_id}: ({self.setup.name}) {did}{software}{again}"
 
 
 class BringUp:
@@ -114,11 +65,10 @@ class BringUp:
         self._network = network
         self._watch = watch
         self._setups = setups
+        self._nodes = {setup.node_id: NodeBringUp(setup, watch) for setup in setups}
         self._settings = settings
         self._say = say
         self._booted: dict[int, int] = {}
-        self._history: dict[int, str] = {}
-        self._refused: set[tuple[int, int]] = set()
         self._listened = listened
         self._resets = resets
         self.took_over = False
@@ -226,110 +176,20 @@ class BringUp:
 
     def _configure_all(self) -> None:
         self._say("identify and configure the nodes")
-        reports = {setup.node_id: NodeReport(setup) for setup in self._setups}
-        repeated = self._talk({i: self._configure(report) for i, report in reports.items()}, self._settings.sdo_s)
-        failures = []
-        for node_id, report in reports.items():
-            report.repeated = repeated.get(node_id, 0)
-            if report.failure is not None:
-                failures.append(self._error(report.failure.reason, report.setup))
+        nodes, stores = self._nodes, self._settings.store
+        repeated = self._talk({i: node.configure(store=stores) for i, node in nodes.items()}, self._settings.sdo_s)
+        failures = [self._error(n.failure.reason, n.setup) for n in nodes.values() if n.failure is not None]
         if failures:
             first, *others = failures
             raise NodeError(first.node_id, "; ".join([first.reason, *map(str, others)]))
-        for report in reports.values():
-            self._say(str(report))
-            node = f"node {report.setup.node_id}: ({report.setup.name})"
-            for remark in report.remarks:
-                self._say(f"{node} {remark}")
-            if left := ", ".join(dict.fromkeys(f"{one.write.index:04X}h" for one in report.setup.left_out)):
-                self._say(f"{node} cannot take {left} by its EDS: left as the device has it")
-
-    def _configure(self, report: NodeReport) -> Dialogue:
-        """The whole dialogue with one node: identify, check, write, store."""
-        setup = report.setup
-        try:
-            yield from self._identify(report)
-            yield from self._check_given(setup)
-            yield from self._check_units(report)
-            report.kept = self._settings.store and (yield from self._is_kept(setup))
-            yield from self._write_all(report)
-            if self._settings.store and not report.kept:
-                yield from self._keep(setup)
-        except NodeError as error:
-            slow = isinstance(error.__cause__, SdoTimeoutError)
-            hint = "; if it is only slow, it needs a larger bring_up.sdo_s" if slow else ""
-            report.failure = NodeError(setup.node_id, error.reason + hint)
-            if not slow:
-                yield from self._recall(setup)
-
-    def _identify(self, report: NodeReport) -> Dialogue:
-        setup = report.setup
-        for subindex, expected in setup.identity.items():
-            got = yield from read_entry(setup, IDENTITY, subindex)
-            newer = got > expected and got >> 16 == expected >> 16  # CiA 301, 1018h:03: of the same major revision
-            if subindex == REVISION_SUBINDEX and newer:
-                report.remarks.append(
-                    f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
-                )
-            elif got != expected:
-                raise NodeError(
-                    setup.node_id,
-                    f"({setup.name}) is not the device of {setup.eds}: 1018h:{subindex:02X}"
-                    f" {IDENTITY_NAMES[subindex]} expected {expected:#x}, got {got:#x}",
-                )
-        if SOFTWARE_VERSION in setup.dictionary:
-            try:
-                version = yield from upload(SOFTWARE_VERSION, 0)
-            except (SdoAbortedError, SdoCommunicationError):
-                return
-            report.software = decode_text(version)
-
-    def _check_given(self, setup: NodeSetup) -> Dialogue:
-        for given in setup.given:
-            got = yield from read_entry(setup, given.index, given.subindex)
-            if got != given.value:
-                raise NodeError(
-                    setup.node_id,
-                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value},"
-                    f" {given.says}, got {got}: {given.otherwise}",
-                )
-
-    def _check_units(self, report: NodeReport) -> Dialogue:
-        """Compare the units of a motor turn that the device states; what it does not answer is not compared."""
-        turn = report.setup.turn
-        if turn is None:
-            return
-        quotients = []
-        for index in (turn.feed, turn.ratio):
-            if index is not None:
-                try:
-                    over = yield from read_entry(report.setup, index, 1)
-                    under = yield from read_entry(report.setup, index, 2)
-                except NodeError as error:
-                    if isinstance(error.__cause__, SdoAbortedError):
-                        return
-                    raise
-                if not over or not under:
-                    return
-                quotients.append(over / under)
-        if (mismatch := turn.mismatch(quotients[0], quotients[1] if len(quotients) > 1 else 1.0)) is not None:
-            report.remarks.append(mismatch)
-
-    def _is_kept(self, setup: NodeSetup) -> Generator[bytes | None, bytes, bool]:
-        """Whether the node reports that it was configured with these very values."""
-        if not _can_verify(setup):
-            return False
-        for subindex, expected in setup.configuration_date.items():
-            if (yield from read_entry(setup, VERIFY_CONFIGURATION, subindex)) != expected:
-                return False
-        return True
-
-    def _keep(self, setup: NodeSetup) -> Dialogue:
-        if not _can_verify(setup):
-            return
-        for subindex, value in setup.configuration_date.items():
-            yield from write_entry(setup, Write(VERIFY_CONFIGURATION, subindex, value, "configuration date"))
-        yield from write_entry(setup, Write(STORE_PARAMETERS, 1, SAVE_SIGNATURE, "store", read_back=False))
+        for node_id, node in nodes.items():
+            node.repeated = repeated.get(node_id, 0)
+            self._say(str(node))
+            name = f"node {node_id}: ({node.setup.name})"
+            for remark in node.remarks:
+                self._say(f"{name} {remark}")
+            if left := ", ".join(dict.fromkeys(f"{one.write.index:04X}h" for one in node.setup.left_out)):
+                self._say(f"{name} cannot take {left} by its EDS: left as the device has it")
 
     # 4. start
 
@@ -344,7 +204,7 @@ class BringUp:
             self._network.pump_until(lambda: not self._not_operational(), self._settings.start_s)
             if not (waiting := self._not_operational()):
                 return
-        self._talk({setup.node_id: self._recall(setup) for setup in waiting}, RELEASE_S)
+        self._talk({setup.node_id: self._nodes[setup.node_id].recall() for setup in waiting}, RELEASE_S)
         state = self._watch.states.get(waiting[0].node_id)
         tries = f", {1 + self._settings.retries} times" if self._settings.retries else ""
         raise self._error(
@@ -418,7 +278,7 @@ class BringUp:
             has_one = any(write.index == HEARTBEAT_CONSUMER for write in setup.writes)
             if setup.node_id not in self._booted or not has_one:
                 return
-            if (setup.node_id, HEARTBEAT_CONSUMER) in self._refused:
+            if HEARTBEAT_CONSUMER in self._nodes[setup.node_id].refused:
                 return
             try:
                 yield from write_entry(setup, Write(HEARTBEAT_CONSUMER, 1, 0, "the master leaves"))
@@ -435,160 +295,12 @@ class BringUp:
     def _talk(self, dialogues: Mapping[int, Dialogue], timeout_s: float) -> dict[int, int]:
         return hold_dialogues(self._network, dialogues, timeout_s=timeout_s, retries=self._settings.retries)
 
-    def _write_all(self, report: NodeReport) -> Dialogue:
-        """Write the configuration; a wish that the device refuses is left out with a remark."""
-        setup = report.setup
-        times = [tuple(write for write in setup.writes if write.index == INTERPOLATION_TIME), *setup.otherwise]
-        for write in setup.writes:
-            if report.kept and write.read_back:
-                continue
-            if write.index != INTERPOLATION_TIME:
-                try:
-                    yield from write_entry(setup, write)
-                except RefusedError as refused:
-                    if write.absence is None:
-                        raise
-                    self._refused.add((setup.node_id, write.index))
-                    reason = refused.reason.removeprefix(f"({setup.name}) ")
-                    report.remarks.append(f"{reason}: left as the device has it ({write.purpose}): {write.absence}")
-            elif write is times[0][0]:
-                yield from self._write_one_of(report, times)
-
-    def _write_one_of(self, report: NodeReport, options: Sequence[Sequence[Write]]) -> Dialogue:
-        """Write the first set that the device takes, of several sets that mean the same."""
-        first: RefusedError | None = None
-        for writes in options:
-            try:
-                for write in writes:
-                    yield from write_entry(report.setup, write)
-            except RefusedError as refused:
-                first = first or refused
-            else:
-                if first is not None:
-                    values = ", ".join(f"{write.place} = {write.value}" for write in writes)
-                    report.remarks.append(f"takes {values}, which means the same as what it refused")
-                return
-        assert first is not None
-        raise RefusedError(first.node_id, first.reason + (yield from _fitting_rate(report.setup, options))) from first
-
-    def _recall(self, setup: NodeSetup) -> Dialogue:
-        """Read the newest entry in the error history of a node that has failed, unless its EMCY was received."""
-        if setup.node_id in self._watch.last_alarm or ERROR_HISTORY not in setup.dictionary:
-            return
-        try:
-            newest = yield from upload(ERROR_HISTORY, 1)
-        except (SdoAbortedError, SdoCommunicationError):
-            return  # it is empty
-        if not is_no_error(code := int.from_bytes(newest[:2], "little")):
-            words = f"; its error history (1003h) begins with {code:04X}h, {describe(code)}"
-            self._history[setup.node_id] = words
-
     def _error(self, reason: str, *setups: NodeSetup) -> NodeError:
         """The error of these nodes, with the last EMCY of each of them."""
         ids = [setup.node_id for setup in setups]
-        return NodeError(ids[0], reason + "".join([self._watch.last_words(i) or self._history.get(i, "") for i in ids]))
-
-
-class RefusedError(NodeError):
-    """A device refused a value, or holds another one after the write."""
-
-
-def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
-    """Read an integer of a node.
-
-    Raises:
-        NodeError: the node has no such entry, refuses, or does not answer.
-    """
-    variable = _variable(setup, index, subindex)
-    try:
-        return int((yield from read_value(variable)))
-    except (SdoAbortedError, SdoCommunicationError, ValueError) as error:  # ValueError: octets are no integer
-        raise NodeError(setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}") from error
-
-
-def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
-    """Write a value and read it back; a refused value counts as written where the device holds it already.
-
-    Raises:
-        RefusedError: the device refuses it, or holds another one.
-        NodeError: the device does not answer.
-    """
-    variable = _variable(setup, write.index, write.subindex)
-    value = write.value
-    try:
-        yield from download(write.index, write.subindex, variable.encode_raw(value))
-    except SdoAbortedError as error:
-        try:
-            held = int((yield from read_value(variable)))
-        except (SdoAbortedError, SdoCommunicationError):
-            raise _refused(setup, write, error) from error
-        value = _with_own_bits(write, held)
-        if held == value and write.read_back:
-            return
-        if value == write.value:
-            raise _refused(setup, write, error, held) from error
-        try:
-            yield from download(write.index, write.subindex, variable.encode_raw(value))
-        except SdoAbortedError as again:
-            raise _refused(setup, write, again, held) from again
-    except SdoCommunicationError as error:
-        raise NodeError(setup.node_id, _failed(setup, write, error)) from error
-    if not write.read_back:
-        return
-    got = yield from read_entry(setup, write.index, write.subindex)
-    if got not in (value, _with_own_bits(write, got)):
-        raise RefusedError(
-            setup.node_id, f"({setup.name}) {write.place} reads back {got:#x} after {write.value:#x} was written"
-        )
-
-
-def _fitting_rate(setup: NodeSetup, options: Sequence[Sequence[Write]]) -> Generator[bytes | None, bytes, str]:
-    """The rates that fit a drive which keeps its 60C2h, for the end of a message; empty where it does not answer."""
-    try:
-        held = yield from read_entry(setup, INTERPOLATION_TIME, 1)
-        has_unit = any(write.subindex == 2 for write in options[0])
-        index = (yield from read_entry(setup, INTERPOLATION_TIME, 2)) if has_unit else -3
-    except NodeError:
-        return ""
-    unit, unit_text = 10.0**index, f"10^{index} s"
-    if held not in {write.value for writes in options for write in writes if write.subindex == 1}:
-        return f"; it keeps {held} · {unit_text}: cycle.rate_hz = {1 / (held * unit):.6g} fits it" if held > 0 else ""
-    value, *others = options[0]  # the value was taken, its unit was not
-    wanted_s = value.value * 10.0 ** (others[0].value if others else -3)
-    counts = [count for count in (int(wanted_s / unit) + 1, int(wanted_s / unit)) if count]
-    return f"; it counts in {unit_text}: {' or '.join(f'cycle.rate_hz = {1 / (n * unit):.6g}' for n in counts)} fits it"
-
-
-def _refused(setup: NodeSetup, write: Write, error: Exception, held: int | None = None) -> RefusedError:
-    text = _failed(setup, write, error)
-    if held is not None:
-        text += f"; it holds {held:#x}"
-        if write.index in PDO_PARAMETERS:
-            text += ": if it is fixed, say so in the EDS (AccessType=const), and the plan takes it as it is"
-    return RefusedError(setup.node_id, text)
-
-
-def _failed(setup: NodeSetup, write: Write, error: Exception) -> str:
-    return f"({setup.name}) write of {write.place} = {write.value:#x} failed: {error}"
-
-
-def _with_own_bits(write: Write, held: int) -> int:
-    """The value with the bits that are the device's as it holds them."""
-    return write.value & ~write.own_bits | held & write.own_bits
+        return NodeError(ids[0], reason + "".join([self._nodes[node_id].last_words() for node_id in ids]))
 
 
 def _others(words: str, setups: Sequence[NodeSetup]) -> str:
     names = ", ".join(f"{s.node_id} ({s.name})" for s in setups[1:])
     return f"; {words} {names}" if names else ""
-
-
-def _can_verify(setup: NodeSetup) -> bool:
-    return VERIFY_CONFIGURATION in setup.dictionary and STORE_PARAMETERS in setup.dictionary
-
-
-def _variable(setup: NodeSetup, index: int, subindex: int) -> Any:  # canopen has no types here
-    try:
-        entry: Any = setup.dictionary[index]
-        return entry if isinstance(entry, ODVariable) else entry[subindex]
-    except KeyError:
-        raise NodeError(setup.node_id, f"({setup.name}) {index:04X}h:{subindex:02X} is not in {setup.eds}") from None

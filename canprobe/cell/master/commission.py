@@ -1,23 +1,213 @@
 """The work of `canprobe scan --lss`: list the nodes, find devices without an id, give them ids, list again.
 
 `commission` is the whole of it. Which device gets which id follows from identities; where two devices could be meant
-it is an error. Source: CiA 305, by canopen's LSS client.
+it is an error. Source: CiA 305.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from canprobe.cell.master.id_assignment import Assignment, Wanted, choose_assignments
-from canprobe.cell.master.lss_session import FoundTwiceError, assign, find_unconfigured
-from canprobe.cell.master.scan import IDENTITY_SUBINDICES, scan_nodes
+from canprobe.cell.master.scan import IDENTITY_SUBINDICES, MAX_NODES, scan_nodes
 from canprobe.cell.planning.model import Plan
-from canprobe.errors import BusError
+from canprobe.errors import BusError, NodeError
+from canprobe.fieldbus.bus.lss import Lss, LssAnswerError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
+from canprobe.fieldbus.protocol.frames import (
+    HEARTBEAT_BASE,
+    NmtCommand,
+    pack_nmt,
+)
 from canprobe.fieldbus.protocol.lss import LssAddress
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A node id and the identity of the device that is to have it; a number that is None matches any.
+
+    Attributes:
+        node_id: 1–127.
+        name: name in messages, such as ``joint 3``.
+        numbers: vendor id, product code, revision number, serial number.
+    """
+
+    node_id: int
+    name: str
+    numbers: tuple[int | None, int | None, int | None, int | None]
+
+    def fits(self, address: LssAddress) -> bool:
+        """Whether a device of this address may be that node."""
+        return all(want in (None, have) for want, have in zip(self.numbers, address.numbers, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """The device with this address gets `node_id`; `before` is the id that it has, None for none."""
+
+    address: LssAddress
+    node_id: int
+    before: int | None = None
+
+
+def choose_assignments(
+    wanted: Iterable[Wanted],
+    unconfigured: Sequence[LssAddress],
+    present: dict[int, LssAddress | None],
+    *,
+    channel: str,
+    must: bool = True,
+) -> list[Assignment]:
+    """Choose the device of each node id.
+
+    Args:
+        wanted: the ids to give.
+        unconfigured: devices without an id.
+        present: devices that have one; None where 1018h is not complete.
+        channel: channel of the bus, as messages name it.
+        must: each wanted id needs a device; False: ids that no device fits are left out.
+
+    Raises:
+        NodeError: an id is in use by another device, no device fits, or more than one does.
+    """
+    choices = [_choose(want, unconfigured, present, channel, must) for want in wanted]
+    chosen = [assignment for assignment in choices if assignment is not None]
+    taken: dict[LssAddress, int] = {}
+    for one in chosen:
+        if one.address in taken:
+            raise NodeError(
+                one.node_id,
+                f"the device {one.address} could also be node {taken[one.address]}: name it by its serial number,"
+                " with --assign SERIAL=ID or the joints' serial_number in the scene",
+            )
+        taken[one.address] = one.node_id
+    return chosen
+
+
+def _choose(
+    want: Wanted, unconfigured: Sequence[LssAddress], present: dict[int, LssAddress | None], channel: str, must: bool
+) -> Assignment | None:
+    holder = present.get(want.node_id)
+    if want.node_id in present and (not must or (holder is not None and want.fits(holder))):
+        return None
+    if want.node_id in present:
+        whose = f"the device {holder}" if holder is not None else "a device without a complete identity (1018h)"
+        raise NodeError(want.node_id, f"({want.name}) the id is busy: {whose} on {channel} has it")
+    fits = [Assignment(address, want.node_id) for address in unconfigured if want.fits(address)]
+    if want.numbers[3] is not None:  # a device named by its serial number may have another id already
+        fits += [
+            Assignment(address, want.node_id, before)
+            for before, address in present.items()
+            if address is not None and want.fits(address)
+        ]
+    if len(fits) > 1:
+        found = ", ".join(str(one.address) for one in fits)
+        raise NodeError(
+            want.node_id,
+            f"({want.name}) {len(fits)} devices could be meant: {found} (vendor:product:revision:serial);"
+            f" name one, as in --assign {fits[0].address.serial_number:#x}={want.node_id}, or connect one at a time",
+        )
+    if not fits and must:
+        there = ", ".join(map(str, unconfigured)) or "none"
+        identity = ":".join("any" if number is None else f"{number:#x}" for number in want.numbers)
+        raise NodeError(
+            want.node_id,
+            f"({want.name}) no device on {channel} is {identity}; without an id:"
+            f" {there}; check its power, bit rate and whether it supports LSS",
+        )
+    return fits[0] if fits else None
+
+
+BOOT_UP_S = 2.0
+
+
+class FoundTwiceError(BusError):
+    """A device that was found answers the search again and hides those of higher addresses.
+
+    Attributes:
+        found: every device that was found, that one last.
+    """
+
+    def __init__(self, channel: str, found: list[LssAddress]) -> None:
+        self.found = found
+        super().__init__(
+            f"{channel}: the device {found[-1]} (vendor:product:revision:serial) answers the search for nodes without"
+            " an id again after it was found, against CiA 305, and hides those of higher addresses: give it an id"
+            f" first, as in --assign {found[-1]}=ID, or disconnect it"
+        )
+
+
+def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
+    """Every node without an id, ascending by address; all LSS slaves are waiting afterwards.
+
+    Raises:
+        FoundTwiceError: a device does not leave the search when it is found.
+        BusError: two devices have one address, or answers do not agree.
+        InterfaceError: the interface failed.
+    """
+    lss = Lss(network)
+    lss.release()
+    found: list[LssAddress] = []
+    try:
+        for _ in range(MAX_NODES):
+            address = lss.fast_scan()  # those found stay in configuration, where they no longer answer it
+            if address is None:
+                return found
+            if address in found:
+                raise FoundTwiceError(network.port.channel, [*(one for one in found if one != address), address])
+            found.append(address)
+            if len(lss.inquire_node_ids()) > len(found):
+                raise BusError(
+                    f"{network.port.channel}: more than one node without an id has the address {found[-1]}"
+                    " (vendor:product:revision:serial); connect them one at a time"
+                )
+        return found
+    finally:
+        lss.release()
+
+
+def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True) -> bool:
+    """Give one device its id and see it boot with it.
+
+    Args:
+        network: pumped meanwhile.
+        assignment: device and id.
+        store: let the device keep the id when its power goes.
+
+    Returns:
+        Whether the device keeps it; one that cannot store answers so and is left with the id for now.
+
+    Raises:
+        NodeError: the device does not answer, refuses, or does not boot with its new id.
+        InterfaceError: the interface failed.
+    """
+    lss, node_id, address = Lss(network), assignment.node_id, assignment.address
+    booted: list[int] = []
+
+    def take(_id: int, data: bytes, t_ns: int) -> None:
+        if data == b"\0":
+            booted.append(t_ns)
+
+    network.subscribe(HEARTBEAT_BASE + node_id, take)
+    try:
+        lss.release()
+        if not lss.select(address):
+            raise LssAnswerError("no answer to switch state selective")
+        lss.configure_node_id(node_id)
+        kept = store and lss.store()
+        lss.release()
+        if assignment.before is not None:
+            network.port.send_batch([pack_nmt(NmtCommand.RESET_COMMUNICATION, assignment.before)])
+        if not network.pump_until(lambda: bool(booted), BOOT_UP_S):
+            raise NodeError(node_id, f"the device {address} took the id but sent no boot-up within {BOOT_UP_S:g} s")
+        return kept
+    except LssAnswerError as error:
+        lss.release()
+        raise NodeError(node_id, f"the device {address} did not take the id: {error}") from error
+    finally:
+        network.unsubscribe(HEARTBEAT_BASE + node_id, take)
 
 
 @dataclass(frozen=True, slots=True)

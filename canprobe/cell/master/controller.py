@@ -4,43 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.cell.master.tactile_frame import TactileFrame
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
+    from canprobe.cell.master.array import PatchReader
     from canprobe.cell.master.trail import TakenWay
-    from canprobe.mechanics.touch import Patch, SurfaceEstimate
-
-
-@dataclass(frozen=True, slots=True)
-class TactileSample:
-    """A whole tactile frame with its place in time.
-
-    Attributes:
-        frame: the frame, complete and with the right CRC.
-        t_sample_ns: instant at which the array was sampled, in the time of the cycle.
-        cycle: the cycle whose SYNC triggered it, or the last one before it was sampled.
-        t_sigma_s: standard deviation of that instant, s; 0 where a SYNC triggers the sample.
-    """
-
-    frame: TactileFrame
-    t_sample_ns: int
-    cycle: int
-    t_sigma_s: float = 0.0
-
-    @property
-    def image(self) -> object:
-        """The content of the frame, to be compared: what repeats where the array has stopped measuring."""
-        return self.frame.features or self.frame.taxels.tobytes()
-
-    def differs_from(self, other: TactileSample) -> bool:
-        """Whether the array shows something else than in another sample."""
-        return self.image != other.image
+    from canprobe.mechanics.touch import SurfaceEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +66,10 @@ class Command:
     estimate: SurfaceEstimate | None = None
 
 
+OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
+"""Columns of the cell in the log; a controller's `Command.columns` have other names."""
+
+
 def check_command(command: Command, *, arm: bool) -> None:
     """Check what a controller returned, but for the joint target of an arm: the supervision checks that.
 
@@ -99,8 +78,10 @@ def check_command(command: Command, *, arm: bool) -> None:
         arm: the scene has one.
 
     Raises:
-        UsageError: a field of the command has the wrong type.
+        UsageError: it is no command, a field of it has the wrong type, or a column has a name of the cell's.
     """
+    if not isinstance(command, Command):
+        raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
     if not isinstance(command.done, bool | np.bool_):
         raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
     if command.stop_reason is not None and not (isinstance(command.stop_reason, str) and command.stop_reason.strip()):
@@ -120,21 +101,9 @@ def check_command(command: Command, *, arm: bool) -> None:
 
         if not isinstance(command.estimate, SurfaceEstimate):
             raise UsageError(f"controller: expected estimate to be a SurfaceEstimate, got {command.estimate!r}")
-
-
-class SampleReader(Protocol):
-    """Makes the patch of each tactile sample, once, and finds taxels that do not measure (`array.PatchReader`)."""
-
-    def read(self, sample: TactileSample) -> Patch:
-        """The patch of a sample; samples come in the order of their times."""
-
-    @property
-    def found(self) -> int:
-        """Number of taxels that were found not to measure."""
-
-    @property
-    def faults(self) -> str:
-        """Taxels that do not measure, in words; empty where none was found."""
+    if not OWN_COLUMNS.isdisjoint(command.columns):
+        taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
+        raise UsageError(f"controller: expected other columns than the cell's, got {taken}")
 
 
 class Controller:
@@ -149,6 +118,7 @@ class Controller:
             names what is wrong; False, the default: the cell does.
         array_alive: whether an image of the array has changed since bring-up; the cell sets it before each step.
         array_blind: why the controller does not believe the array any more; None while it does.
+        remarks: what the controller has found to be wrong with the cell, a line each; more come, and none goes.
     """
 
     lets_go: bool = False
@@ -156,9 +126,10 @@ class Controller:
     compares_motion: bool = False
     array_alive: bool = False
     array_blind: str | None = None
+    remarks: Sequence[str] = ()
 
     @property
-    def reader(self) -> SampleReader | None:
+    def reader(self) -> PatchReader | None:
         """The reader of its tactile samples, which the supervision uses too; None: the cell has its own."""
         return None
 
@@ -217,11 +188,6 @@ class Controller:
         """How often the estimator of this controller diverged and started again."""
         return 0
 
-    @property
-    def remarks(self) -> Sequence[str]:
-        """What the controller has found to be wrong with the cell, a line each; more come, and none goes."""
-        return ()
-
 
 class WrappingController(Controller):
     """Base of controllers that step another one: what it and the cell tell each other of the array passes through.
@@ -251,11 +217,11 @@ class WrappingController(Controller):
             self.inner.array_blind = why
 
     @property
-    def reader(self) -> SampleReader | None:
+    def reader(self) -> PatchReader | None:
         return None if self.inner is None else self.inner.reader
 
     @property
-    def remarks(self) -> Sequence[str]:
+    def remarks(self) -> Sequence[str]:  # type: ignore[override]
         return () if self.inner is None else self.inner.remarks
 
     @property

@@ -215,23 +215,20 @@ class Cycle:
         port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._looks_ns
         if self._on_arrival and self._drives is not None:
             self._route(port.drain())  # nodes that go first on this processor have answered by now
-            if not intake.complete:
-                self._collect_on_arrival(self.sync_ns + looks_ns[0], self.sync_ns + looks_ns[-1])
+            if intake.complete:
+                return
+            last_ns = self.sync_ns + looks_ns[-1]
+            clock.sleep_until_ns(self.sync_ns + looks_ns[0])
+            self._route(port.drain())
+            while not intake.complete and clock.now_ns() < last_ns:  # each arrival wakes it
+                port.wait(last_ns)
+                self._route(port.drain())
         else:
             for look_ns in looks_ns:
                 clock.sleep_until_ns(self.sync_ns + look_ns)
                 self._route(port.drain())
                 if intake.complete:
                     break
-
-    def _collect_on_arrival(self, first_ns: int, last_ns: int) -> None:
-        """Look at `first_ns`, then at each arrival, until all TPDOs are in or `last_ns` is over."""
-        port, clock, intake = self._port, self._port.clock, self._intake
-        clock.sleep_until_ns(first_ns)
-        self._route(port.drain())
-        while not intake.complete and clock.now_ns() < last_ns:
-            port.wait(last_ns)
-            self._route(port.drain())
 
     def _route(self, frames: list[TimedFrame]) -> None:
         watch = self._watch

@@ -27,7 +27,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     known_state,
 )
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.types import Floats
 
@@ -41,8 +41,6 @@ DOUBTED_CYCLES = 2
 """TPDOs in a row whose statusword is not believed either, where their position cannot be: fewer than make a hold."""
 UNSTATED_LAG_S = 0.05
 """Longest usual lag of a drive without a feed-forward, s, where neither scene nor emulation states one."""
-CONTROLWORD, TARGET, CONSTANT = range(3)
-"""Kinds of values in a command."""
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
 """Bits of the statusword that encode the state, and their value in operation enabled; see `known_state` for others."""
@@ -111,40 +109,7 @@ def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
 
 
 DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
-"""One RPDO: COB-ID, what packs each part of it, and the values of each part; see `CommandFrame`."""
-
-
-@dataclass(frozen=True, slots=True)
-class CommandFrame:
-    """An RPDO frame, for one drive or for two.
-
-    Attributes:
-        cob_id: COB-ID of the frame.
-        every_cycle: the frame is sent in every cycle; False: on change.
-        parts: part of each drive: axis, layout, and the kinds of its values: `CONTROLWORD`, `TARGET`, `CONSTANT`.
-    """
-
-    cob_id: int
-    every_cycle: bool
-    parts: tuple[tuple[int, PdoLayout, tuple[int, ...]], ...]
-
-
-def command_frames(axes: tuple[DriveAxis, ...]) -> tuple[CommandFrame, ...]:
-    """The RPDO frames of all drives, by COB-ID."""
-    parts: dict[int, list[tuple[int, PdoLayout, tuple[int, ...]]]] = {}
-    for i, axis in enumerate(axes):
-        for layout in axis.commands:
-            picks = tuple(map(_pick, layout.signals))
-            parts.setdefault(layout.cob_id, []).append((i, layout, picks))
-    return tuple(
-        CommandFrame(cob_id, group[0][1].transmission_type <= SYNCHRONOUS_MAX, tuple(group))
-        for cob_id, group in sorted(parts.items())
-    )
-
-
-def _pick(entry: PdoEntry) -> int:
-    place = entry.index, entry.subindex
-    return CONTROLWORD if place == (0x6040, 0) else TARGET if place in _TARGETS else CONSTANT
+"""One RPDO, for one drive or for two: COB-ID, what packs the part of each, and the values of each part."""
 
 
 class DriveGroup:
@@ -202,15 +167,19 @@ class DriveGroup:
         self._constants: list[int] = []
         self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
         self._steady: tuple[object, ...] | None = None
+        rpdos: dict[int, list[tuple[int, PdoLayout]]] = {}
+        for i, axis in enumerate(axes):
+            for layout in axis.commands:
+                rpdos.setdefault(layout.cob_id, []).append((i, layout))
         self._plan = [
             (
-                frame.cob_id,
-                frame.every_cycle,
-                [layout.pack for _, layout, _ in frame.parts],
-                [_fetcher(self._places_of(axis, layout, picks)) for axis, layout, picks in frame.parts],
-                tuple(axis for axis, _, _ in frame.parts),
+                cob_id,
+                parts[0][1].transmission_type <= SYNCHRONOUS_MAX,  # in every cycle, else on change
+                [layout.pack for _, layout in parts],
+                [_fetcher(self._places_of(i, layout)) for i, layout in parts],
+                tuple(i for i, _ in parts),
             )
-            for frame in command_frames(axes)
+            for cob_id, parts in sorted(rpdos.items())
         ]
         self._sent: dict[int, tuple[list[tuple[int, ...]], int]] = {}
         self._repeat = repeat_cycles
@@ -221,15 +190,18 @@ class DriveGroup:
         self._quickest_ns = period_ns
         self._irregular = False
 
-    def _places_of(self, axis: int, layout: PdoLayout, picks: tuple[int, ...]) -> list[int]:
+    def _places_of(self, axis: int, layout: PdoLayout) -> list[int]:
         """Places of the values of a part in the list of controlwords, targets and constants."""
         places, n = [], len(self.axes)
-        for entry, pick in zip(layout.signals, picks, strict=True):
-            if pick == CONSTANT:
-                places.append(2 * n + len(self._constants))
-                self._constants.append(self.axes[axis].constants[entry.index, entry.subindex])
+        for entry in layout.signals:
+            place = entry.index, entry.subindex
+            if place == (0x6040, 0):
+                places.append(axis)
+            elif place in _TARGETS:
+                places.append(n + axis)
             else:
-                places.append(axis + pick * n)
+                places.append(2 * n + len(self._constants))
+                self._constants.append(self.axes[axis].constants[place])
         return places
 
     @property
@@ -433,7 +405,7 @@ class DriveGroup:
             words = list(map(_controlword, self.states, goals, self._words, self._interpolated))
             self._steady = key if words == self._words else None
             self._words = words
-        values = [*self._words, *targets, *self._constants]  # an axis and its pick name the place
+        values = [*self._words, *targets, *self._constants]
         heard_all = self.heard_all
         commands = []
         for cob_id, every_cycle, packs, fetches, axes in self._plan:

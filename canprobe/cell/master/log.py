@@ -1,11 +1,13 @@
-"""The run's log: a row a cycle; and the notes of what went wrong."""
+"""The rows of a run: one a cycle, and one a tactile frame that the cell used."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator, MutableSequence, Sequence
+from collections.abc import Iterable, Iterator, Mapping, MutableSequence, Sequence
 from copy import copy
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.rows import BLOCK_ROWS, NUMBER, LazyColumns, Rows
 from canprobe.mechanics.types import Floats
+
+
+def joint_columns(name: str, q: Floats, prismatic: NDArray[np.bool_] | None) -> dict[str, Floats]:
+    """Joint positions as columns of the log: of an arm whose joints all turn `name_rad` alone, else with `name_m`.
+
+    Args:
+        name: `q` or `q_target`.
+        q: (n,) rad or m.
+        prismatic: (n,) which joints slide; None: none of them.
+
+    Returns:
+        (n,) each, NaN where a joint is of the other kind.
+    """
+    if prismatic is None:
+        return {f"{name}_rad": q}
+    sliding = {f"{name}_m": np.where(prismatic, q, np.nan)}
+    return sliding if prismatic.all() else {f"{name}_rad": np.where(prismatic, np.nan, q), **sliding}
+
+
+def joint_positions(log: Mapping[str, Floats], name: str = "q") -> Floats | None:
+    """The inverse of `joint_columns` for a whole log: (rows, n) rad or m; None where it has no such columns.
+
+    Args:
+        log: columns by name.
+        name: `q` or `q_target`.
+    """
+    turning, sliding = log.get(f"{name}_rad"), log.get(f"{name}_m")
+    if turning is None or sliding is None:
+        return sliding if turning is None else turning
+    return np.where(np.isnan(turning), sliding, turning)
+
 
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
 _Part = tuple[NDArray[np.int64], Sequence[Any] | Floats]
@@ -187,3 +221,49 @@ class RunLog:
             )
             warnings.warn(text, stacklevel=3)
         return out
+
+
+_NO_FEATURES = (math.nan,) * 7
+
+
+class TactileLog:
+    """The tactile frames that the cell used: images and what belongs to them, for `tactile.npz`.
+
+    Args:
+        kept: how many frames are kept, the last ones; None for all.
+        folder: folder for their file, ``tactile.npy``; None keeps them in memory.
+    """
+
+    def __init__(self, kept: int | None = None, folder: Path | None = None) -> None:
+        self.rows: Rows | None = None
+        self._kept = kept
+        self._file = folder / "tactile.npy" if folder is not None else None
+        self._added = 0
+
+    def add(self, t_s: float, start_s: float, sample: TactileSample) -> None:
+        """Append the sample that became usable in the cycle at ``t_s``, on the run's clock; 0 of its own is `start_s`.
+
+        A device of raw frames has their values besides; features are NaN in a frame of taxels.
+        """
+        frame = sample.frame
+        raw = () if frame.raw is None else (frame.raw,)
+        features = _NO_FEATURES if frame.features is None else astuple(frame.features)
+        times = t_s, sample.t_sample_ns * 1e-9 + start_s, sample.t_sigma_s
+        if self.rows is None:
+            of_raw = [("raw", values.dtype, values.shape) for values in raw]
+            of_times = [(name, np.float64) for name in ("t_s", "t_sample_s", "t_sigma_s")]
+            of_frame = [("taxels", np.uint8, frame.taxels.shape), ("window", np.int64, 4), ("features", np.float64, 7)]
+            self.rows = Rows([*of_raw, *of_times, *of_frame], self._file, self._kept)
+        self.rows.add(np.array((*raw, *times, frame.taxels, frame.window, features), self.rows.dtype).tobytes())
+        self._added += 1
+        if self._file is not None and self._added % BLOCK_ROWS == 0:
+            self.rows.flush()
+
+    def columns(self) -> LazyColumns:
+        """A row for each frame (m, ...): when it was usable and sampled, s, taxels, their window, features."""
+        return LazyColumns({}) if self.rows is None else self.rows.columns()
+
+    def remove(self) -> None:
+        """Remove the file; its rows are in ``tactile.npz`` by now."""
+        if self.rows is not None:
+            self.rows.remove()

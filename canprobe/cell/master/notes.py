@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import count, groupby
 
@@ -65,6 +65,17 @@ class Notes:
         """Count an error, with the reaction of the cell to it in ``then``."""
         reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (str(error), None)
         self.add(f"{reason}: {then}", node_id=node_id, t_s=t_s)
+
+    def saying(self, say: Callable[[str], None]) -> Callable[[str], None]:
+        """A function that reports a step by ``say``; where that fails, it is noted: it must not stop the drives."""
+
+        def report(text: str) -> None:
+            try:
+                say(text)
+            except Exception as error:
+                self.add(f"steps could not be reported: {type(error).__name__}")
+
+        return report
 
     def lines(self) -> list[str]:
         """A line for each kind."""

@@ -9,7 +9,6 @@ from typing import Any
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.master.lss_session import MAX_NODES
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, answering_nodes
@@ -24,6 +23,7 @@ from canprobe.fieldbus.protocol.frames import (
 
 IDENTITY_SUBINDICES = {"vendor_id": 1, "product_code": 2, "revision_number": 3, "serial_number": 4}
 IDENTITY, DEVICE_NAME = 0x1018, 0x1008
+MAX_NODES = 127
 LISTEN_S = 1.0
 """Shortest time in which heartbeats are listened for; few devices send one less often."""
 _SERIAL = IDENTITY.to_bytes(2, "little") + bytes((IDENTITY_SUBINDICES["serial_number"],))

@@ -13,9 +13,10 @@ from enum import Enum
 from typing import Any
 
 from canprobe.cell.master.array import ArrayReceiver
-from canprobe.cell.master.controller import Measurement, TactileSample
+from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.image_witness import ImageWitness
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT

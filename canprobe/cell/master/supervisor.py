@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
-from canprobe.cell.master.controller import Command, Measurement, TactileSample
+from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.push_witness import PushWitness
 from canprobe.cell.master.supervision import Finding, Reaction, Seen, TouchState
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters

@@ -1,4 +1,4 @@
-"""A tactile frame as controllers see it: the taxels of the whole pad, or the contact's features."""
+"""A tactile frame as controllers see it: the taxels of the whole pad, or the contact's features; its place in time."""
 
 from __future__ import annotations
 
@@ -30,6 +30,32 @@ class TactileFrame:
     features: Features | None
     t_ns: int
     raw: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TactileSample:
+    """A whole tactile frame with its place in time.
+
+    Attributes:
+        frame: the frame, complete and with the right CRC.
+        t_sample_ns: instant at which the array was sampled, in the time of the cycle.
+        cycle: the cycle whose SYNC triggered it, or the last one before it was sampled.
+        t_sigma_s: standard deviation of that instant, s; 0 where a SYNC triggers the sample.
+    """
+
+    frame: TactileFrame
+    t_sample_ns: int
+    cycle: int
+    t_sigma_s: float = 0.0
+
+    @property
+    def image(self) -> object:
+        """The content of the frame, to be compared: what repeats where the array has stopped measuring."""
+        return self.frame.features or self.frame.taxels.tobytes()
+
+    def differs_from(self, other: TactileSample) -> bool:
+        """Whether the array shows something else than in another sample."""
+        return self.image != other.image
 
 
 def covered(header: TactileHeader, shape: Shape) -> tuple[int, int, int, int]:

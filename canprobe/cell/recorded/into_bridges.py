@@ -16,8 +16,7 @@ from canprobe.cell.master.options import Say
 from canprobe.cell.planning.bridges import BRIDGES, check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.recorded.cycles import LogCycles
-from canprobe.cell.recorded.recording import read_recording
+from canprobe.cell.recorded.recording import LogCycles, read_recording
 from canprobe.cell.recorded.reestimate import ReplayResult, find_log, replay, scene_of
 from canprobe.cell.recorded.run_folder import RunFolder, read_run
 from canprobe.cell.scene.model import BridgeSettings, Scene
@@ -136,7 +135,7 @@ def _observations_of(
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
     """The answers of the scene's estimator, by the cycle's time since the first, ns."""
-    return {} if result is None else {round(r.told_s * 1e9): r.estimate for r in result.tracker.records}
+    return {} if result is None else {round(r.reported_s * 1e9): r.estimate for r in result.tracker.records}
 
 
 def frames_by_sync(path: Path, first: str, plan: Plan) -> Iterator[list[TimedFrame]]:

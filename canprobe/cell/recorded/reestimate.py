@@ -12,11 +12,10 @@ import numpy as np
 from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.recorded.cycles import LogCycles, replay_contacts
-from canprobe.cell.recorded.recording import read_recording
+from canprobe.cell.recorded.recording import LogCycles, read_recording, replay_contacts
 from canprobe.cell.recorded.run_folder import RunFolder, read_run, replay_task
-from canprobe.cell.results.map_score import estimate_columns, summarise_map
 from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, is_recorded, needed, read_log, read_scene, read_truth
+from canprobe.cell.results.scores import estimate_columns, summarise_map
 from canprobe.cell.results.summary import finite_or_none, summarise_shape
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import SAVED_AS, load_scene

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.controller import Measurement, TactileSample
-from canprobe.cell.master.joint_columns import joint_positions
-from canprobe.cell.master.tactile_frame import TactileFrame
+from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.log import joint_positions
+from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_files import LOG, TACTILE, is_recorded, needed, read_log, read_summary, read_tactile
 from canprobe.cell.scene.setup import Setup

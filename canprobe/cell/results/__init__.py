@@ -6,10 +6,9 @@ refuses to be read before. All files of a run count time from the 0 of its `bus.
 
     open_cell      a cell for controllers, from its bring-up to its results
     run_data       all data of a finished run
-    result         the data for Python users: tables, figures, pages and scores on request
+    result         the data for Python users: tables, figures, scores and the page that replays a run, on request
     summary        the document of `summary.json` (versioned by `schema`; what does not apply is null), and the files
-    scores         comparison with the plant's truth, where there is one
-    map_score      the map of a scan and its estimates, as columns and as part of the summary
+    scores         comparison with the plant's truth, where there is one; a map and estimates as columns
     contacts       the contacts of a scan, and the errors of estimators on them
     text           a summary as text
     expected       the figures to expect of a packaged scene
@@ -19,8 +18,7 @@ refuses to be read before. All files of a run count time from the 0 of its `bus.
     surface_file   a surface map as a file
     tool_file      a calibrated tool centre as a file
     array_report   text and picture of an array's calibration
-    figures, plan_figure, surface_figure, surface_sheet, surface_panels   pictures, all in the style of `picture`
-    page           HTML page that replays a run
+    figures, plan_figure, surface_figure   pictures, all in the style of `picture`
 
 Matplotlib is imported only where pictures are drawn.
 """

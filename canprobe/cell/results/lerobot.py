@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.joint_columns import joint_positions
+from canprobe.cell.master.log import joint_positions
 from canprobe.cell.results.files import needed_module
 from canprobe.cell.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
 from canprobe.cell.scene.resolve import resolve

@@ -64,10 +64,10 @@ class LockstepCell:
         self.folder = self._place / f"run{self._runs}"
         self._runs += 1
         cell = OpenCell(plan, RunOptions(self.folder))
-        faulty = cell.session.world.make_faulty()
+        faulty = cell.session.buses.world.make_faulty()
 
         def throw(text: str) -> Fault:
-            bus = cell.session.lockstep
+            bus = cell.session.buses.lockstep
             return faulty.inject(text, 0 if bus is None else bus.clock.now_ns())
 
         self._faults.attach(throw, faulty.end, faulty.nodes)

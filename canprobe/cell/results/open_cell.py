@@ -13,10 +13,11 @@ import numpy.typing as npt
 
 from canprobe.cell.master.array import PatchReader, make_patch_reader
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
+from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
@@ -193,11 +194,12 @@ class OpenCell:
             self._bridges.end(None)
 
     def _conclude(self, failure: BaseException | None) -> None:
+        files, cell = self.session.files, self.cell
         with interrupts_held():
-            log, tactile = self.session.keep(LOG, self.cell.log), self.session.keep(TACTILE, self.cell.tactile_log)
+            log, tactile = files.keep(LOG, cell.log), files.keep(TACTILE, cell.tactile_log)
             data = self._score(log, tactile, failure)
             self._result.complete(data)
-            summary, lines = data.summary, self.session.unwritten
+            summary, lines = data.summary, files.unwritten
             if isinstance(failure, CanprobeError):
                 failure.summary = summary
             self._write(lambda out: write_files(data, out))
@@ -210,7 +212,7 @@ class OpenCell:
             for name, draw in _drawings(data, self._out).items():
                 self._say(f"draw {name}")
                 if (why := _draw(name, draw)) is not None:
-                    self.session.note_unwritten(why)
+                    files.note_unwritten(why)
         summary["faults"] += [line for line in lines if line not in summary["faults"]]
         if lines and failure is None:
             unwritten = ResultsError("\n".join(lines))
@@ -224,7 +226,7 @@ class OpenCell:
         self, log: dict[str, Floats], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
     ) -> RunData:
         """The data of the run with the estimator in the loop, scored by the plan that it ran with."""
-        record, start_s, setup = record_of(self._last), self.cell.start_ns * 1e-9, self.plan.setup
+        record, start_s, setup = record_of(self._last), self.cell.cycles.start_ns * 1e-9, self.plan.setup
         estimates: dict[str, list[ShapeRecord]] = {}
         if record.shape is not None and setup.shape is not None:
             estimates[setup.shape.method] = record.shape.records
@@ -242,7 +244,7 @@ class OpenCell:
             plan=self.plan,
             summary=summary,
             log=log,
-            truth=self.session.truth,
+            truth=self.session.buses.truth,
             estimates={name: on_run_clock(records, start_s) for name, records in estimates.items()},
             taxels=record.taxels,
             tactile=tactile,
@@ -275,14 +277,14 @@ class OpenCell:
                 write(self._out)
         except ResultsError as error:
             for line in str(error).splitlines():
-                if line not in self.session.unwritten:  # the summary is written twice
-                    self.session.note_unwritten(line)
+                if line not in self.session.files.unwritten:  # the summary is written twice
+                    self.session.files.note_unwritten(line)
 
     def _mapped(self, tracker: ShapeTracker | None) -> tuple[SurfaceMap | None, dict[str, Any] | None]:
         """The surface map of a scan, and its section of the summary."""
         if tracker is None or tracker.surface_map is None:
             return None, None
-        from canprobe.cell.results.map_score import summarise_map
+        from canprobe.cell.results.scores import summarise_map
 
         shape = self.plan.setup.truth.object if truth_of(self.session) else None
         return tracker.surface_map, summarise_map(tracker.surface_map, shape)

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import html
+import importlib
 import importlib.util
+import os
+import sys
 import tempfile
+import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.master.options import quiet
 from canprobe.cell.npz import write_npz
+from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.files import to_frame, write_parquet
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE
 from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
-from canprobe.cell.scene.setup import Touch
+from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.folder import write_scene
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError, install_line
@@ -30,9 +38,53 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from canprobe.cell.results.contacts import Contacts, Scores
-    from canprobe.cell.results.page import Page
     from canprobe.cell.tasks.own_estimators import OwnEstimator
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """One HTML file, which a notebook shows and which can be kept and mailed.
+
+    Attributes:
+        path: path of the file.
+    """
+
+    path: Path
+
+    def _repr_html_(self) -> str:
+        text = html.escape(self.path.read_text(encoding="utf-8"))
+        return f'<iframe srcdoc="{text}" style="width: 100%; height: 640px; border: 0"></iframe>'
+
+
+def write_page_of(folder: Path, setup: Setup) -> None:
+    """Write ``report.html`` into a run's folder.
+
+    Args:
+        folder: folder with the files of the run.
+        setup: setup of the run.
+
+    Raises:
+        UsageError: a controller's column has the name of one of ours.
+    """
+    page = importlib.import_module("canprobe.lab.bridge.view.page")
+    recorded = importlib.import_module("canprobe.lab.bridge.view.recorded")
+    page.write_page(recorded.read_run(folder, setup), folder / "report.html", quiet)
+
+
+def page_of(folder: Path, setup: Setup) -> Page:
+    """The page of a run's folder, written where it is missing, and opened in a browser outside of a notebook.
+
+    Raises:
+        UsageError: the extra `view` is missing, or a controller's column has the name of one of ours.
+    """
+    page = Page(folder / "report.html")
+    if not page.path.is_file():
+        check_bridges(["view"], "")
+        write_page_of(folder, setup)
+    if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        webbrowser.open(page.path.resolve().as_uri())
+    return page
 
 
 class RunResult:
@@ -130,8 +182,6 @@ class RunResult:
         Raises:
             UsageError: the extra `view` is missing.
         """
-        from canprobe.cell.results.page import page_of
-
         folder = self.out
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
@@ -224,7 +274,7 @@ class RunResult:
 
     def _columns(self, what: str) -> dict[str, Floats]:
         if what == "estimates":
-            from canprobe.cell.results.map_score import estimate_columns
+            from canprobe.cell.results.scores import estimate_columns
 
             return estimate_columns(next(iter(self.estimates.values()), []))
         if what not in ("log", "truth"):

@@ -101,7 +101,7 @@ def summarise(
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
         "bridges": bridges,
-        "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
+        "faults": [*cell.notes.lines(), *(session.observers.faults if session.observers is not None else ())],
     }
     if record.explored is not None:
         summary["explore"] = record.explored.summarised()
@@ -135,8 +135,8 @@ def _traffic(session: Session) -> dict[str, Any]:
         return {channel: meter.report().as_dict() for channel, meter in session.record.meters.items()}
     plan = session.plan
     with contextlib.suppress(UsageError):
-        if session.out is not None:
-            log = session.out / LOG
+        if session.options.out is not None:
+            log = session.options.out / LOG
             return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
     errors = {channel: counter.error_frames for channel, counter in session.record.traffic.items()}
     return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
@@ -144,11 +144,11 @@ def _traffic(session: Session) -> dict[str, Any]:
 
 def truth_of(session: Session) -> dict[str, Floats]:
     """The plant's truth; empty where nothing was emulated, or nothing happened."""
-    return session.truth if "force_n" in session.truth else {}
+    return session.buses.truth if "force_n" in session.buses.truth else {}
 
 
 def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) -> dict[str, Any]:
-    task, scan = session.scene.task, record.scan_cycles if session.keeps_all else None
+    task, scan = session.scene.task, record.scan_cycles if session.options.rows_kept is None else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)
@@ -308,8 +308,8 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
         "stale_frames": tactile.stale if tactile is not None else 0,
         "unplaced_contacts": record.unplaced,
         "slowed_cycles": record.slowed,
-        "dropped_frames": cell.counters.overruns,
-        "clock_steps": cell.counters.clock_steps,
+        "dropped_frames": cell.port.counters.overruns,
+        "clock_steps": cell.port.counters.clock_steps,
         "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
         "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
         "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),

@@ -2,29 +2,24 @@
 
 `session.Session` is the only place, besides studies and tests, that sees both sides of the bus. Entered, it plans,
 opens the buses, starts recording, makes the cell and, where nodes are emulated, their world: in the same process on a
-lockstep bus or without a bus, in a child (`emulator_child`) on a real one. It listens before it starts a child. Left,
+lockstep bus or without a bus, in a child (`child_process`) on a real one. It listens before it starts a child. Left,
 it stops everything in the reverse order: drives disabled, logs flushed, bus closed, children ended, truth kept.
 
     session         one cell from bring-up to safe stop
     target          the bus of a run or a command: interface, channels and bit rate, put into a scene by one function
-    buses           ports, buses in virtual time, routes between several buses, counters of their frames
-    links           check of the interfaces' settings before anything is sent
-    link_faults     faults in the setting of one interface
-    folder          the folder of a run before its first frame, and the files of what a cell keeps
+    buses           the three kinds of bus, with what is on their other side: no bus, virtual, real
+    links           check of the interfaces' settings, and of their controllers, before anything is sent
+    folder          the folder of a run, the file of its steps, and the files of what a cell keeps
     direct          a cell without a bus
-    rehearsal       the scene of a short run in lockstep, before a real one
-    bus_record      record of its buses
-    child_process   a process beside the master
-    emulator_child  the process of the emulated nodes
+    bus_record      record of its buses, and counters of their frames
+    child_process   a process beside the master, and that of the emulated nodes
     children        the processes of the bridges to other tools
     recovery        a cell that comes back after a node or the bus was lost
-    step_log        the steps of such a run in a file
-    up              a cell that holds its position for days
+    up              a cell that holds its position for days; its joints one after the other: which is which, their zeros
     check           a verdict on link and machine before motion
     first_second    the same verdict on the first second of a run
-    check_joints, home   the joints of a cell, one after the other: which is which, and their zeros
     joint_record    what a check of the joints has shown, for later runs
-    looking         a bus without a cell: scan, node ids, monitor
+    bus_tools       a bus without a cell: scan, node ids, monitor
     emulation       emulated nodes for other masters
     array_calibration    touches of known objects, visit by visit, and the fit
     terminal        steps and a progress bar on a terminal

@@ -325,7 +325,7 @@ def touch_object(
     assert isinstance(task, Touch)
     with Session(plan, RunOptions(out, say)) as session:
         session.run(roll)
-    log, truth = session.cell.log.arrays(), session.truth
+    log, truth = session.cell.log.arrays(), session.buses.truth
     presses = roll.presses
     places = list(dict.fromkeys(p.at if not p.hz[1:] else (p.at, p.heading) for p in presses))
     dwells = []

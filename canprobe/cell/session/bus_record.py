@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -11,15 +11,52 @@ from typing import Self
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.planning.measured import TrafficMeter
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.session.buses import TrafficCounter
 from canprobe.cell.session.folder import prepare_folder
 from canprobe.cell.session.target import LOCKSTEP
 from canprobe.fieldbus.bus.candump import CandumpWriter
 from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.files import make_folder
-from canprobe.fieldbus.bus.port import is_bus_error
+from canprobe.fieldbus.bus.port import TimedFrame, is_bus_error
+from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits
 
 Write = Callable[[int, bytes, int], None]
+
+
+class TrafficCounter:
+    """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
+
+    Args:
+        speed_up: data bit rate of CAN FD over the nominal one.
+
+    Attributes:
+        error_frames: number of bus errors; whoever receives one counts it here.
+    """
+
+    def __init__(self, speed_up: float) -> None:
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
+        self.error_frames = 0
+
+    @property
+    def frames(self) -> int:
+        """Number of frames so far."""
+        return sum(self._by_length)
+
+    @property
+    def bits(self) -> int:
+        """Number of bits so far, those of a data phase in bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Count one frame."""
+        self._by_length[len(data)] += 1
+
+    def take(self, frames: Sequence[TimedFrame]) -> None:
+        """Count several frames."""
+        for _, data, _ in frames:
+            self._by_length[len(data)] += 1
 
 
 class BusRecord:

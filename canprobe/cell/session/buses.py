@@ -1,57 +1,223 @@
-"""Buses that a session opens: ports, buses in virtual time, routes between several buses, counters of frames."""
+"""The buses of a session with what is on their other side: emulated nodes in virtual time, or real interfaces."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
+from canprobe.cell.emulated.truth_columns import TruthColumns
+from canprobe.cell.master.cycle import Cycle
+from canprobe.cell.master.options import RunOptions, quiet
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.wire_time import exact_frame_bits
+from canprobe.cell.scene.hardware import DIRECT
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.session.link_faults import data_bitrate
-from canprobe.fieldbus.bus.clock import Clock, VirtualClock
-from canprobe.fieldbus.bus.port import Port, Reports, TimedFrame
+from canprobe.cell.session.bus_record import BusRecord
+from canprobe.cell.session.child_process import EmulatorChild
+from canprobe.cell.session.folder import KeptFiles, prepare_folder
+from canprobe.cell.session.links import check_links, data_bitrate, expected_of
+from canprobe.cell.session.target import LOCKSTEP
+from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.candump import RecordingPort
+from canprobe.fieldbus.bus.clock import Clock, MonotonicClock, VirtualClock
+from canprobe.fieldbus.bus.files import writing
+from canprobe.fieldbus.bus.joined import JoinedPort
+from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
-from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
+from canprobe.fieldbus.protocol.frame_bits import exact_bits
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
+from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.emulated.world import World
 
 
-class TrafficCounter:
-    """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
+class SessionBuses(ABC):
+    """The buses of a session.
 
     Args:
-        speed_up: data bit rate of CAN FD over the nominal one.
+        plan: plan of the cell.
+        options: options of the run.
+        files: files of the run's folder.
+        stack: the way out of the session.
 
     Attributes:
-        error_frames: number of bus errors; whoever receives one counts it here.
+        ports: ports of the interfaces, by channel; empty in virtual time.
+        lockstep: the first bus in virtual time, once it is open.
+        make_cycle: makes a cycle without a bus; None where there is one.
+        truth: the plant's true values, at the end; empty where nothing was emulated.
     """
 
-    def __init__(self, speed_up: float) -> None:
-        self._by_length = [0] * 65
-        self._speed_up = speed_up
-        self.error_frames = 0
+    def __init__(self, plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitStack) -> None:
+        self.ports: dict[str, Port] = {}
+        self.lockstep: LockstepBus | None = None
+        self.make_cycle: Callable[..., Cycle] | None = None
+        self.truth: dict[str, Floats] = {}
+        self._child: EmulatorChild | None = None
+        self._plan, self._options, self._files, self._stack = plan, options, files, stack
 
-    @property
-    def frames(self) -> int:
-        """Number of frames so far."""
-        return sum(self._by_length)
+    @cached_property
+    def world(self) -> World:
+        """The emulated nodes and their plant in this process; participants may be replaced until the buses open."""
+        from canprobe.cell.emulated.world import make_world
 
-    @property
-    def bits(self) -> int:
-        """Number of bits so far, those of a data phase in bits of the nominal rate."""
-        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
-        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
-        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
+        nodes, truth = self._plan.scene.emulated_node_ids, self._options.rows_kept is None
+        return make_world(self._plan, nodes, truth=truth, at_once=True, folder=self._options.rows_folder)
 
-    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Count one frame."""
-        self._by_length[len(data)] += 1
+    @abstractmethod
+    def open(self, record: BusRecord) -> Port:
+        """Open the buses, each recorded; one port for the cell, whatever their number.
 
-    def take(self, frames: Sequence[TimedFrame]) -> None:
-        """Count several frames."""
-        for _, data, _ in frames:
-            self._by_length[len(data)] += 1
+        Raises:
+            UsageError: the scene does not fit these buses.
+            InterfaceError: an interface is missing, down, set wrong or cannot be opened.
+        """
+
+    def reopen(self, port: Port) -> Port:
+        """Open the interfaces again; in virtual time there is nothing to open.
+
+        Raises:
+            InterfaceError: one is missing, down or bus-off.
+        """
+        return port
+
+    def raise_ended(self) -> None:
+        """Raise the error with which the process of the emulated nodes ended; nothing where it runs, or there is none.
+
+        Raises:
+            BusError: it ended.
+        """
+        if self._child is not None:
+            self._child.raise_ended()
+
+    def _need_emulated(self, what: str) -> None:
+        if missing := set(self._plan.node_ids) - set(self._plan.scene.emulated_node_ids):
+            raise UsageError(f"{what} emulated nodes only: node {min(missing)} is marked emulated = false")
+
+    def _keep_truth(self) -> None:
+        if self.world.recorder is not None:
+            self.truth = TruthColumns(self._files.keep("truth.npz", self.world.recorder))
+
+    def _joined(self, ports: dict[str, Port]) -> Port:
+        if len(ports) == 1:
+            return ports.popitem()[1]
+        routes = {frames.can_id: frames.channel for frames in self._plan.raw}
+        routes |= {pdo.cob_id: pdo.channel for pdo in self._plan.pdos}
+        for node in self._plan.nodes:  # identifiers that only one node sends or reads
+            for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
+                routes[base + node.node_id] = node.channel
+        return JoinedPort(ports, routes)
+
+
+class NoBus(SessionBuses):
+    """Counts and images in the place of frames: the port's bus has no node, only its clock is used."""
+
+    def open(self, record: BusRecord) -> Port:
+        from canprobe.cell.session.direct import DirectCycle
+
+        self._need_emulated("without a bus there are")
+        if (out := self._options.out) is not None:
+            prepare_folder(self._plan, out)
+            with writing(out / "bus.log"):
+                (out / "bus.log").unlink(missing_ok=True)
+        self._stack.callback(self._keep_truth)
+        self.make_cycle = partial(DirectCycle, world=self.world)
+        clock = VirtualClock()
+        nobody = LockstepBus(clock, self._plan.buses[0].channel)
+        clock.detach(nobody)
+        return nobody.port()
+
+
+class VirtualBuses(SessionBuses):
+    """Buses in virtual time, with the emulated nodes in this process."""
+
+    def open(self, record: BusRecord) -> Port:
+        plan, array = self._plan, self._plan.setup.array
+        self._need_emulated("a lockstep bus has")
+        if array is not None and not array.emulated:
+            raise UsageError("a lockstep bus has emulated devices only: sensor.emulated = false")
+        clock = VirtualClock()
+        buses = {bus.channel: lockstep_bus(plan.scene, clock, bus.channel) for bus in plan.buses}
+        for channel, bus in buses.items():
+            bus.recorder = record.writer(channel)
+            bus.error_recorder = record.error_writer(channel)
+        self.lockstep = buses[plan.buses[0].channel]
+        participants = self.world.participants
+        self._stack.callback(self._keep_truth)
+        bus_of = {node.node_id: buses[node.channel] for node in plan.nodes}
+        for participant in participants:
+            bus = bus_of.get(getattr(participant, "node_id", 0), self.lockstep)
+            if participant is self.world.raw_array and array is not None:
+                bus = buses[array.channel]
+            bus.attach(participant)
+        return self._joined({channel: bus.port() for channel, bus in buses.items()})
+
+
+class RealBuses(SessionBuses):
+    """Real interfaces, with the emulated nodes in a process of their own."""
+
+    def __init__(self, plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitStack) -> None:
+        super().__init__(plan, options, files, stack)
+        self._open_ports = stack.enter_context(ExitStack())  # left last, also those that were opened again
+        self._record: BusRecord | None = None
+
+    def open(self, record: BusRecord) -> Port:
+        bus = self._plan.scene.bus
+        if bus.interface == "virtual" and self._plan.setup.emulates:
+            raise UsageError(
+                "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
+                " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
+            )
+        check_links(bus.interface, expected_of(self._plan), self._options.say)
+        clock = MonotonicClock()
+        self._record, record.origin_ns = record, clock.now_ns()
+        return self._open(record, clock)
+
+    def reopen(self, port: Port) -> Port:
+        assert self._record is not None
+        check_links(self._plan.scene.bus.interface, expected_of(self._plan), quiet)
+        return self._open(self._record, port.clock)
+
+    def _open(self, record: BusRecord, clock: Clock) -> Port:
+        """Open the ports of all buses, in the place of those that were open; their counters go on."""
+        before = self.ports
+        for port in before.values():
+            port.close()
+        ports = open_ports(self._plan, clock, lambda name: Reports(record.error_writer(name), self._files.note))
+        self.ports = self._open_ports.enter_context(ports)
+        for name, port in before.items():
+            self.ports[name].counters.add(port.counters)
+        return self._joined({name: RecordingPort(port, record.writer(name)) for name, port in self.ports.items()})
+
+    def start_nodes(self) -> None:
+        """Start the process of the emulated nodes, if there are any."""
+        if not self._plan.setup.emulates:
+            return
+        assert self._record is not None
+        self._options.say("start the emulated nodes")
+        channels, truth = list(self._plan.emulated_channels), self._options.rows_kept is None
+        child = EmulatorChild(self._plan, self._options.out, channels, truth=truth, origin_ns=self._record.origin_ns)
+        self._stack.callback(self._end_nodes, child)
+        child.start()
+        self._child = child
+
+    def await_nodes(self, port: Port, hear: Callable[[int, bytes, int], object]) -> None:
+        """Wait for the boot-ups of the emulated nodes; `hear` gets each frame meanwhile."""
+        if self._child is not None:
+            self._child.await_boot_ups(port, self._options.say, hear)
+
+    def _end_nodes(self, child: EmulatorChild) -> None:
+        self.truth = child.end()
+        self._files.note_unwritten(child.unwritten)
+
+
+def make_buses(plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitStack) -> SessionBuses:
+    """The buses of a plan, not open yet; for the arguments see `SessionBuses`."""
+    kinds = {DIRECT: NoBus, LOCKSTEP: VirtualBuses}
+    return kinds.get(plan.scene.bus.interface, RealBuses)(plan, options, files, stack)
 
 
 @contextmanager
@@ -81,16 +247,6 @@ def open_ports(
             stack.callback(port.close)
             ports[name] = port
         yield ports
-
-
-def channel_routes(plan: Plan) -> dict[int, str]:
-    """Channel of each identifier that only one node sends or reads."""
-    routes = {frames.can_id: frames.channel for frames in plan.raw}
-    routes |= {pdo.cob_id: pdo.channel for pdo in plan.pdos}
-    for node in plan.nodes:
-        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
-            routes[base + node.node_id] = node.channel
-    return routes
 
 
 def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:

@@ -16,7 +16,6 @@ from canprobe.cell.session.first_second import link_limits
 from canprobe.cell.session.links import SOCKETCAN
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.port import ControllerState, Port
 from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
@@ -105,24 +104,6 @@ class LinkReport:
         return "\n".join([*lines, *(f"  warning: {remark}" for remark in self.remarks)])
 
 
-class IdleLoops:
-    """Two loops that do nothing but wake, before anything is sent: of the cycle's period, and a fast one."""
-
-    def __init__(self) -> None:
-        self.slow_ns: list[int] = []
-        self.fast_ns: list[int] = []
-
-    def run(self, clock: Clock, period_ns: int) -> None:
-        """Run both, one after the other."""
-        self.slow_ns = wake_lateness(clock, period_ns, round(IDLE_S * 1e9 / period_ns))
-        self.fast_ns = wake_lateness(clock, IDLE_FAST_NS, round(IDLE_S * 1e9 / IDLE_FAST_NS))
-
-    def text(self) -> str:
-        """Lateness of the loop of the cycle's period."""
-        shown = [_us(us(quantile(self.slow_ns, share))) for share in (0.5, 0.99, 1.0)]
-        return "p50 {}, p99 {}, at most {}, without a bus".format(*shown)
-
-
 def _us(value: float | None) -> str:
     return "–" if value is None else f"{value:.0f} µs"
 
@@ -164,12 +145,13 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     """
     plan, around, failure = session.plan, session.around, None
     meters: list[LinkMeter] = []
-    idle = IdleLoops()
+    idle_ns: dict[int, list[int]] = {}  # lateness of two loops that do nothing but wake, by their periods
 
     def metered(port: Port) -> Port:
         port = around(port)
         with realtime(MASTER_PRIORITY, quiet) if plan.setup.realtime and not session.virtual else nullcontext():
-            idle.run(port.clock, plan.sync.period_ns)
+            for period_ns in (plan.sync.period_ns, IDLE_FAST_NS):
+                idle_ns[period_ns] = wake_lateness(port.clock, period_ns, round(IDLE_S * 1e9 / period_ns))
         meters.append(LinkMeter(port, **_traffic(plan)))
         return meters[0]
 
@@ -177,25 +159,26 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     machine = {} if session.virtual else machine_facts(plan.buses[0].channel)
     with session:
         cell, meter = session.cell, meters[0]
+        assert cell.cycle is not None
+        lateness_ns, first, full, torn = cell.cycle.statistics.period_error_ns, 0, 0, 0
         session.options.say(f"measure for {seconds:g} s, with the drives disabled")
         try:
             cell.idle(SETTLE_S)
-            first, full, torn = _lateness_count(cell), meter.counters.transmit_full, _torn(cell)
+            first, full, torn = len(lateness_ns), meter.counters.transmit_full, _torn(cell)
             meter.begin()
             cell.idle(seconds)
         except InterfaceError as error:
             failure = str(error)
         meter.end()
-        assert cell.cycle is not None
-        counters = meter.counters
+        counters, load = meter.counters, meter.load(plan.setup.bus.bitrate)
         figures = LinkFigures(
             period_ns=plan.sync.period_ns,
-            lateness_ns=sorted(list(cell.cycle.statistics.period_error_ns)[first:]),
+            lateness_ns=sorted(list(lateness_ns)[first:]),
             wait_ns=plan.traffic.budget.looks_ns[-1],
             answers=meter.answers(),
             torn=None if cell.tactile is None else _torn(cell) - torn,
             array_silent=_is_silent(cell),
-            load=_per_bus(meter.load(plan.setup.bus.bitrate), plan),
+            load=None if load is None else load / len(plan.buses),
             planned_load=max(bus.traffic.load for bus in plan.buses),
             foreign_hz=meter.foreign / max(meter.seconds, 1e-9),
             queue_full=counters.transmit_full - full,
@@ -204,11 +187,12 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
             passive=meter.state in (ControllerState.PASSIVE, ControllerState.BUS_OFF),
             failure=failure,
             work_ns=meter.work_ns,
-            idle_ns=idle.slow_ns,
-            idle_fast_ns=idle.fast_ns,
+            idle_ns=idle_ns[plan.sync.period_ns],
+            idle_fast_ns=idle_ns[IDLE_FAST_NS],
         )
     if not session.virtual:
-        machine = {"wakes_late_by": idle.text(), **machine}
+        late = [_us(us(quantile(idle_ns[plan.sync.period_ns], share))) for share in (0.5, 0.99, 1.0)]
+        machine = {"wakes_late_by": "p50 {}, p99 {}, at most {}, without a bus".format(*late), **machine}
         machine["controller"] = _controller(plan)
     found = session.cell.found
     return LinkReport(
@@ -244,11 +228,6 @@ def _traffic(plan: Plan) -> dict[str, Any]:
     return {"wait_ns": plan.traffic.budget.looks_ns[-1], "answers": answers, "known": known}
 
 
-def _lateness_count(cell: Cell) -> int:
-    assert cell.cycle is not None
-    return len(cell.cycle.statistics.period_error_ns)
-
-
 def _torn(cell: Cell) -> int:
     """Images that did not come, or not whole."""
     return cell.tactile.unusable + cell.tactile.lost if cell.tactile is not None else 0
@@ -260,7 +239,3 @@ def _is_silent(cell: Cell) -> bool:
         return False
     age = cell.cycle.number - (cell.tactile.newest_cycle or 0)
     return age > cell.supervisor.seen.limits.tactile_timeout
-
-
-def _per_bus(load: float | None, plan: Plan) -> float | None:
-    return None if load is None else load / len(plan.buses)

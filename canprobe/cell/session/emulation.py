@@ -18,8 +18,7 @@ from canprobe.cell.planning.warnings import bus_open_to_others
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.link_faults import ExpectedLink, data_bitrate
-from canprobe.cell.session.links import check_links
+from canprobe.cell.session.links import ExpectedLink, check_links, data_bitrate
 from canprobe.cell.session.session import rehearse
 from canprobe.cell.session.target import Target
 from canprobe.errors import NodeError, ResultsError, UsageError
@@ -43,8 +42,8 @@ ALL_CYCLES_PERCENT = 100
 """`limits.late_cycles_max_percent` with which late cycles stop nothing."""
 
 
-class Onlooker(Protocol):
-    """Somebody who looks on while nodes are served, and says when that ends."""
+class ServeObserver(Protocol):
+    """Observer of served nodes. `look` returns True to stop serving."""
 
     def tap(self, port: Port) -> Port:
         """A port in the place of the port of the nodes."""
@@ -68,7 +67,7 @@ def emulate(
     without_id: tuple[int, ...] = (),
     homed: bool = False,
     faults: Sequence[str] = (),
-    onlooker: Onlooker | None = None,
+    observer: ServeObserver | None = None,
     say: Say = quiet,
     outlasts: bool = False,
 ) -> None:
@@ -85,7 +84,7 @@ def emulate(
         without_id: ids of the nodes that start without a node id and wait for LSS.
         homed: whether drives that need homing start with their zeros, and keep them.
         faults: faults, as `canprobe.fieldbus.tools.faults.parse_fault` reads them; their times count from the start.
-        onlooker: looks on, and may end the serving.
+        observer: observer of the nodes, which may end the serving.
         say: called when the nodes are about to be served.
         outlasts: whether the nodes outlast an interface that is down for a while.
 
@@ -130,7 +129,7 @@ def emulate(
                 [(on[channel], port) for channel, port in ports.items()],
                 faulty,
                 faults,
-                onlooker,
+                observer,
                 say=say,
                 in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
@@ -163,7 +162,7 @@ def emulate_eds(
     positions: Sequence[int] = (),
     in_realtime: bool = False,
     faults: Sequence[str] = (),
-    onlooker: Onlooker | None = None,
+    observer: ServeObserver | None = None,
     say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
@@ -175,7 +174,7 @@ def emulate_eds(
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         positions: place of the motor of each drive at first, counts; left out: 0.
         in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
-        faults, onlooker: as for :func:`emulate`.
+        faults, observer: as for :func:`emulate`.
         say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:
@@ -211,7 +210,7 @@ def emulate_eds(
                 node.lss.bitrate = target.bitrate
         _keep(nodes, store_folder)
         faulty = FaultyNodes(map(FaultyNode, nodes))
-        _serve([(faulty.nodes, port)], faulty, faults, onlooker, say=say, in_realtime=in_realtime)
+        _serve([(faulty.nodes, port)], faulty, faults, observer, say=say, in_realtime=in_realtime)
 
 
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
@@ -263,7 +262,7 @@ def _serve(
     buses: Sequence[tuple[Sequence[Participant], Port]],
     faulty: FaultyNodes,
     faults: Sequence[str],
-    onlooker: Onlooker | None,
+    observer: ServeObserver | None,
     *,
     say: Say,
     in_realtime: bool,
@@ -296,11 +295,11 @@ def _serve(
         def look() -> bool:
             for server in servers:
                 server.poll(clock.now_ns())
-            return onlooker is not None and onlooker.look(clock.now_ns())
+            return observer is not None and observer.look(clock.now_ns())
 
-        if onlooker is not None:
-            buses = [(nodes, onlooker.tap(port)) for nodes, port in buses]
-            onlooker.begin(faulty, start_ns)
+        if observer is not None:
+            buses = [(nodes, observer.tap(port)) for nodes, port in buses]
+            observer.begin(faulty, start_ns)
         with garbage_collection_paused():
             serve(buses, look, outlasts=outlasts)
 

@@ -59,4 +59,4 @@ class FirstSecond:
     def _counts(self) -> tuple[int, int, int]:
         drives = self._cell.drives
         missed, late = (drives.missed, drives.late) if drives is not None else (0, 0)
-        return missed, late, self._cell.counters.transmit_full
+        return missed, late, self._cell.port.counters.transmit_full

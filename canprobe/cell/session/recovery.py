@@ -16,16 +16,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from canprobe.cell.master.bringup import HEARTBEAT_CONSUMER, read_entry
+from canprobe.cell.master.bringup import HEARTBEAT_CONSUMER
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller
+from canprobe.cell.master.entries import read_entry
 from canprobe.cell.master.homing import TOLERANCE_RAD, UnhomedError
 from canprobe.cell.master.notes import nodes_text
 from canprobe.cell.master.options import Say
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, make_setups
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan
-from canprobe.cell.tasks.held import HeldTask, LastPlace
+from canprobe.cell.session.buses import SessionBuses
+from canprobe.cell.tasks.paused import LastPlace, PausedController
 from canprobe.errors import BusError, CanprobeError, InterfaceError, NodeError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.presence import answering_nodes
@@ -61,8 +63,7 @@ class Recovery:
         cell: the cell, brought up.
         port: its port.
         make_cell: makes the next cell on a port, after a stopped one.
-        reopen: closes the ports and opens them again.
-        alive: raises the error of a process that the cell cannot do without.
+        buses: its buses, which are opened again after a loss.
         say: called with each step.
         longest_s: longest wait for the nodes, s.
 
@@ -77,14 +78,13 @@ class Recovery:
         port: Port,
         *,
         make_cell: Callable[[Port, Cell], Cell],
-        reopen: Callable[[], Port],
-        alive: Callable[[], None],
+        buses: SessionBuses,
         say: Say,
         longest_s: float,
     ) -> None:
         self.cell = cell
         self._plan, self._port, self._say = plan, port, say
-        self._make_cell, self._reopen, self._alive = make_cell, reopen, alive
+        self._make_cell, self._buses = make_cell, buses
         self._longest_s = longest_s
         self._lost: CanprobeError | None = None
         self._lost_ns = self._back_ns = self._tries = 0
@@ -114,13 +114,13 @@ class Recovery:
             if self._lost is None and (error := self._attempt(lambda: self.cell.start(runs))) is not None:
                 self._lose(error)
             if self._lost is not None:
-                self._come_back(HeldTask(runs, self._place, None))
+                self._come_back(PausedController(runs, self._place, None))
                 self._report_back("")
             while (error := self._attempt(lambda: self.cell.advance(None, progress))) is not None:
                 self._lose(error)
                 if not runs.can_go_on:
                     raise error
-                self._come_back(HeldTask(runs, self._place, lambda: self._asked, self._note_resumed))
+                self._come_back(PausedController(runs, self._place, lambda: self._asked, self._note_resumed))
                 self._asked = False
                 self._report_back(" and holds; motion goes on when it is asked for (resume)")
         finally:
@@ -176,7 +176,7 @@ class Recovery:
 
     def _run_s(self, cell: Cell) -> float:
         """Time on the run's clock, s."""
-        return (cell.start_ns + cell.supervisor.seen.measurement.t_ns) * 1e-9
+        return cell.cycles.run_s(cell.supervisor.seen.measurement)
 
     def _note_resumed(self) -> None:
         self._say("motion goes on")
@@ -225,7 +225,7 @@ class Recovery:
         clock, seen = self._port.clock, _Wait(self._plan, self.cell.watch.foreign is not None)
         end_ns, said = clock.now_ns() + self._longest_s * 1e9, ""
         while True:
-            self._alive()
+            self._buses.raise_ended()
             try:
                 why = seen.look(self._port, self._must_boot)
                 if why is None:
@@ -243,7 +243,7 @@ class Recovery:
     def _reopened(self) -> str | None:
         """Open the interfaces again; why that failed, None where it did not."""
         try:
-            self._port = self._reopen()
+            self._port = self._buses.reopen(self._port)
         except InterfaceError as error:
             return str(error)
         return None

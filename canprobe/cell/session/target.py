@@ -74,15 +74,6 @@ class Target:
         return replace(scene, bus=bus, joints=joints, sensor=sensor)
 
 
-def need_real_bus(scene: Scene, command: str) -> None:
-    """Refuse a command that needs a bus which other processes can reach.
-
-    Raises:
-        UsageError: when the scene's bus is lockstep or direct.
-    """
-    refuse_virtual(scene.bus.interface, command)
-
-
 def refuse_virtual(interface: str, command: str) -> None:
     """Refuse an interface that ends with its run.
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Calibrate
 from canprobe.cell.tasks.probing import Phase, ProbingTask

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.regain import SEARCH_SPEED, Search
@@ -58,13 +58,10 @@ class ExploreTask(TouchTask):
     _near_rim = False
     _ends = False
 
-    def _middle_of_path(self, contact: ContactSample) -> Floats:
-        """The end of the approach: beside it an inclined surface is touched first, and the rectangle stays."""
-        return self._task.approach.start
-
-    def _follower(self) -> Explorer:
-        scan, contact = self._task.scan, self._contact
-        assert scan is not None and isinstance(scan.strategy, Rectangle) and contact is not None
+    def _leader(self, contact: ContactSample) -> tuple[Explorer, Floats]:
+        """Its origin is the end of the approach: an inclined surface is touched beside it, and the rectangle stays."""
+        scan = self._task.scan
+        assert scan is not None and isinstance(scan.strategy, Rectangle)
         surface_map = self.shape.surface_map if self.shape is not None else None
         assert surface_map is not None
         area = scan.strategy
@@ -90,7 +87,7 @@ class ExploreTask(TouchTask):
         reach = self._task.array.pad.reach_m  # of an array that is as small as the patch, no place is near its edge
         self._rim = rim if (rim := edge_margin(self._task) + RIM_M) < reach else 0.0
         self._gone: deque[ProbePose] = deque(maxlen=round(BACK_M / STEP_M))
-        return self.explorer
+        return self.explorer, self._task.approach.start
 
     def record(self) -> TaskRecord:
         explored = None if self.explorer is None else end_of(self.explorer, self._scan_t, over=not self._ends)
@@ -108,7 +105,7 @@ class ExploreTask(TouchTask):
         if self.phase is Phase.SCAN and contact is not None and self.explorer is not None:
             from_edge = self._task.array.pad.reach_m - max(abs(patch.u), abs(patch.v))
             self._near_rim = from_edge < self._rim
-            self.explorer.walk(contact.p_base, contact.n_base, contact.force_n / self._target_force)
+            self.explorer.walk(contact.p_base, contact.n_base, contact.force_n / self.targets["target_force_n"])
             self._columns = self._columns | {
                 "explored_mm": 1e3 * self.explorer.path,
                 "explored_sigma_um": 1e6 * self.explorer.ground.largest,
@@ -166,13 +163,14 @@ class ExploreTask(TouchTask):
             self._gone.append(pose)
         return pose
 
-    def _search_from(self, pose: ProbePose) -> Search:
-        assert self.explorer is not None
+    def _look_for_contact(self) -> None:
+        """Return to where the contact was, in the air over the path."""
+        super()._look_for_contact()
+        assert self.explorer is not None and self._motion is not None
         self._brake_from = None
         self.explorer.turn_back(without=BACK_M)
-        back = [pose, *reversed(self._gone)]
+        self._search = Return([self._motion.pose, *reversed(self._gone)])
         self._gone.clear()
-        return Return(back)
 
 
 class Return(Search):

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.array import PatchReader, force_columns
 from canprobe.cell.master.conditions import touch_finding
-from canprobe.cell.master.controller import Command, Measurement, TactileSample
+from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import Finding, TouchState, limits_of
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.trail import GrowingForce, Retrace, TakenWay
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT

@@ -195,5 +195,5 @@ class RequestedTask(WrappingController):
         """Move the task's targets towards what was asked for; what they are now, once anything was asked for."""
         for kind, wanted in self._asked.items():
             now, step = task.targets[kind], self._steps[kind]
-            task.set_target(kind, now + min(max(wanted - now, -step), step))
+            task.targets[kind] = now + min(max(wanted - now, -step), step)
         return {f"target_{kind.removeprefix('target_')}": task.targets[kind] for kind in self._asked}

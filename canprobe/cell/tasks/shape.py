@@ -36,18 +36,18 @@ class ShapeRecord:
         t_s: instant of its last sample, s, since the first SYNC; in results on the run's clock.
         travelled_m: path of the contact since the start of the scan, m.
         estimate: the answer, in the base frame's terms.
-        told_s: instant of the cycle in which it was reported, s, on the same clock.
+        reported_s: instant of the cycle in which it was reported, s, on the same clock.
     """
 
     t_s: float
     travelled_m: float
     estimate: SurfaceEstimate
-    told_s: float
+    reported_s: float
 
 
 def on_run_clock(records: Sequence[ShapeRecord], start_s: float) -> list[ShapeRecord]:
     """Estimates of a run in which the first SYNC was due at ``start_s``."""
-    return [replace(record, t_s=start_s + record.t_s, told_s=start_s + record.told_s) for record in records]
+    return [replace(record, t_s=start_s + record.t_s, reported_s=start_s + record.reported_s) for record in records]
 
 
 class ShapeTracker:

@@ -72,7 +72,7 @@ class Episode:
         self.coverage = Coverage(1e-3 * scan.length_mm, 1e-3 * scan.width_mm)
         self.coverage.touch(np.zeros(2))
         self.forces = [task.force]
-        self.truth = self.session.world.plant.truth()
+        self.truth = self.session.buses.world.plant.truth()
         self.over = False
         self.reason: str | None = None
         self.well_mm2 = 0.0
@@ -92,7 +92,7 @@ class Episode:
         self._steps += 1
         self.over = self.reason is not None or self._steps == self._most_steps
         self.forces = forces or [task.force]
-        self.truth = self.session.world.plant.truth()
+        self.truth = self.session.buses.world.plant.truth()
         place = task.axes[:2] @ (task.last_contact.p_base - self.origin)
         new_mm2 = 1e6 * self.coverage.touch(place) if task.touching else 0.0
         well_mm2 = new_mm2 * math.exp(-0.5 * (self._force_error() / (TOLERANCE * task.wanted_force)) ** 2)

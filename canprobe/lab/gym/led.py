@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
@@ -68,7 +68,7 @@ class LedTask(TouchTask):
         self._heading = _Heading()
         self._change = 0.0, 0.0, 0.0
         self._left = 0
-        self._speed = 0.0
+        self.targets["speed_m_s"] = 0.0
         self._newest: ContactSample | None = None
 
     @property
@@ -106,7 +106,7 @@ class LedTask(TouchTask):
     @property
     def force_set_point(self) -> float:
         """Wanted force of the servo, N."""
-        return self._target_force
+        return self.targets["target_force_n"]
 
     def frame(self, normal: Floats) -> Floats:
         """Rows x, y, z (3, 3) of the contact frame in base, for an outward unit normal (3,)."""
@@ -117,15 +117,15 @@ class LedTask(TouchTask):
     def lead(self, velocity: Floats, force: float, cycles: int) -> None:
         """Change to a velocity of the contact (2,), m/s, and a force, N, evenly within a number of cycles."""
         vx, vy = self.velocity
-        dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self._target_force
+        dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self.targets["target_force_n"]
         self._change, self._left = (dx / cycles, dy / cycles, more / cycles), cycles
 
     def _feel(self, sample: TactileSample, patch: Patch) -> None:
         super()._feel(sample, patch)
         self._newest = self._contact or self._newest
 
-    def _follower(self) -> PathFollower:
-        return self._heading
+    def _leader(self, contact: ContactSample) -> tuple[PathFollower, Floats]:
+        return self._heading, contact.p_base
 
     def _scan(self) -> ProbePose:
         assert self._servo is not None
@@ -134,9 +134,9 @@ class LedTask(TouchTask):
             self._left -= 1
             dx, dy, more = self._change
             self.velocity = vx, vy = vx + dx, vy + dy
-            self._target_force += more
-        self._speed = math.hypot(vx, vy)
-        if self._speed > 0.0:
+            self.targets["target_force_n"] += more
+        self.targets["speed_m_s"] = speed = math.hypot(vx, vy)
+        if speed > 0.0:
             # x = (h − (n·h) n)/s with s its length and y = n × x, seen from above the scan plane of h, c = u × h and u
             nh, nc, nu = (self.axes @ self._servo.surface.normal).tolist()
             s = math.sqrt(1.0 - nh * nh)

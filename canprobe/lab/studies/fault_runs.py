@@ -127,22 +127,22 @@ class FaultRun:
         self.begun: dict[Phase, int] = {}
         self.steps = self.stepped_ns = 0
         self.reason_ns: int | None = None
-        world = self.session.world
+        world = self.session.buses.world
         self.witness = Witness(world.plant, LOOK_NS)
         self.faulty = world.make_faulty(faults)
         # the witness sees what the recorder of the truth would, and more
         world.participants[:] = [self.witness, *self.faulty.nodes]
         self.outcome, self.error = run_to_end(self.session, self.task, self._count)
-        assert self.session.lockstep is not None
-        self.clock = self.session.lockstep.clock
+        assert self.session.buses.lockstep is not None
+        self.clock = self.session.buses.lockstep.clock
         self.end_ns = self.clock.now_ns()
         if self.outcome == "completed":
             self.begun.setdefault(Phase.DONE, self.stepped_ns)
 
     def _count(self, _: Measurement) -> None:
-        assert self.session.lockstep is not None
+        assert self.session.buses.lockstep is not None
         self.steps += 1
-        self.stepped_ns = self.session.lockstep.clock.now_ns()
+        self.stepped_ns = self.session.buses.lockstep.clock.now_ns()
         self.begun.setdefault(getattr(self.task, "phase", Phase.SCAN), self.stepped_ns)
         if self.reason_ns is None and getattr(self.task, "reason", None) is not None:
             self.reason_ns = self.stepped_ns
@@ -150,8 +150,8 @@ class FaultRun:
     def result(self) -> dict[str, Any]:
         """The score."""
         session, reason, rows = self.session, str(self.error or ""), self.witness.rows
-        assert session.lockstep is not None
-        session.lockstep.recorder = None  # the log is closed
+        assert session.buses.lockstep is not None
+        session.buses.lockstep.recorder = None  # the log is closed
         limit = self.plan.setup.limits.force_max
         highest, left = max((force for _, force in rows), default=0.0), rows[-1][1] if rows else 0.0
         failures = self._ends(reason) + self._log_problems() + self._summary_problems(reason)
@@ -237,7 +237,7 @@ class FaultRun:
 
     def _rest_problems(self) -> list[str]:
         """Motion after the stop, once all must be at rest and no master is there; and drives that are not disabled."""
-        plant = self.session.world.plant
+        plant = self.session.buses.world.plant
         ends_ns = [fault.end_ns for fault in self.faults if fault.duration_ns < FOREVER_NS]
         try:
             self.clock.sleep_until_ns(self.end_ns + round(SETTLED_S * 1e9))
@@ -268,10 +268,10 @@ class FaultRun:
         session, failures = self.session, []
         if session.opened and (rows := len(session.cell.log)) < self.steps:
             failures.append(f"log: {rows} rows of {self.steps} cycles")
-        if session.out is None:
+        if session.options.out is None:
             return failures
         try:
-            lines = sum(1 for _ in read_candump(session.out / "bus.log", whole=True))
+            lines = sum(1 for _ in read_candump(session.options.out / "bus.log", whole=True))
         except CanprobeError as error:
             return [*failures, f"log: {error}"]
         frames = sum(counter.frames for counter in session.record.traffic.values())

@@ -33,8 +33,7 @@ from canprobe.cell.results.picture import BLUE, ORANGE, legend, picture
 from canprobe.cell.scene.load import dump_scene, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.child_process import with_our_imports
-from canprobe.cell.session.emulator_child import EmulatorChild
+from canprobe.cell.session.child_process import EmulatorChild, with_our_imports
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase

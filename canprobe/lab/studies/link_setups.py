@@ -99,13 +99,13 @@ def construct(session: Session, setup: SetUp, part: int) -> None:
     """
     period_ns = round(1e9 / setup.rate_hz)
     if setup.kind == "node":
-        faulty = session.world.make_faulty()
+        faulty = session.buses.world.make_faulty()
         faulty.inject(f"node {setup.node_id}: delay ms={setup.size * period_ns * 1e-6:.6f}", 0)
 
     def around(port: Port) -> Port:
         if setup.kind == "load":
-            assert session.lockstep is not None
-            session.lockstep.attach(Loud(round(FRAME_NS / setup.size)))
+            assert session.buses.lockstep is not None
+            session.buses.lockstep.attach(Loud(round(FRAME_NS / setup.size)))
         return DisturbedPort(port, setup, Random(setup.seed * 1000 + part))
 
     session.around = around

@@ -25,7 +25,7 @@ from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.emulator_child import EmulatorChild
+from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError

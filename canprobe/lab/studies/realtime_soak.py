@@ -24,7 +24,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.picture import BLUE, GREEN, ORANGE, legend, parts, picture
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.emulator_child import EmulatorChild
+from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
@@ -75,7 +75,7 @@ class Soaker(Controller):
 
     def _look(self, t_s: float) -> None:
         cell = self._session.cell
-        cycle, drives, counters = cell.cycle, cell.drives, cell.counters
+        cycle, drives, counters = cell.cycle, cell.drives, cell.port.counters
         assert cycle is not None and drives is not None
         counted, packets = counters.sent + counters.received, packets_on(CHANNEL)
         if not self.samples:

@@ -204,9 +204,9 @@ class RecoverRun:
         plan = make_plan(resolve(load_scene(SCENES[case.work], changes)))
         self._score = RecoverScore(case, plan, say)
         self._session = session = Session(plan, RunOptions(out, self._say, recover=True))
-        self._faulty = session.world.make_faulty()
-        self._drives = WatchedDrives(session.world.nodes)
-        session.world.participants.append(self._drives)
+        self._faulty = session.buses.world.make_faulty()
+        self._drives = WatchedDrives(session.buses.world.nodes)
+        session.buses.world.participants.append(self._drives)
         session.around = self._disturbed
         self._away: list[tuple[int, int, bool]] = []
         with session:
@@ -214,11 +214,11 @@ class RecoverRun:
 
     @property
     def _now_ns(self) -> int:
-        assert self._session.lockstep is not None
-        return self._session.lockstep.clock.now_ns()
+        assert self._session.buses.lockstep is not None
+        return self._session.buses.lockstep.clock.now_ns()
 
     def _say(self, text: str) -> None:
-        self._score.say(self._now_ns * 1e-9 if self._session.lockstep is not None else 0.0, text)
+        self._score.say(self._now_ns * 1e-9 if self._session.buses.lockstep is not None else 0.0, text)
         if text.startswith(("lift off", "enable the drives")):
             self._drives.lifting = text.startswith("lift off")
 
@@ -258,8 +258,8 @@ class RecoverRun:
         boot_ups = {node_id: [t_ns * 1e-9 for t_ns in times] for node_id, times in self._drives.boot_ups.items()}
         times_s = session.cell.log.arrays()["t_s"].tolist() if len(session.cell.log) else list[float]()
         found = self._score.outcome(boot_ups, times_s, self._drives.syncs, forces_of(session), self._drives.jump_counts)
-        if session.out is not None:
-            found["bus_log_sha256"] = hashlib.sha256((session.out / "bus.log").read_bytes()).hexdigest()
+        if session.options.out is not None:
+            found["bus_log_sha256"] = hashlib.sha256((session.options.out / "bus.log").read_bytes()).hexdigest()
         return found
 
 

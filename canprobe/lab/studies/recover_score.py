@@ -308,5 +308,5 @@ class RecoverScore:
 
 def forces_of(session: Session) -> list[tuple[float, float]]:
     """Force of the plant of a finished session: (time, s; force, N)."""
-    truth = session.truth
+    truth = session.buses.truth
     return list(zip(truth["t_s"].tolist(), truth["force_n"].tolist(), strict=True)) if "force_n" in truth else []

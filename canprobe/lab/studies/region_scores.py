@@ -123,7 +123,7 @@ def open_scan(drawn: DrawnScene) -> tuple[Session, Any]:
     plan = make_plan(resolve(drawn.scene))
     session = Session(plan)
     if drawn.array is not None:
-        session.world.plant.array = drawn.array
+        session.buses.world.plant.array = drawn.array
     return session, make_task(plan)
 
 
@@ -145,11 +145,11 @@ def scores_of(session: Session, records: list[ShapeRecord]) -> tuple[list[list[f
     late: list[list[float]] = []
     behind: list[list[float]] = []
     if records:
-        times, jumped = session.cell.log.arrays()["t_s"], behind_jump(session.truth)
+        times, jumped = session.cell.log.arrays()["t_s"], behind_jump(session.buses.truth)
         for record in (r for r in records if r.travelled_m >= RUN_IN_M):
             row = row_of(record, times)
             (behind if jumped[row] else late).append(
-                scored(record, session.truth, row) if record.estimate.rank == 3 else []
+                scored(record, session.buses.truth, row) if record.estimate.rank == 3 else []
             )
     return late, behind
 

@@ -247,7 +247,7 @@ def measure(case: ExtremeCase) -> Row:
     scene = extreme_scene(case)
     try:
         session = Session(scene)
-        world = session.world
+        world = session.buses.world
     except PlanError as refusal:
         return row | refused_row(refusal) | none
     task = make_task(session.plan)
@@ -265,7 +265,9 @@ def measure(case: ExtremeCase) -> Row:
         found["curvature_per_m"], found["stated_per_m"] = (float(np.sqrt(scores[:, i].mean())) for i in (1, 2))
         found["held"] = float(np.mean(scores[:, 3] < CHI2_95_OF_3))
     assert scene.probe is not None
-    return found | judged(found, 1e3 / scene.probe.radius_mm + float(np.abs(session.truth["kappa_per_m"][-1]).max()))
+    return found | judged(
+        found, 1e3 / scene.probe.radius_mm + float(np.abs(session.buses.truth["kappa_per_m"][-1]).max())
+    )
 
 
 def sync_delay_ns(jitter_ns: float, t_ns: int) -> int:

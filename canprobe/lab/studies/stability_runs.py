@@ -188,7 +188,7 @@ def carry_out(case: LoopCase) -> Row:
     """Run a case to its end: `ended`, `reason` and figures of the force; None where there are none."""
     try:
         session = Session(scene_of(case))
-        world = session.world
+        world = session.buses.world
     except PlanError as refusal:
         return refused_row(refusal)
     task = make_task(session.plan)
@@ -220,8 +220,8 @@ def run_touch(session: Session, task: TouchTask, force_n: float, late_ms: float 
         late_ms: delay of targets and tactile frames, ms.
     """
     limits = limits_of(session.plan)
-    witness = Witness(session.world.plant, LOOK_NS)
-    session.world.participants.insert(0, witness)
+    witness = Witness(session.buses.world.plant, LOOK_NS)
+    session.buses.world.participants.insert(0, witness)
     outcome, error = run_to_end(session, task)
     ended = {"completed": "stable", "hang": "failed", "crash": "failed"}.get(outcome, "stopped")
     plain = error is None or isinstance(error, SafetyStop)
@@ -241,7 +241,7 @@ def run_touch(session: Session, task: TouchTask, force_n: float, late_ms: float 
 
 def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple[float | None, float | None]:
     """RMS error and standard deviation of the true force, second half of the hold, percent of the target."""
-    cycles, truth = task.scan_cycles, session.truth
+    cycles, truth = task.record().scan_cycles, session.buses.truth
     if cycles is None or "force_n" not in truth:
         return None, None
     half = truth["force_n"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / force_n

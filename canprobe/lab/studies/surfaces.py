@@ -123,8 +123,8 @@ def measure(case: SurfaceCase) -> dict[str, Any]:
                 session.run(controller)
             except SafetyStop as error:  # a scan that ends early has shown less
                 stopped = error.reason
-        first, last = controller.scan_cycles
-        scored = score_contact(session.truth, first, last, touch.force)
+        first, last = controller.record().scan_cycles
+        scored = score_contact(session.buses.truth, first, last, touch.force)
         samples = list(controller.shape.samples)
         # an exploration lays its rectangle round the end of the approach, a curve lies round the first contact
         middle = touch.approach.start if case.strategy == "explore" else samples[0].p_base

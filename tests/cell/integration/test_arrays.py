@@ -312,15 +312,15 @@ def test_contradictions_are_said_with_their_key(sensor, problem):
 def test_an_array_that_is_silent_is_named(tmp_path):
     scene = listen("icub-triangles", "emulated = true")
     session = Session(scene)
-    session.world.raw_array.running = False
-    session.world.raw_array.receive = lambda *_: []  # deaf
+    session.buses.world.raw_array.running = False
+    session.buses.world.raw_array.receive = lambda *_: []  # deaf
     with pytest.raises(canprobe.BusError, match=r"sent 0 of 1 images of its frames 4D0h-4D1h"), session:
         pass
 
 
 def test_an_array_that_falls_silent_ends_the_run():
     with Session(listen("linker12x6", duration=3.0)) as session:
-        array = session.world.raw_array
+        array = session.buses.world.raw_array
         cycles = []
 
         def mute(measurement):

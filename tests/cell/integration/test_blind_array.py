@@ -25,8 +25,8 @@ def run(scene, text, phase, after_s, **changes):
         k.replace("__", "."): v for k, v in changes.items()
     }
     session = Session(canprobe.load_scene(scene, overrides), RunOptions())
-    faulty, task, begun, thrown = session.world.make_faulty(), None, [], []
-    session.world.participants[:] = faulty.nodes
+    faulty, task, begun, thrown = session.buses.world.make_faulty(), None, [], []
+    session.buses.world.participants[:] = faulty.nodes
     task = make_task(session.plan)
     forces = []
 
@@ -34,9 +34,9 @@ def run(scene, text, phase, after_s, **changes):
         if task.phase is phase and not begun:
             begun.append(measurement.t_ns)
         if begun and not thrown and measurement.t_ns >= begun[0] + after_s * 1e9:
-            faulty.inject(text, session.lockstep.clock.now_ns())
+            faulty.inject(text, session.buses.lockstep.clock.now_ns())
             thrown.append(measurement.t_ns)
-        forces.append(session.world.plant.truth()["force"])
+        forces.append(session.buses.world.plant.truth()["force"])
 
     with pytest.raises(SafetyStop) as stopped, session:
         session.run(task, progress)
@@ -69,13 +69,15 @@ def test_a_blind_array_presses_no_harder(scene, text, phase, after_s, words):
     highest, stop, session = run(scene, text, phase, after_s)
     assert words in stop.reason
     assert highest < (1.5 if phase is Phase.APPROACH else 1.2) * LIMIT_N
-    assert session.world.plant.truth()["force"] == 0.0, "the probe was taken off"
-    assert not any(node.application.powered for node in session.world.nodes if hasattr(node.application, "powered"))
+    assert session.buses.world.plant.truth()["force"] == 0.0, "the probe was taken off"
+    assert not any(
+        node.application.powered for node in session.buses.world.nodes if hasattr(node.application, "powered")
+    )
 
 
 def test_what_it_is_left_with_is_said_to_be_unknown():
     _, _, session = run("press", "node 16: stuck-image", Phase.SCAN, 0.3)
-    (note,) = [line for line in session.cell.faults if "left pressing" in line]
+    (note,) = [line for line in session.cell.notes.lines() if "left pressing" in line]
     assert "with an unknown force: the array is not believed, as the array has sent the same image" in note
 
 

@@ -27,7 +27,7 @@ def run_with(faults: Sequence[Fault], scene: str, out: Path, monkeypatch: pytest
     class Faulty(OpenCell):
         def __init__(self, *words: Any, **options: Any) -> None:
             super().__init__(*words, **options)
-            self.session.world.make_faulty(faults)
+            self.session.buses.world.make_faulty(faults)
 
     monkeypatch.setattr("canprobe.api.OpenCell", Faulty)
     canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds, force=True)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.master.monitor import Monitor
-from canprobe.cell.master.monitor_text import lines
+from canprobe.cell.master.monitor import Monitor, lines
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
@@ -25,7 +24,7 @@ def scan(pad=None, **config):
     """A scan of a cylinder of 36 mm with an array that has the calibration of another one."""
     plan = make_plan(resolve(load_scene("cylinder", SCAN)))
     session, task = Session(plan), make_task(plan)
-    session.world.plant.array = TaxelArray(TaxelConfig(**config), np.random.default_rng(3), pad=pad or Pad())
+    session.buses.world.plant.array = TaxelArray(TaxelConfig(**config), np.random.default_rng(3), pad=pad or Pad())
     with session:
         session.run(task)
     return session, task
@@ -59,7 +58,7 @@ def test_a_harder_layer_is_said_once_and_widens_the_force_alone():
 
 def test_images_that_contradict_the_motion_are_left_out(blurred):
     session, task = blurred
-    (line,) = said(session.cell.faults)
+    (line,) = said(session.cell.notes.lines())
     assert re.search(r"blurred by 1\.[5-8]. mm", line)
     assert ": forces and regions are stated wider from here on" in line
     answers = [record.estimate for record in task.shape.records]
@@ -103,7 +102,7 @@ def test_its_own_calibration_is_not_doubted():
 )
 def test_another_array_is_noticed(config, pad, sign):
     session, _ = scan(pad, **config)
-    (line,) = said(session.cell.faults)
+    (line,) = said(session.cell.notes.lines())
     assert re.search(sign, line)
 
 
@@ -118,7 +117,7 @@ def test_the_monitor_shows_the_blur():
             views.append(monitor.view(observation.t_ns).array)
 
     session, task = Session(plan, RunOptions(observers=(watch,))), make_task(plan)
-    session.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3))
+    session.buses.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3))
     with session:
         session.run(task)
     assert views[0] is None and views[-1].startswith(f"{SAID}: its images are blurred by")

@@ -35,7 +35,7 @@ def test_the_true_force_is_the_asked_one_whatever_the_full_scale(full_scale_kpa,
 def test_an_array_of_another_full_scale_is_refused():
     session = Session(press(100.0, "window"))
 
-    (sensor,) = [node for node in session.world.nodes if node.node_id == 16]
+    (sensor,) = [node for node in session.buses.world.nodes if node.node_id == 16]
     sensor.dictionary.set_default(FULL_SCALE, 0, 300_000)
     said = r"node 16: \(tactile array\) 2004h:00 expected 100000, as the scene's sensor.full_scale_kpa says, got 300000"
     with pytest.raises(NodeError, match=said):

@@ -28,7 +28,7 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 def lifted(run):
     """How far the probe's centre went back along its pole after the fault, m, and how far to the side."""
-    truth = run.session.truth
+    truth = run.session.buses.truth
     way = truth["probe_centre_m"][-1] - truth["probe_centre_m"][run.at]
     back = -float(way @ truth["pole"][run.at])
     return back, float(np.linalg.norm(way + back * truth["pole"][run.at]))
@@ -36,7 +36,7 @@ def lifted(run):
 
 def turned(run):
     """How far each motor turned after the fault, counts."""
-    return np.ptp(run.session.truth["q_rad"][run.at :] @ run.session.cell.drives._model.units_per_q.T, axis=0)
+    return np.ptp(run.session.buses.truth["q_rad"][run.at :] @ run.session.cell.drives._model.units_per_q.T, axis=0)
 
 
 def mute(node_id):
@@ -59,13 +59,13 @@ def test_the_probe_is_taken_off(what):
     key, action = LOST[what]
     run = Injected("press", HOLD_CYCLE, action)
     run.assert_within(key).assert_drives_off(but=(6,) if "frozen" in what else ())
-    assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     back, aside = lifted(run)
     assert 0.95 * WAY_BACK < back < 1.2 * WAY_BACK and aside < 0.05 * WAY_BACK, (
         "without a sensor the task begins to retreat by itself"
     )
-    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.notes.lines())
     if what.startswith("joint"):
         lost = int(what.split()[1]) - 1
         assert turned(run)[lost] < 30, "it stood still"
@@ -79,14 +79,14 @@ def test_two_lost_drives_leave_four():
 
     run = Injected("press", HOLD_CYCLE, both)
     run.assert_within("drive_silent").assert_drives_off()
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def pressed_on(run, told):
     run.assert_drives_off()
-    assert run.session.truth["force_n"][-1] == pytest.approx(2.0, abs=0.3)
+    assert run.session.buses.truth["force_n"][-1] == pytest.approx(2.0, abs=0.3)
     assert abs(lifted(run)[0]) < 0.1 * WAY_BACK
-    assert any(told in fault for fault in (str(run.error), *run.session.cell.faults))
+    assert any(told in fault for fault in (str(run.error), *run.session.cell.notes.lines()))
 
 
 def test_a_drive_that_tells_what_cannot_be_may_be_moving():
@@ -102,7 +102,7 @@ def test_with_another_master_nothing_moves():
     assert 1.8 < force < 2.2
     assert any(
         fault.endswith("free it; a run does not begin while the array measures a force")
-        for fault in run.session.cell.faults
+        for fault in run.session.cell.notes.lines()
     )
 
 
@@ -111,7 +111,7 @@ def test_with_a_node_that_another_master_took_nothing_moves(command):
     """The node has left operation, for which the others would lift."""
     run = Injected("press", HOLD_CYCLE, lambda r: send(r, pack_nmt(command, 16)))
     pressed_on(run, "another master is on the bus: an NMT command")
-    assert not any("lift off" in fault for fault in run.session.cell.faults)
+    assert not any("lift off" in fault for fault in run.session.cell.notes.lines())
 
 
 @pytest.mark.parametrize("other", ["bus-off", "a jump"])
@@ -121,13 +121,13 @@ def test_nothing_lifts_where_another_condition_says_stop(other):
     def both(run):
         run.inject("node 3: reboot for 1 ms")
         if other == "bus-off":
-            run.session.cell._port.state = ControllerState.BUS_OFF
+            run.session.cell.port.state = ControllerState.BUS_OFF
         else:
             run.session.cell.supervisor._guard.measure = lambda _: "joint 2 reports a motion"
 
     run = Injected("press", HOLD_CYCLE, both)
     pressed_on(run, "node 3: left operation")
-    assert not any("lift off" in fault for fault in run.session.cell.faults)
+    assert not any("lift off" in fault for fault in run.session.cell.notes.lines())
 
 
 def interrupted(number):
@@ -164,7 +164,7 @@ def master_heard(run):
 
 
 def bus_off(run):
-    run.session.cell._port.state = ControllerState.BUS_OFF
+    run.session.cell.port.state = ControllerState.BUS_OFF
 
 
 def drive_fault(run):
@@ -191,7 +191,7 @@ def test_a_lift_off_does_not_go_on_when_something_else_comes(second, cycles):
     assert 20 <= run.lifting <= 20 + cycles
     assert 0.2 * WAY_BACK < lifted(run)[0] < 0.5 * WAY_BACK, "as far as it was, and what is left of the motion"
     if second is master_heard:
-        assert "another master is on the bus: SYNC from another master" in run.session.cell.faults
+        assert "another master is on the bus: SYNC from another master" in run.session.cell.notes.lines()
 
 
 def test_a_disabled_drive_stands_still_and_the_others_lift():
@@ -203,7 +203,7 @@ def test_a_disabled_drive_stands_still_and_the_others_lift():
 
     run = Injected("press", HOLD_CYCLE, both)
     assert "node 16: left operation" in str(run.error)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert turned(run)[1] < 30 and turned(run).max() > 100
 
 
@@ -215,7 +215,7 @@ def test_a_drive_with_an_alarm_stands_still_also_where_another_one_had_one_befor
 
     run = Injected("press", HOLD_CYCLE, alarms)
     assert run.error.node_id == 1
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert turned(run)[1] < 30 and turned(run).max() > 100
     words = run.session.cell.log.arrays()["statusword"][run.at + 60].astype(int).tolist()
     assert [state_of(word) is DriveState.OPERATION_ENABLED for word in words] == [False, False, True, True, True, True]
@@ -230,13 +230,13 @@ def test_a_drive_that_left_operation_beside_the_one_that_is_named_does_not_lift(
 
     run = Injected("press", HOLD_CYCLE, left)
     assert "node 3: left operation" in str(run.error)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert max(turned(run)[2], turned(run)[4]) < 30 and turned(run).max() > 100
 
 
 def left_pressing(session):
     """The forces that the user is told to free, N."""
-    return [float(fault.split(" N")[0].split()[-1]) for fault in session.cell.faults if "left pressing" in fault]
+    return [float(fault.split(" N")[0].split()[-1]) for fault in session.cell.notes.lines() if "left pressing" in fault]
 
 
 def test_a_light_press_after_a_strong_one_is_told():
@@ -244,12 +244,12 @@ def test_a_light_press_after_a_strong_one_is_told():
         def command(self, measurement, command):
             share = np.clip((self.at - measurement.cycle) / 200.0, 0.0, 1.0)
             if share < 1.0:
-                self.task.set_target("target_force_n", 0.4 + 1.6 * float(share))
+                self.task.targets["target_force_n"] = 0.4 + 1.6 * float(share)
             return command
 
     run = Softer("press", HOLD_CYCLE + 200, lambda r: send(r, (SYNC_ID, b"")))
-    assert run.session.truth["force_n"].max() > 1.8 and 0.15 < run.session.truth["force_n"][-1] < 0.5
-    assert left_pressing(run.session) == [pytest.approx(run.session.truth["force_n"][-1], abs=0.15)]
+    assert run.session.buses.truth["force_n"].max() > 1.8 and 0.15 < run.session.buses.truth["force_n"][-1] < 0.5
+    assert left_pressing(run.session) == [pytest.approx(run.session.buses.truth["force_n"][-1], abs=0.15)]
 
 
 @pytest.mark.slow(reason="12 s of a press")
@@ -268,14 +268,14 @@ def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
                 session.run(lambda m, step=task.step: replace(step(m), done=task.phase is Phase.SCAN))  # noqa: B023
         told = left_pressing(session)
         # the drives stop a count or two from where the last image was taken: 0.6 N a count of joint 3 at this force
-        assert told == ([pytest.approx(session.truth["force_n"][-1], abs=0.6)] if pressed_again else [])
-        assert bool(session.truth["force_n"][-1] > 4.0) is pressed_again
+        assert told == ([pytest.approx(session.buses.truth["force_n"][-1], abs=0.6)] if pressed_again else [])
+        assert bool(session.buses.truth["force_n"][-1] > 4.0) is pressed_again
     assert min(remembered) > TOUCH_FORCE, "by its size it could be a press"
 
 
 def test_after_bus_off_nothing_can_be_sent():
     def off(run):
-        run.session.cell._port.state = ControllerState.BUS_OFF
+        run.session.cell.port.state = ControllerState.BUS_OFF
 
     pressed_on(Injected("press", HOLD_CYCLE, off), "left pressing")
 
@@ -295,10 +295,10 @@ def test_whoever_ends_the_run_the_probe_is_taken_off(what):
     run = Injected("press", HOLD_CYCLE, action)
     run.assert_within("interrupt").assert_drives_off()
     assert type(run.error) is kind
-    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
-    assert not any("left pressing" in fault for fault in run.session.cell.faults)
-    assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.notes.lines())
+    assert not any("left pressing" in fault for fault in run.session.cell.notes.lines())
+    assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     back, aside = lifted(run)
     assert 0.95 * WAY_BACK < back < 1.05 * WAY_BACK and aside < 0.05 * WAY_BACK
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
@@ -312,8 +312,8 @@ def test_a_controller_that_returns_no_command_is_told_so_off_the_object():
     run = Forgetful("press", HOLD_CYCLE, lambda _: None)
     run.assert_within("interrupt").assert_drives_off()
     assert str(run.error) == "controller: expected its step to return a Command, got None"
-    assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def test_nobody_need_listen():
@@ -328,9 +328,9 @@ def test_nobody_need_listen():
     run = Unheard("press", HOLD_CYCLE, interrupted(signal.SIGINT))
     assert isinstance(run.error, KeyboardInterrupt)
     run.assert_drives_off()
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     assert {node.node.core.state for node in run.nodes.values()} == {NmtState.PRE_OPERATIONAL}
-    assert any("BrokenPipeError" in fault for fault in run.session.cell.faults)
+    assert any("BrokenPipeError" in fault for fault in run.session.cell.notes.lines())
 
 
 def test_a_second_interrupt_stops_at_once():
@@ -367,11 +367,11 @@ def test_a_way_back_on_which_the_force_grows_ends():
 def test_an_own_controller_that_cannot_retreat_is_taken_off_at_the_force_limit():
     class Pressing(Injected):
         def command(self, measurement, command):
-            self.task.set_target("target_force_n", 4.0)
+            self.task.targets["target_force_n"] = 4.0
             return self.task.step(measurement) if measurement.cycle < self.at else Command()
 
     run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 2.5})
     assert isinstance(run.error, SafetyStop) and "above the limit of 2.50 N" in str(run.error)
     run.assert_drives_off()
-    assert 2.0 < run.session.truth["force_n"].max() < 3.2
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert 2.0 < run.session.buses.truth["force_n"].max() < 3.2
+    assert run.session.buses.truth["force_n"][-1] == 0.0

@@ -28,12 +28,12 @@ def session_of(name, duration_s=1.0, **changes):
 
 
 def node(session, node_id):
-    return next(n for n in session.world.nodes if n.node_id == node_id)
+    return next(n for n in session.buses.world.nodes if n.node_id == node_id)
 
 
 def assert_safe(session, but=()):
     """Every node is pre-operational and every drive without power; ``but`` were lost."""
-    for slave in session.world.nodes:
+    for slave in session.buses.world.nodes:
         if slave.node_id in but:
             continue
         assert slave.state is NmtState.PRE_OPERATIONAL, slave.name
@@ -53,7 +53,7 @@ def test_scene_runs_to_its_end_and_leaves_the_cell_safe(name):
     controller = make_task(session.plan)
     with session:
         session.run(controller)
-    assert session.cell.faults == []
+    assert session.cell.notes.lines() == []
     assert session.cell.cycle.statistics.overruns == 0
     assert_safe(session)
 
@@ -91,7 +91,7 @@ def test_a_lost_drive_stops_the_cell():
     session = session_of("free")
 
     def cut(_):
-        session.lockstep.detach(node(session, 3))
+        session.buses.lockstep.detach(node(session, 3))
         return Command()
 
     with pytest.raises(NodeError, match="node 3: lost"), session:
@@ -117,7 +117,7 @@ def test_a_lost_sensor_stops_the_scan_with_a_retreat():
 
     def step(measurement):
         if measurement.cycle == 900:
-            session.lockstep.detach(node(session, 16))
+            session.buses.lockstep.detach(node(session, 16))
         return controller.step(measurement)
 
     with pytest.raises((SafetyStop, NodeError), match=r"no tactile frame|node 16: lost"), session:
@@ -134,7 +134,7 @@ def test_a_drive_fault_stops_the_cell_and_names_it():
 
     with pytest.raises(NodeError, match=r"node 2: .*(4210|temperature)"), session:
         session.run(_once(fault))
-    assert any("4210h" in fault for fault in session.cell.faults)
+    assert any("4210h" in fault for fault in session.cell.notes.lines())
     assert_safe(session)
 
 
@@ -188,7 +188,7 @@ def test_the_drives_are_moving_until_quick_stop_brings_them_to_rest():
 
     with pytest.raises(KeyboardInterrupt), session:
         session.run(step)
-    q = session.truth["q_rad"]
+    q = session.buses.truth["q_rad"]
     assert np.abs(q[795] - q[790]).max() > 1e-4  # it was moving
     assert np.abs(q[-1] - q[-2]).max() < 5e-5  # a tenth of a count of the coarsest joint, each cycle
     assert_safe(session)
@@ -197,10 +197,10 @@ def test_the_drives_are_moving_until_quick_stop_brings_them_to_rest():
 def test_another_master_stops_bring_up():
     session = session_of("free")
     session.plan  # noqa: B018
-    original = session._open_lockstep
+    original = session.buses.open
 
-    def opened():
-        port = original()
+    def opened(record):
+        port = original(record)
 
         class Foreign(Participant):
             next_deadline_ns = 100_000_000
@@ -209,10 +209,10 @@ def test_another_master_stops_bring_up():
                 self.next_deadline_ns = t_ns + 100_000_000
                 return [(0x77F, b"\x05")]
 
-        session.lockstep.attach(Foreign())
+        session.buses.lockstep.attach(Foreign())
         return port
 
-    session._open_lockstep = opened
+    session.buses.open = opened
     with pytest.raises(BusError, match="another master"), session:
         pass
 
@@ -220,14 +220,14 @@ def test_another_master_stops_bring_up():
 @pytest.mark.parametrize("name", ["free", "press"])
 def test_a_missing_node_is_named(name):
     session = session_of(name)
-    original = session._open_lockstep
+    original = session.buses.open
 
-    def opened():
-        port = original()
-        session.lockstep.detach(node(session, 4))
+    def opened(record):
+        port = original(record)
+        session.buses.lockstep.detach(node(session, 4))
         return port
 
-    session._open_lockstep = opened
+    session.buses.open = opened
     with pytest.raises(NodeError, match=r"node 4: \(joint 4\) sent no boot-up"), session:
         pass
 
@@ -253,8 +253,8 @@ def test_own_controller_in_ten_lines():
             return Command(q_target=target, done=measurement.cycle > 600)
 
         cell.run(nod)
-    assert np.ptp(cell.session.truth["q_rad"][:, 5]) == pytest.approx(0.2, abs=0.01)
-    assert np.ptp(cell.session.truth["q_rad"][:, 0]) < 1e-3
+    assert np.ptp(cell.session.buses.truth["q_rad"][:, 5]) == pytest.approx(0.2, abs=0.01)
+    assert np.ptp(cell.session.buses.truth["q_rad"][:, 0]) < 1e-3
 
 
 def test_what_is_no_controller_is_told_before_a_drive_is_enabled():

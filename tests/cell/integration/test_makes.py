@@ -55,7 +55,7 @@ def moved(plan, folder, *, at_cycles=200):
 
     with Session(plan, RunOptions(folder, said.append)) as session:
         session.run(controller)
-        faults = session.cell.faults
+        faults = session.cell.notes.lines()
     from canprobe.fieldbus.bus.candump import read_candump
 
     assert faults == []
@@ -184,7 +184,7 @@ def told_by(scene, change_device):
     """What bring-up says of the second drive after its device was changed."""
     said = []
     session = Session(canprobe.plan(scene), RunOptions(say=said.append))
-    change_device(session.world.nodes[1].dictionary)
+    change_device(session.buses.world.nodes[1].dictionary)
     with session:
         pass
     return [line for line in said if "node 2: (joint 2)" in line and "units a motor turn" in line]

@@ -128,7 +128,7 @@ def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors
     """One bit in 10 000 fails: about one frame in 90 is sent again. The log has the error frames, as candump has."""
     scene = timed(canprobe.load_scene("free"), bit_error_rate=1e-4)
     first, second = carry_out(scene, tmp_path), carry_out(scene)
-    buses = [session.lockstep for session in (first, second)]
+    buses = [session.buses.lockstep for session in (first, second)]
     assert buses[0].error_frames / buses[0].frames == pytest.approx(110 * 1e-4, rel=0.3)
     assert (buses[0].frames, buses[0].error_frames) == (buses[1].frames, buses[1].error_frames)
     assert all(one.as_planned for one in first.record.meters["can0"].report().classes)
@@ -158,8 +158,8 @@ def real_bus(monkeypatch):
         return bus.port()
 
     monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", open_port)
-    monkeypatch.setattr("canprobe.cell.session.session.MonotonicClock", lambda: bus.clock)
-    monkeypatch.setattr("canprobe.cell.session.session.check_links", lambda *_: None)
+    monkeypatch.setattr("canprobe.cell.session.buses.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.cell.session.buses.check_links", lambda *_: None)
     return scene, reports
 
 

@@ -42,7 +42,7 @@ def test_an_arm_of_its_own_and_an_emulated_sensor():
 
     with Cell(plan, bus.port()) as cell:
         cell.run(nod)
-    assert cell.faults == []
+    assert cell.notes.lines() == []
     assert len(samples) == pytest.approx(100, abs=2) and set(np.diff(samples)) == {2}
     assert np.ptp(np.array(q)[:, 5]) == pytest.approx(0.2, abs=0.01)
     assert all(state_of(node.dictionary.number(0x6041)) not in POWERED_STATES for node in arm.nodes)

@@ -33,11 +33,11 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
     )
     flat = replace(scene, object=ObjectSettings("plane", scene.object.position_mm, scene.object.rotation_deg))
     with pytest.raises(SafetyStop) as stopped, Session(flat) as session:
-        plant = session.world.plant
+        plant = session.buses.world.plant
         plant.config = replace(plant.config, object=true_object(scene.object))
         session.run(make_task(session.plan))
     assert "the contact runs off the edge of the array" in stopped.value.reason
-    truth = session.truth
+    truth = session.buses.truth
     outside = np.flatnonzero(np.abs(truth["pad_uv_m"]).max(axis=1) > EDGE_M)
     pressed = np.count_nonzero(truth["force_n"][outside] > 0.0) * session.plan.sync.period_ns
     assert BY_KEY["off_pad"].reaction is Reaction.RETREAT

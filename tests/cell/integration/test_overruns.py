@@ -60,22 +60,24 @@ def test_the_nodes_say_that_sync_was_late_and_it_is_told_in_one_line(stalled: tu
     """1.5 periods (1006h) after a SYNC its absence is an EMCY 8100h; the next SYNC ends that error (1001h)."""
     session, controller = stalled
     overruns = summarise(session, controller.record(), {}, None)["cycle"]["overruns"]
-    (told,) = session.cell.faults
+    (told,) = session.cell.notes.lines()
     what = r"nodes 1-6, 16: EMCY 8100h, communication \(no SYNC in time\)"
     times = re.fullmatch(what + r", (\d+) times, first at [\d.]+ s, last at [\d.]+ s", told)
     assert times is not None and int(times[1]) == session.cell.supervisor.counts["emcy_communication"]
     assert overruns / 2 <= int(times[1]) / 7 <= overruns, "the inhibit time (1015h) lets a node send ten a second"
-    assert session.world is not None and not any(node.dictionary.number(0x1001) for node in session.world.nodes)
+    assert session.buses.world is not None and not any(
+        node.dictionary.number(0x1001) for node in session.buses.world.nodes
+    )
 
 
 def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Stalls]) -> None:
     session, controller = stalled
-    assert controller.task.scan_cycles is not None
-    first, last = controller.task.scan_cycles
+    assert controller.task.record().scan_cycles is not None
+    first, last = controller.task.record().scan_cycles
     contact = summarise(session, controller.record(), {}, None)["contact"]
     assert contact["contact_fraction"] == 1.0
     assert contact["force_max_n"] < 3.0
-    t, points = session.truth["t_s"], session.truth["contact_point_m"]
+    t, points = session.buses.truth["t_s"], session.buses.truth["contact_point_m"]
     steady = slice(first + 60, last - 60)
     path = np.linalg.norm(np.diff(points[steady], axis=0), axis=1).sum()
     assert path / (t[steady][-1] - t[steady][0]) == pytest.approx(0.025, rel=0.02)
@@ -113,7 +115,7 @@ class PatientScan(Injected):
     def _stall(self, measurement, late_sync):
         number, since = divmod(measurement.cycle - FIRST, SPACING)
         if since == 0 and 0 <= number < len(EPISODES) and number % 2 == late_sync:
-            clock = self.session.lockstep.clock
+            clock = self.session.buses.lockstep.clock
             clock.sleep_until_ns(clock.now_ns() + EPISODES[number][0] * 1_000_000)
 
     def command(self, measurement, command):
@@ -141,7 +143,7 @@ def test_no_stall_with_lost_tpdos_ends_a_patient_scan(patient: PatientScan) -> N
 def test_no_stall_with_lost_tpdos_presses_harder_than_the_limit(patient: PatientScan, episode: int) -> None:
     """The true force between this stall and the next, not only the one that the array measured."""
     limit = patient.session.scene.limits.force_max_n
-    starts = np.flatnonzero(np.diff(patient.session.truth["t_s"]) > 9e-3)
+    starts = np.flatnonzero(np.diff(patient.session.buses.truth["t_s"]) > 9e-3)
     first = starts[episode]
     assert len(starts) == len(EPISODES)
-    assert patient.session.truth["force_n"][first : first + SPACING + 2].max() < limit
+    assert patient.session.buses.truth["force_n"][first : first + SPACING + 2].max() < limit

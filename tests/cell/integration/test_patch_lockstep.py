@@ -25,7 +25,7 @@ def axial():
 
 
 def score(session, records):
-    return score_shape(records, session.truth, session.cell.log.arrays()["t_s"])
+    return score_shape(records, session.buses.truth, session.cell.log.arrays()["t_s"])
 
 
 @pytest.mark.slow(reason="a second path")
@@ -39,15 +39,15 @@ def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
     assert found.kappa_rms_error_percent < 10.0
     last = controller.shape.records[-1].estimate
     assert last.method == "recursive+patch"
-    truth = session.truth["direction1"][-1]
+    truth = session.buses.truth["direction1"][-1]
     assert abs(last.directions[0] @ truth) > 0.99
 
 
 def test_the_first_answer_gives_the_force_no_knock(axial):
     """The patch tells the curvature, and with it the depth for 2 N, in one instant."""
     session, controller = axial
-    first, last = controller.scan_cycles
-    assert session.truth["force_n"][first:last].max() < 2.35
+    first, last = controller.record().scan_cycles
+    assert session.buses.truth["force_n"][first:last].max() < 2.35
 
 
 def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
@@ -61,7 +61,7 @@ def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
     assert records[-1].estimate.kappa[0] == pytest.approx(0.0, abs=1.0)
     assert np.isnan(records[-1].estimate.kappa[1])
     times = session.cell.log.arrays()["t_s"]
-    shape = summarise_shape(off, None, {"recursive": records}, session.truth, times)
+    shape = summarise_shape(off, None, {"recursive": records}, session.buses.truth, times)
     assert shape["kappa_true_per_m"] == pytest.approx((1 / 0.036, 0.0), abs=1e-6)  # it is known all the same
     assert shape_lines(shape) == [
         f"  curvature  {records[-1].estimate.kappa[0]:.2f} 1/m, the other one not observed; true 27.78, 0.00 1/m",

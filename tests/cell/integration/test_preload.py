@@ -23,7 +23,7 @@ def press_begun_pressed(**limits):
     x, y, z = scene.object.position_mm
     raised = true_object(replace(scene.object, position_mm=(x, y, z + 8.3)))
 
-    plant = session.world.plant
+    plant = session.buses.world.plant
     plant.config = replace(plant.config, object=raised)
     with pytest.raises(SafetyStop) as stopped, session:
         session.run(make_task(session.plan))
@@ -34,18 +34,18 @@ def test_no_drive_is_enabled():
     reason, session = press_begun_pressed()
     assert BY_KEY["preload"].reaction is Reaction.STOP and "preload" in session.cell.supervisor.first
     force = float(reason.removeprefix("the array measures ").split(" N before the run")[0])
-    assert force == pytest.approx(session.truth["force_n"].max(), rel=0.15) and force > 0.5
+    assert force == pytest.approx(session.buses.truth["force_n"].max(), rel=0.15) and force > 0.5
     assert "limits.preload_max_n = 0.15" in reason and "free the probe" in reason
-    assert np.ptp(session.truth["q_rad"], axis=0).max() == 0.0
+    assert np.ptp(session.buses.truth["q_rad"], axis=0).max() == 0.0
     words = session.cell.log.arrays()["statusword"]
     assert {state_of(int(word)) for word in words[np.isfinite(words)]} == {DriveState.SWITCH_ON_DISABLED}
-    assert {node.state for node in session.world.nodes} == {NmtState.PRE_OPERATIONAL}
+    assert {node.state for node in session.buses.world.nodes} == {NmtState.PRE_OPERATIONAL}
 
 
 def test_a_larger_limit_lets_an_array_with_offsets_begin():
     reason, session = press_begun_pressed(preload_max_n=3.0)
     assert "before the run" not in reason
-    assert np.ptp(session.truth["q_rad"], axis=0).max() > 1e-3, "it began to move"
+    assert np.ptp(session.buses.truth["q_rad"], axis=0).max() > 1e-3, "it began to move"
 
 
 def test_a_force_during_the_run_is_no_preload():
@@ -54,4 +54,4 @@ def test_a_force_during_the_run_is_no_preload():
     with Session(scene) as session:
         session.run(make_task(session.plan))
     assert session.cell.supervisor.seen.preload < 0.15 and "preload" not in session.cell.supervisor.first
-    assert session.truth["force_n"].max() > 1.5
+    assert session.buses.truth["force_n"].max() > 1.5

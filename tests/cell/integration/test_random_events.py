@@ -140,7 +140,7 @@ class CellUnderFaults(RuleBasedStateMachine):
         self.folder, self.swing, self.ended, self.start, self.angle = Path(mkdtemp()), 0.0, False, None, 0.0
         scene = canprobe.load_scene("free", {"scene.seed": seed, "scene.figures": False})
         self.session = Session(scene, RunOptions(out=self.folder))
-        self.faulty = self.session.world.make_faulty()
+        self.faulty = self.session.buses.world.make_faulty()
         self.nodes = {node.node_id: node.node for node in self.faulty.nodes}
         self.session.__enter__()
         self.attempt(lambda: self.session.cell.start(self.step))
@@ -171,7 +171,7 @@ class CellUnderFaults(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS), node=st.sampled_from(NODES), ms=st.sampled_from((2, 5, 20, 100, 400)))
     def strike(self, kind, node, ms):
-        self.faulty.inject(f"node {node}: {kind} seed=1 for {ms} ms", self.session.lockstep.clock.now_ns())
+        self.faulty.inject(f"node {node}: {kind} seed=1 for {ms} ms", self.session.buses.lockstep.clock.now_ns())
 
     def teardown(self):
         if self.session is None:

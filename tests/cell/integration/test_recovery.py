@@ -62,7 +62,7 @@ def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_
 
 
 def somebody_resets(run):
-    run.session.lockstep.port().send_batch([pack_nmt(NmtCommand.RESET_NODE, 3)])
+    run.session.buses.lockstep.port().send_batch([pack_nmt(NmtCommand.RESET_NODE, 3)])
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ class Busy(Participant):
 def test_somebody_who_goes_on_is_waited_for():
     def act(run):
         somebody_resets(run)
-        run.session.lockstep.attach(Busy(run.now()))
+        run.session.buses.lockstep.attach(Busy(run.now()))
 
     run = Returning(act).assert_came_back()
     assert run.steps("wait:") == ["wait: another master is on the bus: an NMT command from another master"]
@@ -121,7 +121,7 @@ def cut_for(seconds, *, replugged=False, opened=None):
     """Take the interface away for a time; one that was replugged is another one, which has to be opened."""
 
     def cut(run):
-        port, until_ns = run.session.cell._port, run.now() + round(seconds * 1e9)
+        port, until_ns = run.session.cell.port, run.now() + round(seconds * 1e9)
         opened_ns = [] if opened is None else opened
 
         def failing(method):
@@ -138,7 +138,7 @@ def cut_for(seconds, *, replugged=False, opened=None):
             opened_ns.append(run.now())
             return port
 
-        run.session._reopen = reopen
+        run.session.buses.reopen = reopen
         for name in ("send_batch", "drain", "wait"):
             setattr(port, name, failing(getattr(port, name)))
 
@@ -289,8 +289,8 @@ def test_homing_needs_somebody_beside_it(capsys):
 
 def test_a_second_controller_begins_where_the_arm_stands():
     session = Session(canprobe.load_scene("free", {"bus.timed": False}))
-    watcher = Enabled(session.world.nodes)
-    session.world.participants.append(watcher)
+    watcher = Enabled(session.buses.world.nodes)
+    session.buses.world.participants.append(watcher)
 
     def steps_ahead(measurement):
         ahead = 0.004 if measurement.cycle > 200 else 0.0

@@ -36,14 +36,14 @@ class Disturbed(Wrapped):
         )
         super().__init__(make_task(self.session.plan))
         self.move_mm = move_mm
-        self.witness = Witness(self.session.world.plant, 1_250_000)
+        self.witness = Witness(self.session.buses.world.plant, 1_250_000)
         self.positions = []
-        self.session.world.participants.insert(0, self.witness)
+        self.session.buses.world.participants.insert(0, self.witness)
 
     def step(self, measurement):
         gone = (measurement.cycle - AT_CYCLE) / MOVING_CYCLES
         if 0.0 <= gone <= 1.0:
-            plant = self.session.world.plant
+            plant = self.session.buses.world.plant
             there = None
             if self.move_mm is not None:
                 moved = np.add(self.session.scene.object.position_mm, np.multiply(gone, self.move_mm))

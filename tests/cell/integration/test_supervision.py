@@ -61,7 +61,7 @@ def test_an_emcy_of_the_sensor():
     def alarm(run):
         run.nodes[16].node.emcy.report(0x5000)
         send(run, (0x7A0, b""))  # a frame wakes the bus, which then carries the EMCY
-        run.session.lockstep._queue(run.session.lockstep._nodes[6], run.nodes[16].node._taken())
+        run.session.buses.lockstep._queue(run.session.buses.lockstep._nodes[6], run.nodes[16].node._taken())
 
     run = Injected("press", HOLD_CYCLE, alarm)
     run.assert_within("emcy").assert_drives_off()
@@ -71,9 +71,9 @@ def test_an_emcy_of_the_sensor():
 def test_an_emcy_about_communication_is_noted():
     run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
     run.assert_counted("emcy_communication")
-    at_s = run.session.cell.start_ns * 1e-9 + FREE_CYCLE * 0.0025
+    at_s = run.session.cell.cycles.start_ns * 1e-9 + FREE_CYCLE * 0.0025
     told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {at_s:.2f} s"
-    assert run.session.cell.faults == [told]
+    assert run.session.cell.notes.lines() == [told]
 
 
 def test_another_master():
@@ -97,7 +97,7 @@ def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_e
     def say(text):
         said.append(text)
         if text.startswith(step):
-            session.lockstep.port().send_batch([pack_nmt(NmtCommand.STOP, 4)])
+            session.buses.lockstep.port().send_batch([pack_nmt(NmtCommand.STOP, 4)])
 
     session = Session(canprobe.load_scene("free"), RunOptions(say=say))
     with pytest.raises(CanprobeError, match="an NMT command from another master"), session:
@@ -113,9 +113,9 @@ def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
         if text != "enable the drives":
             return
         if what == "bus-off":
-            session.cell._port.state = ControllerState.BUS_OFF
+            session.cell.port.state = ControllerState.BUS_OFF
         else:
-            session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
+            session.buses.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
 
     session = Session(canprobe.load_scene("free"), RunOptions(say=say))
     with pytest.raises(CanprobeError, match=what), session:
@@ -133,7 +133,7 @@ def not_enabled(told, *changes):
                 altered(participants[node_id - 1], cob_id, change)
 
     session = Session(canprobe.load_scene("free"), RunOptions(say=say))
-    participants = session.world.make_faulty().nodes
+    participants = session.buses.world.make_faulty().nodes
     with pytest.raises(CanprobeError, match=told), session:
         session.run(lambda _: Command(done=True))
     words = session.cell.log.arrays()["statusword"]
@@ -170,13 +170,13 @@ def test_a_moving_arm_is_stopped_before_it_is_disabled():
     sent = []
 
     def interrupt(run):
-        inner = run.session.lockstep.recorder
+        inner = run.session.buses.lockstep.recorder
 
         def recorder(can_id, data, t_ns):
             sent.append((can_id, data[:2]))
             inner(can_id, data, t_ns)
 
-        run.session.lockstep.recorder = recorder
+        run.session.buses.lockstep.recorder = recorder
         raise KeyboardInterrupt
 
     Injected("free", FREE_CYCLE, interrupt).assert_drives_off()
@@ -226,14 +226,14 @@ def test_tactile_frames_that_are_torn_or_corrupt_are_dropped(fault):
 def test_a_frame_that_names_another_sync():
     run = Injected("press", HOLD_CYCLE, lambda r: r.inject("node 16: wrong-data seed=4 for 15 ms"), until=40)
     run.assert_counted("sync_mismatch")
-    assert run.session.truth["force_n"].max() < 3.0
+    assert run.session.buses.truth["force_n"].max() < 3.0
 
 
 def test_a_stale_sensor_makes_the_probe_retreat():
     run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[16], 0x511, lambda _: None))
     run.assert_within("sensor_stale").assert_drives_off()
     assert "no tactile frame for 13 cycles" in str(run.error)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def test_a_drive_that_is_late_makes_all_of_them_hold():
@@ -246,7 +246,7 @@ def test_a_drive_that_is_late_makes_all_of_them_hold():
     assert np.isnan(log["q_target_rad"][noticed]).all(), "no new ones"
     stands = np.abs(log["q_target_rad"][noticed + 1] - log["q_rad"][noticed + 1])
     assert np.delete(stands, 4).max() < 2e-4, "on the way, next to where those are that are heard"
-    assert any("node 5: no usable TPDO for 3 cycles: hold" in fault for fault in run.session.cell.faults)
+    assert any("node 5: no usable TPDO for 3 cycles: hold" in fault for fault in run.session.cell.notes.lines())
 
 
 def test_a_wrong_position_is_not_believed():
@@ -262,7 +262,7 @@ def test_a_wrong_position_is_not_believed():
     run.assert_counted("pdo_missed")
     assert 2 <= run.session.cell.drives.implausible <= 3
     q = run.session.cell.log.arrays()["q_rad"][run.at - 5 : run.at + 10, 1]
-    truth = run.session.truth["q_rad"][run.at - 5 : run.at + 10, 1]
+    truth = run.session.buses.truth["q_rad"][run.at - 5 : run.at + 10, 1]
     assert np.abs(q - truth).max() < 1e-3 < 60 / 7000, "sixty counts are 5 mrad"
 
 
@@ -271,15 +271,15 @@ def test_a_wrong_position_is_not_believed():
 
 def test_error_frames_dropped_frames_and_a_wall_clock_that_is_set_are_noted():
     def count(run):
-        run.session.cell._port.counters.error_frames += 3
-        run.session.cell._port.counters.overruns += 2
-        run.session.cell._port.counters.clock_steps += 1
+        run.session.cell.port.counters.error_frames += 3
+        run.session.cell.port.counters.overruns += 2
+        run.session.cell.port.counters.clock_steps += 1
 
     run = Injected("free", FREE_CYCLE, count, until=10)
     run.assert_counted("error_frames").assert_counted("frames_dropped").assert_counted("clock_step")
-    assert f"wall clock set: 1, the first in cycle {FREE_CYCLE + 1}" in run.session.cell.faults
-    assert any("bus error frames: 3" in fault for fault in run.session.cell.faults)
-    assert any("dropped by the kernel or the controller: 2" in fault for fault in run.session.cell.faults)
+    assert f"wall clock set: 1, the first in cycle {FREE_CYCLE + 1}" in run.session.cell.notes.lines()
+    assert any("bus error frames: 3" in fault for fault in run.session.cell.notes.lines())
+    assert any("dropped by the kernel or the controller: 2" in fault for fault in run.session.cell.notes.lines())
 
 
 class Passive(Injected):
@@ -289,11 +289,11 @@ class Passive(Injected):
 
     def after(self, measurement):
         if measurement.cycle == self.at + self.for_cycles:
-            self.session.cell._port.state = ControllerState.ACTIVE
+            self.session.cell.port.state = ControllerState.ACTIVE
 
 
 def passive(run):
-    run.session.cell._port.state = ControllerState.PASSIVE
+    run.session.cell.port.state = ControllerState.PASSIVE
 
 
 def test_error_passive_holds_until_it_is_over():
@@ -303,19 +303,19 @@ def test_error_passive_holds_until_it_is_over():
     stands = (np.diff(targets, axis=0) == 0.0).all(axis=1)
     assert stands[run.at + 2 : run.at + run.for_cycles].all()
     assert not stands[run.at - 20 : run.at].any() and not stands[run.at + run.for_cycles + 2 : run.until - 1].any()
-    assert any("error-passive: hold" in fault for fault in run.session.cell.faults)
+    assert any("error-passive: hold" in fault for fault in run.session.cell.notes.lines())
 
 
 def test_error_passive_for_long_makes_the_probe_retreat():
     run = Injected("press", HOLD_CYCLE, passive, until=1500)
     assert "error-passive for 1.0 s" in str(run.error)
     run.assert_within("error_passive_long")
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def test_bus_off():
     def off(run):
-        run.session.cell._port.state = ControllerState.BUS_OFF
+        run.session.cell.port.state = ControllerState.BUS_OFF
 
     run = Injected("free", FREE_CYCLE, off)
     run.assert_within("bus_off").assert_drives_off()
@@ -325,8 +325,8 @@ def test_bus_off():
 @pytest.mark.parametrize("back_after_ns", [None, 100_000_000])
 def test_the_interface_is_removed_and_the_drives_stop_by_themselves(back_after_ns):
     def remove(run):
-        port = run.session.cell._port
-        bus, counters = run.session.lockstep, port.counters
+        port = run.session.cell.port
+        bus, counters = run.session.buses.lockstep, port.counters
         gone_ns = run.now()
 
         class Gone:
@@ -355,12 +355,12 @@ def test_the_interface_is_removed_and_the_drives_stop_by_themselves(back_after_n
                 port.close()
 
         cell = run.session.cell
-        cell._port = cell.cycle._port = cell._network.port = Gone()
+        cell.port = cell.cycles.port = cell.cycle._port = cell._network.port = Gone()
 
     run = Injected("free", FREE_CYCLE, remove)
     run.assert_within("interface").assert_drives_off()
     assert isinstance(run.error, InterfaceError) and "interface lost" in str(run.error)
-    assert any("while stopping" in fault for fault in run.session.cell.faults) is (back_after_ns is None)
+    assert any("while stopping" in fault for fault in run.session.cell.notes.lines()) is (back_after_ns is None)
 
 
 # time
@@ -371,7 +371,7 @@ class Late(Injected):
 
     def command(self, measurement, command):
         if measurement.cycle >= self.at:
-            clock = self.session.lockstep.clock
+            clock = self.session.buses.lockstep.clock
             clock.sleep_until_ns(clock.now_ns() + 8 * self.limits.period_ns // 5)
         return command
 
@@ -380,7 +380,7 @@ def test_the_overrun_budget_makes_the_probe_retreat():
     run = Late("press", HOLD_CYCLE, lambda _: None, until=1000)
     assert "of the last second's cycles came more than half a period late" in str(run.error)
     run.assert_within("overruns")
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 # the touch and the arm
@@ -388,18 +388,18 @@ def test_the_overrun_budget_makes_the_probe_retreat():
 
 def test_force_above_the_limit_makes_the_probe_retreat():
     def squeeze(run):
-        run.task.set_target("target_force_n", 4.0)
+        run.task.targets["target_force_n"] = 4.0
 
     run = Injected("press", HOLD_CYCLE, squeeze, limits={"force_max_n": 3.0})
     assert "above the limit of 3.00 N" in str(run.error)
-    above = np.flatnonzero(run.session.truth["force_n"] > 1.03 * 3.0)[0]
+    above = np.flatnonzero(run.session.buses.truth["force_n"] > 1.03 * 3.0)[0]
     retreat = np.flatnonzero(run.session.cell.log.arrays()["phase"] == Phase.RETREAT)[0]
     assert 0 < (retreat - above) * run.limits.period_ns <= BY_KEY["force"].within(run.limits)
     run.assert_drives_off()
 
 
 def vanish(run):
-    plant = run.session.world.plant
+    plant = run.session.buses.world.plant
     plant.config = replace(plant.config, object=None)
     plant._solved = None
 
@@ -418,7 +418,7 @@ def test_contact_lost_in_a_scan_makes_it_search_and_then_retreat():
 
         def command(self, measurement, command):
             if self.injected_ns is not None and (sunk := (measurement.cycle - self.at) * 2.5e-3 * 12.0) < 8.0:
-                plant, given = self.session.world.plant, self.session.scene.object
+                plant, given = self.session.buses.world.plant, self.session.scene.object
                 moved = tuple(np.subtract(given.position_mm, (0.0, 0.0, sunk)))
                 plant.config = replace(plant.config, object=true_object(replace(given, position_mm=moved)))
                 plant._solved = None
@@ -453,7 +453,7 @@ def test_a_saturated_array_makes_the_probe_retreat():
     run = Saturated("press", FREE_CYCLE, lambda _: None, until=1000, plant=stiff, servo={"surface_height_hz": 2.0})
     assert "the array is saturated and no stiffness was measured" in str(run.error)
     assert 0 < run.answered_ns - run.saturated_ns <= BY_KEY["force_hidden"].within(run.limits)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def own_target(change):
@@ -470,7 +470,7 @@ def test_an_own_controller_cannot_leave_the_joints_range():
     run = own_target(lambda q: q + np.array([0, 0, 0, 0, 3.0, 0]))("free", FREE_CYCLE, lambda _: None, own=True)
     run.assert_within("joint_stop").assert_drives_off()
     assert "joint 5 at" in str(run.error) and "its stop" in str(run.error)
-    q = run.session.truth["q_rad"]
+    q = run.session.buses.truth["q_rad"]
     assert np.abs(q[-1] - q[FREE_CYCLE - 20]).max() < 1e-3
 
 
@@ -484,7 +484,7 @@ def test_an_own_controllers_target_that_is_none(target):
 def test_an_own_controllers_jump_is_made_at_the_joints_speed():
     run = own_target(lambda q: np.radians([90, 65, 15, 20, 100, 0.0]))("free", FREE_CYCLE, lambda _: None, own=True)
     run.assert_counted("target_speed")
-    q = run.session.truth["q_rad"]
+    q = run.session.buses.truth["q_rad"]
     speeds = np.abs(np.diff(q[:, 3])) / 2.5e-3
     assert np.degrees(speeds.max()) < 1.2 * 675
     assert np.degrees(q[-1, 3]) == pytest.approx(20, abs=1.0)
@@ -493,7 +493,7 @@ def test_an_own_controllers_jump_is_made_at_the_joints_speed():
 def test_the_workspace_ends_a_press():
     run = Injected("press", 5000, lambda _: None, limits={"workspace_min_mm": (-500.0, -500.0, 375.0)})
     assert "the probe's tip at z =" in str(run.error) and "workspace ends at 375.0 mm" in str(run.error)
-    assert run.session.truth["force_n"].max() == 0.0
+    assert run.session.buses.truth["force_n"].max() == 0.0
 
 
 def test_the_workspace_ends_an_own_controllers_motion():
@@ -503,7 +503,7 @@ def test_the_workspace_ends_an_own_controllers_motion():
     up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
     run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
     assert isinstance(run.error, SafetyStop) and "workspace ends at" in str(run.error)
-    tips = np.array([T_base_tip_of(q)[:3, 3] for q in run.session.truth["q_rad"][::5]])
+    tips = np.array([T_base_tip_of(q)[:3, 3] for q in run.session.buses.truth["q_rad"][::5]])
     assert (1e3 * tips < start + 15.0 + 3.0).all()
     run.assert_drives_off()
 
@@ -513,16 +513,16 @@ def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stop
     run.assert_within("drive_fault").assert_drives_off()
     told = "node 3: (joint 3) left operation enabled: in no CiA 402 state (statusword 0x0601)"
     assert str(run.error) == told
-    assert run.session.cell.faults == ["while stopping: node 3 did not confirm that it is disabled"]
+    assert run.session.cell.notes.lines() == ["while stopping: node 3 did not confirm that it is disabled"]
 
 
 def test_a_drive_that_is_never_in_a_state_is_not_enabled():
     session = Session(canprobe.load_scene("free"))
-    altered(session.world.make_faulty().nodes[2], 0x183, lambda d: b"\x01\x06" + d[2:])
+    altered(session.buses.world.make_faulty().nodes[2], 0x183, lambda d: b"\x01\x06" + d[2:])
     told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after the command to enable operation"
     with pytest.raises(NodeError, match=told), session:
         session.run(lambda _: Command())
-    assert {node.state for node in session.world.nodes} == {NmtState.PRE_OPERATIONAL}
+    assert {node.state for node in session.buses.world.nodes} == {NmtState.PRE_OPERATIONAL}
 
 
 def test_a_drive_that_keeps_telling_a_wrong_position_is_lost():
@@ -530,7 +530,7 @@ def test_a_drive_that_keeps_telling_a_wrong_position_is_lost():
     run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
     run.assert_within("drive_silent").assert_drives_off()
     assert "node 2: lost: no usable TPDO for 6 cycles" in str(run.error)
-    assert np.abs(np.diff(run.session.truth["q_rad"], axis=0)).max() < 0.01
+    assert np.abs(np.diff(run.session.buses.truth["q_rad"], axis=0)).max() < 0.01
 
 
 def test_a_measured_jump_that_no_joint_can_make():
@@ -538,7 +538,7 @@ def test_a_measured_jump_that_no_joint_can_make():
 
     class Unguarded(Injected):
         def after(self, measurement):
-            self.session.cell._controller.compares_motion = True
+            self.session.cell.cycles.controller.compares_motion = True
             for track in self.session.cell.drives._tracks:
                 track._asked = 1e9
 
@@ -565,14 +565,14 @@ def test_an_estimator_that_diverges_starts_afresh():
     run = Injected("cylinder", 620, diverge, until=200, shape={"also": ()})
     assert run.error is None
     assert run.session.cell.supervisor.counts["estimator"] == run.task.shape.restarts == 1
-    assert any("estimator diverges: 1" in fault for fault in run.session.cell.faults)
+    assert any("estimator diverges: 1" in fault for fault in run.session.cell.notes.lines())
     assert max(float(np.abs(r.estimate.kappa[0])) for r in run.task.shape.records if r.estimate.observed[0]) < 100
 
 
 def test_an_own_controller_is_stopped_at_the_force_limit():
     class Pressing(Injected):
         def command(self, measurement, command):
-            self.task.set_target("target_force_n", 4.0)
+            self.task.targets["target_force_n"] = 4.0
             return self.task.step(measurement) if measurement.cycle < self.at else Command()
 
     run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 2.5})
@@ -598,7 +598,7 @@ def test_an_interrupt_does_not_wait_for_a_controller_that_hangs(hung_ns, waits):
     reached = []
 
     def hang(run):
-        clock = run.session.lockstep.clock
+        clock = run.session.buses.lockstep.clock
         clock.sleep_until_ns(clock.now_ns() + hung_ns)
         signal.raise_signal(signal.SIGINT)
         reached.append(True)
@@ -612,7 +612,7 @@ def test_the_drives_of_a_dead_master_stop_by_themselves():
     seen = {}
 
     def die(run):
-        clock, start = run.session.lockstep.clock, run.now()
+        clock, start = run.session.buses.lockstep.clock, run.now()
         limit = BY_KEY["master_dead"].within(run.limits)
         clock.sleep_until_ns(start + limit - run.limits.period_ns)
         seen["before"] = [state_of(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
@@ -628,7 +628,7 @@ def test_the_drives_of_a_dead_master_stop_by_themselves():
 def test_a_full_disk(tmp_path):
     class OnDisk(Injected):
         def _run(self):
-            self.session.out = tmp_path
+            self.session.options.out = tmp_path
             super()._run()
 
     def fill(run):
@@ -665,13 +665,13 @@ def test_a_full_disk(tmp_path):
 
             return written
 
-        run.session.lockstep.recorder = flushed_each_time()
+        run.session.buses.lockstep.recorder = flushed_each_time()
 
     run = OnDisk("press", HOLD_CYCLE, fill)
     assert str(run.error) == f"{tmp_path}/bus.log: cannot be written: No space left on device"
     assert isinstance(run.error, ResultsError)  # after the task has let go
     run.assert_drives_off()
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     text = (tmp_path / "bus.log").read_text()
     assert text.endswith("\n") and len(list(canprobe_lines(tmp_path / "bus.log"))) > 1000
 

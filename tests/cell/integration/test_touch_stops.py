@@ -14,7 +14,7 @@ from canprobe.errors import SafetyStop
 def run_until_stopped(session, at_cycle=None, action=None, target_n=None):
     controller = make_task(session.plan)
     if target_n is not None:
-        controller.set_target("target_force_n", target_n)
+        controller.targets["target_force_n"] = target_n
 
     def step(measurement):
         if measurement.cycle == at_cycle:
@@ -24,7 +24,7 @@ def run_until_stopped(session, at_cycle=None, action=None, target_n=None):
     step.retreat = controller.retreat
     with pytest.raises(SafetyStop) as stopped, session:
         session.run(step)
-    return stopped.value.reason, session.truth
+    return stopped.value.reason, session.buses.truth
 
 
 def press_session(**changes):
@@ -48,7 +48,7 @@ def test_no_object_where_it_was_expected():
     session.scene = session.plan.scene
 
     def sink(session):
-        plant = session.world.plant
+        plant = session.buses.world.plant
         plant.config = replace(plant.config, object=None)
         plant._solved = None
 
@@ -59,7 +59,7 @@ def test_no_object_where_it_was_expected():
 
 def test_contact_lost_in_the_hold():
     def vanish(session):
-        plant = session.world.plant
+        plant = session.buses.world.plant
         plant.config = replace(plant.config, object=None)
         plant._solved = None
 
@@ -69,7 +69,7 @@ def test_contact_lost_in_the_hold():
 
 def test_sensor_falls_silent_but_lives():
     session, silent = press_session(), []
-    (sensor,) = [node for node in session.world.nodes if node.node_id == 16]
+    (sensor,) = [node for node in session.buses.world.nodes if node.node_id == 16]
     original = sensor.receive
     sensor.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] < 0x511 or not silent]
     reason, truth = run_until_stopped(session, at_cycle=1100, action=silent.append)
@@ -81,7 +81,7 @@ def test_sensor_lives_but_never_sends_a_frame():
     session = press_session()
     frames = {pdo.cob_id for pdo in session.plan.pdos_of(16, "tpdo")}
 
-    (sensor,) = [node for node in session.world.nodes if node.node_id == 16]
+    (sensor,) = [node for node in session.buses.world.nodes if node.node_id == 16]
     original = sensor.receive
     sensor.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] not in frames]
     reason, truth = run_until_stopped(session)
@@ -104,7 +104,7 @@ def test_samples_that_say_they_are_old_do_not_move_the_surface():
     with session:
         session.run(step)
     assert controller.record().unplaced > 20
-    assert session.truth["force_n"].max() < 3.0
+    assert session.buses.truth["force_n"].max() < 3.0
 
 
 def test_joint_at_its_stop():

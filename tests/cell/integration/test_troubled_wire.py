@@ -25,7 +25,7 @@ def test_a_babbling_idiot_stops_the_cell_and_the_drives_end_without_power(tmp_pa
     session = Session(canprobe.load_scene("free", {"task.duration_s": 2.0}), RunOptions(tmp_path))
     shout = (0x001, bytes(8))
     with pytest.raises(CanprobeError), session:
-        bus = session.lockstep
+        bus = session.buses.lockstep
         begin = bus.clock.now_ns() + 400_000_000
         bus.attach(Babbler(shout, exact_bits(*shout) * 1000, first_ns=begin, last_ns=begin + 150_000_000))
         session.run(make_task(session.plan))
@@ -41,9 +41,9 @@ def test_a_drive_whose_controller_goes_bus_off_is_missed(tmp_path):
     """32 of its TPDOs in a row are hit; it comes back after 128 times eleven recessive bits."""
     session = Session(canprobe.load_scene("free", {"task.duration_s": 1.0}), RunOptions(tmp_path))
     with session:
-        bus = session.lockstep
+        bus = session.buses.lockstep
         bus.errors = ErrorsAt({200 + k: 40 for k in range(32)}, can_id=0x183)
-        drive = session.world.nodes[2]
+        drive = session.buses.world.nodes[2]
         session.run(make_task(session.plan))
         assert bus.counters(drive).bus_offs == 1
         assert bus.counters(drive).outstanding == 0

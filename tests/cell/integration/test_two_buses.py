@@ -167,15 +167,15 @@ def test_the_arm_is_stopped_by_its_master_when_the_sensors_bus_is_lost():
     session = CutSession(split_scene(), "can1", 1_500_000_000)
     heard = []
     with pytest.raises(InterfaceError, match="can1: it is gone"), session:
-        write = session.lockstep.recorder
+        write = session.buses.lockstep.recorder
 
         def record(can_id, data, t_ns):
             heard.append((can_id, data, t_ns))
             write(can_id, data, t_ns)
 
-        session.lockstep.recorder = record
+        session.buses.lockstep.recorder = record
         session.run(hold)
-    words = [node.dictionary.number(0x6041) for node in session.world.nodes if node.node_id <= 6]
+    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes if node.node_id <= 6]
     assert not POWERED_STATES.intersection(map(state_of, words))
     assert not [frame for frame in heard if 0x81 <= frame[0] <= 0x86]
     stops = [t for can_id, data, t in heard if can_id == 0x201 and t > 1_500_000_000 and data[0] & 0x06 == 0x02]
@@ -186,9 +186,9 @@ def test_the_sensor_is_let_go_when_the_arms_bus_is_lost():
     session = CutSession(split_scene(), "can0", 1_500_000_000)
     with pytest.raises(InterfaceError, match="can0: it is gone"), session:
         session.run(hold)
-    (sensor,) = [node for node in session.world.nodes if node.node_id == 16]
+    (sensor,) = [node for node in session.buses.world.nodes if node.node_id == 16]
     assert sensor.state is NmtState.PRE_OPERATIONAL
-    words = [node.dictionary.number(0x6041) for node in session.world.nodes if node.node_id <= 6]
+    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes if node.node_id <= 6]
     assert not POWERED_STATES.intersection(map(state_of, words))  # by themselves
 
 
@@ -284,5 +284,5 @@ def test_the_arm_is_stopped_when_one_of_its_buses_is_lost():
     session = CutSession(spread_scene(canprobe.load_scene("free"), 3), "can1", 1_500_000_000)
     with pytest.raises(InterfaceError, match="can1: it is gone"), session:
         session.run(hold)
-    words = [node.dictionary.number(0x6041) for node in session.world.nodes]
+    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes]
     assert not POWERED_STATES.intersection(map(state_of, words))

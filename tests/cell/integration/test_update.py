@@ -21,7 +21,7 @@ class Working(Controller):
 
     def _note(self, what):
         cell = self._session.cell
-        self.calls.append((what, cell.cycle.number, cell._port.counters.sent))
+        self.calls.append((what, cell.cycle.number, cell.port.counters.sent))
 
     def step(self, measurement):
         self._note("step")
@@ -61,8 +61,8 @@ def test_what_it_raises_ends_the_run_off_the_object():
 
     run = Failing("press", HOLD_CYCLE, lambda _: None)
     run.assert_drives_off()
-    assert run.session.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.buses.truth["force_n"][-1] == 0.0
     np.testing.assert_allclose(np.diff(run.session.cell.log.arrays()["t_s"]), 2.5e-3, rtol=1e-6)
 
 
@@ -80,6 +80,6 @@ def test_a_task_in_a_controller_that_never_updates_it_moves_and_answers_alike():
     """Whoever wraps a task's `step` alone has its estimates none the less, and the same."""
     (answers, targets), (wrapped, wrapped_targets) = scanned(lambda task: task), scanned(lambda task: task.step)
     assert len(answers) > 5
-    assert [a.told_s for a in answers] == [w.told_s for w in wrapped]
+    assert [a.reported_s for a in answers] == [w.reported_s for w in wrapped]
     np.testing.assert_array_equal([a.estimate.K for a in answers], [w.estimate.K for w in wrapped])
     np.testing.assert_array_equal(targets, wrapped_targets)

@@ -20,7 +20,7 @@ SCAN_CYCLE = 900
 
 def steps_deg(run, joint):
     """Largest step of a joint in a cycle after the fault, degrees."""
-    return math.degrees(np.abs(np.diff(run.session.truth["q_rad"][run.at :, joint - 1])).max())
+    return math.degrees(np.abs(np.diff(run.session.buses.truth["q_rad"][run.at :, joint - 1])).max())
 
 
 def stands(node_id):
@@ -41,23 +41,23 @@ def test_a_joint_that_does_not_follow_is_left_out_and_the_probe_taken_off(what):
     assert isinstance(run.error, NodeError) and run.error.node_id == 3
     assert "(joint 3) does not follow its targets" in str(run.error)
     assert run.session.cell.stopped_by.key == "following"
-    assert run.session.truth["force_n"][run.at] > 1.5
-    assert run.session.truth["force_n"].max() < 6.0 and run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][run.at] > 1.5
+    assert run.session.buses.truth["force_n"].max() < 6.0 and run.session.buses.truth["force_n"][-1] == 0.0
     assert steps_deg(run, 3) < 0.03, "no leap when it lets go"
-    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.notes.lines())
 
 
 def test_a_slow_joint_that_stands_for_a_moment_does_not_leap():
     """It is behind by less than what is looked for, and the scan goes on."""
     run = Injected("plane", SCAN_CYCLE, lambda run: run.inject("node 3: brake-stuck for 50 ms"), until=400)
-    assert run.session.truth["force_n"].max() < 5.0 and steps_deg(run, 3) < 0.05
+    assert run.session.buses.truth["force_n"].max() < 5.0 and steps_deg(run, 3) < 0.05
 
 
 def test_a_joint_that_stands_in_the_approach_stops_the_cell_before_the_object():
     run = Injected("press", 100, FAULTS["a brake that is stuck for a second"], until=2000)
     assert run.task.phase in (Phase.MOVE, Phase.APPROACH)
     assert run.session.cell.stopped_by.key == "following"
-    assert run.session.truth["force_n"].max() == 0.0 and steps_deg(run, 3) < 0.1
+    assert run.session.buses.truth["force_n"].max() == 0.0 and steps_deg(run, 3) < 0.1
 
 
 def test_while_a_drive_is_not_heard_the_others_stand_where_they_were_and_go_on_smoothly():
@@ -90,10 +90,10 @@ def test_a_retreat_before_the_scan_goes_back_on_the_measured_way(phase, t_s):
     came, targets = log["q_rad"][: run.came_to + 1], log["q_target_rad"][run.came_to + 3 :]
     targets = targets[~np.isnan(targets[:, 0])]
     assert max(np.abs(came - q).max(axis=1).min() for q in targets) < 1e-3
-    centre = run.session.truth["probe_centre_m"]
+    centre = run.session.buses.truth["probe_centre_m"]
     way, back = (float(np.linalg.norm(np.diff(c, axis=0), axis=1).sum()) for c in np.split(centre, [run.came_to]))
     assert back == pytest.approx(min(way, WAY_BACK), rel=0.15)
-    assert run.session.truth["force_n"][-1] == 0.0
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def some_cycles(number=40):
@@ -131,11 +131,11 @@ def test_after_a_stop_for_safety_nothing_moves_before_a_person_has_asked_for_it(
 
 def test_a_stop_by_the_supervision_needs_the_word_too_and_a_mistake_in_a_call_does_not():
     session = Session(canprobe.load_scene("free"))
-    faulty = session.world.make_faulty()
+    faulty = session.buses.world.make_faulty()
     with session:
         with pytest.raises(UsageError):
             session.run(lambda measurement: None)
-        faulty.inject("node 3: drive-fault at 100 ms", session.lockstep.clock.now_ns())
+        faulty.inject("node 3: drive-fault at 100 ms", session.buses.lockstep.clock.now_ns())
         with pytest.raises(NodeError):
             session.run(some_cycles(2000))
         with pytest.raises(UsageError, match=r"stopped for safety: node 3: "):

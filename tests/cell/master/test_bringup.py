@@ -34,7 +34,7 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     said = []
     session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), RunOptions(tmp_path, said.append))
     session.said = said
-    world = session.world
+    world = session.buses.world
     for node in world.nodes:
         if nodes is not None:
             if node.node_id in nodes:
@@ -218,7 +218,7 @@ def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(
 
     with open_session(tmp_path, change=change) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
-    assert session.cell.faults == []
+    assert session.cell.notes.lines() == []
     remarks = [line for line in session.said if "left as the device has it" in line]
     assert remarks == [
         "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as"
@@ -346,11 +346,11 @@ def test_a_drive_that_changes_its_mode_late_is_waited_for(tmp_path):
             node.dictionary.on_read(0x6061, lambda _: node.dictionary.put(0x6061, 0, answer(right)))
 
     def answer(right):
-        answers.append(right if session.lockstep.clock.now_ns() > began + 200 * MS else 1)
+        answers.append(right if session.buses.lockstep.clock.now_ns() > began + 200 * MS else 1)
         return 8 if answers[-1] != 1 else 1
 
     with open_session(tmp_path, change=change, enable_s=0.3) as session:
-        began = session.lockstep.clock.now_ns()
+        began = session.buses.lockstep.clock.now_ns()
         session.cell.run(lambda _: Command(done=True))
     assert answers.count(1) == len(answers) - 1 > 3
 
@@ -363,7 +363,7 @@ def test_a_kept_configuration_is_not_written_again(tmp_path):
             kept.append(["kept" in done for done in done_to(session)])
         nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
         logs.append(frames(tmp_path))
-        assert session.cell.faults == [], run
+        assert session.cell.notes.lines() == [], run
     assert kept == [[False] * 7, [True] * 7]
     assert len(writes_to(logs[0], 2)) > 25 and writes_to(logs[1], 2) == [(0x1016, 1)]  # the heartbeat consumer's end
     assert writes_to(logs[1], 16) == [(0x2003, 0), (0x1016, 1)]  # and the tare, which is a command
@@ -667,7 +667,7 @@ def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
     """The scene names each drive's serial number; the nodes have others."""
     session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
     swapped = Session(with_joints(session.scene, serial_number=(1001, 1002, 1004, 1003, 1005, 1006)))
-    swapped.world.participants[:] = session.world.participants
+    swapped.buses.world.participants[:] = session.buses.world.participants
     with (
         pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; node 4: ") as failed,
         swapped,

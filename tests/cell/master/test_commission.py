@@ -7,9 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from canprobe.cell.master.commission import commission
-from canprobe.cell.master.id_assignment import Assignment, Wanted, choose_assignments
-from canprobe.cell.master.lss_session import assign, find_unconfigured
+from canprobe.cell.master.commission import (
+    Assignment,
+    Wanted,
+    assign,
+    choose_assignments,
+    commission,
+    find_unconfigured,
+)
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.lss import Lss

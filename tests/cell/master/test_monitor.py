@@ -12,8 +12,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe import api
-from canprobe.cell.master.monitor import Monitor
-from canprobe.cell.master.monitor_text import image_lines, lines, screen
+from canprobe.cell.master.monitor import Monitor, image_lines, lines, screen
 from canprobe.cell.scene.load import load_scene
 from canprobe.cli import main
 from canprobe.fieldbus.bus.candump import read_candump

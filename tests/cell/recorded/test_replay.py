@@ -109,7 +109,7 @@ def test_all_files_of_a_run_count_from_the_instant_that_is_0_in_its_bus_log(lock
     wire = syncs[: len(log["t_s"])] - log["t_s"]
     assert wire.min() > 0 and wire.max() < 200e-6  # the frame, and one that was under way at the deadline
     answers = lockstep_run.estimates["recursive"]
-    told = np.array([record.told_s for record in answers])
+    told = np.array([record.reported_s for record in answers])
     rows = [int(np.abs(log["t_s"] - t_s).argmin()) for t_s in told]
     np.testing.assert_allclose(log["t_s"][rows], told, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(log["K_per_m"][rows], [record.estimate.K for record in answers])
@@ -134,7 +134,7 @@ def test_a_bus_with_delays_and_overruns_is_replayed_to_the_last_bit(delayed_run)
     result = canprobe.replay(folder)
     assert result.summary["driven_by"] == "task"
     assert_same(result.tracker.records, task.shape.records)
-    assert_same(result.estimates["recursive"], task.shape.records, cell.start_ns)
+    assert_same(result.estimates["recursive"], task.shape.records, cell.cycles.start_ns)
 
 
 def test_another_tools_log_of_that_bus_gives_the_shape(delayed_run, tmp_path):

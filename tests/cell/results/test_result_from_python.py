@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.results import page
+from canprobe.cell.results import result as page
 from canprobe.cell.results.contacts import contacts_of
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt

@@ -47,7 +47,7 @@ class FoundCell:
 
     def __init__(self, scene="cylinder", **overrides):
         self.session = session_of(scene, **overrides)
-        self.nodes = {node.node_id: node for node in self.session.world.nodes}
+        self.nodes = {node.node_id: node for node in self.session.buses.world.nodes}
         self.nodes[3].dictionary.put(0x1A01, 0, 0)
         self.found = {}
         self.session.around = self.around
@@ -112,7 +112,7 @@ def test_a_check_that_is_interrupted_leaves_the_nodes_as_they_were_found(share, 
 
 def test_an_array_that_sends_no_image_is_not_fit():
     session = session_of("listen")
-    session.world.make_faulty().inject("node 16: sync-lost", 0)
+    session.buses.world.make_faulty().inject("node 16: sync-lost", 0)
     verdict = measure_link(session, 1.0).verdict
     assert verdict.fitness is Fitness.UNFIT and verdict.cause == "loss" and "the array sends no images" in verdict.why
 
@@ -124,7 +124,7 @@ def test_a_verdict_needs_a_second(capsys):
 
 def test_a_drive_under_power_is_refused_and_nothing_is_written():
     session = session_of()
-    node = session.world.nodes[2]
+    node = session.buses.world.nodes[2]
 
     def around(port):
         node.dictionary.put(0x6041, 0, 0x0237)
@@ -147,7 +147,7 @@ FOREIGN = [(0x080, b"\1"), pack_nmt(NmtCommand.START, 3), (0x77F, b"\5")]
 def test_another_master_is_refused_whenever_it_comes(frame, step):
     def say(text):
         if text.startswith(step):
-            cell.session.lockstep.port().send_batch([frame])
+            cell.session.buses.lockstep.port().send_batch([frame])
 
     cell = FoundCell("free", say=say, **{"bus.timed": False})
     with pytest.raises(BusError, match="another master is"):
@@ -162,7 +162,7 @@ def test_a_node_that_is_not_there_is_status_3(capsys, monkeypatch):
 
 
 def silent(session):
-    session.world.make_faulty().inject("node 5: mute", 0)
+    session.buses.world.make_faulty().inject("node 5: mute", 0)
     return session
 
 

@@ -12,10 +12,10 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.session.emulator_child import END_TIMEOUT_S, EmulatorChild
+from canprobe.cell.session.child_process import END_TIMEOUT_S, EmulatorChild
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
-from canprobe.fieldbus.bus.port import Port, TimedFrame
+from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 from canprobe.fieldbus.protocol.frames import Frame
 
@@ -44,7 +44,7 @@ def await_boot_ups(folder: Path, boots_s: float, *, silent: int | None = None, s
 
 
 def await_on(
-    port: Port, folder: Path, status: int | None = None, hear: Callable[[list[TimedFrame]], None] = lambda _: None
+    port: Port, folder: Path, status: int | None = None, hear: Callable[[int, bytes, int], object] = nothing
 ) -> list[str]:
     scene = canprobe.load_scene("free")
     scene = replace(scene, bring_up=replace(scene.bring_up, emulated_s=60.0))
@@ -102,8 +102,8 @@ def test_what_others_send_meanwhile_is_heard_by_the_cell(tmp_path: Path) -> None
     bus.attach(Nodes(1_000_000_000, None, beside=[(0x080, b"")]))
     port = bus.port()
     cell = Cell(canprobe.plan(canprobe.load_scene("free")), port)
-    cell.listen()
-    await_on(port, tmp_path, hear=cell.hear)
+    cell.bring_up.listen()
+    await_on(port, tmp_path, hear=cell.watch.push)
     sent: list[int] = []
     bus.recorder = lambda can_id, _data, _t_ns: sent.append(can_id)
     with pytest.raises(BusError, match="SYNC from another master: another master is at work here"):

@@ -29,11 +29,14 @@ def loaded(name, cell=None, duration_s=0.2, **sections):
 
 
 def assert_same(direct, lockstep):
-    for ours, theirs in ((direct.cell.log.columns(), lockstep.cell.log.columns()), (direct.truth, lockstep.truth)):
+    for ours, theirs in (
+        (direct.cell.log.columns(), lockstep.cell.log.columns()),
+        (direct.buses.truth, lockstep.buses.truth),
+    ):
         assert ours.keys() == theirs.keys()
         assert [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()] == []
-    assert len(direct.truth["t_s"]) == len(direct.cell.log) > 30
-    assert direct.cell.faults == lockstep.cell.faults == []
+    assert len(direct.buses.truth["t_s"]) == len(direct.cell.log) > 30
+    assert direct.cell.notes.lines() == lockstep.cell.notes.lines() == []
 
 
 @pytest.mark.parametrize(
@@ -84,12 +87,12 @@ def test_a_drive_that_fails_stops_the_cell_with_the_words_of_a_bus():
 
         def fail(measurement, session=session):
             if measurement.cycle == 150:
-                session.world.nodes[2].application.inject_fault(0x7500)
+                session.buses.world.nodes[2].application.inject_fault(0x7500)
             return Command()
 
         with pytest.raises(NodeError) as stopped, session:
             session.run(fail)
-        words.append((str(stopped.value), session.cell.faults))
+        words.append((str(stopped.value), session.cell.notes.lines()))
     assert words[0] == words[1]
     assert "node 3: EMCY 7500h" in words[0][0]
 

@@ -10,8 +10,7 @@ import pytest
 
 import canprobe
 import canprobe.cli
-from canprobe.cell.session.link_faults import ExpectedLink, check_link, expected_of
-from canprobe.cell.session.links import check_links
+from canprobe.cell.session.links import ExpectedLink, check_link, check_links, expected_of
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ControllerState
@@ -266,7 +265,7 @@ def silent_bus(ip, monkeypatch):
     bus = LockstepBus(VirtualClock())
     monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
     monkeypatch.setattr("canprobe.fieldbus.bus.clock.MonotonicClock", lambda: bus.clock)
-    monkeypatch.setattr("canprobe.cell.session.session.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.cell.session.buses.MonotonicClock", lambda: bus.clock)
     return bus
 
 

@@ -34,7 +34,7 @@ class Nodes:
         )
         self.bring_up = SimpleNamespace(booted_again=lambda: set(booted), released=set())
         self.supervisor = SimpleNamespace(seen=seen)
-        self.drives, self.start_ns = None, 0
+        self.drives, self.cycles = None, SimpleNamespace(run_s=lambda _: 0.0)
         self.notes = SimpleNamespace(add=lambda *_, **__: None, add_error=lambda *_: None)
 
 
@@ -105,8 +105,7 @@ class Bench:
             self.cells[0],
             self,
             make_cell=lambda *_: next(left),
-            reopen=self.reopen,
-            alive=lambda: None,
+            buses=self,
             say=self.said.append,
             longest_s=60.0,
         )
@@ -114,7 +113,10 @@ class Bench:
     def now_ns(self):
         return self.now
 
-    def reopen(self):
+    def raise_ended(self):
+        pass
+
+    def reopen(self, port):
         self.opened += 1
         return self
 

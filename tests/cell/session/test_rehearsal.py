@@ -10,8 +10,7 @@ import pytest
 import canprobe
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.rehearsal import shortened
-from canprobe.cell.session.session import Session, rehearse, run_beginning
+from canprobe.cell.session.session import Session, rehearse, run_beginning, shortened
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
 from canprobe.fieldbus.eds.packaged import eds_path
@@ -60,7 +59,7 @@ def test_real_nodes_are_emulated_in_it():
     )
     with Session(replace(plan, setup=resolve(shortened(plan.scene)))) as session:
         session.run(make_task(session.plan))
-    assert session.opened and not session.cell.faults
+    assert session.opened and not session.cell.notes.lines()
 
 
 def test_joints_keep_within_their_drives_in_it_as_in_the_plan(tmp_path):
@@ -74,4 +73,4 @@ def test_joints_keep_within_their_drives_in_it_as_in_the_plan(tmp_path):
     assert "607Fh: drives that fault below the speeds of their joints" in plan.warnings[0]
     session = run_beginning(plan)
     assert session.plan.setup.arm.model.qd_max.tolist() == plan.setup.arm.model.qd_max.tolist()
-    assert not session.cell.faults
+    assert not session.cell.notes.lines()

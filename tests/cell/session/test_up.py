@@ -15,7 +15,8 @@ import canprobe.api
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.session import check_joints as joint_report
+from canprobe.cell.session import up as joint_report
+from canprobe.cell.session.buses import SessionBuses
 from canprobe.cell.session.joint_record import JointRecord, warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import reporting_notes
@@ -63,7 +64,7 @@ class Watcher:
         self.asked.append(question)
 
     def answer(self):
-        plant = self.session.world.plant
+        plant = self.session.buses.world.plant
         prismatic = plant.config.model.chain.prismatic
         q = np.where(prismatic, 1e3, 180 / np.pi) * plant.truth()["q"]
         joint = int(re.search(r"joint (\d)", self._question)[1]) - 1
@@ -88,15 +89,15 @@ def cell(monkeypatch):
     def make(*args, **more):
         Opened.session = Session(*args, **more)
         if Opened.world is not None:
-            vars(Opened.session)["world"] = Opened.world
-        participants = Opened.session.world.participants
+            vars(Opened.session.buses)["world"] = Opened.world
+        participants = Opened.session.buses.world.participants
         participants[:] = map(Opened.joins, participants)
         if Opened.operator is not None:
             Opened.operator.session = Opened.session
         return Opened.session
 
     monkeypatch.setattr(joint_report, "Session", make)
-    monkeypatch.setattr(Session, "_need_emulated", lambda *_: None)  # real drives, as far as the cell can see
+    monkeypatch.setattr(SessionBuses, "_need_emulated", lambda *_: None)  # real drives, as far as the cell can see
     return Opened
 
 
@@ -146,7 +147,7 @@ def scaled(joint, factor, *, gear_only=True):
 
 
 def assert_disabled(session):
-    words = [node.dictionary.number(0x6041) for node in session.world.nodes]
+    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes]
     assert not POWERED_STATES.intersection(map(state_of, words))
 
 
@@ -351,12 +352,12 @@ def test_an_exchanged_drive_is_noticed_once_the_nodes_are_up(cell, state, checke
     state.write_text(checked.replace('"serial": 5', '"serial": 55'))
     assert warning(real) is None, "no cell file says which it has"
     session = Session(canprobe.plan(real), RunOptions(say=said.append))
-    vars(session)["world"] = true_world(real)
+    vars(session.buses)["world"] = true_world(real)
     with session:
         pass
     (line,) = [line for line in said if line.startswith("warning: whether")]
     assert "joint 5 was checked with another drive (1018h:04); before the first contact type" in line
-    assert line.removeprefix("warning: ") in session.cell.faults
+    assert line.removeprefix("warning: ") in session.cell.notes.lines()
 
 
 def test_a_joint_that_is_found_wrong_is_forgotten(cell, state, checked):
@@ -411,7 +412,7 @@ def test_what_presses_on_the_array_stops_the_joint_and_is_named(cell):
 
         def receive(self, can_id, data, t_ns):
             if can_id == SYNC_ID:
-                forces.append(cell.session.world.plant.truth()["force"])
+                forces.append(cell.session.buses.world.plant.truth()["force"])
             return self._node.receive(can_id, data, t_ns)
 
     cell.operator, cell.joins = Watcher(0, {1}), on_node(1, lambda node: Noting(node, 1.0))
@@ -463,7 +464,7 @@ def test_each_kind_is_told_when_it_comes_and_counted_at_the_end():
 
     def disturb(measurement):
         if measurement.cycle in (60, 70):
-            session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())])
+            session.buses.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())])
         return Command(done=measurement.cycle > 80)
 
     with reporting_notes(session, lines.append) as report_news:
@@ -471,7 +472,8 @@ def test_each_kind_is_told_when_it_comes_and_counted_at_the_end():
         assert len(lines) == 1, "the second of the same kind is no news"
     what = "noted: node 4: EMCY 8210h, PDO not processed due to length error, "
     told = [re.findall(r"at ([\d.]+) s", line) for line in lines]
-    first, last = (session.cell.start_ns * 1e-9 + cycle * 0.0025 for cycle in (60, 70))  # on the clock of bus.log
+    start_s = session.cell.cycles.start_ns * 1e-9  # on the clock of bus.log
+    first, last = (start_s + cycle * 0.0025 for cycle in (60, 70))
     assert [float(t) for times in told for t in times] == pytest.approx([first, first, last], abs=0.01)
     (one,), (start, end) = told
     assert lines == [what + f"at {one} s", what + f"2 times, first at {start} s, last at {end} s"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from canprobe.cell.master.controller import Measurement, TactileSample
-from canprobe.cell.master.tactile_frame import TactileFrame
+from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks.from_plan import make_sensing

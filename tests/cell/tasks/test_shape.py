@@ -54,8 +54,8 @@ def test_an_answer_is_there_in_the_cycle_after_the_contact_that_it_stands_at():
     assert reported == [False, False, False, True, False, False, False, True]
     assert estimator.knew == [2, 4]
     first, second = tracker.records
-    assert (first.t_s, first.told_s, first.travelled_m) == pytest.approx((5e-3, 7.5e-3, 25e-3 * 5e-3))
-    assert (second.t_s, second.told_s) == pytest.approx((15e-3, 17.5e-3))
+    assert (first.t_s, first.reported_s, first.travelled_m) == pytest.approx((5e-3, 7.5e-3, 25e-3 * 5e-3))
+    assert (second.t_s, second.reported_s) == pytest.approx((15e-3, 17.5e-3))
 
 
 def test_contacts_faster_than_cycles_are_all_taken():

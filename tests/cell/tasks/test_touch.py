@@ -91,11 +91,11 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
     target = log["target_force_n"][np.isfinite(log["target_force_n"])]
     assert target[-1] == 3.0
     assert np.abs(np.diff(target)).max() == pytest.approx(FORCE_RATE * 2.5e-3)  # no step
-    first, last = task.scan_cycles
+    first, last = task.record().scan_cycles
     assert last - first == pytest.approx(480, abs=2)
     assert log["force_n"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.1)
-    assert press.truth["force_n"][last - 60 : last].mean() == pytest.approx(3.0, rel=1 / 12)
-    assert task.reason is None and press.cell.faults == []
+    assert press.buses.truth["force_n"][last - 60 : last].mean() == pytest.approx(3.0, rel=1 / 12)
+    assert task.reason is None and press.cell.notes.lines() == []
 
 
 def test_a_stop_lets_a_calibration_go_of_its_ball():
@@ -112,7 +112,7 @@ def test_a_stop_lets_a_calibration_go_of_its_ball():
 
     with session:
         session.run(step)
-    assert session.truth["force_n"][-1] == 0.0 and session.cell.faults == []
+    assert session.buses.truth["force_n"][-1] == 0.0 and session.cell.notes.lines() == []
     assert len(task.touches) == 1 and task.reason is None
 
 

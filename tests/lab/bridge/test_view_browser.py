@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 from zstandard import ZstdDecompressor
 
 import canprobe
-from canprobe.cell.results.page import write_page_of
+from canprobe.cell.results.result import write_page_of
 from canprobe.cell.scene.model import BridgeSettings
 from canprobe.cli import main
 from canprobe.errors import install_line

@@ -14,7 +14,7 @@ from msgspec import msgpack
 from zstandard import ZstdDecompressor
 
 import canprobe
-from canprobe.cell.results.page import write_page_of
+from canprobe.cell.results.result import write_page_of
 from canprobe.cell.scene.geometry import true_object
 from canprobe.errors import CanprobeError
 from canprobe.lab.bridge.codec import pack_observation, unpack_observation

@@ -10,7 +10,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.controller import Command, Controller, Measurement
-from canprobe.cell.tasks.held import HeldTask, LastPlace
+from canprobe.cell.tasks.paused import LastPlace, PausedController
 from canprobe.cell.tasks.requested import Request, RequestedTask
 from canprobe.cli.operator import LetterKey
 
@@ -30,7 +30,7 @@ class Mine(Controller):
 
 def test_nothing_is_commanded_before_motion_is_asked_for():
     asked, mine, resumed = [], Mine(), []
-    held = HeldTask(mine, None, lambda: bool(asked), lambda: resumed.append(1))
+    held = PausedController(mine, None, lambda: bool(asked), lambda: resumed.append(1))
     assert held.step(Measurement(0, 0)).q_target is None and not held.lets_go and mine.steps == 0
     asked.append(True)
     assert held.step(Measurement(1, 0)).q_target is not None
@@ -51,7 +51,7 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
         def retreat(self, reason):
             done.append(reason)
 
-    held = HeldTask(Working(), None, lambda: bool(asked))
+    held = PausedController(Working(), None, lambda: bool(asked))
     held.update()
     assert done == [] and not held.lets_go and held.restarts == 3
     held.step(Measurement(0, 0))
@@ -60,21 +60,21 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
     held.update()
     held.retreat("the force")
     assert done == ["update", "the force"] and held.lets_go
-    assert HeldTask(Working(), None, None).lets_go, "a controller that is new begins at once"
+    assert PausedController(Working(), None, None).lets_go, "a controller that is new begins at once"
 
 
 @pytest.mark.parametrize(("moved_deg", "words"), [(0.9, None), (1.1, "joint 2 reports")])
 def test_an_arm_that_stands_elsewhere_is_refused(moved_deg, words):
     joints = canprobe.plan("free").setup.arm.model.joints
     place = LastPlace(joints, np.zeros(6), np.full(6, np.radians(1.0)))
-    found = HeldTask(Mine(), place, lambda: False).inspect(np.radians([0, moved_deg, 0, 0, 0, 0]))
+    found = PausedController(Mine(), place, lambda: False).inspect(np.radians([0, moved_deg, 0, 0, 0, 0]))
     assert (found is None) if words is None else found.startswith(words)
 
 
 def test_a_bridge_asks_for_motion_and_what_came_before_is_dropped():
     queue, made = deque(), []
     task = RequestedTask(None, lambda: made.append(Mine()) or made[-1], [queue], 0.0025)
-    held = HeldTask(task, None, lambda: False)
+    held = PausedController(task, None, lambda: False)
     queue += [Request("resume"), Request("start")]
     held.step(Measurement(0, 0))
     assert held.held, "what was asked for while the cell was lost does not count"
@@ -125,7 +125,7 @@ def test_an_arm_is_compared_with_where_it_stood_and_not_with_its_zero(stands_deg
 def test_a_hold_lasts_for_as_long_as_nobody_asks():
     """The first cycle of a hold takes no word for motion; none of those after it begins motion without one."""
     mine, asked = Mine(), []
-    held = HeldTask(mine, None, lambda: bool(asked))
+    held = PausedController(mine, None, lambda: bool(asked))
     for cycle in range(50):
         assert held.step(Measurement(cycle, cycle * 2_500_000)) == Command() and held.held
     assert (mine.steps, mine.went_on) == (0, 0)
@@ -134,7 +134,7 @@ def test_a_hold_lasts_for_as_long_as_nobody_asks():
 
 
 def test_a_controller_that_does_not_let_go_leaves_that_to_the_cell_after_the_hold_too():
-    held = HeldTask(Mine(), None, lambda: True)
+    held = PausedController(Mine(), None, lambda: True)
     for cycle in range(2):
         held.step(Measurement(cycle, cycle * 2_500_000))
     assert not held.held and not held.lets_go

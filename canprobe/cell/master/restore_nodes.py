@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.master.bringup import read_entry, write_entry
+from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.scene.hardware import BringUpSettings

@@ -44,7 +44,7 @@ class LastPlace:
         )
 
 
-class HeldTask(WrappingController):
+class PausedController(WrappingController):
     """Holds the arm until motion is asked for, then steps another controller.
 
     Args:

@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from canprobe.cell.master.commission import Commissioned, wanted_by
+from canprobe.cell.master.commission import Commissioned, Wanted, wanted_by
 from canprobe.cell.master.commission import commission as commission_nodes
-from canprobe.cell.master.id_assignment import Wanted
 from canprobe.cell.master.monitor import CellView, Monitor
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.master.scan import scan_nodes
@@ -18,9 +17,8 @@ from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import open_ports
-from canprobe.cell.session.link_faults import ExpectedLink, expected_of
-from canprobe.cell.session.links import check_links, need_controllers
-from canprobe.cell.session.target import Target, need_real_bus
+from canprobe.cell.session.links import ExpectedLink, check_links, expected_of, need_controllers
+from canprobe.cell.session.target import Target, refuse_virtual
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
@@ -116,7 +114,7 @@ def monitor(scene: Scene, *, duration_s: float | None = None, say: Say = quiet) 
         UsageError: when the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
         InterfaceError: when there is no such interface, it was lost, or its controller's state explains its silence.
     """
-    need_real_bus(scene, "monitor")
+    refuse_virtual(scene.bus.interface, "monitor")
     plan, clock, interface = make_plan(resolve(scene)), MonotonicClock(), scene.bus.interface
     wanted = {name: replace(expected, frames_at_once=0) for name, expected in expected_of(plan).items()}
     check_links(interface, wanted, say, must=False)

@@ -1,0 +1,209 @@
+"""One node in bring-up: its dialogue from identity to storage, and what became of it.
+
+Source: CiA 301, objects 1003h, 100Ah, 1010h, 1018h, 1020h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from canprobe.cell.master.entries import RefusedError, read_entry, write_entry
+from canprobe.cell.master.watch import NodeWatch
+from canprobe.cell.planning.configuration import NodeSetup, Write
+from canprobe.cell.planning.operation import INTERPOLATION_TIME
+from canprobe.errors import NodeError
+from canprobe.fieldbus.bus.sdo import Dialogue, SdoTimeoutError, decode_text, upload
+from canprobe.fieldbus.protocol.emcy import describe, is_no_error
+
+ERROR_HISTORY = 0x1003
+SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
+SAVE_SIGNATURE = int.from_bytes(b"save", "little")
+IDENTITY, REVISION_SUBINDEX = 0x1018, 3
+IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
+
+
+class NodeBringUp:
+    """One node in bring-up.
+
+    Args:
+        setup: configuration of the node.
+        watch: what the nodes reported so far.
+
+    Attributes:
+        software: its version by 100Ah; None where the node does not report it.
+        kept: its configuration was there already, by 1020h.
+        repeated: requests that were sent again.
+        remarks: accepted differences of the device from its EDS or from the wished configuration.
+        refused: objects that the device did not take.
+        failure: error of this node; None without one.
+    """
+
+    def __init__(self, setup: NodeSetup, watch: NodeWatch) -> None:
+        self.setup = setup
+        self.software: str | None = None
+        self.kept = False
+        self.repeated = 0
+        self.remarks: list[str] = []
+        self.refused: set[int] = set()
+        self.failure: NodeError | None = None
+        self._watch = watch
+        self._history = ""
+
+    def __str__(self) -> str:
+        did = "configuration kept" if self.kept else "configured"
+        software = f", software {self.software}" if self.software else ""
+        again = f", {self.repeated} requests repeated" if self.repeated else ""
+        return f"node {self.setup.node_id}: ({self.setup.name}) {did}{software}{again}"
+
+    def last_words(self) -> str:
+        """The node's last EMCY, else the newest entry of its error history, to be put behind an error."""
+        return self._watch.last_words(self.setup.node_id) or self._history
+
+    def configure(self, *, store: bool) -> Dialogue:
+        """Identify the node, check it, write its configuration and, where it can, store it; see `failure`."""
+        setup = self.setup
+        store = store and VERIFY_CONFIGURATION in setup.dictionary and STORE_PARAMETERS in setup.dictionary
+        try:
+            yield from self._identify()
+            yield from self._check_given()
+            yield from self._check_units()
+            self.kept = store and (yield from self._is_kept())
+            yield from self._write_all()
+            if store and not self.kept:
+                for subindex, value in setup.configuration_date.items():
+                    yield from write_entry(setup, Write(VERIFY_CONFIGURATION, subindex, value, "configuration date"))
+                yield from write_entry(setup, Write(STORE_PARAMETERS, 1, SAVE_SIGNATURE, "store", read_back=False))
+        except NodeError as error:
+            slow = isinstance(error.__cause__, SdoTimeoutError)
+            hint = "; if it is only slow, it needs a larger bring_up.sdo_s" if slow else ""
+            self.failure = NodeError(setup.node_id, error.reason + hint)
+            if not slow:
+                yield from self.recall()
+
+    def _identify(self) -> Dialogue:
+        setup = self.setup
+        for subindex, expected in setup.identity.items():
+            got = yield from read_entry(setup, IDENTITY, subindex)
+            newer = got > expected and got >> 16 == expected >> 16  # CiA 301, 1018h:03: of the same major revision
+            if subindex == REVISION_SUBINDEX and newer:
+                self.remarks.append(
+                    f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
+                )
+            elif got != expected:
+                raise NodeError(
+                    setup.node_id,
+                    f"({setup.name}) is not the device of {setup.eds}: 1018h:{subindex:02X}"
+                    f" {IDENTITY_NAMES[subindex]} expected {expected:#x}, got {got:#x}",
+                )
+        if SOFTWARE_VERSION in setup.dictionary:
+            try:
+                version = yield from upload(SOFTWARE_VERSION, 0)
+            except (SdoAbortedError, SdoCommunicationError):
+                return
+            self.software = decode_text(version)
+
+    def _check_given(self) -> Dialogue:
+        setup = self.setup
+        for given in setup.given:
+            got = yield from read_entry(setup, given.index, given.subindex)
+            if got != given.value:
+                raise NodeError(
+                    setup.node_id,
+                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value},"
+                    f" {given.says}, got {got}: {given.otherwise}",
+                )
+
+    def _check_units(self) -> Dialogue:
+        """Compare the units of a motor turn that the device states; what it does not answer is not compared."""
+        turn = self.setup.turn
+        if turn is None:
+            return
+        quotients = []
+        for index in (turn.feed, turn.ratio):
+            if index is not None:
+                try:
+                    over = yield from read_entry(self.setup, index, 1)
+                    under = yield from read_entry(self.setup, index, 2)
+                except NodeError as error:
+                    if isinstance(error.__cause__, SdoAbortedError):
+                        return
+                    raise
+                if not over or not under:
+                    return
+                quotients.append(over / under)
+        if (mismatch := turn.mismatch(quotients[0], quotients[1] if len(quotients) > 1 else 1.0)) is not None:
+            self.remarks.append(mismatch)
+
+    def _is_kept(self) -> Generator[bytes | None, bytes, bool]:
+        """Whether the node reports that it was configured with these very values."""
+        for subindex, expected in self.setup.configuration_date.items():
+            if (yield from read_entry(self.setup, VERIFY_CONFIGURATION, subindex)) != expected:
+                return False
+        return True
+
+    def _write_all(self) -> Dialogue:
+        """Write the configuration; a wish that the device refuses is left out with a remark."""
+        setup = self.setup
+        times = [tuple(write for write in setup.writes if write.index == INTERPOLATION_TIME), *setup.otherwise]
+        for write in setup.writes:
+            if self.kept and write.read_back:
+                continue
+            if write.index != INTERPOLATION_TIME:
+                try:
+                    yield from write_entry(setup, write)
+                except RefusedError as refused:
+                    if write.absence is None:
+                        raise
+                    self.refused.add(write.index)
+                    reason = refused.reason.removeprefix(f"({setup.name}) ")
+                    self.remarks.append(f"{reason}: left as the device has it ({write.purpose}): {write.absence}")
+            elif write is times[0][0]:
+                yield from self._write_one_of(times)
+
+    def _write_one_of(self, options: Sequence[Sequence[Write]]) -> Dialogue:
+        """Write the first set that the device takes, of several sets that mean the same."""
+        first: RefusedError | None = None
+        for writes in options:
+            try:
+                for write in writes:
+                    yield from write_entry(self.setup, write)
+            except RefusedError as refused:
+                first = first or refused
+            else:
+                if first is not None:
+                    values = ", ".join(f"{write.place} = {write.value}" for write in writes)
+                    self.remarks.append(f"takes {values}, which means the same as what it refused")
+                return
+        assert first is not None
+        raise RefusedError(first.node_id, first.reason + (yield from _fitting_rate(self.setup, options))) from first
+
+    def recall(self) -> Dialogue:
+        """Read the newest entry in the error history of a node that has failed, unless its EMCY was received."""
+        setup = self.setup
+        if setup.node_id in self._watch.last_alarm or ERROR_HISTORY not in setup.dictionary:
+            return
+        try:
+            newest = yield from upload(ERROR_HISTORY, 1)
+        except (SdoAbortedError, SdoCommunicationError):
+            return  # it is empty
+        if not is_no_error(code := int.from_bytes(newest[:2], "little")):
+            self._history = f"; its error history (1003h) begins with {code:04X}h, {describe(code)}"
+
+
+def _fitting_rate(setup: NodeSetup, options: Sequence[Sequence[Write]]) -> Generator[bytes | None, bytes, str]:
+    """The rates that fit a drive which keeps its 60C2h, for the end of a message; empty where it does not answer."""
+    try:
+        held = yield from read_entry(setup, INTERPOLATION_TIME, 1)
+        has_unit = any(write.subindex == 2 for write in options[0])
+        index = (yield from read_entry(setup, INTERPOLATION_TIME, 2)) if has_unit else -3
+    except NodeError:
+        return ""
+    unit, unit_text = 10.0**index, f"10^{index} s"
+    if held not in {write.value for writes in options for write in writes if write.subindex == 1}:
+        return f"; it keeps {held} · {unit_text}: cycle.rate_hz = {1 / (held * unit):.6g} fits it" if held > 0 else ""
+    value, *others = options[0]  # the value was taken, its unit was not
+    wanted_s = value.value * 10.0 ** (others[0].value if others else -3)
+    counts = [count for count in (int(wanted_s / unit) + 1, int(wanted_s / unit)) if count]
+    return f"; it counts in {unit_text}: {' or '.join(f'cycle.rate_hz = {1 / (n * unit):.6g}' for n in counts)} fits it"
