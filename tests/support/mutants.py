@@ -39,9 +39,15 @@ import scipy.spatial  # noqa: F401
 from reach import Reach
 
 ROOT = Path(__file__).resolve().parents[2]
-MASTER_MODULES = ("lift_off", "supervisor", "conditions", "drives", "bringup", "homing", "watch", "cycle")
+MASTER_MODULES = (
+    *("lift_off", "supervisor", "supervision", "conditions", "drives", "bringup", "homing", "watch", "cycle"),
+    *("following", "position_track", "trail", "image_witness", "push_witness"),
+)
+PLANNING_MODULES = ("force", "first_touch", "witnesses")
 MODULES = {
     **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
+    **{name: f"canprobe/cell/planning/{name}.py" for name in PLANNING_MODULES},
+    "depth_witness": "canprobe/mechanics/touch/depth_witness.py",
     "recovery": "canprobe/cell/session/recovery.py",
     "held": "canprobe/cell/tasks/held.py",
 }
@@ -54,9 +60,12 @@ INTEGRATION = (
     "troubled_wire",
     "overruns",
     "two_buses",
+    "blind_array",
+    "way_back",
 )
 TESTS = (
-    *("tests/cell/master", "tests/cell/tasks/test_held.py"),
+    *("tests/cell/master", "tests/cell/planning", "tests/cell/tasks/test_held.py"),
+    "tests/mechanics/touch/test_depth_witness.py",
     *("tests/cell/session/test_up.py", "tests/cell/session/test_recovery.py"),
     *(f"tests/cell/integration/test_{name}.py" for name in INTEGRATION),
 )

@@ -12,6 +12,7 @@ from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.tactile_frame import TactileFrame, decode
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Array, RawWire, Setup
+from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.period import PeriodFit
 from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
@@ -204,6 +205,16 @@ class RawReceiver(ArrayReceiver):
             self._unloaded = np.full(array.pad.shape, float(self.wire.unloaded))
         self._taring: list[Floats] = []
         self._complete: list[tuple[TactileFrame, int, float]] = []
+
+    def tare(self) -> None:
+        """Take the mean of the next images for the unloaded value of each taxel.
+
+        Raises:
+            UsageError: the array file states that value.
+        """
+        if not self.wire.tare_images:
+            raise UsageError("tare: the array file states wire.unloaded_counts; give it wire.tare_images instead")
+        self._unloaded, self._taring = None, []
 
     @property
     def images(self) -> int:

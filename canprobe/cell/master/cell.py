@@ -56,6 +56,8 @@ Result = TypeVar("Result")
 WARM_UP_S = 0.1
 """Time of cycles before the drives are enabled, s, until both sides run at their usual speed."""
 REST_TIMEOUT_S = 2.0
+TARE_S = 0.3
+"""Time in which an array takes the images of a tare, s."""
 SILENT_TAXELS = (
     ": interpolated; have the array repaired, or state the taxels as `dead` in [taxels] of its calibration file"
 )
@@ -312,8 +314,29 @@ class Cell:
                     return True
         return False
 
-    def idle(self, seconds: float) -> None:
+    def tare(self) -> None:
+        """Take what the array shows for zero.
+
+        Raises:
+            UsageError: it cannot be tared.
+            SdoError, BusError: it does not answer, or another master has come.
+        """
+        if isinstance(self.tactile, RawReceiver):
+            self.tactile.tare()
+        elif (array := self._plan.setup.array) is None:
+            raise UsageError("tare: expected a cell with an array; got one without")
+        else:
+            with self.bring_up.tares(array.node_id) as writes:
+                while writes.waiting:
+                    self.idle(self._one_cycle_s)
+                    writes.serve()
+        self.idle(TARE_S)
+
+    def idle(self, seconds: float) -> Measurement:
         """Cycle with disabled drives and without a controller; nothing is supervised, and no row is kept.
+
+        Returns:
+            The measurement of the last cycle.
 
         Raises:
             BusError: another master has come.
@@ -328,6 +351,7 @@ class Cell:
             self.cycle.count_work()
             if self.watch.another_master is not None:
                 raise BusError(self.watch.another_master)
+        return self._recorded
 
     def _begin_cycle(self) -> Measurement:
         """Begin a cycle. One that an error has left before its commands and its row gets both first."""
@@ -393,7 +417,11 @@ class Cell:
             KeyboardInterrupt: when an interrupt came.
             UsageError: when the controller returns something else.
         """
-        interrupts.take()
+        try:
+            interrupts.take()
+        except KeyboardInterrupt:
+            if not self._controller.brake():
+                raise
         command = step(measurement)
         if not isinstance(command, Command):
             raise UsageError(f"controller: expected its step to return a Command, got {command!r}")

@@ -103,7 +103,7 @@ class Homing:
     ) -> None:
         assert plan.setup.arm is not None
         self._arm, self._times = plan.setup.arm, plan.setup.bring_up
-        self._command_line = plan.setup.up_line("--home")
+        self._command_line = plan.setup.line_to_type("home")
         self._model, self._drives = self._arm.model, self._arm.drives
         by_id = {setup.node_id: setup for setup in setups}
         self._setups = [by_id[drive.node_id] for drive in self._drives]

@@ -29,6 +29,7 @@ _OF_REVOLUTE = {
     "q_min": ("min_deg", math.radians(1)),
     "q_max": ("max_deg", math.radians(1)),
     "qd_max": ("speed_deg_s", math.radians(1)),
+    "qdd_max": ("acceleration_deg_s2", math.radians(1)),
     "rated_torque": ("rated_torque_nm", 1.0),
     "rotor_inertia": ("rotor_inertia_kg_m2", 1.0),
     "coulomb": ("coulomb_nm", 1.0),
@@ -38,6 +39,7 @@ _OF_PRISMATIC = {
     "q_min": ("min_mm", MM),
     "q_max": ("max_mm", MM),
     "qd_max": ("speed_mm_s", MM),
+    "qdd_max": ("acceleration_mm_s2", MM),
     "rated_torque": ("rated_force_n", 1.0),
     "rotor_inertia": ("rotor_mass_kg", 1.0),
     "coulomb": ("coulomb_n", 1.0),
@@ -200,6 +202,12 @@ def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swin
             for s in sections.values()
         ]
     )
+
+
+def in_si(sections: Mapping[str, JointSettings], posture: Sequence[float]) -> Floats:
+    """(n,) rad or m of a posture in degrees or millimetres."""
+    scale = [MM if section.kind == "prismatic" else math.radians(1.0) for section in sections.values()]
+    return np.array(posture) * scale
 
 
 def homing_of(section: JointSettings, number: int) -> HomingParameters | None:

@@ -62,14 +62,14 @@ def dump_scene(scene: Scene | CellFile) -> str:
     Args:
         scene: a scene as `load_scene` gave it, or a cell as `read_cell` gave it.
     """
-    tables = []
+    tables: list[tuple[str, Mapping[str, Any]]] = []
     for name, part in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
-        if isinstance(part, Mapping):
+        if isinstance(part, Mapping) and all(map(dataclasses.is_dataclass, part.values())):
             tables += [(f"{name}.{toml_key(key)}", _values(section)) for key, section in part.items()]
         elif part is not None:
-            tables.append((name, _values(part)))
+            tables.append((name, part if isinstance(part, Mapping) else _values(part)))
     return "\n".join(
-        f"[{name}]\n" + "".join(f"{key} = {toml_value(value)}\n" for key, value in table.items())
+        f"[{name}]\n" + "".join(f"{toml_key(key)} = {toml_value(value)}\n" for key, value in table.items())
         for name, table in tables
     )
 
@@ -84,8 +84,10 @@ def _document(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _values(section: Any) -> dict[str, Any]:
-    """The keys of a section that have a value and belong to the others."""
+def _values(section: Any) -> Any:
+    """The keys of a section that have a value and belong to the others; what is no section as TOML has it."""
+    if not dataclasses.is_dataclass(section):
+        return _as_toml(section)
     annotations, values = _annotations(type(section)), {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
@@ -150,6 +152,8 @@ def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     files: dict[str, bytes] = {}
 
     def beside(section: Any) -> Any:
+        if not dataclasses.is_dataclass(section) or isinstance(section, type):
+            return section
         annotations = _annotations(type(section))
         names = {}
         for key in FILE_KEYS & set(annotations):
@@ -667,11 +671,17 @@ class Reader:
         }
 
     def _named(self, hint: Any, tables: Any, name: str) -> dict[str, Any]:
-        if not isinstance(tables, dict):
-            self.complain(name, f"expected sections [{name}.NAME], got {toml_value(tables)}")
-            return {}
         cls = typing.get_args(hint)[1]
-        read = {key: self.section(cls, table, f"{name}.{toml_key(key)}") for key, table in tables.items()}
+        has_sections = dataclasses.is_dataclass(cls)
+        if not isinstance(tables, dict):
+            wanted = f"sections [{name}.NAME]" if has_sections else f"a section [{name}]"
+            self.complain(name, f"expected {wanted}, got {toml_value(tables)}")
+            return {}
+        paths = {key: f"{name}.{toml_key(key)}" for key in tables}
+        read = {
+            key: self.section(cls, table, paths[key]) if has_sections else self._value(table, cls, paths[key])
+            for key, table in tables.items()
+        }
         if None in read.values():
             self.bad.add(name)
         return read
