@@ -196,6 +196,7 @@ def open_cell(
     bridge: Sequence[str] = (),
     rows_kept: int | None = None,
     recover: bool = False,
+    to_home: bool = False,
 ) -> OpenCell:
     """A cell for your own controllers; leaving its block always disables the drives and closes the bus.
 
@@ -217,6 +218,7 @@ def open_cell(
         recover: come back after a node was switched off or reset, or the interface was down. `run` raises the error of
             the loss, and the next `run` waits for the nodes and brings them up again. A controller that says
             `can_go_on` is held instead where the arm stands, and goes on after `OpenCell.resume`.
+        to_home: joints may be without a known zero, for `OpenCell.home`.
 
     Returns:
         The cell; ``with`` brings it up.
@@ -235,5 +237,5 @@ def open_cell(
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
-    options = RunOptions(folder, say, observers, rows_kept, recover=recover)
+    options = RunOptions(folder, say, observers, rows_kept, recover=recover, to_home=to_home)
     return OpenCell(make_plan(resolve(resolved)), options)

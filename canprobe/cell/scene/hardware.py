@@ -182,7 +182,7 @@ class JointSettings:
     speed_deg_s: Annotated[float | None, Range(0, 36_000, open_low=True), REVOLUTE_ONLY] = None
     """Highest speed."""
     acceleration_deg_s2: Annotated[float | None, Range(0, 1e6, open_low=True), REVOLUTE_ONLY] = None
-    """Highest acceleration of a motion by hand (`canprobe move`), reached in 0.1 s. Left out: the speed in 0.5 s."""
+    """Highest acceleration of a motion by hand (`canprobe move`), reached in 50 ms. Left out: the speed in 0.5 s."""
     start_deg: Annotated[float, Range(-3600, 3600), REVOLUTE_ONLY] = 0.0
     """Start posture. It selects the branch of the inverse kinematics. An emulated arm starts here in `free`, and
     above the start point in other tasks."""
@@ -195,7 +195,7 @@ class JointSettings:
     speed_mm_s: Annotated[float | None, Range(0, 100_000, open_low=True), PRISMATIC_ONLY] = None
     """Highest speed."""
     acceleration_mm_s2: Annotated[float | None, Range(0, 1e6, open_low=True), PRISMATIC_ONLY] = None
-    """Highest acceleration of a motion by hand (`canprobe move`), reached in 0.1 s. Left out: the speed in 0.5 s."""
+    """Highest acceleration of a motion by hand (`canprobe move`), reached in 50 ms. Left out: the speed in 0.5 s."""
     start_mm: Annotated[float, Range(-100_000, 100_000), PRISMATIC_ONLY] = 0.0
     """Start posture."""
     swing_mm: Annotated[float, Range(0, 10_000), PRISMATIC_ONLY] = 10.0

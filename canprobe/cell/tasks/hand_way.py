@@ -22,7 +22,7 @@ from canprobe.mechanics.robot.motion_profile import MotionProfile
 from canprobe.mechanics.touch.linear_algebra import checked
 from canprobe.mechanics.types import Floats
 
-JERK_S = 0.1
+JERK_S = 0.05
 """Time in which a joint reaches its acceleration limit, s."""
 USUAL_SPEED = 0.1
 """Share of the speed limits that a motion by hand has where nothing else is asked for."""

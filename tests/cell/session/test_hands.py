@@ -12,6 +12,7 @@ from canprobe.cell.scene.load import packaged_cells
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks.hand_way import joint_way
 from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 READY = [80.0, 70.0, 10.0, 5.0, 90.0, 20.0]
 
@@ -66,18 +67,20 @@ def test_no_joint_is_faster_than_its_limits_on_any_way(name):
         assert (qd <= share * model.qd_max * (1 + 1e-6)).all()
         qdd = np.abs(np.diff(np.diff(q, axis=0), axis=0)) / (t[1] - t[0]) ** 2
         assert (qdd <= model.qdd_max * 1.02).all()
-        assert (qd / (share * model.qd_max)).max() > 0.99 or (qdd / model.qdd_max).max() > 0.95, "no slower than needed"
+        used = max((qd / (share * model.qd_max)).max(), (qdd / model.qdd_max).max())
+        short = motion.duration_s < 0.5  # where neither is reached, the jerk bounds it
+        assert short or used > 0.95, "no slower than needed"
         np.testing.assert_allclose(q[-1], goal, atol=1e-9)
 
 
 def test_a_way_through_a_limit_or_a_keep_out_is_refused_with_joint_place_and_time():
-    with cell(keep_out__floor_mm=100.0) as opened:
+    with cell(keep_out__floor_mm=250.0) as opened:
         for goal, said in (
             (
                 [0, 0, 0, 0, 0, 300],
                 r"joint 6 would come to 29\d\.\d deg; it may go from -214.0 to 294.0 deg, .* s after",
             ),
-            ([80, -60, 10, 5, 90, 20], r"the (arm|probe) comes to -?\d+ mm, the floor is at 100 mm, .* % of the way"),
+            ([90, -60, 15, 0, 100, 0], r"the (arm|probe) comes to -?\d+ mm, the floor is at 250 mm, .* % of the way"),
         ):
             with pytest.raises(UsageError, match=said):
                 opened.move(np.radians(goal))
@@ -134,29 +137,33 @@ def test_a_jog_goes_back_from_what_it_touches_at_half_of_the_limit(way, fidelity
 def test_a_motion_that_is_no_longer_wanted_ends_in_a_tenth_of_a_second():
     with cell() as opened:
         cycles = iter(range(10_000))
-        ended = opened.move("ready", 0.3, wanted=lambda: next(cycles) < 100)
+        ended = opened.move("ready", wanted=lambda: next(cycles) < 100)
         log = log_of(opened)
     moves = np.abs(np.diff(log["q_target_rad"], axis=0)).max(axis=1) > 0
-    assert ended == "no longer asked for" and moves[90]
-    assert np.flatnonzero(moves)[-1] / 400.0 < 100 / 400.0 + 0.15
+    assert ended == "no longer asked for"
+    first = np.flatnonzero(moves)[0]
+    assert (np.flatnonzero(moves)[-1] - first - 100) / 400.0 < 0.15
 
 
 def test_ctrl_c_brakes_and_then_ends():
     with cell() as opened, pytest.raises(KeyboardInterrupt):
         opened.move("ready", 0.3, progress=lambda m: m.cycle == 160 and signal.raise_signal(signal.SIGINT))
     q = log_of(opened)["q_target_rad"]
+    q = q[np.isfinite(q).all(axis=1)]
     speed = np.abs(np.diff(q, axis=0)).max(axis=1) * 400
     last = np.flatnonzero(speed > 0)[-1]
-    assert last + 5 < len(q), "it came to rest before the end"
+    assert speed[last] < 0.01 * speed.max(), "it came to rest before the end"
     assert np.abs(np.diff(speed[: last + 2])).max() * 400 < 1.05 * opened.plan.setup.arm.model.qdd_max.max()
 
 
 def test_an_arm_that_stands_beyond_a_limit_is_jogged_back_and_no_further_out():
-    with cell(joints__joint_3__start_deg=59.5) as opened:  # 1 degree is kept from the stop at 60
-        with pytest.raises(UsageError, match="joint 3 would come to 60"):
-            opened.jog(3, velocity=np.radians(2.0), for_s=0.5)
+    with cell(joints__joint_3__start_deg=50.0) as opened:
+        opened.plan.setup.arm.model.q_max.setflags(write=True)
+        opened.plan.setup.arm.model.q_max[2] = np.radians(49.0)  # a stop that was set while the arm stood beyond it
+        assert opened.jog(3, velocity=np.radians(2.0), for_s=0.5) is None
+        assert np.degrees(opened.read().q[2]) == pytest.approx(50.0, abs=0.02), "not further out"
         assert opened.jog(3, velocity=np.radians(-4.0), for_s=1.0) is None
-        assert np.degrees(opened.read().q[2]) == pytest.approx(55.5, abs=0.02)
+        assert np.degrees(opened.read().q[2]) == pytest.approx(46.0, abs=0.02)
 
 
 @pytest.mark.parametrize("kind", ["brake-stuck", "freeze", "encoder-frozen", "mute", "sto", "drive-fault", "emcy"])
@@ -174,8 +181,8 @@ def test_a_fault_of_a_drive_ends_a_motion(kind):
             opened.move("ready", 0.3, progress=throw)
         with pytest.raises(UsageError, match="call resume"):
             opened.move("start")
-    enabled = [drive.node_id for drive in opened.session.world.drives if drive.node_id != 2 and drive.powered]
-    assert enabled == []
+    words = {node.node_id: node.node.dictionary.number(0x6041) for node in faulty.nodes if node.node_id not in (2, 16)}
+    assert not [number for number, word in words.items() if state_of(word) in POWERED_STATES]
 
 
 def test_a_tare_takes_what_the_array_shows_for_zero():
