@@ -22,10 +22,11 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.bus_tools import commission, monitor, scan
 from canprobe.cell.session.check import check
 from canprobe.cell.session.emulation import emulate, emulate_eds
+from canprobe.cell.session.home import home
 from canprobe.cell.session.session import with_bridges
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.terminal import Progress
-from canprobe.cell.session.up import check_joints, home, up
+from canprobe.cell.session.up import check_joints, up
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import UsageError
 
@@ -194,6 +195,7 @@ def open_cell(
     bridge: Sequence[str] = (),
     rows_kept: int | None = None,
     recover: bool = False,
+    to_home: bool = False,
 ) -> OpenCell:
     """A cell for your own controllers; leaving its block always disables the drives and closes the bus.
 
@@ -215,6 +217,7 @@ def open_cell(
         recover: come back after a node was switched off or reset, or the interface was down. `run` raises the error of
             the loss, and the next `run` waits for the nodes and brings them up again. A controller that says
             `can_go_on` is held instead where the arm stands, and goes on after `OpenCell.resume`.
+        to_home: joints may be without a known zero, for `OpenCell.home`.
 
     Returns:
         The cell; ``with`` brings it up.
@@ -233,5 +236,5 @@ def open_cell(
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
-    options = RunOptions(folder, say, observers, rows_kept, recover=recover)
+    options = RunOptions(folder, say, observers, rows_kept, recover=recover, to_home=to_home)
     return OpenCell(make_plan(resolve(resolved)), options)

@@ -374,10 +374,8 @@ def pictures() -> Entry:
 
 RESULTS = DOCS.parent / "canprobe" / "cell" / "results"
 DRAWN_BY: Mapping[str, Sequence[Path]] = {
-    "cylinder.png": [RESULTS / f"{name}.py" for name in ("figures", "picture", "surface_panels")],
-    "surface.png": [
-        RESULTS / f"{name}.py" for name in ("surface_figure", "picture", "surface_panels", "surface_sheet")
-    ],
+    "cylinder.png": [RESULTS / f"{name}.py" for name in ("figures", "picture", "surface_figure")],
+    "surface.png": [RESULTS / f"{name}.py" for name in ("surface_figure", "picture")],
     "scan.webp": [DOCS / "moving_picture.py"],
 }
 """Code that draws a picture: where it changes, the picture is drawn anew."""

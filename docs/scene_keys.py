@@ -40,12 +40,20 @@ This page is generated from the definition of a scene: `python docs/generate.py`
 
 ## Sections and tasks
 
-`[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[limits]`, `[bring_up]` and `[bridge]` may stand
-in every scene. `[cell]`, `[arm]`, `[joints.NAME]`, `[sensor]`, `[probe]` and `[emulate]` usually come from the cell
-file, and `[wire]` from the array file. The other sections depend on `task.kind`. *required*: the scene must have the
-section. *default*: a scene without the section has all its defaults. *optional*: a scene without the section does
-without it. *–*: the section is an error.
+`[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[limits]`, `[bring_up]`, `[keep_out]` and
+`[bridge]` may stand in every scene. `[cell]`, `[arm]`, `[joints.NAME]`, `[postures]`, `[keep_out]`, `[sensor]`,
+`[probe]` and `[emulate]` usually come from the cell file, and `[wire]` from the array file. The other sections depend
+on `task.kind`. *required*: the scene must have the section. *default*: a scene without the section has all its
+defaults. *optional*: a scene without the section does without it. *–*: the section is an error.
 """
+
+
+POSTURES = (
+    "Postures of the arm by name: a list of the positions of its joints, in degrees, or millimetres where they slide."
+    " `canprobe move` goes there, `canprobe posture save` writes one; `start` is what the joints have as `start_deg` or"
+    " `start_mm`."
+)
+"""Meaning of `[postures]`, whose keys are names."""
 
 
 def scene_keys() -> str:
@@ -83,6 +91,9 @@ def _needs() -> Iterator[str]:
 
 
 def _section(name: str, cls: type[Any]) -> Iterator[str]:
+    if not dataclasses.is_dataclass(cls):
+        yield f"## `[{name}]`\n\n{POSTURES}\n"
+        return
     head, _, rest = (inspect.getdoc(cls) or "").partition("\n\n")
     about = head.partition(": ")[2].replace("\n", " ")
     yield f"## `[{'joints.NAME' if name == 'joints' else name}]`\n"

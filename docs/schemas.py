@@ -13,7 +13,7 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-from scene_keys import meanings, section_class
+from scene_keys import POSTURES, meanings, section_class
 
 from canprobe.cell.scene.checks import MAX_NUMBER, Check, Only, conditions_of
 from canprobe.cell.scene.model import ArrayFile, CellFile, Scene
@@ -47,9 +47,14 @@ def schema_of(file: str) -> JsonSchema:
     properties: JsonSchema = {WRITTEN_BY_KEY: {"type": "string", "description": WRITER}}
     for name, hint in sections.items():
         cls = section_class(hint)
-        section = section_schema(cls, whole=name in WHOLE_SECTIONS[file])
+        section = (
+            section_schema(cls, whole=name in WHOLE_SECTIONS[file])
+            if dataclasses.is_dataclass(cls)
+            else value_schema(cls)
+        )
         if typing.get_origin(hint) is Mapping:
             section = {"type": "object", "additionalProperties": section}
+            section |= {} if dataclasses.is_dataclass(cls) else {"description": POSTURES}
         properties[name] = section
     if file == "scene":
         properties["cell"] = {

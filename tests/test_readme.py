@@ -112,10 +112,13 @@ def test_cheap_command_runs(line, folder, monkeypatch, capsys):
 def test_keys_exist_and_take_the_values(block):
     sections = tomllib.loads(block)
     joints = [("joints", joint) for joint in sections.pop("joints", {}).values()]
+    postures = sections.pop("postures", {})  # whose keys are names
     for section, keys in [*sections.items(), *joints]:
         annotations = typing.get_type_hints(SECTIONS[section], include_extras=True)
         for key, value in keys.items():
             convert(value, annotations[key])
+    for posture in postures.values():
+        convert(posture, SECTIONS["postures"])
 
 
 @pytest.mark.parametrize("block", blocks("sh"))

@@ -138,7 +138,7 @@ def test_a_scene_or_cell_with_keys_of_a_newer_version_names_it(tmp_path):
 def renamed(monkeypatch):
     """Two keys that have got other names."""
     names = {("task", "time_s"): "duration_s", ("joints", "least_deg"): "min_deg"}
-    monkeypatch.setattr("canprobe.cell.scene.load.RENAMED_KEYS", names)
+    monkeypatch.setattr("canprobe.cell.scene.toml_files.RENAMED_KEYS", names)
 
 
 def test_a_renamed_key_is_read_with_a_warning(tmp_path, renamed):

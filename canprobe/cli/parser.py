@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import textwrap
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -35,9 +36,13 @@ class Parser(argparse.ArgumentParser):
 
     Attributes:
         takes_command: whether what stands behind `--` is a command, which is kept as the list `command`.
+        takes_ways: whether an argument such as `-5deg` is a number, and no option.
+        late: an optional positional argument that may stand behind options.
     """
 
     takes_command = False
+    takes_ways = False
+    late: str | None = None
 
     def __init__(self, **settings: object) -> None:
         settings.setdefault("formatter_class", _Formatter)
@@ -54,9 +59,13 @@ class Parser(argparse.ArgumentParser):
         if self.takes_command and "--" in (args or ()):
             split = args.index("--")
             args, command = args[:split], args[split + 1 :]
+        if self.takes_ways:  # argparse takes what begins with a space for no option
+            args = [f" {one}" if re.match(r"-[\d.]", one) else one for one in args]
         found, rest = super().parse_known_args(args, namespace)
         if self.takes_command:
             found.command = command
+        if self.late is not None and rest and getattr(found, self.late) is None and rest[0][0] != "-":
+            setattr(found, self.late, rest.pop(0))
         if rest:
             self.refuse_unknown(rest)
         return found, rest

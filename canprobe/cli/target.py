@@ -68,8 +68,11 @@ def with_scene(text: str, args: argparse.Namespace) -> str:
     if getattr(args, "scene", None) is None:
         return text
     cell = f" --cell {shlex.quote(args.cell)}" if getattr(args, "cell", None) else ""
-    steps = r"(?<=type: canprobe up ).+?(?= --(?:home|check-joints))"
-    return re.sub(steps, lambda _: shlex.quote(str(args.scene)) + cell, text)
+    return re.sub(
+        r"(type: canprobe (?:up|home) ).+?(?= --(?:check-joints|bus))",
+        lambda found: found[1] + shlex.quote(str(args.scene)) + cell,
+        text,
+    )
 
 
 def target_of(args: argparse.Namespace, scene: Scene) -> Target:

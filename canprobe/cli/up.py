@@ -19,7 +19,6 @@ EXAMPLE = """\
 examples:
   canprobe up free --bus socketcan --channel can0
   canprobe up free --bus socketcan --channel can0 --check-joints
-  canprobe up cell.toml --bus socketcan --channel can0 --home
   canprobe up free --bus socketcan --channel can0 --recover
 """
 
@@ -34,44 +33,35 @@ def add_arguments(parser: Parser) -> None:
         " compare the encoders and what you see, record it, and end; asks before each motion",
     )
     parser.add_argument(
-        "--home",
-        action="store_true",
-        help='home the joints with zero = "homing" one after the other, and end; asks before each',
-    )
-    parser.add_argument(
         "--recover",
         action="store_true",
         help="come back after a node was switched off or reset, or the interface was down: stop, wait, bring up again"
         " and hold; `r` and Enter let requested motion go on",
     )
     parser.add_argument(
-        "--yes", action="store_true", help="with --check-joints or --home: do not ask; by 10 deg nothing moves then"
+        "--yes", action="store_true", help="with --check-joints: do not ask; by 10 deg nothing moves then"
     )
     add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Hold the cell until Ctrl-C, which is the normal way to leave."""
-    if args.home and args.check_joints:
-        raise UsageError("up: --home and --check-joints are two steps; home the joints first")
-    option = "--home" if args.home else "--check-joints" if args.check_joints else None
-    if args.yes and option is None:
-        raise UsageError("up: --yes goes with --check-joints or --home")
-    if args.bridge and option is not None:
-        raise UsageError(f"up: {option} feeds no --bridge")
-    if args.recover and option is not None:
-        raise UsageError(f"up: {option} moves one joint after the other with somebody beside it; leave out --recover")
+    if args.yes and not args.check_joints:
+        raise UsageError("up: --yes goes with --check-joints")
+    if args.bridge and args.check_joints:
+        raise UsageError("up: --check-joints feeds no --bridge")
+    if args.recover and args.check_joints:
+        raise UsageError("up: --check-joints moves joints with somebody beside it; leave out --recover")
     scene = scene_of(args)
-    if option is not None and not args.yes and not sys.stdin.isatty():
-        raise UsageError(f"up {option} asks before each motion and needs a terminal; --yes leaves that out")
+    if args.check_joints and not args.yes and not sys.stdin.isatty():
+        raise UsageError("up --check-joints asks before each motion and needs a terminal; --yes leaves that out")
 
     from canprobe import api
 
-    if option is not None:
+    if args.check_joints:
         from canprobe.cli.operator import TerminalOperator
 
-        step = api.home if args.home else api.check_joints
-        step(scene, operator=None if args.yes else TerminalOperator(), say=args.report.say)
+        api.check_joints(scene, operator=None if args.yes else TerminalOperator(), say=args.report.say)
         return 0
     with left_by_ctrl_c():
         if args.recover:

@@ -178,7 +178,7 @@ BUSY = {
     "run": ("run", "free"),
     "up": ("up", "free"),
     "check_joints": ("up", "free", "--check-joints", "--yes"),
-    "home": ("up", "free", "--home", "--yes"),
+    "home": ("home", "free", "--yes"),
     "emulate": ("emulate", "free", "--channel", "vcan0"),
     "emulate_eds": ("emulate", "--eds", "puma260_joint.eds", "--node-id", "5", "--channel", "vcan0"),
     "monitor": ("monitor", "free", "--channel", "vcan0"),
@@ -452,12 +452,12 @@ def test_a_reader_that_goes_away_is_quiet():
 
 def test_a_line_to_type_names_the_scene_that_was_given(monkeypatch, capsys):
     def refuse(args):
-        raise NodeError(1, "is not homed; type: canprobe up 'a cell' --home --bus socketcan")
+        raise NodeError(1, "is not homed; type: canprobe home 'a cell' --bus socketcan")
 
     monkeypatch.setattr("canprobe.cli.plan.run", refuse)
     assert main(["plan", "my cell.toml", "--cell", "puma560"]) == 3
     assert capsys.readouterr().err == (
-        "canprobe: node 1: is not homed; type: canprobe up 'my cell.toml' --cell puma560 --home --bus socketcan\n"
+        "canprobe: node 1: is not homed; type: canprobe home 'my cell.toml' --cell puma560 --bus socketcan\n"
     )
 
 

@@ -40,11 +40,15 @@ from reach import Reach
 
 ROOT = Path(__file__).resolve().parents[2]
 MASTER_MODULES = (
-    *("lift_off", "supervisor", "conditions", "drives", "bringup", "node_bringup", "entries", "homing", "led_drive"),
-    *("watch", "cycle", "supervised_cycle", "arm_power", "cell"),
+    *("lift_off", "supervisor", "supervision", "conditions", "drives", "bringup", "node_bringup", "entries", "homing"),
+    *("led_drive", "watch", "cycle", "supervised_cycle", "arm_power", "cell"),
+    *("following", "position_track", "trail", "image_witness", "push_witness"),
 )
+PLANNING_MODULES = ("force", "first_touch", "witnesses")
 MODULES = {
     **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
+    **{name: f"canprobe/cell/planning/{name}.py" for name in PLANNING_MODULES},
+    "depth_witness": "canprobe/mechanics/touch/depth_witness.py",
     "recovery": "canprobe/cell/session/recovery.py",
     "held": "canprobe/cell/tasks/paused.py",
 }
@@ -57,9 +61,12 @@ INTEGRATION = (
     "troubled_wire",
     "overruns",
     "two_buses",
+    "blind_array",
+    "way_back",
 )
 TESTS = (
-    *("tests/cell/master", "tests/cell/tasks/test_paused.py"),
+    *("tests/cell/master", "tests/cell/planning", "tests/cell/tasks/test_paused.py"),
+    "tests/mechanics/touch/test_depth_witness.py",
     *("tests/cell/session/test_up.py", "tests/cell/session/test_recovery.py"),
     *(f"tests/cell/integration/test_{name}.py" for name in INTEGRATION),
 )

@@ -26,7 +26,7 @@ home_deg = 0
 
 
 @pytest.mark.slow(reason="homing of a cell and two runs on a real bus")
-def test_a_run_after_up_home(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_after_homing(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(bench.folder / "state"))
     scene = bench.scene("free", emulated=False)
     scene.write_text(scene.read_text() + HOMED)
@@ -34,9 +34,9 @@ def test_a_run_after_up_home(bench: Any, monkeypatch: pytest.MonkeyPatch) -> Non
     line = bench.start("run", scene, *ON_VCAN0, "--out", "early").end(3)[-1]
     assert line == (
         "canprobe: node 1: (joint 1) is not homed, or was switched off or moved since; nor are 6 (joint 6); type:"
-        f" canprobe up {scene} --home --bus socketcan --channel vcan0"
+        f" canprobe home {scene} --bus socketcan --channel vcan0"
     )
-    told = bench.start("up", scene, *ON_VCAN0, "--home", "--yes").end(0)
+    told = bench.start("home", scene, *ON_VCAN0, "--yes").end(0)
     assert "joint 6 (joint_6) is homed: home is at 0.00 deg; it stands there" in told
     record = bench.folder / "state" / "canprobe" / "zeros-puma260.json"
     assert list(json.loads(record.read_text())["nodes"]) == ["1", "6"]

@@ -11,7 +11,7 @@ import numpy as np
 from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample, decode
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Array, RawWire, Setup
-from canprobe.errors import BusError
+from canprobe.errors import BusError, UsageError
 from canprobe.fieldbus.bus.joined import send_on
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
@@ -208,6 +208,16 @@ class RawReceiver(ArrayReceiver):
         self._taring: list[Floats] = []
         self._complete: list[tuple[TactileFrame, int, float]] = []
         self._started = False
+
+    def tare(self) -> None:
+        """Take the mean of the next images for the unloaded value of each taxel.
+
+        Raises:
+            UsageError: the array file states that value.
+        """
+        if not self.wire.tare_images:
+            raise UsageError("tare: the array file states wire.unloaded_counts; give it wire.tare_images instead")
+        self._unloaded, self._taring = None, []
 
     @property
     def images(self) -> int:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.node_bringup import IDENTITY, NodeBringUp
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeSetup, Write
+from canprobe.cell.planning.configuration import TARE, TARE_COMMAND, NodeSetup, Write
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import DEVICE_TYPE_REQUEST, SECOND_ANSWER_S
@@ -243,6 +243,12 @@ class BringUp:
         """
         until_ns = self._network.port.clock.now_ns() + round(timeout_s * 1e9)
         asked = {s.node_id: self._confirm_mode(s, s.mode, until_ns) for s in self._setups if s.mode is not None}
+        return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
+
+    def tares(self, node_id: int) -> Dialogues:
+        """Have the array tared anew: to be served while cycling."""
+        write = Write(TARE_COMMAND, 0, TARE, "tare", read_back=False)
+        asked = {s.node_id: write_entry(s, write) for s in self._setups if s.node_id == node_id}
         return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
 
     def _confirm_mode(self, setup: NodeSetup, mode: int, until_ns: int) -> Dialogue:

@@ -43,6 +43,8 @@ from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
 REST_S = 0.05
 """Time in which drives come to rest at their last targets before a quick stop, s: the longest usual lag."""
+TARE_S = 0.3
+"""Time in which an array takes the images of a tare, s."""
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
 
@@ -252,7 +254,7 @@ class Cell:
         measurement = cycles.begin()  # SYNC, collect
         held = self._supervise(measurement)
         with self._lifting_off_on_error():
-            interrupts.take()
+            self._take(interrupts)
             command = self._held.freeze(measurement) if held else controller.step(measurement)
             check_command(command, arm=self.drives is not None)
         command, finding = self.supervisor.guard_target(command if held else self._held.thaw(command, measurement))
@@ -269,8 +271,37 @@ class Cell:
             raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
         return bool(command.done)
 
-    def idle(self, seconds: float) -> None:
+    def _take(self, interrupts: Interrupts) -> None:
+        """Raise an interrupt that came; a controller that brakes by itself raises it when it has."""
+        try:
+            interrupts.take()
+        except KeyboardInterrupt:
+            if not self.cycles.controller.brake():
+                raise
+
+    def tare(self) -> None:
+        """Take what the array shows for zero.
+
+        Raises:
+            UsageError: it cannot be tared.
+            SdoError, BusError: it does not answer, or another master has come.
+        """
+        if isinstance(self.tactile, RawReceiver):
+            self.tactile.tare()
+        elif (array := self._plan.setup.array) is None:
+            raise UsageError("tare: expected a cell with an array; got one without")
+        else:
+            with self.bring_up.tares(array.node_id) as writes:
+                while writes.waiting:
+                    self.idle(self._plan.sync.period_ns * 1e-9)
+                    writes.serve()
+        self.idle(TARE_S)
+
+    def idle(self, seconds: float) -> Measurement:
         """Cycle with disabled drives and without a controller; nothing is supervised, and no row is kept.
+
+        Returns:
+            The measurement of the last cycle.
 
         Raises:
             BusError: another master has come.
@@ -284,6 +315,7 @@ class Cell:
             self.cycle.count_work()
             if self.watch.another_master is not None:
                 raise BusError(self.watch.another_master)
+        return self.cycles.recorded
 
     @contextmanager
     def _running_one(self) -> Iterator[None]:

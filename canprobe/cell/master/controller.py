@@ -167,6 +167,13 @@ class Controller:
             reason: reason for `Command.stop_reason`.
         """
 
+    def brake(self) -> bool:
+        """Come to rest after an interrupt, then raise KeyboardInterrupt; False: the cell stops at once.
+
+        A second interrupt stops the cell in any case.
+        """
+        return False
+
     def asks_to_go_on(self) -> bool:
         """Whether motion is asked for in a way that the controller knows. Called in each cycle of a hold."""
         return False

@@ -92,7 +92,7 @@ class Homing:
     ) -> None:
         arm = plan.setup.arm
         assert arm is not None
-        self._command_line = plan.setup.up_line("--home")
+        self._command_line = plan.setup.line_to_type("home")
         self._model = arm.model
         self.link = SdoLink(network, watch, plan.setup.bring_up, supervise)
         by_id = {setup.node_id: setup for setup in setups}

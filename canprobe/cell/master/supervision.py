@@ -91,7 +91,7 @@ def limits_of(plan: Plan) -> Limits:
         tactile_cycles=round(ratio),
         tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
         regain=scan.regain if scan is not None else 0.0,
-        tares=setup.touch is not None,
+        tares=setup.tares,
         lag_ns=round(lag_s(setup) * 1e9),
     )
 

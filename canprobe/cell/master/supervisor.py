@@ -125,8 +125,11 @@ class JointGuard:
         else:
             target = q_target
         wanted: list[float] = target.tolist() if target.shape == (n,) else [math.nan] * n
+        last = self._target
+        if last is None and measurement.q is not None:
+            last = measurement.q.tolist()
         inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
-        if not all(inside):
+        if not all(inside) and not self._goes_back(wanted, last):
             if not all(map(math.isfinite, wanted)):
                 got = f"is {target}" if target.shape == (n,) else f"has shape {target.shape}"
                 return GuardedTarget(None, f"the controller's q_target {got}: expected {n} finite {self._si}")
@@ -135,9 +138,6 @@ class JointGuard:
             return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")
         if self._workspace is not None and (left := self.outside(target)) is not None:
             return GuardedTarget(None, left)
-        last = self._target
-        if last is None and measurement.q is not None:
-            last = measurement.q.tolist()
         if last is not None:
             joints = zip(wanted, last, self._speed, strict=True)
             share = max([abs(q - was) / speed for q, was, speed in joints]) / (self._period_ns * 1e-9)
@@ -147,6 +147,11 @@ class JointGuard:
                 return GuardedTarget(np.array(self._target))
         self._target = wanted
         return GuardedTarget(q_target)
+
+    def _goes_back(self, wanted: list[float], last: list[float] | None) -> bool:
+        """Whether joints that are out of their range stand or move back into it, as far as the last target knows."""
+        joints = zip(wanted, last or (), self._range, strict=False)
+        return last is not None and all(min(low, was) <= q <= max(high, was) for q, was, (low, high) in joints)
 
 
 NOTED_ONCE = ("error_frames", "frames_dropped", "clock_step", "estimator")

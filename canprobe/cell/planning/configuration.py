@@ -67,6 +67,7 @@ MODE = 0x6060
 HOME_OFFSET = 0x607C
 HOMES_HERE = frozenset({35, 37})
 """Homing methods that take the present position."""
+TARE_COMMAND = 0x2003
 TARE = 0x65726174  # "tare", as 1010h has "save"
 FOLLOWING_TIMEOUT_MS = 50
 QUICK_STOP_AND_DISABLE = 2  # 605Ah: slow down on the quick stop ramp, then switch on disabled
@@ -425,9 +426,8 @@ def _array_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
     writes = [Write(0x2000, 0, TactileMode[array.mode.upper()], "what the array sends")]
     if array.mode == "window" and has_window_size(device.od):
         writes.append(Write(WINDOW_SIZE, 0, int(array.window), "taxels along the window"))
-    # nothing touches the array yet; a listening cell knows no such moment
-    if plan.setup.touch is not None:
-        writes.append(Write(0x2003, 0, TARE, "tare", read_back=False))
+    if plan.setup.tares:
+        writes.append(Write(TARE_COMMAND, 0, TARE, "tare", read_back=False))
     return writes
 
 

@@ -49,15 +49,20 @@ def depth_at(force_n: float, probe: Probe, array: Array, kappa: Sequence[float])
     return max(layer_depth(force_n, probe, kappa), force_n / (probe.stiffness * float(array.pad.areas.sum())))
 
 
-def blind_s(setup: Setup, task: Touch | Calibrate) -> float:
+def blind_s(rate_hz: float, array: Array, lag_s: float) -> float:
     """Longest time from the moment when the array can show the contact to the end of the approach, s.
+
+    Args:
+        rate_hz: rate of the cycle.
+        array: the array.
+        lag_s: lag of the drives behind a ramp.
 
     The next image comes up to a period later, it arrives a period after its sample (a device of raw frames says how
     much later), and the command of that cycle takes effect `CYCLES_TO_EFFECT` later, behind the lag of the drives.
     """
-    array, period_s = task.array, 1.0 / task.array.rate_hz
+    period_s = 1.0 / array.rate_hz
     arrives_s = period_s if array.raw is None else array.raw.latency_s
-    return period_s + arrives_s + CYCLES_TO_EFFECT / setup.rate_hz + task.lag_s
+    return period_s + arrives_s + CYCLES_TO_EFFECT / rate_hz + lag_s
 
 
 def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[float]) -> Iterator[str]:
@@ -84,7 +89,8 @@ def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[
             + " or ".join(ways)
         )
         return
-    depth, speed, after_s = depth_at(shown_n, probe, array, kappa), task.approach.speed, blind_s(setup, task)
+    depth, speed = depth_at(shown_n, probe, array, kappa), task.approach.speed
+    after_s = blind_s(setup.rate_hz, array, task.lag_s)
     reached_n = force_at(depth + speed * after_s, probe, array, kappa)
     known_n = highest_known_force(array, probe, limit_n, (0.0,))
     if reached_n <= known_n:

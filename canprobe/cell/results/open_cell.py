@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -33,9 +33,12 @@ from canprobe.cell.results.summary import (
 )
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
+from canprobe.cell.session.home import home_joints
 from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import estimates_of
+from canprobe.cell.tasks.hand_motion import HandMotion
+from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_way, joint_way, refuse, share_of_speed
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
@@ -49,6 +52,12 @@ if TYPE_CHECKING:
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,
 answers that are nearer to each other than a memory rest on the same contacts."""
+
+
+READ_S = 0.1
+"""Time of cycles until each drive has said where it stands, s."""
+READ_IMAGES = 3
+"""Longest wait for an image of the array, in their periods."""
 
 
 class OpenCell:
@@ -166,6 +175,136 @@ class OpenCell:
             self._last = runs
         self.session.run(runs, progress)
         return self._result
+
+    def read(self) -> Measurement:
+        """The state of the cell, with its drives disabled and a new image of the array; nothing moves.
+
+        Raises:
+            BusError: the bus fails, or another master has come.
+        """
+        measurement = self.cell.idle(READ_S)
+        array, rate_hz = self.plan.setup.array, self.plan.setup.rate_hz
+        left = 0 if array is None else round(READ_IMAGES * rate_hz / array.rate_hz)
+        while measurement.tactile is None and left > 0:
+            measurement, left = self.cell.idle(1.0 / rate_hz), left - 1
+        return measurement
+
+    def way_to(self, to: str | npt.ArrayLike, speed: float = USUAL_SPEED) -> HandWay:
+        """The way from where the arm stands to a posture, which was looked at as a whole.
+
+        Args:
+            to: name of a posture, or joint positions (n,), rad or m.
+            speed: share of the speed limits of the joints.
+
+        Raises:
+            UsageError: there is no such posture, or the way leads through a limit or what the arm keeps out of.
+        """
+        way = joint_way(self.plan, self._stands(), goal_of(self.plan, to), share_of_speed(speed))
+        refuse(self.plan, way)
+        return way
+
+    def move(
+        self,
+        to: str | npt.ArrayLike | HandWay,
+        speed: float = USUAL_SPEED,
+        *,
+        wanted: Callable[[], bool] = lambda: True,
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> str | None:
+        """Move to a posture, straight in joints and as fast as speed, acceleration and jerk allow, or along a way.
+
+        Ctrl-C brakes, then ends. A force from `limits.jog_force_n` on ends the motion, and the probe goes back a few
+        millimetres.
+
+        Args:
+            to, speed: as for `way_to`; or a way of `way_to` that was not gone yet.
+            wanted: asked in each cycle; where it says no, the motion brakes.
+            progress: called with the measurement of each cycle.
+
+        Returns:
+            Why the motion ended before its end; None where it did not.
+
+        Raises:
+            UsageError: as `way_to`; or the cell was stopped for safety and `resume` was not called.
+            SafetyStop: the arm has touched something, or the cell was stopped.
+            BusError: as in `run`.
+        """
+        way = to if isinstance(to, HandWay) else self.way_to(to, speed)
+        motion = HandMotion(self.plan, way, wanted)
+        self.run(motion, progress)
+        return motion.ended_by
+
+    def jog(
+        self,
+        joint: int | None = None,
+        *,
+        velocity: float,
+        for_s: float,
+        along: npt.ArrayLike | None = None,
+        about: npt.ArrayLike | None = None,
+        in_probe_frame: bool = False,
+        wanted: Callable[[], bool] = lambda: True,
+    ) -> str | None:
+        """Move one joint, or the probe along or about a direction, for a time.
+
+        In a cell with an array the probe is so slow that it can stop at what it touches.
+
+        Args:
+            joint: number of the joint, from 1.
+            velocity: of the joint, rad/s or m/s, or of the probe, m/s along or rad/s about.
+            for_s: time, s; the motion ends before at a limit of the joint.
+            along, about: direction (3,) of the probe instead of a joint, in base.
+            in_probe_frame: the direction is in the frame of the probe, whose z points to the object.
+            wanted: as for `move`.
+
+        Returns:
+            As `move`.
+
+        Raises:
+            UsageError: not one of joint, along and about, or as `way_to`.
+            SafetyStop, BusError: as `move`.
+        """
+        way = jog_way(
+            self.plan,
+            self._stands(),
+            joint,
+            along=along,
+            about=about,
+            velocity=velocity,
+            for_s=for_s,
+            in_probe_frame=in_probe_frame,
+        )
+        refuse(self.plan, way)
+        return self.move(way, wanted=wanted)
+
+    def tare(self) -> None:
+        """Take what the array shows for zero: nothing may touch it.
+
+        Raises:
+            UsageError: there is no array on a bus, or its file states the unloaded value.
+            BusError: it does not answer.
+        """
+        self.cell.tare()
+
+    def home(self, joints: Sequence[int] | None = None) -> None:
+        """Home the joints that have `zero = "homing"`, one after the other; ``open_cell(..., to_home=True)``.
+
+        Args:
+            joints: their numbers, from 1; by default all.
+
+        Raises:
+            UsageError: one of them is not homed.
+            NodeError: a drive did not find its home position; it is stopped and disabled.
+        """
+        home_joints(self.plan, self.cell, joints, say=self._say)
+
+    def _stands(self) -> Floats:
+        """Joint positions (n,), rad or m."""
+        if self.plan.setup.arm is None:
+            raise UsageError(f"{self.plan.setup.name}: expected a scene with an arm; got one without")
+        measurement = self.cell.idle(READ_S)
+        assert measurement.q is not None
+        return measurement.q
 
     def resume(self) -> None:
         """A person's word that the arm may move again.

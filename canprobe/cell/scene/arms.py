@@ -30,6 +30,7 @@ _FIELDS = {
     "min": "q_min",
     "max": "q_max",
     "speed": "qd_max",
+    "acceleration": "qdd_max",
     "rated_torque": "rated_torque",
     "rated_force": "rated_torque",
     "rotor_inertia": "rotor_inertia",
@@ -181,6 +182,12 @@ def joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
 def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Floats:
     """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
     return np.array([in_si(section)[key] for section in sections.values()])
+
+
+def posture_in_si(sections: Mapping[str, JointSettings], posture: Sequence[float]) -> Floats:
+    """(n,) rad or m of a posture in degrees or millimetres."""
+    scale = [MM if section.kind == "prismatic" else math.radians(1.0) for section in sections.values()]
+    return np.array(posture) * scale
 
 
 def homing_of(section: JointSettings, number: int) -> HomingParameters | None:

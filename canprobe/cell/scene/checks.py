@@ -7,6 +7,7 @@ except an integer where a number is wanted (TOML's `25` for `25.0`); a boolean i
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import re
 import types
@@ -192,8 +193,10 @@ def annotations_of(cls: type[Any]) -> Mapping[str, Any]:
     return _ANNOTATIONS[cls]
 
 
-def values_of(section: Any) -> dict[str, Any]:
-    """The keys of a section that have a value and belong to the others."""
+def values_of(section: Any) -> Any:
+    """The keys of a section that have a value and belong to the others; what is no section as it is."""
+    if not dataclasses.is_dataclass(section):
+        return section
     values = {key: getattr(section, key) for key in annotations_of(type(section))}
     return {
         key: value

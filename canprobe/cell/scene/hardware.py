@@ -145,6 +145,18 @@ class ArmSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class KeepOutSettings:
+    """`[keep_out]`: places that the arm and its probe stay out of when it is moved by hand (`canprobe move`)."""
+
+    floor_mm: Annotated[float | None, Range(-100_000, 100_000)] = None
+    """Height of a floor in the base frame. Left out: no floor."""
+    boxes_mm: tuple[tuple[Vec3, Vec3], ...] = ()
+    """Boxes in the base frame, each by its lowest and its highest corner."""
+    link_radius_mm: Annotated[float, Range(0, 2000)] = 50.0
+    """Radius of the arm round the straight lines from joint to joint. The probe has that of `[probe]`."""
+
+
+@dataclass(frozen=True, slots=True)
 class JointSettings:
     """`[joints.NAME]`: one joint and its drive. The sections stand in the order of the joints, from the base.
 
@@ -169,6 +181,8 @@ class JointSettings:
     """Highest position."""
     speed_deg_s: Annotated[float | None, Range(0, 36_000, open_low=True), REVOLUTE_ONLY] = None
     """Highest speed."""
+    acceleration_deg_s2: Annotated[float | None, Range(0, 1e6, open_low=True), REVOLUTE_ONLY] = None
+    """Highest acceleration of a motion by hand (`canprobe move`), reached in 50 ms. Left out: the speed in 0.5 s."""
     start_deg: Annotated[float, Range(-3600, 3600), REVOLUTE_ONLY] = 0.0
     """Start posture. It selects the branch of the inverse kinematics. An emulated arm starts here in `free`, and
     above the start point in other tasks."""
@@ -180,6 +194,8 @@ class JointSettings:
     """Highest position."""
     speed_mm_s: Annotated[float | None, Range(0, 100_000, open_low=True), PRISMATIC_ONLY] = None
     """Highest speed."""
+    acceleration_mm_s2: Annotated[float | None, Range(0, 1e6, open_low=True), PRISMATIC_ONLY] = None
+    """Highest acceleration of a motion by hand (`canprobe move`), reached in 50 ms. Left out: the speed in 0.5 s."""
     start_mm: Annotated[float, Range(-100_000, 100_000), PRISMATIC_ONLY] = 0.0
     """Start posture."""
     swing_mm: Annotated[float, Range(0, 10_000), PRISMATIC_ONLY] = 10.0
@@ -207,7 +223,7 @@ class JointSettings:
     coupling: Mapping[str, float] | None = None
     """Turns of this motor per turn of other joints, by their names: a wrist whose motors stand in the forearm."""
     zero: Literal["absolute", "homing"] = "absolute"
-    """absolute: the drive knows its position after power on. homing: it has to be homed, by `canprobe up --home`."""
+    """absolute: the drive knows its position after power on. homing: it has to be homed, by `canprobe home`."""
     homing_method: Annotated[int | None, HOMING_METHOD, Only("zero", ("homing",), required=True)] = None
     """Homing method (6098h), such as 17 for the negative limit switch, 35 or 37 for where the joint stands."""
     homing_order: Annotated[int | None, Range(1, 1000), HOMING_ONLY] = None

@@ -55,10 +55,11 @@ def dump_scene(scene: Scene | CellFile) -> str:
     """
     tables: list[tuple[str, dict[str, Any]]] = []
     for name, table in _document(scene).items():
-        named = isinstance(getattr(scene, name), Mapping)
-        tables += [(f"{name}.{toml_key(key)}", one) for key, one in table.items()] if named else [(name, table)]
+        part = getattr(scene, name)
+        has_sections = isinstance(part, Mapping) and all(map(dataclasses.is_dataclass, part.values()))
+        tables += [(f"{name}.{toml_key(key)}", one) for key, one in table.items()] if has_sections else [(name, table)]
     return "\n".join(
-        f"[{name}]\n" + "".join(f"{key} = {toml_value(value)}\n" for key, value in table.items())
+        f"[{name}]\n" + "".join(f"{toml_key(key)} = {toml_value(value)}\n" for key, value in table.items())
         for name, table in tables
     )
 
@@ -91,6 +92,8 @@ def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     files: dict[str, bytes] = {}
 
     def beside(section: Any) -> Any:
+        if not dataclasses.is_dataclass(section) or isinstance(section, type):
+            return section
         annotations = annotations_of(type(section))
         names = {}
         for key in FILE_KEYS & set(annotations):

@@ -22,6 +22,7 @@ from canprobe.cell.scene.hardware import (
     EmulateSettings,
     Fidelity,
     JointSettings,
+    KeepOutSettings,
     NodeId,
     SerialNumber,
     TactileModeName,
@@ -57,6 +58,8 @@ version of canprobe."""
 
 Vec2 = tuple[float, float]
 Row4 = tuple[float, float, float, float]
+Posture = tuple[float, ...]
+"""Position of each joint, deg or mm."""
 
 TOUCH_KINDS: tuple[TaskKind, ...] = ("scan", "press", "calibrate")
 """Tasks that touch an object."""
@@ -351,6 +354,8 @@ class LimitSettings:
     """Highest force: the upper end of the measured one, with twice its standard deviation, stays below."""
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15
     """Highest force before the run. The tare of the array would take it for zero."""
+    jog_force_n: Annotated[float, Range(0, 50, open_low=True)] = 1.0
+    """Force at which a motion by hand (`canprobe move`) goes back; half of `force_max_n` at most."""
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0
     """Angle that is kept from the stops of revolute joints."""
     joint_margin_mm: Annotated[float, Range(0, 1000)] = 3.5
@@ -475,6 +480,8 @@ class CellFile:
     bring_up: BringUpSettings | None = None
     arm: ArmSettings | None = None
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
+    postures: Mapping[str, Posture] = field(default_factory=dict)
+    keep_out: KeepOutSettings | None = None
     sensor: SensorSettings | None = None
     wire: WireSettings | None = None
     probe: ProbeSettings | None = None
@@ -514,6 +521,8 @@ class Scene:
     cell: CellInfo = CellInfo()  # noqa: RUF009 - frozen
     arm: ArmSettings | None = None
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
+    postures: Mapping[str, Posture] = field(default_factory=dict)
+    keep_out: KeepOutSettings | None = None
     sensor: SensorSettings | None = None
     wire: WireSettings | None = None
     probe: ProbeSettings | None = None

@@ -89,11 +89,17 @@ class Reader:
         }
 
     def _named(self, hint: Any, tables: Any, name: str) -> dict[str, Any]:
-        if not isinstance(tables, dict):
-            self.complain(name, f"expected sections [{name}.NAME], got {toml_value(tables)}")
-            return {}
         cls = typing.get_args(hint)[1]
-        read = {key: self.section(cls, table, f"{name}.{toml_key(key)}") for key, table in tables.items()}
+        has_sections = dataclasses.is_dataclass(cls)
+        if not isinstance(tables, dict):
+            wanted = f"sections [{name}.NAME]" if has_sections else f"a section [{name}]"
+            self.complain(name, f"expected {wanted}, got {toml_value(tables)}")
+            return {}
+        paths = {key: f"{name}.{toml_key(key)}" for key in tables}
+        read = {
+            key: self.section(cls, table, paths[key]) if has_sections else self._value(table, cls, paths[key])
+            for key, table in tables.items()
+        }
         if None in read.values():
             self.bad.add(name)
         return read

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint
+from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint, posture_in_si
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.cell.scene.hardware import MM, EmulateSettings
@@ -24,7 +24,7 @@ from canprobe.cell.scene.model import (
     TaskSettings,
     WireSettings,
 )
-from canprobe.cell.scene.rules import image_format
+from canprobe.cell.scene.rules import START, image_format
 from canprobe.cell.scene.setup import (
     Approach,
     Arm,
@@ -49,6 +49,7 @@ from canprobe.errors import PlanError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
+from canprobe.mechanics.robot.keep_out import KeepOut
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.tool_calibration import ball_approaches
 from canprobe.mechanics.touch import ArrayCalibration, Pad
@@ -103,7 +104,7 @@ def resolve(scene: Scene) -> Setup:
         rate_hz=scene.cycle.rate_hz,
         realtime=scene.cycle.realtime,
         compute_ns=round(scene.cycle.compute_us * 1000),
-        limits=_limits(scene.limits, arm),
+        limits=_limits(scene.limits, arm, _keep_out(scene, settings)),
         bring_up=scene.bring_up,
         bridge=scene.bridge or BridgeSettings(),
         arm=arm,
@@ -139,7 +140,17 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
         )
     ]
     q_start = per_joint(joints, "start")
-    arm = Arm(model, tuple(drives), q_start, settings.missed_syncs, settings.grouped_rpdo, settings.torque, warnings)
+    postures = {START: q_start} | {name: posture_in_si(joints, posture) for name, posture in scene.postures.items()}
+    arm = Arm(
+        model,
+        tuple(drives),
+        q_start,
+        settings.missed_syncs,
+        settings.grouped_rpdo,
+        postures,
+        settings.torque,
+        warnings,
+    )
     return arm, bodies
 
 
@@ -242,17 +253,31 @@ def _frame(text: str) -> Frame:
     return int(can_id, 16), bytes.fromhex(data)
 
 
-def _limits(settings: LimitSettings, arm: Arm | None) -> SafetyLimits:
+def _keep_out(scene: Scene, probe: ProbeSettings) -> KeepOut | None:
+    settings = scene.keep_out
+    if settings is None or (settings.floor_mm is None and not settings.boxes_mm):
+        return None
+    floor = -math.inf if settings.floor_mm is None else settings.floor_mm * MM
+    boxes = np.array(settings.boxes_mm, dtype=float).reshape(-1, 2, 3) * MM
+    radius = settings.link_radius_mm * MM
+    if scene.probe is None and scene.sensor is None:
+        return KeepOut(floor, boxes, radius, np.zeros(3), radius)
+    return KeepOut(floor, boxes, radius, T_flange_probe(probe)[:3, 3], probe.radius_mm * MM)
+
+
+def _limits(settings: LimitSettings, arm: Arm | None, keep_out: KeepOut | None) -> SafetyLimits:
     low, high = settings.workspace_min_mm, settings.workspace_max_mm
     slides = [] if arm is None else [joint.prismatic for joint in arm.model.joints]
     bounded = low is not None or high is not None
     return SafetyLimits(
         force_max=settings.force_max_n,
         preload_max=settings.preload_max_n,
+        jog_force=min(settings.jog_force_n, 0.5 * settings.force_max_n),
         joint_margin=np.where(slides, settings.joint_margin_mm * MM, math.radians(settings.joint_margin_deg)),
         speed_share=settings.joint_speed_share,
         late_share=settings.late_cycles_max_percent / 100,
         workspace=np.array([low or (-math.inf,) * 3, high or (math.inf,) * 3]) * MM if bounded else None,
+        keep_out=keep_out,
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from canprobe.cell.scene.hardware import JointSettings, Vec3
-from canprobe.cell.scene.model import TOUCH_KINDS, WireSettings
+from canprobe.cell.scene.model import TOUCH_KINDS, Posture, WireSettings
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageFormat
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE, WINDOW_SIZES
@@ -48,8 +48,7 @@ _BESIDES = {
     },
     "free": {
         "arm": ("must", "free motion moves the arm"),
-        "sensor": ("never", "free motion measures no contact"),
-        "wire": ("never", "free motion measures no contact"),
+        "wire": ("may", ""),
         "probe": ("may", ""),
         "object": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
@@ -61,6 +60,8 @@ SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
 }
 """For each task and section (need, why). Need: "must" be given, "default" when left out, "may" be given, "never"."""
 
+START = "start"
+"""Name of the posture that the joints' start keys describe."""
 _Complaint = Iterator[tuple[str, str]]
 _RULES: list[tuple[tuple[str, ...], Callable[..., _Complaint]]] = []
 
@@ -82,6 +83,15 @@ def _across(*keys: str) -> Callable[[Callable[..., _Complaint]], Callable[..., _
 def _joints_missing(arm: object, joints: Mapping[str, JointSettings]) -> _Complaint:
     if not 1 <= len(joints) <= MAX_JOINTS:
         yield "joints", f"expected 1 to {MAX_JOINTS} sections [joints.NAME], got {len(joints)}"
+
+
+@_across("joints", "postures")
+def _posture_of_other_joints(joints: Mapping[str, JointSettings], postures: Mapping[str, Posture]) -> _Complaint:
+    for name, posture in postures.items():
+        if name == START:
+            yield f"postures.{name}", "it is what the joints have as start_deg or start_mm; choose another name"
+        elif joints and len(posture) != len(joints):
+            yield f"postures.{name}", f"expected a position of each of the {len(joints)} joints, got {len(posture)}"
 
 
 @_across("joints", "arm.urdf?")

@@ -22,6 +22,7 @@ from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKi
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
+from canprobe.mechanics.robot.keep_out import KeepOut
 from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.robot.tool_calibration import BallApproach
 from canprobe.mechanics.touch import ArrayCalibration, Pad
@@ -103,6 +104,7 @@ class Arm:
         q_start: (n,) rad; selects the branch of the inverse kinematics, and is where an emulated arm stands.
         missed_syncs: SYNC periods of silence after which drive and master treat each other as lost.
         grouped: two targets share an RPDO through dummy mapping.
+        postures: (n,) rad or m by name, that of the start among them.
         torque: the drives send their torque where they can; the plan gives it up where the bus has no room for it.
         warnings: values of its URDF that are hardly meant.
     """
@@ -112,6 +114,7 @@ class Arm:
     q_start: Floats
     missed_syncs: int
     grouped: bool | Auto
+    postures: Mapping[str, Floats]
     torque: bool = True
     warnings: tuple[str, ...] = ()
 
@@ -215,6 +218,8 @@ class SafetyLimits:
         speed_share: share of the joints' speed limits that a motion may use.
         late_share: share of the last second's cycles that may be late by half a period.
         workspace: box (2, 3) of the probe's tip in base, m; an open side is infinite; None without any.
+        jog_force: force at which a motion by hand goes back, N; half of `force_max` at most.
+        keep_out: what the whole arm keeps out of when it is moved by hand.
     """
 
     force_max: float
@@ -223,6 +228,8 @@ class SafetyLimits:
     speed_share: float
     late_share: float
     workspace: Floats | None
+    jog_force: float = 1.0
+    keep_out: KeepOut | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -490,6 +497,11 @@ class Setup:
         return self.task if isinstance(self.task, Touching) else None
 
     @property
+    def tares(self) -> bool:
+        """Whether bring-up tares the array: a cell that only listens knows no moment at which nothing touches it."""
+        return self.array is not None and self.arm is not None
+
+    @property
     def scan(self) -> Scan | None:
         """The path; None where no surface is followed."""
         return self.task.scan if isinstance(self.task, Touch) else None
@@ -512,10 +524,11 @@ class Setup:
         """Whether any part of the cell is emulated."""
         return bool(self.emulated_node_ids) or (self.array is not None and self.array.emulated)
 
-    def up_line(self, option: str) -> str:
-        """The command line of a step of `up` on the cell's bus; on SocketCAN where the scene names none."""
+    def line_to_type(self, command: str, *options: str) -> str:
+        """The line of a command on the cell's bus; on SocketCAN where the scene names none."""
         interface = "socketcan" if self.bus.virtual else self.bus.interface
-        return f"canprobe up {shlex.quote(self.name)} {option} --bus {interface} --channel {self.bus.channel}"
+        more = "".join(f" {option}" for option in options)
+        return f"canprobe {command} {shlex.quote(self.name)}{more} --bus {interface} --channel {self.bus.channel}"
 
     def changed(self, part: Literal["bus", "arm", "array"], **values: Any) -> Setup:
         """A setup with other values of one part, in the task too."""

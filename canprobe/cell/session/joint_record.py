@@ -125,7 +125,7 @@ def _warning(plan: Plan, serials: Mapping[int, int]) -> str | None:
     never = [axis for axis, what in changes.items() if not what]
     told = [f"{_joints(never)} not checked"] if never else []
     told += [f"{_joints([axis])} checked with another {what}" for axis, what in changes.items() if what]
-    line = plan.setup.up_line("--check-joints")
+    line = plan.setup.line_to_type("up", "--check-joints")
     return (
         f"whether the arm moves as its file says is not known: {'; '.join(told)}; before the first contact type: {line}"
     )

@@ -17,6 +17,8 @@ from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.types import Floats
 
+SPEED_UP_S = 0.5
+"""Time in which a joint reaches its speed limit, s, where no acceleration is known."""
 METRES_PER_RADIAN = 0.2
 """Travel of a prismatic joint that counts as much as a radian of a revolute one, m: about the length of a link."""
 
@@ -34,6 +36,7 @@ class Joint:
         rotor_inertia: inertia of its motor's rotor, at the joint; only emulation uses it, and friction.
         coulomb: friction torque that does not depend on the speed.
         viscous: friction torque per speed.
+        qdd_max: acceleration limit, per second²; by default that which reaches the speed limit in `SPEED_UP_S`.
 
     The defaults of drive and friction are assumptions: a geared motor of a small arm.
     """
@@ -47,6 +50,7 @@ class Joint:
     rotor_inertia: float = 0.05
     coulomb: float = 0.5
     viscous: float = 0.3
+    qdd_max: float | None = None
 
     @property
     def unit(self) -> str:
@@ -148,7 +152,7 @@ class ArmModel:
         zero_units: (n,) drive units at q = 0.
 
     Attributes:
-        q_min, q_max, qd_max: (n,) stops and speed limits of the joints, rad or m, and per second.
+        q_min, q_max, qd_max, qdd_max: (n,) stops, speed and acceleration limits of the joints, rad or m, per s and s².
         q_per_unit: (n, n) inverse of `units_per_q`.
         radian: (n,) motion of each joint that counts as a radian: 1 rad, or `METRES_PER_RADIAN` of a prismatic one.
 
@@ -164,6 +168,7 @@ class ArmModel:
     q_min: Floats = field(init=False)
     q_max: Floats = field(init=False)
     qd_max: Floats = field(init=False)
+    qdd_max: Floats = field(init=False)
     q_per_unit: Floats = field(init=False)
     radian: Floats = field(init=False)
 
@@ -178,6 +183,7 @@ class ArmModel:
             "q_per_unit": np.linalg.inv(units),
             "radian": np.where([joint.prismatic for joint in self.joints], METRES_PER_RADIAN, 1.0),
         }
+        arrays["qdd_max"] = np.array([joint.qdd_max or joint.qd_max / SPEED_UP_S for joint in self.joints])
         for name in ("q_min", "q_max", "qd_max"):
             arrays[name] = np.array([getattr(joint, name) for joint in self.joints])
         for name, array in arrays.items():

@@ -210,7 +210,7 @@ def test_a_drive_that_counts_increments_is_homed_again_after_it_was_without_powe
     run = Returning("node 3: reboot for 300 ms", homed_scene())
     (error,) = run.errors
     assert "node 3: (joint 3) is not homed" in str(error)
-    assert "type: canprobe up free --home --bus socketcan --channel can0" in str(error)
+    assert "type: canprobe home free --bus socketcan --channel can0" in str(error)
     assert {time for _, time in run.enabled.distances} == {1}, "no drive was enabled after it"
 
 
@@ -280,11 +280,6 @@ def test_a_node_that_is_lost_again_and_again_ends_it():
 def test_resume_needs_a_cell_that_recovers():
     with canprobe.open_cell("free") as cell, pytest.raises(UsageError, match="not opened with recover=True"):
         cell.resume()
-
-
-def test_homing_needs_somebody_beside_it(capsys):
-    assert main(["up", "free", "--home", "--yes", "--recover"]) == 2
-    assert "leave out --recover" in capsys.readouterr().err
 
 
 def test_a_second_controller_begins_where_the_arm_stands():

@@ -250,8 +250,8 @@ def refusal(bench):
 def test_a_run_with_drives_that_are_not_homed_is_refused_with_the_command(tmp_path):
     bench = Bench(scene_of([35, 0, 35]), tmp_path)
     assert refusal(bench) == (
-        "node 1: (joint 1) is not homed, or was switched off or moved since; nor are 3 (joint 3); type: canprobe up"
-        " free --home --bus socketcan --channel can0"
+        "node 1: (joint 1) is not homed, or was switched off or moved since; nor are 3 (joint 3); type: canprobe"
+        " home free --bus socketcan --channel can0"
     )
     bench.home(0)
     assert refusal(bench).startswith("node 3: (joint 3) is not homed")
@@ -337,7 +337,7 @@ def test_emulated_drives_of_a_run_start_homed_and_can_be_homed(capsys):
     ]
     assert sum("is homed" in line for line in said) == 1
     assert "joint 5 is left as it is" in said
-    with pytest.raises(UsageError, match='no joint of scene free has zero = "homing"'):
+    with pytest.raises(UsageError, match='no joint of free has zero = "homing"'):
         canprobe.api.home(canprobe.load_scene("free"))
 
 

@@ -83,6 +83,7 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
     assert {field.name for field in dataclasses.fields(scene) if getattr(scene, field.name) is None} == {
         *absent,
         "bridge",
+        "keep_out",
     }
 
 
@@ -251,6 +252,7 @@ def test_every_field_can_be_left_out_or_says_that_it_cannot():
     required = {
         (section, field.name)
         for section, hint in typing.get_type_hints(Scene).items()
+        if section != "postures"  # its keys are names
         for field in dataclasses.fields(typing.get_args(hint)[-1] if section == "joints" else _class_of(hint))
         if field.default is dataclasses.MISSING
     }
@@ -306,6 +308,9 @@ def keys_of(scene):
     """Every key of a scene, those of the tables within tables too, and some that it does not have."""
     for section, hint in typing.get_type_hints(Scene).items():
         value = getattr(scene, section)
+        if section == "postures":
+            yield from (section, f"{section}.ready")
+            continue
         tables = {f"{section}.{name}": one for name, one in value.items()} if section == "joints" else {section: value}
         for path, table in tables.items():
             kind = type(table) if table is not None else _class_of(hint)

@@ -441,10 +441,8 @@ def test_a_scene_without_an_arm_is_refused():
     ("words", "what"),
     [
         (("--check-joints",), "needs a terminal; --yes leaves that out"),
-        (("--home",), "up --home asks before each motion and needs a terminal; --yes leaves that out"),
-        (("--home", "--yes"), 'no joint of scene free has zero = "homing"'),
-        (("--home", "--check-joints"), "--home and --check-joints are two steps"),
-        (("--yes",), "--yes goes with --check-joints or --home"),
+        (("--yes",), "--yes goes with --check-joints"),
+        (("--check-joints", "--yes", "--recover"), "leave out --recover"),
         (("--check-joints", "--yes", "--bridge", "mcap"), "--check-joints feeds no --bridge"),
     ],
 )

@@ -1,0 +1,45 @@
+"""Home the joints with `zero = "homing"`: each drive finds its zero, one after the other, and stops safely.
+
+Asks before each joint. A zero is recorded beside the cell file, and holds as long as the drive is not switched off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from canprobe.cli.argument_types import whole
+from canprobe.cli.common_arguments import add_scene
+from canprobe.cli.hands import add_arguments_of_hands
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import scene_of
+from canprobe.errors import UsageError
+
+HELP = "home the joints whose drives have no absolute encoder"
+EXAMPLE = """\
+examples:
+  canprobe home cell.toml --bus socketcan --channel can0
+  canprobe home cell.toml 3 4 --bus socketcan --channel can0 --yes
+"""
+
+
+def add_arguments(parser: Parser) -> None:
+    add_scene(parser)
+    parser.add_argument(
+        "joints", metavar="JOINT", nargs="*", type=whole(1, 99), help="numbers of joints, from 1 [all that are homed]"
+    )
+    add_arguments_of_hands(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Home joint by joint."""
+    if not args.yes and not sys.stdin.isatty():
+        raise UsageError("home asks before each joint and needs a terminal; --yes leaves that out")
+    scene = scene_of(args)
+
+    from canprobe import api
+    from canprobe.cli.operator import TerminalOperator
+
+    operator = None if args.yes else TerminalOperator()
+    api.home(scene, args.joints or None, operator=operator, say=args.report.say)
+    return 0

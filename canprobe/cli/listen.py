@@ -1,0 +1,115 @@
+"""Show what the array measures: force, place and the taxels. No drive is touched.
+
+On a terminal the image is renewed ten times a second. Elsewhere each line is one image, with --json a JSON document.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from canprobe.cli.argument_types import seconds
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.hands import opened
+from canprobe.cli.parser import Parser
+from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.clock import MonotonicClock
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.controller import Command, Measurement
+    from canprobe.cell.results.open_cell import OpenCell
+    from canprobe.cell.scene.model import Scene
+
+HELP = "show what the array measures"
+EXAMPLE = """\
+examples:
+  canprobe listen puma260
+  canprobe listen cell.toml --bus socketcan --channel can0
+  canprobe listen cell.toml --bus socketcan --channel can0 --json --every 0.01
+"""
+_CLEAR = "\x1b[H\x1b[J"
+
+
+def add_arguments(parser: Parser) -> None:
+    add_scene(parser)
+    add_options(parser, *BUS, "--realtime", "--patient")
+    parser.add_argument("--duration", metavar="S", type=seconds, default=10.0, help="end after S seconds [10]")
+    parser.add_argument("--every", metavar="S", type=seconds, default=0.1, help="time between two images [0.1]")
+    parser.add_argument("--json", action="store_true", help="print one JSON document a line")
+    add_verbosity(parser)
+
+
+def array_only(scene: Scene) -> Scene:
+    """The scene with its array alone.
+
+    Raises:
+        UsageError: it has none.
+    """
+    if scene.sensor is None:
+        raise UsageError(f"{scene.name}: has no array ([sensor])")
+    alone = replace(scene, arm=None, joints={}, postures={}, keep_out=None, object=None, shape=None, servo=None)
+    return replace(alone, task=replace(scene.task, kind="listen"))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print images until the time is over, or Ctrl-C."""
+    from canprobe.cell.master.controller import Command
+
+    duration_s, args.duration = args.duration, None
+    on_terminal = sys.stdout.isatty() and not args.json
+    next_s, clock = 0.0, MonotonicClock()
+    with opened(args, prepared=array_only) as cell:
+
+        def step(measurement: Measurement) -> Command:
+            nonlocal next_s
+            t_s = 1e-9 * measurement.t_ns
+            if measurement.tactile is not None and t_s >= next_s:
+                next_s = t_s + args.every
+                if args.json:
+                    print(json.dumps({"t_s": round(t_s, 6), **array_values(cell, measurement)}), flush=True)
+                else:
+                    text = f"{t_s:7.2f} s  {array_line(cell, measurement)}"
+                    print(_CLEAR + text + "\n" + _picture(measurement) if on_terminal else text, flush=True)
+                if cell.session.virtual and on_terminal:
+                    clock.sleep_until_ns(clock.now_ns() + round(1e9 * args.every))
+            return Command(done=t_s >= duration_s)
+
+        cell.run(step)
+    return 0
+
+
+def array_values(cell: OpenCell, measurement: Measurement) -> dict[str, Any]:
+    """The figures of an image: force and its standard deviation, place, highest taxel."""
+    sample = measurement.tactile
+    if sample is None:
+        return {"force_n": None}
+    patch = cell.patch(sample)
+    return {
+        "force_n": round(patch.force, 4),
+        "force_sigma_n": round(patch.sigma.total, 4) if patch.sigma.total < float("inf") else None,
+        "u_mm": None if math.isnan(patch.u) else round(1e3 * patch.u, 3),
+        "v_mm": None if math.isnan(patch.v) else round(1e3 * patch.v, 3),
+        "highest_count": int(sample.frame.taxels.max(initial=0)),
+        "age_cycles": measurement.tactile_age,
+    }
+
+
+def array_line(cell: OpenCell, measurement: Measurement) -> str:
+    """The figures of an image in a line."""
+    if measurement.tactile is None:
+        return "no image"
+    at = array_values(cell, measurement)
+    sigma = "unknown error" if at["force_sigma_n"] is None else f"± {at['force_sigma_n']:.3f} N"
+    place = "no contact" if at["u_mm"] is None else f"at u {at['u_mm']:+.1f}, v {at['v_mm']:+.1f} mm"
+    return f"{at['force_n']:.3f} N {sigma}, {place}, highest taxel {at['highest_count']} of 255"
+
+
+def _picture(measurement: Measurement) -> str:
+    from canprobe.cell.master.monitor import image_lines
+
+    assert measurement.tactile is not None
+    return "\n".join(image_lines(measurement.tactile.frame.taxels))

@@ -1,0 +1,140 @@
+"""Move the arm to a posture, or one joint by a way, and stop it safely.
+
+All joints begin and end together, as fast as their limits of speed, acceleration and jerk allow, times --speed. The way
+is looked at as a whole before: joint limits, workspace, and what `[keep_out]` names. Ctrl-C, a closed terminal and the
+end of a pipe at stdin brake the motion. A force from `limits.jog_force_n` on ends it, and the probe goes back.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from typing import TYPE_CHECKING
+
+from canprobe.cli.common_arguments import add_scene
+from canprobe.cli.hands import InputOpen, add_arguments_of_hands, agreed, opened
+from canprobe.cli.parser import Parser
+from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from canprobe.cell.results.open_cell import OpenCell
+    from canprobe.cell.tasks.hand_way import HandWay
+
+HELP = "move the arm to a posture, or one joint by a way"
+EXAMPLE = """\
+examples:
+  canprobe move puma260 start
+  canprobe move cell.toml ready --bus socketcan --channel can0 --speed 20%
+  canprobe move cell.toml --joint 3 --by 5deg
+  canprobe move cell.toml -90,65,15,0,100,0 --dry-run
+"""
+_WAY = re.compile(r"([+-]?\d+(?:\.\d*)?)(deg|mm)?")
+
+
+def add_arguments(parser: Parser) -> None:
+    parser.takes_ways, parser.late = True, "to"
+    add_scene(parser)
+    parser.add_argument(
+        "to",
+        metavar="TO",
+        nargs="?",
+        help="name of a posture (`canprobe posture list`), or the positions of all joints, deg or mm, with commas",
+    )
+    parser.add_argument("--joint", metavar="N", type=int, help="move this joint alone, by its number from 1")
+    parser.add_argument("--by", metavar="WAY", type=way, help="its way, such as 5deg or -10mm")
+    parser.add_argument(
+        "--speed", metavar="SHARE", type=share, default=0.1, help="share of the speed limits, such as 20%% [10%%]"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="show the way, and move nothing")
+    add_arguments_of_hands(parser)
+
+
+def way(text: str) -> tuple[float, str | None]:
+    """An argument type: a number with deg or mm."""
+    if (match := _WAY.fullmatch(text.replace("°", "deg").replace(" ", ""))) is None:
+        raise argparse.ArgumentTypeError(f"expected a way such as 5deg or -10mm, got {text!r}")
+    return float(match[1]), match[2]
+
+
+def share(text: str) -> float:
+    """An argument type: a share, in percent or as a number up to 1."""
+    try:
+        value = float(text.removesuffix("%")) * (0.01 if text.endswith("%") else 1.0)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= 1.0:
+        raise argparse.ArgumentTypeError(f"expected a share such as 20% or 0.2, above 0 and up to 1, got {text!r}")
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show the way, ask, and go it."""
+    if (args.joint is None) != (args.by is None) or (args.to is None) == (args.joint is None):
+        raise UsageError("move: expected a posture, or --joint and --by; `canprobe posture list CELL` has the postures")
+    args.yes = args.yes or args.dry_run
+    stdin = InputOpen()
+    with opened(args) as cell:
+        found = cell.way_to(_goal(args, cell), args.speed)
+        print(described(cell, found, args.speed))
+        if args.dry_run or not agreed(args, cell, "move?"):
+            args.report.say("nothing was moved")
+            return 0
+        if not stdin.watched:
+            args.report.say("Ctrl-C brakes the motion")
+        ended = cell.move(found, wanted=stdin)
+        print(f"the arm stands at {standing(cell)}")
+    if ended is not None:
+        args.report.say("warning: stdin has ended, and the motion was braked")
+    return 0
+
+
+def _goal(args: argparse.Namespace, cell: OpenCell) -> str | npt.ArrayLike:
+    """The posture of the command line: a name, or joint positions, rad or m."""
+    arm = cell.plan.setup.arm
+    if arm is None:
+        raise UsageError(f"move: {cell.plan.setup.name} has no arm")
+    joints = arm.model.joints
+    if args.joint is not None:
+        if not 1 <= args.joint <= len(joints):
+            raise UsageError(f"move: --joint {args.joint}: the arm has joints 1 to {len(joints)}")
+        its, (number, unit) = joints[args.joint - 1], args.by
+        if unit not in (None, its.unit):
+            raise UsageError(f"move: --by {number:g}{unit}: joint {args.joint} moves in {its.unit}")
+        q = cell.read().q
+        assert q is not None
+        q = q.copy()
+        q[args.joint - 1] += number / its.shown(1.0)
+        return q
+    try:
+        numbers = [float(part) for part in args.to.split(",")]
+    except ValueError:
+        return str(args.to)
+    if len(numbers) != len(joints):
+        raise UsageError(f"move: expected positions of {len(joints)} joints, got {len(numbers)}: {args.to}")
+    return [number / joint.shown(1.0) for number, joint in zip(numbers, joints, strict=True)]
+
+
+def described(cell: OpenCell, found: HandWay, speed: float) -> str:
+    """The way in words: what each joint does, and how long it takes."""
+    arm = cell.plan.setup.arm
+    assert arm is not None
+    start, end = found.q[0], found.q[-1]
+    lines = [
+        f"  joint {i + 1}: {its.shown(start[i]):.2f} to {its.text(end[i], '.2f')} ({its.shown(end[i] - start[i]):+.2f})"
+        for i, its in enumerate(arm.model.joints)
+    ]
+    tip = found.tip[-1]
+    places = ", ".join(f"{1e3 * value:.0f}" for value in tip)
+    slowed = f"; {found.slowed_by}" if found.slowed_by else ""
+    head = f"the way: {found.profile().duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
+    return "\n".join([head, *lines, f"  the probe's tip comes to {places} mm"])
+
+
+def standing(cell: OpenCell) -> str:
+    """Where the arm stands, in deg or mm."""
+    arm, q = cell.plan.setup.arm, cell.read().q
+    assert arm is not None and q is not None
+    return ", ".join(its.text(value, ".2f") for its, value in zip(arm.model.joints, q, strict=True))

@@ -1,0 +1,106 @@
+"""List the postures of a cell, check them, or save the one in which the arm stands.
+
+Postures stand in the cell file, `[postures]`, in degrees or millimetres; `start` is what the joints have as start_deg
+or start_mm. `save` keeps the comments of the file. Nothing is moved.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.hands import opened
+from canprobe.cli.move import standing
+from canprobe.cli.output import print_json, print_table
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import loaded
+from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.cell.planning.model import Plan
+
+HELP = "list, check or save postures of a cell"
+EXAMPLE = """\
+examples:
+  canprobe posture list puma260
+  canprobe posture check cell.toml
+  canprobe posture save cell.toml ready --bus socketcan --channel can0
+"""
+
+
+def add_arguments(parser: Parser) -> None:
+    actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
+    for action, text in (
+        ("list", "list the postures"),
+        ("check", "check that each posture, and the way from the start to it, keeps all limits"),
+        ("save", "save the posture in which the arm stands"),
+    ):
+        one = actions.add_parser(action, help=text, description=f"{text.capitalize()}.")
+        add_scene(one)
+        if action == "save":
+            one.add_argument("name", metavar="NAME", help="name of the posture")
+            add_options(one, *BUS, "--realtime", "--patient")
+        if action == "list":
+            add_options(one, "--json")
+        add_verbosity(one)
+        one.set_defaults(run=run, action=action)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what ACTION says."""
+    if args.action == "save":
+        return _save(args)
+
+    from canprobe.cell.planning.make import make_plan
+    from canprobe.cell.scene.resolve import resolve
+
+    plan = make_plan(resolve(loaded(args)))
+    arm = plan.setup.arm
+    if arm is None:
+        raise UsageError(f"posture: {plan.setup.name} has no arm")
+    shown = {
+        name: [round(its.shown(value), 3) for its, value in zip(arm.model.joints, q, strict=True)]
+        for name, q in arm.postures.items()
+    }
+    if args.action == "list":
+        if args.json:
+            print_json(shown)
+        else:
+            heads = [f"{its.name} ({its.unit})" for its in arm.model.joints]
+            print_table([["posture", *heads], *([name, *(f"{v:g}" for v in row)] for name, row in shown.items())])
+        return 0
+    return _check(plan)
+
+
+def _check(plan: Plan) -> int:
+    """Print what is wrong with each posture; status 2 where something is."""
+    from canprobe.cell.tasks.hand_way import joint_way, refuse
+
+    arm, wrong = plan.setup.arm, 0
+    assert arm is not None
+    for name, q in arm.postures.items():
+        try:
+            refuse(plan, joint_way(plan, arm.q_start, q))
+            print(f"{name}: fits")
+        except UsageError as error:
+            wrong += 1
+            print(f"{name}: from the start, {error}")
+    return 2 if wrong else 0
+
+
+def _save(args: argparse.Namespace) -> int:
+    """Read where the arm stands, and write it into the cell file."""
+    from canprobe.cli.posture_file import save_posture
+
+    path = Path(args.cell or args.scene)
+    with opened(args) as cell:
+        arm, q = cell.plan.setup.arm, cell.read().q
+        if arm is None or q is None:
+            raise UsageError(f"posture: {cell.plan.setup.name} has no arm")
+        text = standing(cell)
+        posture = [round(its.shown(value), 4) for its, value in zip(arm.model.joints, q, strict=True)]
+    save_posture(path, args.name, posture)
+    print(f"{path}: {args.name} is {text}")
+    return 0

@@ -1,0 +1,141 @@
+"""`move`, `tare`, `listen`, `posture`: what is printed, what is refused, and what is written."""
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+
+import pytest
+
+from canprobe.cell.scene.load import packaged_files
+from canprobe.cli import main
+
+HEAD = "# my cell, with a comment\n"
+
+
+@pytest.fixture
+def mine(tmp_path):
+    """A cell file of one's own."""
+    path = tmp_path / "mine.toml"
+    path.write_text(HEAD + packaged_files("cells")["puma260"].read_text())
+    return path
+
+
+def told(capsys, *words, status=0):
+    assert main([*map(str, words)]) == status
+    return capsys.readouterr()
+
+
+def test_a_dry_run_shows_the_way_and_moves_nothing(capsys):
+    out = told(capsys, "move", "puma260", "-90,65,15,0,100,0", "--dry-run").out
+    assert "joint 1: 90.00 to -90.00 deg (-180.00)" in out and "the way: 8.7 s at 10 % of the speed limits" in out
+    assert "the arm stands at" not in out
+    words = ("move", "puma260", "--joint", 2, "--by", "-5deg", "--speed", "50%", "--dry-run")
+    assert "joint 2: 65.00 to 60.00 deg (-5.00)" in told(capsys, *words).out
+
+
+def test_a_move_in_millimetres(capsys):
+    out = told(capsys, "move", "gantry", "--joint", 1, "--by", "10mm", "--yes", "-q").out
+    assert out.endswith("the arm stands at 210.00 mm, 200.00 mm, 150.00 mm\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("move", "puma260"), "expected a posture, or --joint and --by"),
+        (("move", "puma260", "start", "--joint", "1", "--by", "1deg"), "expected a posture, or --joint and --by"),
+        (("move", "puma260", "start"), "move asks before the motion and needs a terminal; --yes leaves that out"),
+        (("move", "puma260", "1,2", "--yes"), "expected positions of 6 joints, got 2"),
+        (("move", "puma260", "strat", "--yes"), "did you mean start?"),
+        (("move", "puma260", "--joint", "7", "--by", "1", "--yes"), "the arm has joints 1 to 6"),
+        (("move", "puma260", "--joint", "3", "--by", "5mm", "--yes"), "joint 3 moves in deg"),
+        (("move", "listen", "start", "--yes"), "expected a scene with an arm|has no arm"),
+        (("home", "puma260", "--yes"), 'home: no joint of puma260 has zero = "homing"'),
+        (("home", "puma260"), "home asks before each joint and needs a terminal"),
+        (("tare", "free", "--yes"), r"free: has no array \(\[sensor\]\)"),
+        (("listen", "free"), r"free: has no array"),
+        (("posture", "save", "puma260", "a"), "`canprobe init` makes one of a packaged cell"),
+    ],
+)
+def test_what_cannot_be_is_one_clear_line(words, said, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
+    *_, line = told(capsys, *words, "-q", status=2).err.splitlines()
+    assert re.search(said, line), line
+
+
+def test_a_speed_is_a_share(capsys):
+    assert (
+        "expected a share such as 20% or 0.2"
+        in told(capsys, "move", "puma260", "start", "--speed", "20deg", status=2).err
+    )
+
+
+def test_a_posture_is_saved_without_touching_the_rest(mine, capsys):
+    before = mine.read_text()
+    told(capsys, "posture", "save", mine, "ready", "-q", "--set", "joints.joint_1.start_deg=80")
+    told(capsys, "posture", "save", mine, "other one", "-q")
+    told(capsys, "posture", "save", mine, "ready", "-q", "--set", "joints.joint_1.start_deg=70")
+    text = mine.read_text()
+    assert text.startswith(before.rstrip("\n")) and text.startswith(HEAD)
+    listed = json.loads(told(capsys, "posture", "list", mine, "--json").out)
+    assert [*listed] == ["start", "other one", "ready"]
+    assert (
+        listed["ready"][0] == pytest.approx(70.0, abs=0.01) and len(text.splitlines()) == len(before.splitlines()) + 4
+    )
+    assert told(capsys, "posture", "check", mine).out.splitlines() == ["start: fits", "other one: fits", "ready: fits"]
+    told(capsys, "move", mine, "ready", "--yes", "-q")
+    assert "choose another name" in told(capsys, "posture", "save", mine, "start", "-q", status=2).err
+
+
+def test_a_posture_that_does_not_fit_is_named(mine, capsys):
+    mine.write_text(mine.read_text() + "\n[postures]\nfar = [90, 65, 80, 0, 100, 0]\n")
+    out = told(capsys, "posture", "check", mine, status=2).out
+    assert "far: from the start, joint 3 would come to 5" in out
+    mine.write_text(mine.read_text().replace("80, 0, 100, 0]", "80, 0]"))
+    assert (
+        "postures.far: expected a position of each of the 6 joints, got 4"
+        in told(capsys, "posture", "check", mine, status=2).err
+    )
+
+
+def test_listen_prints_each_image_as_a_document(capsys):
+    lines = told(capsys, "listen", "puma260", "--duration", 0.5, "--json", "-q").out.splitlines()
+    images = [json.loads(line) for line in lines]
+    assert len(images) == 5 and [*images[0]][:2] == ["t_s", "force_n"] and images[0]["highest_count"] == 0
+    assert "no contact" in told(capsys, "listen", "puma260", "--duration", 0.2, "-q").out
+
+
+def test_a_tare_shows_the_image_before_and_after(capsys):
+    lines = told(capsys, "tare", "gantry", "--yes", "-q").out.splitlines()
+    assert [line.split()[0] for line in lines] == ["before:", "after:"]
+
+
+@pytest.mark.parametrize(("answer", "said"), [("n", "nothing was moved"), ("y", "the arm stands at 70.00 deg")])
+def test_a_person_is_asked_and_may_say_no(answer, said):
+    command = [sys.executable, "-m", "canprobe", "move", "puma260", "--joint", "1", "--by", "-20deg"]
+    master, slave = pty.openpty()
+    with subprocess.Popen(command, stdin=slave, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        os.close(slave)
+        lines = []
+        for line in process.stdout:
+            lines.append(line)
+            if line.startswith("move? ["):
+                os.write(master, f"{answer}\n".encode())
+    os.close(master)
+    assert process.returncode == 0 and said in "".join(lines)
+
+
+def test_the_end_of_a_pipe_at_stdin_brakes_the_motion():
+    """The motion takes a minute of the cell's time, and the pipe ends when it has begun."""
+    command = [sys.executable, "-m", "canprobe", "move", "puma260", "--joint", "1", "--by", "-100deg", "--yes"]
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen([*command, "--speed", "0.5%", "-v"], **pipes) as process:
+        for line in process.stderr:
+            if b"enable the drives" in line:
+                break
+        process.stdin.close()
+        out, err = process.stdout.read(), process.stderr.read()
+    assert process.returncode == 0 and b"stdin has ended, and the motion was braked" in err
+    assert b"-10.00 deg, 65.00" not in out and b"the arm stands at" in out
