@@ -29,7 +29,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in PAGES}
 PATHS = ("canprobe/", "docs/", "tests/", ".ci/")
 SECTIONS = {
-    name: typing.get_args(hint)[-1] if name == "joints" else next(iter(typing.get_args(hint)), hint)
+    name: typing.get_args(hint)[-1] if name in ("joints", "postures") else next(iter(typing.get_args(hint)), hint)
     for name, hint in {**typing.get_type_hints(ArrayFile), **typing.get_type_hints(Scene)}.items()
 }
 
