@@ -37,6 +37,8 @@ COMMAND_REPEAT_NS = 100_000_000
 _FEEDBACK: tuple[Place, ...] = ((0x6041, 0), (0x6064, 0), (0x6077, 0))
 _TARGETS = frozenset(TARGETS.values())
 _UNTOLD = (None, DriveState.OPERATION_ENABLED)
+MOVED_NS = 20_000_000
+"""Time for which a drive reports the same place and counts as moving: one wrong report may repeat the last one."""
 DOUBTED_CYCLES = 2
 """TPDOs in a row whose statusword is not believed either, where their position cannot be: fewer than make a hold."""
 UNSTATED_LAG_S = 0.05
@@ -290,10 +292,10 @@ class DriveGroup:
 
     @property
     def brakeable(self) -> tuple[bool, ...]:
-        """Whether each drive is enabled and reports that it moves: a target where it is brakes it."""
+        """Whether each drive is enabled and moved a moment ago, by its reports: a target where it is brakes it."""
         return tuple(
             [
-                track.cycle == self._cycle and track.rested_ns == 0 and on
+                track.cycle == self._cycle and track.rested_ns < MOVED_NS and on
                 for track, on in zip(self._tracks, self.enabled_ones(), strict=True)
             ]
         )
