@@ -275,8 +275,8 @@ class Cell:
         """Raise an interrupt that came; a controller that brakes by itself raises it when it has."""
         try:
             interrupts.take()
-        except KeyboardInterrupt:
-            if not self.cycles.controller.brake():
+        except KeyboardInterrupt as interrupt:
+            if not self.cycles.controller.brake(interrupt):
                 raise
 
     def tare(self) -> None:

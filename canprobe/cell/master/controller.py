@@ -167,10 +167,11 @@ class Controller:
             reason: reason for `Command.stop_reason`.
         """
 
-    def brake(self) -> bool:
-        """Come to rest after an interrupt, then raise KeyboardInterrupt; False: the cell stops at once.
+    def brake(self, interrupt: KeyboardInterrupt) -> bool:
+        """Come to rest, then raise the interrupt in a step; False: the cell stops at once.
 
-        A second interrupt stops the cell in any case.
+        Args:
+            interrupt: Ctrl-C, or a signal that ends the process. A second one stops the cell in any case.
         """
         return False
 

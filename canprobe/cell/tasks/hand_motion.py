@@ -52,7 +52,7 @@ class HandMotion(Controller):
         self._back: MotionProfile | None = None
         self._t = self._touched_at = self.share = 0.0
         self._late_ns = 0
-        self._interrupted = False
+        self._interrupt: KeyboardInterrupt | None = None
         self.ended_by: str | None = None
 
     @property
@@ -68,10 +68,9 @@ class HandMotion(Controller):
         stands, was = its.text(q[joint], ".2f"), its.text(self._way.q[0][joint], ".2f")
         return f"joint {joint + 1} stands at {stands}, and was at {was} when the way was planned: plan it again"
 
-    def brake(self) -> bool:
-        if not self._interrupted:
-            self._end("interrupted")
-            self._interrupted = True
+    def brake(self, interrupt: KeyboardInterrupt) -> bool:
+        self._end("interrupted")
+        self._interrupt = interrupt
         return True
 
     def step(self, measurement: Measurement) -> Command:
@@ -89,8 +88,8 @@ class HandMotion(Controller):
         assert measurement.q is not None
         if measurement.t_ns < self._late_ns and (np.abs(measurement.q - q) > self._count).any():
             return Command(q)
-        if self._interrupted:
-            raise KeyboardInterrupt
+        if self._interrupt is not None:
+            raise self._interrupt
         return Command(q, done=True, stop_reason=self.ended_by if self._back is not None else None)
 
     def _end(self, why: str) -> None:

@@ -12,6 +12,7 @@ from canprobe.cell.scene.load import packaged
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks.hand_way import joint_way
 from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
+from canprobe.fieldbus.bus.real.interrupts import Terminated
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 READY = [80.0, 70.0, 10.0, 5.0, 90.0, 20.0]
@@ -145,9 +146,10 @@ def test_a_motion_that_is_no_longer_wanted_ends_in_a_tenth_of_a_second():
     assert (np.flatnonzero(moves)[-1] - first - 100) / 400.0 < 0.15
 
 
-def test_ctrl_c_brakes_and_then_ends():
-    with cell() as opened, pytest.raises(KeyboardInterrupt):
-        opened.move("ready", 0.3, progress=lambda m: m.cycle == 160 and signal.raise_signal(signal.SIGINT))
+@pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGHUP, Terminated)])
+def test_ctrl_c_and_a_closed_terminal_brake_and_then_end(number, kind):
+    with cell() as opened, pytest.raises(kind):
+        opened.move("ready", 0.3, progress=lambda m: m.cycle == 160 and signal.raise_signal(number))
     q = log_of(opened)["q_target_rad"]
     q = q[np.isfinite(q).all(axis=1)]
     speed = np.abs(np.diff(q, axis=0)).max(axis=1) * 400
