@@ -147,9 +147,9 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
         q_start,
         settings.missed_syncs,
         settings.grouped_rpdo,
-        postures,
         settings.torque,
         warnings,
+        postures,
     )
     return arm, bodies
 

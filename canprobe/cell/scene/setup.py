@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
@@ -104,9 +104,9 @@ class Arm:
         q_start: (n,) rad; selects the branch of the inverse kinematics, and is where an emulated arm stands.
         missed_syncs: SYNC periods of silence after which drive and master treat each other as lost.
         grouped: two targets share an RPDO through dummy mapping.
-        postures: (n,) rad or m by name, that of the start among them.
         torque: the drives send their torque where they can; the plan gives it up where the bus has no room for it.
         warnings: values of its URDF that are hardly meant.
+        postures: (n,) rad or m by name, that of the start among them.
     """
 
     model: ArmModel
@@ -114,9 +114,9 @@ class Arm:
     q_start: Floats
     missed_syncs: int
     grouped: bool | Auto
-    postures: Mapping[str, Floats]
     torque: bool = True
     warnings: tuple[str, ...] = ()
+    postures: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def node_ids(self) -> tuple[int, ...]:

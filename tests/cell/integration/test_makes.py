@@ -465,5 +465,5 @@ def test_a_limit_of_speed_below_the_rounding_of_targets_is_refused(tmp_path):
 
 def test_a_drive_without_an_object_for_it_waits_for_arm_missed_syncs(tmp_path):
     scene = change(scene_of("milliseconds_only", tmp_path), arm={"missed_syncs": 40})
-    drive = Session(canprobe.plan(scene)).world.nodes[0].application
+    drive = Session(canprobe.plan(scene)).buses.world.nodes[0].application
     assert drive.parts.parameters.misses == 40

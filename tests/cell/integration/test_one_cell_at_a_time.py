@@ -15,7 +15,7 @@ from canprobe.api import results_folder
 from canprobe.cell.master.controller import Command
 from canprobe.cell.npz import read_npz
 from canprobe.cell.results import summary as results
-from canprobe.cell.session import session as recording
+from canprobe.cell.session import folder as recording
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump

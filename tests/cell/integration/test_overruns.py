@@ -31,7 +31,7 @@ class Stalls(Wrapped):
     def step(self, measurement: Measurement) -> Command:
         command = self.task.step(measurement)
         if measurement.cycle % self._every == self._every - 1:
-            bus = self._session.lockstep
+            bus = self._session.buses.lockstep
             assert bus is not None
             bus.clock.sleep_until_ns(bus.clock.now_ns() + STALL_NS)
         return command

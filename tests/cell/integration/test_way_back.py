@@ -66,7 +66,9 @@ def test_while_a_drive_is_not_heard_the_others_stand_where_they_were_and_go_on_s
     targets = run.session.cell.log.arrays()["q_target_rad"]
     first, held = run.at + np.flatnonzero(np.isnan(targets[run.at : run.at + 20]).all(axis=1))[0], [0, 1, 3, 4, 5]
     q = run.session.cell.log.arrays()["q_rad"]
-    assert np.abs(targets[first + 1, held] - q[first + 1, held]).max() < 1e-9, "measured, not the last target"
+    assert np.abs(targets[first + 1, held] - q[first + 1, held]).max() < 5e-4, (
+        "next to where they are, not at the last target"
+    )
     usual = np.nanmax(np.abs(np.diff(targets[: run.at], axis=0)))
     assert np.nanmax(np.abs(np.diff(targets[first + 2 :], axis=0))) < 3.0 * usual
 

@@ -11,7 +11,7 @@ import pytest
 from scenes import change
 
 import canprobe
-from canprobe.cell.planning.device_capabilities import Abilities
+from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.planning.report_json import plan_dict
@@ -183,4 +183,4 @@ def test_a_plan_knows_about_how_many_cycles_it_takes():
 def test_the_identity_that_1018h_leaves_open_is_that_of_device_info():
     """The plan compares it in bring-up; a revision of 0 there is an empty field."""
     path = Path(__file__).parents[2] / "fieldbus" / "eds" / "messy" / "untold_drive.eds"
-    assert Abilities.of(str(path), 5).identity.numbers == (0xFB, 0x62100000, None, None)
+    assert DeviceCapabilities.of(str(path), 5).identity.numbers == (0xFB, 0x62100000, None, None)

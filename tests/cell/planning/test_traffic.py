@@ -10,7 +10,7 @@ from makes import write_eds
 from scenes import change, reasons, refused, ways_out, with_joints, without_torque
 
 import canprobe
-from canprobe.cell.planning.device_capabilities import Abilities
+from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.identifiers import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages
@@ -418,7 +418,7 @@ class TestOtherDevices:
         assert "has objects of more axes, from 6800h, 7000h" in left["axes 2, 3 of node 4 (joint 4)"]
 
     def test_abilities_read_from_the_packaged_eds(self):
-        device = Abilities.of("puma260_joint.eds", 1)
+        device = DeviceCapabilities.of("puma260_joint.eds", 1)
         assert device.entry(0x6064, 0, "tpdo").signed
         assert device.entry(0x6064, 0, "rpdo") is None, "a read-only object cannot be received"
         assert device.entry(0x607A, 0, "rpdo").bits == 32

@@ -161,7 +161,7 @@ class ZeroShift(DriveEffect):
 
     name, what = "zero-shift", "the zero of the drive is elsewhere"
     clause, reaction = "CiA 402-2, 607Ch", "does not hold the old zero"
-    trips = "drive_fault"
+    trips = "pdo_missed emcy"
     parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "way of the zero, units of position"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:

@@ -144,7 +144,7 @@ class Babble(Effect):
 
     name, what = "babble", "frames that nobody asked for; the seed chooses their sort"
     clause, reaction = "ISO 11898-1, arbitration", "stays below the load that it bears"
-    trips, fails = "drive_fault", "6 30 31 37 40"
+    trips, fails = "pdo_missed", "6 30 31 37 40"
     parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:

@@ -228,7 +228,7 @@ class Remapped(Effect):
 
     name, what = "remapped", "two entries of a TPDO are exchanged"
     clause, reaction = "CiA 301, 1A00h", "reads 1Axxh at bring-up; drops what cannot be"
-    trips = "drive_fault"
+    trips = "pdo_missed drive_fault"
     _exchanged: tuple[int, int, int] | None = None
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
