@@ -628,7 +628,7 @@ def test_the_drives_of_a_dead_master_stop_by_themselves():
 def test_a_full_disk(tmp_path):
     class OnDisk(Injected):
         def _run(self):
-            self.session.options.out = tmp_path
+            self.session.options = replace(self.session.options, out=tmp_path)
             super()._run()
 
     def fill(run):

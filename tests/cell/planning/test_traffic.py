@@ -143,7 +143,7 @@ def test_average_below_one_but_peak_too_high_is_refused(cylinder, monkeypatch):
 
     The search for ways out, which takes a quarter of a minute at this rate, is tried elsewhere.
     """
-    monkeypatch.setattr("canprobe.cell.planning.make.ways_out", lambda *_: [])
+    monkeypatch.setattr("canprobe.cell.planning.make.suggested_changes", lambda *_: [])
     problems = reasons(change(cylinder, sensor={"mode": "image", "rate_hz": 50.0}))
     assert not any("load" in problem for problem in problems)
     assert any("7585 µs of the 5000 µs" in problem for problem in problems)
