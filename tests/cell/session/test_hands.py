@@ -146,8 +146,8 @@ def test_a_motion_that_is_no_longer_wanted_ends_in_a_tenth_of_a_second():
     assert (np.flatnonzero(moves)[-1] - first - 100) / 400.0 < 0.15
 
 
-@pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGHUP, Terminated)])
-def test_ctrl_c_and_a_closed_terminal_brake_and_then_end(number, kind):
+@pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+def test_an_interrupt_from_inside_or_outside_brakes_and_then_ends(number, kind):
     with cell() as opened, pytest.raises(kind):
         opened.move("ready", 0.3, progress=lambda m: m.cycle == 160 and signal.raise_signal(number))
     q = log_of(opened)["q_target_rad"]
