@@ -29,6 +29,7 @@ class ContactLearning:
         check: compares the array with its calibration; None where nothing can be compared.
 
     Attributes:
+        sensing: as above.
         remarks: that the calibration is another array's, once.
         columns: columns of the log with the newest estimate.
     """
@@ -37,7 +38,7 @@ class ContactLearning:
         self.remarks: list[str] = []
         self.columns: dict[str, float | Floats] = {}
         self.check = check
-        self._sensing, self._shape = sensing, shape
+        self.sensing, self._shape = sensing, shape
         self._push = PushFit()
         self._push_from: tuple[Floats, Floats] | None = None
 
@@ -48,7 +49,7 @@ class ContactLearning:
 
     def push(self, contact: ContactSample, surface: LocalSurface) -> float:
         """Learn from the growing force how stiff this touch is; the way by which the surface rises with it, m."""
-        sensing = self._sensing
+        sensing = self.sensing
         centre = contact.p_base + contact.n_base * (sensing.radius - sensing.depth(contact.force_n))
         if self._push_from is None:
             self._push_from = centre, contact.n_base
@@ -74,9 +75,9 @@ class ContactLearning:
         if not bool(np.all(estimate.observed)):
             return False
         surface.set_curvature(estimate.curvature_tensor_base())
-        before = self._sensing.depth(contact.force_n)
-        self._sensing.set_kappa(np.asarray(estimate.kappa), estimate.stiffness)
-        surface.raise_by(self._sensing.depth(contact.force_n) - before)
+        before = self.sensing.depth(contact.force_n)
+        self.sensing.set_kappa(np.asarray(estimate.kappa), estimate.stiffness)
+        surface.raise_by(self.sensing.depth(contact.force_n) - before)
         return True
 
     def doubt(self) -> None:
@@ -84,11 +85,11 @@ class ContactLearning:
         check = self.check
         if check is None or not check.work() or (finding := check.finding) is None:
             return
-        self._sensing.reader.widen(check.force_spread)
+        self.sensing.reader.widen(check.force_spread)
         if self._shape is not None:
             self._shape.doubted = check.image_model_off
         if check.contradicted:
-            self._sensing.leave_out_moments()
+            self.sensing.leave_out_moments()
         if not self.remarks:
             wider = "forces and regions" if check.image_model_off else "forces"
             self.remarks.append(f"{finding}: {wider} are stated wider from here on; {CALIBRATE}")

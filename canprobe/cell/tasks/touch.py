@@ -91,6 +91,7 @@ class TouchTask(ProbingTask):
 
     Attributes:
         targets: what the servo aims at, `target_force_n` and `speed_m_s`; it follows a small step at once.
+        learned: what the contact has taught, by the same sensing.
     """
 
     def __init__(
@@ -103,8 +104,8 @@ class TouchTask(ProbingTask):
     ) -> None:
         super().__init__(plan, task.lag_s, sensing, holds=task.scan is None)
         self.shape = shape
-        self._learned = ContactLearning(sensing, shape, check)
-        self.remarks = self._learned.remarks
+        self.learned = ContactLearning(sensing, shape, check)
+        self.remarks = self.learned.remarks
         self._scan_start: int | None = None
         self._scan_end: int | None = None
         self._task = task
@@ -146,7 +147,7 @@ class TouchTask(ProbingTask):
         if self._updated:
             return
         self._updated = True
-        learned, contact, servo = self._learned, self._contact, self._servo
+        learned, contact, servo = self.learned, self._contact, self._servo
         if self.shape is not None and (estimate := self.shape.work()) is not None:
             if learned.check is not None:
                 learned.check.take(estimate, self.sensing.slope)
@@ -160,7 +161,7 @@ class TouchTask(ProbingTask):
     # sensing and supervision
 
     def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
-        self._touch.feel(patch, sample.t_sample_ns, known=patch.saturated and self._learned.stiffness_known)
+        self._touch.feel(patch, sample.t_sample_ns, known=patch.saturated and self.learned.stiffness_known)
         if self.phase is Phase.SCAN:
             self.taxels = sample.frame.taxels
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
@@ -175,15 +176,15 @@ class TouchTask(ProbingTask):
             self._sample_t = contact.t_s
             if self.phase is Phase.SETTLE:
                 assert self._sinking is not None
-                self._sinking.depth += self._learned.push(contact, self._servo.surface)
+                self._sinking.depth += self.learned.push(contact, self._servo.surface)
                 if self._t > REST_SHARE * SETTLE_S:
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self.shape.add(contact)
-            if self.phase is Phase.SCAN and (check := self._learned.check) is not None:
+            if self.phase is Phase.SCAN and (check := self.learned.check) is not None:
                 check.see(contact.t_s, self.sensing.reader.image, sample.frame.window, patch)
         felt_columns = self._felt_columns(sample, patch, contact)
-        self._columns = felt_columns | self._learned.columns | {"depth_at_1n_mm": depth_at_1n_mm}
+        self._columns = felt_columns | self.learned.columns | {"depth_at_1n_mm": depth_at_1n_mm}
         return contact
 
     def _at_hollow(self, radius: float) -> None:
@@ -271,7 +272,7 @@ class TouchTask(ProbingTask):
         if self._t >= SETTLE_S:
             self._enter(Phase.SCAN)
             self._scan_start = self._cycle
-            doubt = self._at_rest.doubt(self.targets["target_force_n"], self._learned.stiffness_known)
+            doubt = self._at_rest.doubt(self.targets["target_force_n"], self.learned.stiffness_known)
             if doubt is not None:
                 self.retreat(doubt)
         return pose

@@ -194,7 +194,7 @@ def carry_out(case: LoopCase) -> Row:
     task = make_task(session.plan)
     assert isinstance(task, TouchTask)
     if case.servo == "stated":
-        task.sensing = stated_sensing(session.plan.scene)
+        task.sensing = task.learned.sensing = stated_sensing(session.plan.scene)
     if case.late_ms > 0.0:
         assert session.scene.sensor is not None
         late_ids = {pdo.cob_id for pdo in session.plan.pdos if pdo.direction == "rpdo"}
