@@ -6,14 +6,13 @@ Asks before each joint. A zero is recorded beside the cell file, and holds as lo
 from __future__ import annotations
 
 import argparse
-import sys
 
 from canprobe.cli.argument_types import whole
 from canprobe.cli.common_arguments import add_scene
 from canprobe.cli.hands import add_arguments_of_hands
 from canprobe.cli.parser import Parser
+from canprobe.cli.stdin import need_terminal
 from canprobe.cli.target import scene_of
-from canprobe.errors import UsageError
 
 HELP = "home the joints whose drives have no absolute encoder"
 EXAMPLE = """\
@@ -33,8 +32,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Home joint by joint."""
-    if not args.yes and not sys.stdin.isatty():
-        raise UsageError("home asks before each joint and needs a terminal; --yes leaves that out")
+    need_terminal(args.yes, "home asks before each joint")
     scene = scene_of(args)
 
     from canprobe import api

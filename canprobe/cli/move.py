@@ -13,8 +13,9 @@ import re
 from typing import TYPE_CHECKING
 
 from canprobe.cli.common_arguments import add_scene
-from canprobe.cli.hands import InputOpen, add_arguments_of_hands, agreed, opened
+from canprobe.cli.hands import add_arguments_of_hands, agreed, opened
 from canprobe.cli.parser import Parser
+from canprobe.cli.stdin import InputOpen
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:

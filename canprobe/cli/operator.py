@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
-import select
 import sys
 
 from canprobe.cell.tasks.joint_finding import Answer, SeenWay
 from canprobe.cli.output import say
+from canprobe.cli.stdin import typed
 
 _CHOICES = {False: "Enter or y: yes, n: no, q: end", True: "a number, Enter or y: just so, n: otherwise, q: end"}
 """The choices of a question, by whether it asks for a way."""
@@ -36,14 +35,10 @@ class LetterKey:
         if self._descriptor is None or self._left > 0:
             return False
         self._left = _LOOK_EVERY
-        typed = b""
-        while select.select([self._descriptor], [], [], 0)[0]:
-            data = os.read(self._descriptor, 4096)
-            if not data:
-                self._descriptor = None
-                break
-            typed += data
-        return self._letter in (line.strip().lower() for line in typed.decode(errors="replace").splitlines())
+        lines, is_open = typed(self._descriptor)
+        if not is_open:
+            self._descriptor = None
+        return self._letter in (line.strip().lower() for line in lines.decode(errors="replace").splitlines())
 
 
 class TerminalOperator:
@@ -87,9 +82,6 @@ class TerminalOperator:
 
     def _read(self) -> bool:
         """Read the available text; False at the end of the file."""
-        while select.select([self._descriptor], [], [], 0)[0]:
-            data = os.read(self._descriptor, 4096)
-            if not data:
-                return bool(self._text)
-            self._text += data
-        return True
+        text, is_open = typed(self._descriptor)
+        self._text += text
+        return is_open or bool(self._text)

@@ -6,11 +6,11 @@ The drives hold their positions. A SocketCAN interface is checked before anythin
 from __future__ import annotations
 
 import argparse
-import sys
 
 from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
+from canprobe.cli.stdin import need_terminal
 from canprobe.cli.target import scene_of
 from canprobe.errors import UsageError
 
@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     if args.recover and args.check_joints:
         raise UsageError("up: --check-joints moves joints with somebody beside it; leave out --recover")
     scene = scene_of(args)
-    if args.check_joints and not args.yes and not sys.stdin.isatty():
-        raise UsageError("up --check-joints asks before each motion and needs a terminal; --yes leaves that out")
+    if args.check_joints:
+        need_terminal(args.yes, "up --check-joints asks before each motion")
 
     from canprobe import api
 

@@ -117,4 +117,4 @@ class HandMotion(Controller):
     def _share_of_back(self) -> float:
         """Share of the way on which the probe goes `BACK_M`."""
         steps = np.linalg.norm(np.diff(self._way.tip, axis=0), axis=1)
-        return BACK_M / max(float(steps.mean()) * len(steps), 1e-9)
+        return BACK_M / max(float(steps.sum()), 1e-9)
