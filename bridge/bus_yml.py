@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from canprobe.cell.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
+from canprobe.cell.planning.configuration import SYNC_START_VALUE, NodeConfiguration, Write
 from canprobe.cell.planning.device_capabilities import INVALID, MAPPING
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
@@ -100,7 +100,7 @@ def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
         if not path.exists() or not path.samefile(eds_file(eds)):
             with whole_file(path) as part:
                 part.write_bytes(eds_file(eds).read_bytes())
-    setups = {setup.node_id: setup for setup in make_setups(plan)}
+    setups = {setup.node_id: setup for setup in plan.configurations}
     paths = []
     for bus in plan.buses:
         document: dict[str, Any] = {"options": {"dcf_path": "."}, "master": _master(plan)}
@@ -142,7 +142,7 @@ def _master(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _slave(plan: Plan, node: PlannedNode, setup: NodeSetup, eds: str) -> dict[str, Any]:
+def _slave(plan: Plan, node: PlannedNode, setup: NodeConfiguration, eds: str) -> dict[str, Any]:
     driver, package = _DRIVERS[node.kind]
     revision = node.identity.revision_number
     return {
@@ -178,7 +178,7 @@ def _by_hand(pdo: PlannedPdo) -> bool:
     return pdo.layout.length > CLASSIC_BYTES or any(entry.is_dummy for entry in pdo.entries)
 
 
-def _pdos(plan: Plan, node: PlannedNode, setup: NodeSetup, direction: Direction) -> dict[int, Any]:
+def _pdos(plan: Plan, node: PlannedNode, setup: NodeConfiguration, direction: Direction) -> dict[int, Any]:
     off = {n: {"enabled": False, "cob_id": _Hex(INVALID)} for way, n in node.switched_off if way == direction}
     written = {write.index for write in setup.writes}
     on = {pdo.number: _pdo(pdo, written) for pdo in plan.pdos_of(node.node_id, direction) if not _by_hand(pdo)}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from canprobe.cell.planning.configuration import NodeSetup, make_setups
+from canprobe.cell.planning.configuration import NodeConfiguration
 from canprobe.cell.planning.model import (
     Plan,
 )
@@ -33,19 +33,19 @@ def write_dcfs(plan: Plan, folder: Path) -> list[Path]:
         The files.
     """
     paths = []
-    for setup in make_setups(plan):
+    for setup in plan.configurations:
         path = folder / f"node{setup.node_id:03}.dcf"
         write_text(path, _dcf_of(plan, setup, path.name), newline="")
         paths.append(path)
     return paths
 
 
-def final_values(setup: NodeSetup) -> dict[tuple[int, int], int]:
+def final_values(setup: NodeConfiguration) -> dict[tuple[int, int], int]:
     """Value of each entry after bring-up; commands, which keep no value, are left out."""
     return {(write.index, write.subindex): write.value for write in setup.writes if write.read_back}
 
 
-def _dcf_of(plan: Plan, setup: NodeSetup, name: str) -> str:
+def _dcf_of(plan: Plan, setup: NodeConfiguration, name: str) -> str:
     source = eds_file(setup.eds)
     commissioning = {
         "NodeID": str(setup.node_id),

@@ -216,7 +216,7 @@ def open_cell(
             where there is one. With a number the truth is not kept, and a scan is not scored.
         recover: come back after a node was switched off or reset, or the interface was down. `run` raises the error of
             the loss, and the next `run` waits for the nodes and brings them up again. A controller that says
-            `can_go_on` is held instead where the arm stands, and goes on after `OpenCell.resume`.
+            `resumable` is held instead where the arm stands, and goes on after `OpenCell.resume`.
         to_home: joints may be without a known zero, for `OpenCell.home`.
 
     Returns:

@@ -53,9 +53,9 @@ class _Completer:
 def _packaged(kind: str) -> Callable[[], Iterable[str]]:
     def names() -> Iterable[str]:
         from canprobe.cell.scene.load import packaged_files
-        from canprobe.cell.scene.offers import offers
+        from canprobe.cell.scene.plugins import plugins
 
-        return [*packaged_files(f"{kind}s"), *(offer.name for offer in offers(kind))]
+        return [*packaged_files(f"{kind}s"), *(plugin.name for plugin in plugins(kind))]
 
     return names
 

@@ -45,7 +45,7 @@ def print_packaged(
     """
     from canprobe.cell.results.expected import LISTED_FIGURES, expected_text, seeds_text
     from canprobe.cell.scene.load import offered, packaged, packaged_files
-    from canprobe.cell.scene.offers import offers
+    from canprobe.cell.scene.plugins import plugins
 
     document: list[dict[str, Any]] = []
     for kind, then in advice.items():
@@ -67,9 +67,9 @@ def print_packaged(
             print(f"in {next(iter(paths.values())).parent}; {then}")
             print_table([(row["name"], row["title"], f"of the package {row['package']}") for row in others])
     if "scene" in advice:
-        document += [{"kind": "estimator", "name": one.name, "package": one.package} for one in offers("estimator")]
+        document += [{"kind": "estimator", "name": one.name, "package": one.package} for one in plugins("estimator")]
         if not args.json:
-            print_table([(one.name, f"estimator of the package {one.package}") for one in offers("estimator")])
+            print_table([(one.name, f"estimator of the package {one.package}") for one in plugins("estimator")])
     if args.json:
         print_json(document)
     return 0

@@ -206,6 +206,7 @@ def failure(words: list[str], refusal: Answer, line: str, command: list[str]) ->
         return None
     repeated = line in then.lines and not line.startswith("  ")
     besides = {"bus can at  bit/s"} if "which the bus has no room for" in line else set()
+    besides |= set(re.findall(KEY, line.partition(", which asks for another ")[2]))
     announced = subjects(then.lines) <= subjects(refusal.lines) | besides or "(for `run`)" in line
     if announced and not repeated and (line.startswith("  ") or then.lines != refusal.lines):
         return None

@@ -18,7 +18,7 @@ HELD_CYCLES = 100
 class Way(Controller):
     """Moves every joint on at a constant rate, from where it is; it can go on after a loss."""
 
-    can_go_on = True
+    resumable = True
 
     def __init__(self, cycles=150):
         self.left, self.q, self.went_on = cycles, None, []

@@ -26,8 +26,8 @@ class Wrapped(Task):
         self.task.update()
 
     @property
-    def lets_go(self) -> bool:
-        return self.task.lets_go
+    def retreats_itself(self) -> bool:
+        return self.task.retreats_itself
 
     @property
     def trail(self):

@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.node_bringup import IDENTITY, NodeBringUp
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import TARE, TARE_COMMAND, NodeSetup, Write
+from canprobe.cell.planning.configuration import TARE, TARE_COMMAND, NodeConfiguration, Write
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import DEVICE_TYPE_REQUEST, SECOND_ANSWER_S
@@ -55,7 +55,7 @@ class BringUp:
         self,
         network: PumpedNetwork,
         watch: NodeWatch,
-        setups: tuple[NodeSetup, ...],
+        setups: tuple[NodeConfiguration, ...],
         settings: BringUpSettings,
         say: Callable[[str], None],
         *,
@@ -149,7 +149,7 @@ class BringUp:
             if count > resets[setup.node_id]:
                 self._refuse_twins(setup, count)
 
-    def _refuse_twins(self, setup: NodeSetup, boot_ups: int) -> None:
+    def _refuse_twins(self, setup: NodeConfiguration, boot_ups: int) -> None:
         """Refuse two nodes of one id: both answer a request. A node that boots twice, by its loader, answers once."""
         answers: list[bytes] = []
         cob_id = SDO_TX_BASE + setup.node_id
@@ -213,7 +213,7 @@ class BringUp:
             *waiting,
         )
 
-    def _not_operational(self) -> list[NodeSetup]:
+    def _not_operational(self) -> list[NodeConfiguration]:
         return [s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL]
 
     def booted_again(self) -> set[int]:
@@ -251,7 +251,7 @@ class BringUp:
         asked = {s.node_id: write_entry(s, write) for s in self._setups if s.node_id == node_id}
         return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
 
-    def _confirm_mode(self, setup: NodeSetup, mode: int, until_ns: int) -> Dialogue:
+    def _confirm_mode(self, setup: NodeConfiguration, mode: int, until_ns: int) -> Dialogue:
         while (got := (yield from read_entry(setup, MODE_DISPLAY, 0))) != mode:
             if self._network.port.clock.now_ns() >= until_ns:
                 raise self._error(
@@ -264,7 +264,7 @@ class BringUp:
         """1018h:04 of nodes, once they are up; without those that have or answer none."""
         found: dict[int, int] = {}
 
-        def ask(setup: NodeSetup) -> Dialogue:
+        def ask(setup: NodeConfiguration) -> Dialogue:
             with contextlib.suppress(NodeError):
                 found[setup.node_id] = yield from read_entry(setup, IDENTITY, SERIAL_SUBINDEX)
 
@@ -280,7 +280,7 @@ class BringUp:
         self._network.port.send_batch([pack_nmt(NmtCommand.PRE_OPERATIONAL, s.node_id) for s in self._setups])
         failures: list[NodeError] = []
 
-        def consumer_off(setup: NodeSetup) -> Dialogue:
+        def consumer_off(setup: NodeConfiguration) -> Dialogue:
             has_one = any(write.index == HEARTBEAT_CONSUMER for write in setup.writes)
             if setup.node_id not in self._booted or not has_one:
                 return
@@ -301,12 +301,12 @@ class BringUp:
     def _talk(self, dialogues: Mapping[int, Dialogue], timeout_s: float) -> dict[int, int]:
         return hold_dialogues(self._network, dialogues, timeout_s=timeout_s, retries=self._settings.retries)
 
-    def _error(self, reason: str, *setups: NodeSetup) -> NodeError:
+    def _error(self, reason: str, *setups: NodeConfiguration) -> NodeError:
         """The error of these nodes, with the last EMCY of each of them."""
         ids = [setup.node_id for setup in setups]
         return NodeError(ids[0], reason + "".join([self._nodes[node_id].last_words() for node_id in ids]))
 
 
-def _others(words: str, setups: Sequence[NodeSetup]) -> str:
+def _others(words: str, setups: Sequence[NodeConfiguration]) -> str:
     names = ", ".join(f"{s.node_id} ({s.name})" for s in setups[1:])
     return f"; {words} {names}" if names else ""

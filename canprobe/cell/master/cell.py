@@ -29,9 +29,8 @@ from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.master.restore_nodes import FoundNodes
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
-from canprobe.cell.master.supervision import Condition, Finding, Reaction, Seen, limits_of
+from canprobe.cell.master.supervision import Condition, CycleState, Finding, Reaction, limits_of
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import BusError, CanprobeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
@@ -98,7 +97,7 @@ class Cell:
         self.drives = make_drives(plan)
         self.tactile: ArrayReceiver | None = make_tactile(plan) if before is None else before.tactile
         self.watch = NodeWatch(plan.node_ids)
-        seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
+        seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
         earlier: SupervisedCycle | None = None if before is None else before.cycles
         self.cycles: SupervisedCycle = SupervisedCycle(
             plan, port, seen, options, observers, log_failure, origin_ns, earlier
@@ -109,7 +108,7 @@ class Cell:
         self._plan, self._options, self._say = plan, options, self.cycles.say
         self._network = PumpedNetwork(port, other=self._other)
         self._make_cycle = direct or Cycle
-        setups = make_setups(plan) if direct is None else ()  # without setups, bring-up only takes its time
+        setups = plan.configurations if direct is None else ()  # without setups, bring-up only takes its time
         settings, check = setup.bring_up, options.to_check
         if check:  # nothing is commanded or stored, such as a tare
             setups = tuple(replace(one, writes=tuple(w for w in one.writes if w.read_back)) for one in setups)
@@ -368,7 +367,7 @@ class Cell:
     def _supervise(self, measurement: Measurement) -> bool:
         """Check the conditions of the table; True: hold in this cycle."""
         finding = self.supervisor.finding()
-        if finding is None and not self.cycles.controller.lets_go:
+        if finding is None and not self.cycles.controller.retreats_itself:
             finding = self.supervisor.guard_contact(measurement)
         if finding is None or finding.condition.reaction is not Reaction.HOLD:
             self._holding = False
@@ -384,7 +383,7 @@ class Cell:
         self.stopped_by, reaction = finding.condition, finding.condition.reaction
         if finding.condition.blind and controller.array_blind is None:
             controller.array_blind = str(finding.error)
-        if reaction is Reaction.RETREAT and controller.lets_go:
+        if reaction is Reaction.RETREAT and controller.retreats_itself:
             self._retreats_for = self._retreats_for or finding.error
             controller.retreat(str(finding.error))
             return

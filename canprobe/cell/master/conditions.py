@@ -1,9 +1,9 @@
 """The table of conditions: what can go wrong, how it is seen, how fast, and what the cell does about it.
 
-Each row stands on its check. A check looks at the cell (`Seen`) or at a touch (`TouchState`) and returns the error that
-names what is wrong, or None; conditions that do not stop the cell are counted. Pure: no clock, no port. The order is
-the order of precedence. docs/supervision.md has the same table for users, with what they can do about each condition;
-a test compares the two.
+Each row stands on its check. A check looks at the cell (`CycleState`) or at a touch (`TouchState`) and returns the
+error that names what is wrong, or None; conditions that do not stop the cell are counted. Pure: no clock, no port. The
+order is the order of precedence. docs/supervision.md has the same table for users, with what they can do about each
+condition; a test compares the two.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from canprobe.cell.master.supervision import (
     HOLD_CYCLES,
     MAX_HOLD_NS,
     Condition,
+    CycleState,
     Finding,
     Limits,
     Reaction,
-    Seen,
     TouchState,
 )
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS
@@ -96,7 +96,7 @@ def _lost(limits: Limits) -> int:
 
 
 @_checked("foreign_master", "another master on the bus", Reaction.STOP, _cycles(2), enabling=True)
-def _foreign_master(seen: Seen) -> SafetyStop | None:
+def _foreign_master(seen: CycleState) -> SafetyStop | None:
     words = seen.watch.another_master
     return SafetyStop(words) if words is not None else None
 
@@ -104,7 +104,7 @@ def _foreign_master(seen: Seen) -> SafetyStop | None:
 @_checked(
     "heartbeat", "heartbeat of a node lost", Reaction.LIFT, _after(HEARTBEAT_CONSUMED_MS * NS_PER_MS), enabling=True
 )
-def _heartbeat(seen: Seen) -> NodeError | None:
+def _heartbeat(seen: CycleState) -> NodeError | None:
     node_id = seen.watch.silent(seen.sync_ns)
     if node_id is None:
         return None
@@ -118,7 +118,7 @@ def _heartbeat(seen: Seen) -> NodeError | None:
     _after(HEARTBEAT_PRODUCED_MS * NS_PER_MS),
     enabling=True,
 )
-def _nmt_state(seen: Seen) -> NodeError | None:
+def _nmt_state(seen: CycleState) -> NodeError | None:
     node_id = seen.watch.not_in(NmtState.OPERATIONAL)
     if node_id is None:
         return None
@@ -127,7 +127,7 @@ def _nmt_state(seen: Seen) -> NodeError | None:
 
 
 @_checked("drive_fault", "drive leaves operation enabled (fault, quick stop)", Reaction.LIFT, _cycles(2))
-def _drive_fault(seen: Seen) -> NodeError | None:
+def _drive_fault(seen: CycleState) -> NodeError | None:
     drives = seen.drives
     if drives is None or seen.measurement.enabled:
         return None
@@ -137,7 +137,7 @@ def _drive_fault(seen: Seen) -> NodeError | None:
     return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {instead}{words}{_held_up(seen)}")
 
 
-def _held_up(seen: Seen) -> str:
+def _held_up(seen: CycleState) -> str:
     """Why the drives stopped by themselves, where that is known: the master was late in its cycle for too long."""
     patience_ns = seen.limits.missed_cycles * seen.limits.period_ns
     if seen.gap_ns <= patience_ns:
@@ -152,13 +152,13 @@ def _held_up(seen: Seen) -> str:
 
 
 @_checked("emcy", "EMCY of a device error", Reaction.LIFT, _cycles(2), enabling=True)
-def _emcy(seen: Seen) -> NodeError | None:
+def _emcy(seen: CycleState) -> NodeError | None:
     event = seen.watch.device_alarm
     return NodeError(event.node_id, event.what) if event is not None else None
 
 
 @_counted("emcy_communication", "EMCY of communication (81xxh, 82xxh)", _cycles(2))
-def _emcy_communication(seen: Seen) -> int:
+def _emcy_communication(seen: CycleState) -> int:
     return seen.watch.communication
 
 
@@ -166,21 +166,21 @@ def _emcy_communication(seen: Seen) -> int:
 
 
 @_counted("pdo_missed", "TPDO of a drive missed, late, twice, malformed or impossible", _cycles(1))
-def _pdo_missed(seen: Seen) -> int:
+def _pdo_missed(seen: CycleState) -> int:
     return seen.drives.missed + seen.drives.implausible if seen.drives is not None else 0
 
 
 @_checked("drive_late", "drive late", Reaction.HOLD, lambda limits: (HOLD_CYCLES + 1) * limits.period_ns)
-def _drive_late(seen: Seen) -> NodeError | None:
+def _drive_late(seen: CycleState) -> NodeError | None:
     return _not_heard(seen, HOLD_CYCLES, "")
 
 
 @_checked("drive_silent", "drive silent", Reaction.LIFT, lambda limits: (limits.missed_cycles + 2) * limits.period_ns)
-def _drive_silent(seen: Seen) -> NodeError | None:
+def _drive_silent(seen: CycleState) -> NodeError | None:
     return _not_heard(seen, seen.limits.missed_cycles + 1, "lost: ")
 
 
-def _not_heard(seen: Seen, cycles: int, word: str) -> NodeError | None:
+def _not_heard(seen: CycleState, cycles: int, word: str) -> NodeError | None:
     """The first drive without a usable TPDO for so many cycles."""
     ages = seen.measurement.q_age
     if not any(ages) or max(ages) < cycles:
@@ -191,7 +191,7 @@ def _not_heard(seen: Seen, cycles: int, word: str) -> NodeError | None:
 
 
 @_checked("following", "joint that does not follow its targets", Reaction.LIFT, _cycles(2))
-def _following(seen: Seen) -> NodeError | None:
+def _following(seen: CycleState) -> NodeError | None:
     drives = seen.drives
     if drives is None or seen.compares_motion or not (beyond := drives.beyond_lag()):
         return None
@@ -206,17 +206,17 @@ def _following(seen: Seen) -> NodeError | None:
 
 
 @_counted("torn_frame", "tactile frame torn, corrupt or mixed", _frame)
-def _torn_frame(seen: Seen) -> int:
+def _torn_frame(seen: CycleState) -> int:
     return seen.tactile.unusable if seen.tactile is not None else 0
 
 
 @_counted("sync_mismatch", "tactile frame names another SYNC than it followed", _frame)
-def _sync_mismatch(seen: Seen) -> int:
+def _sync_mismatch(seen: CycleState) -> int:
     return seen.tactile.stale if seen.tactile is not None else 0
 
 
 @_counted("silent_taxels", "row, column or taxel that does not measure", lambda limits: NS_PER_S)
-def _silent_taxels(seen: Seen) -> int:
+def _silent_taxels(seen: CycleState) -> int:
     return seen.silent_taxels
 
 
@@ -237,31 +237,31 @@ def _sensor_stale(contact: TouchState) -> SafetyStop | None:
 
 
 @_counted("error_frames", "bus error frames", _cycles(2))
-def _error_frames(seen: Seen) -> int:
+def _error_frames(seen: CycleState) -> int:
     return seen.counters.error_frames
 
 
 @_counted("frames_dropped", "frames dropped by the kernel or the controller", _cycles(2))
-def _frames_dropped(seen: Seen) -> int:
+def _frames_dropped(seen: CycleState) -> int:
     return seen.counters.overruns
 
 
 @_checked("error_passive", "CAN controller error-passive", Reaction.HOLD, _cycles(2), enabling=True)
-def _error_passive(seen: Seen) -> SafetyStop | None:
+def _error_passive(seen: CycleState) -> SafetyStop | None:
     if seen.controller_state is not ControllerState.PASSIVE or seen.passive_ns > MAX_HOLD_NS:
         return None
     return SafetyStop("CAN controller error-passive")
 
 
 @_checked("error_passive_long", "CAN controller error-passive for 1 s", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
-def _error_passive_long(seen: Seen) -> SafetyStop | None:
+def _error_passive_long(seen: CycleState) -> SafetyStop | None:
     if seen.passive_ns <= MAX_HOLD_NS:
         return None
     return SafetyStop(f"CAN controller error-passive for {seen.passive_ns * 1e-9:.1f} s: check termination and cabling")
 
 
 @_checked("bus_off", "CAN controller bus-off", Reaction.STOP, _cycles(2), enabling=True)
-def _bus_off(seen: Seen) -> InterfaceError | None:
+def _bus_off(seen: CycleState) -> InterfaceError | None:
     if seen.controller_state is not ControllerState.BUS_OFF:
         return None
     return InterfaceError("CAN controller bus-off: check bit rate, termination and cabling, then restart the interface")
@@ -274,12 +274,12 @@ _unchecked("interface", "interface removed or down", Reaction.STOP, _cycles(1))
 
 
 @_counted("clock_step", "wall clock set", _cycles(2))
-def _clock_step(seen: Seen) -> int:
+def _clock_step(seen: CycleState) -> int:
     return seen.counters.clock_steps
 
 
 @_checked("overruns", "overrun budget used up", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
-def _overruns(seen: Seen) -> SafetyStop | None:
+def _overruns(seen: CycleState) -> SafetyStop | None:
     if seen.late_share <= seen.limits.safety.late_share:
         return None
     return SafetyStop(
@@ -292,7 +292,7 @@ def _overruns(seen: Seen) -> SafetyStop | None:
 
 
 @_checked("preload", "probe pressed before the run", Reaction.STOP, None, enabling=True)
-def _preload(seen: Seen) -> SafetyStop | None:
+def _preload(seen: CycleState) -> SafetyStop | None:
     limits = seen.limits
     if not limits.tares or seen.preload <= limits.safety.preload_max:
         return None
@@ -404,7 +404,7 @@ def _depth(contact: TouchState) -> SafetyStop | None:
     _after(4 * MEAN_NS, 2),
     blind=True,
 )
-def _push_unfelt(seen: Seen) -> SafetyStop | None:
+def _push_unfelt(seen: CycleState) -> SafetyStop | None:
     if seen.unfelt is None:
         return None
     return SafetyStop(
@@ -445,17 +445,17 @@ def _joint_stop(contact: TouchState) -> SafetyStop | None:
 
 
 @_counted("target_speed", "target too far for one cycle", _cycles(1))
-def _target_speed(seen: Seen) -> int:
+def _target_speed(seen: CycleState) -> int:
     return seen.slowed
 
 
 @_checked("joint_speed", "measured joint motion that no joint can make", Reaction.STOP, _cycles(2), enabling=True)
-def _joint_speed(seen: Seen) -> SafetyStop | None:
+def _joint_speed(seen: CycleState) -> SafetyStop | None:
     return SafetyStop(seen.speeding) if seen.speeding is not None else None
 
 
 @_counted("estimator", "shape estimator diverges", _cycles(2))
-def _estimator(seen: Seen) -> int:
+def _estimator(seen: CycleState) -> int:
     return seen.restarts
 
 
@@ -479,7 +479,7 @@ _unchecked(
 
 
 @_checked("log", "frames cannot be written down (full disk)", Reaction.RETREAT, _cycles(2), enabling=True)
-def _log(seen: Seen) -> ResultsError | None:
+def _log(seen: CycleState) -> ResultsError | None:
     return ResultsError(seen.log_failure) if seen.log_failure is not None else None
 
 

@@ -110,9 +110,9 @@ class Controller:
     """Base of everything that a cell can run: `step` decides a cycle, the other methods do nothing by default.
 
     Attributes:
-        lets_go: True: the controller supervises its contact and takes the probe off the object when `retreat` is
-            called. False, the default: the cell does both.
-        can_go_on: True: after the cell has come back from a loss (``recover`` of `canprobe.open_cell`) the controller
+        retreats_itself: True: the controller supervises its contact and takes the probe off the object when
+            `retreat` is called. False, the default: the cell does both.
+        resumable: True: after the cell has come back from a loss (``recover`` of `canprobe.open_cell`) the controller
             goes on from where the arm stands, once motion is asked for. False, the default: a loss ends it.
         compares_motion: True: the controller itself compares the motion of the joints with what it has asked for, and
             names what is wrong; False, the default: the cell does.
@@ -121,8 +121,8 @@ class Controller:
         remarks: what the controller has found to be wrong with the cell, a line each; more come, and none goes.
     """
 
-    lets_go: bool = False
-    can_go_on: bool = False
+    retreats_itself: bool = False
+    resumable: bool = False
     compares_motion: bool = False
     array_alive: bool = False
     array_blind: str | None = None
@@ -161,7 +161,7 @@ class Controller:
     def retreat(self, reason: str) -> None:
         """Take the probe off the object in the next steps, then end with this reason.
 
-        Called once, and only where `lets_go` is True and the condition leaves time for it.
+        Called once, and only where `retreats_itself` is True and the condition leaves time for it.
 
         Args:
             reason: reason for `Command.stop_reason`.

@@ -8,7 +8,7 @@ from typing import Any
 from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.planning.configuration import NodeSetup, Write
+from canprobe.cell.planning.configuration import NodeConfiguration, Write
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.sdo import Dialogue, download, read_value
 
@@ -19,7 +19,7 @@ class RefusedError(NodeError):
     """A device refused a value, or holds another one after the write."""
 
 
-def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
+def read_entry(setup: NodeConfiguration, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
     """Read an integer of a node.
 
     Raises:
@@ -32,7 +32,7 @@ def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes |
         raise NodeError(setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}") from error
 
 
-def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
+def write_entry(setup: NodeConfiguration, write: Write) -> Dialogue:
     """Write a value and read it back; a refused value counts as written where the device holds it already.
 
     Raises:
@@ -68,7 +68,7 @@ def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
         )
 
 
-def _refused(setup: NodeSetup, write: Write, error: Exception, held: int | None = None) -> RefusedError:
+def _refused(setup: NodeConfiguration, write: Write, error: Exception, held: int | None = None) -> RefusedError:
     text = _failed(setup, write, error)
     if held is not None:
         text += f"; it holds {held:#x}"
@@ -77,7 +77,7 @@ def _refused(setup: NodeSetup, write: Write, error: Exception, held: int | None 
     return RefusedError(setup.node_id, text)
 
 
-def _failed(setup: NodeSetup, write: Write, error: Exception) -> str:
+def _failed(setup: NodeConfiguration, write: Write, error: Exception) -> str:
     return f"({setup.name}) write of {write.place} = {write.value:#x} failed: {error}"
 
 
@@ -86,7 +86,7 @@ def _with_own_bits(write: Write, held: int) -> int:
     return write.value & ~write.own_bits | held & write.own_bits
 
 
-def _variable(setup: NodeSetup, index: int, subindex: int) -> Any:  # canopen has no types here
+def _variable(setup: NodeConfiguration, index: int, subindex: int) -> Any:  # canopen has no types here
     try:
         entry: Any = setup.dictionary[index]
         return entry if isinstance(entry, ODVariable) else entry[subindex]

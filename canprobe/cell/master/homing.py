@@ -27,7 +27,7 @@ from canprobe.cell.master.node_bringup import IDENTITY
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, NodeSetup, Write
+from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, NodeConfiguration, Write
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
@@ -82,7 +82,7 @@ class Homing:
     def __init__(
         self,
         plan: Plan,
-        setups: tuple[NodeSetup, ...],
+        setups: tuple[NodeConfiguration, ...],
         network: PumpedNetwork,
         watch: NodeWatch,
         supervise: Callable[[], None],
@@ -268,7 +268,7 @@ class Homing:
         drive.wait_until(lambda: abs(drive.read(POSITION) - target) <= tolerance, timeout_s, lambda: late)
 
 
-def _has_profile_position(setup: NodeSetup) -> bool:
+def _has_profile_position(setup: NodeConfiguration) -> bool:
     drive = Description(setup.dictionary)
     listed = drive.modes is None or OperationMode.PROFILE_POSITION in drive.modes
     return listed and drive.entry(TARGET) is not None and drive.entry(PROFILE_SPEED) is not None

@@ -13,7 +13,7 @@ from typing import Any
 from canprobe.cell.master.bringup import MODE_DISPLAY
 from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import MODE, NodeSetup, Write
+from canprobe.cell.planning.configuration import MODE, NodeConfiguration, Write
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import CanprobeError, NodeError
@@ -96,7 +96,7 @@ class LedDrive:
         say: called where the drive was stopped by an error.
     """
 
-    def __init__(self, setup: NodeSetup, link: SdoLink, say: Callable[[str], None]) -> None:
+    def __init__(self, setup: NodeConfiguration, link: SdoLink, say: Callable[[str], None]) -> None:
         self.setup = setup
         self._link, self._say = link, say
 

@@ -11,7 +11,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.cell.master.entries import RefusedError, read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeSetup, Write
+from canprobe.cell.planning.configuration import NodeConfiguration, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.sdo import Dialogue, SdoTimeoutError, decode_text, upload
@@ -40,7 +40,7 @@ class NodeBringUp:
         failure: error of this node; None without one.
     """
 
-    def __init__(self, setup: NodeSetup, watch: NodeWatch) -> None:
+    def __init__(self, setup: NodeConfiguration, watch: NodeWatch) -> None:
         self.setup = setup
         self.software: str | None = None
         self.kept = False
@@ -192,7 +192,7 @@ class NodeBringUp:
             self._history = f"; its error history (1003h) begins with {code:04X}h, {describe(code)}"
 
 
-def _fitting_rate(setup: NodeSetup, options: Sequence[Sequence[Write]]) -> Generator[bytes | None, bytes, str]:
+def _fitting_rate(setup: NodeConfiguration, options: Sequence[Sequence[Write]]) -> Generator[bytes | None, bytes, str]:
     """The rates that fit a drive which keeps its 60C2h, for the end of a message; empty where it does not answer."""
     try:
         held = yield from read_entry(setup, INTERPOLATION_TIME, 1)

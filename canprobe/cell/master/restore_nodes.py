@@ -12,7 +12,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeSetup, Write
+from canprobe.cell.planning.configuration import NodeConfiguration, Write
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
@@ -38,7 +38,7 @@ class FoundNodes:
     """
 
     def __init__(
-        self, network: PumpedNetwork, watch: NodeWatch, setups: tuple[NodeSetup, ...], settings: BringUpSettings
+        self, network: PumpedNetwork, watch: NodeWatch, setups: tuple[NodeConfiguration, ...], settings: BringUpSettings
     ) -> None:
         self._network, self._watch, self._setups, self._settings = network, watch, setups, settings
         self._values: dict[int, dict[tuple[int, int], int]] = {}
@@ -64,7 +64,7 @@ class FoundNodes:
     def _talk(self, dialogues: dict[int, Dialogue]) -> None:
         hold_dialogues(self._network, dialogues, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
 
-    def _read(self, setup: NodeSetup) -> Dialogue:
+    def _read(self, setup: NodeConfiguration) -> Dialogue:
         found = self._values[setup.node_id]
         try:
             if setup.mode is not None:
@@ -84,7 +84,7 @@ class FoundNodes:
             if not isinstance(error.__cause__, SdoTimeoutError | SdoCommunicationError):
                 raise  # else bring-up says that the node does not answer
 
-    def _write(self, setup: NodeSetup) -> Dialogue:
+    def _write(self, setup: NodeConfiguration) -> Dialogue:
         for write in self._writes_back(setup):
             try:
                 yield from write_entry(setup, write)
@@ -93,7 +93,7 @@ class FoundNodes:
                 if isinstance(error.__cause__, SdoTimeoutError):
                     return
 
-    def _writes_back(self, setup: NodeSetup) -> Iterator[Write]:
+    def _writes_back(self, setup: NodeConfiguration) -> Iterator[Write]:
         """The writes of bring-up in their order, the last to each entry with the value that was found.
 
         Also where that is the value that bring-up writes: it may have been interrupted while a PDO was switched off.

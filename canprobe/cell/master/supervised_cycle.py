@@ -17,7 +17,7 @@ from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.master.push_witness import PushWitness
-from canprobe.cell.master.supervision import Seen
+from canprobe.cell.master.supervision import CycleState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
@@ -51,7 +51,7 @@ class SupervisedCycle:
         self,
         plan: Plan,
         port: Port,
-        seen: Seen,
+        seen: CycleState,
         options: RunOptions,
         observers: Observers | None,
         log_failure: Callable[[], str | None],

@@ -97,7 +97,7 @@ def limits_of(plan: Plan) -> Limits:
 
 
 @dataclass(slots=True)
-class Seen:
+class CycleState:
     """The cell in one cycle, as the checks see it.
 
     Attributes:
@@ -191,7 +191,7 @@ class TouchState:
         """Upper end of the measured force, N; of a lower bound the bound itself, as its end is open."""
         return upper_end(self.force, self.force_sigma) if math.isfinite(self.force_sigma) else self.force
 
-    def feel(self, patch: Patch, t_ns: int, *, known: bool = False) -> None:
+    def update_force(self, patch: Patch, t_ns: int, *, known: bool = False) -> None:
         """Take the patch of a tactile sample.
 
         Args:
@@ -261,9 +261,10 @@ class Condition:
         what: the condition in words for users.
         reaction: reaction of the cell.
         within: longest time from the fault to the reaction, ns; None where no such time applies.
-        check: function of a `Seen` in every cycle, or of a `TouchState` in a touch; it returns the error that names
-            what is wrong, or None. A condition without check and count shows by itself: an exception, a dead master.
-        count: function of a `Seen`; it returns how often a condition that does not stop the cell has happened.
+        check: function of a `CycleState` in every cycle, or of a `TouchState` in a touch; it returns the error that
+            names what is wrong, or None. A condition without check and count shows by itself: an exception, a dead
+            master.
+        count: function of a `CycleState`; it returns how often a condition that does not stop the cell has happened.
         touch: the check takes a `TouchState`.
         enabling: the check holds already while the drives are enabled.
         blind: the array is not believed any more: what it measures from then on is no force.
@@ -274,7 +275,7 @@ class Condition:
     reaction: Reaction
     within: Callable[[Limits], int] | None
     check: Callable[[Any], CanprobeError | None] | None = None
-    count: Callable[[Seen], int] | None = None
+    count: Callable[[CycleState], int] | None = None
     touch: bool = False
     enabling: bool = False
     blind: bool = False

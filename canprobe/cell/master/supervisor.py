@@ -13,7 +13,7 @@ import numpy as np
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.push_witness import PushWitness
-from canprobe.cell.master.supervision import Finding, Reaction, Seen, TouchState
+from canprobe.cell.master.supervision import CycleState, Finding, Reaction, TouchState
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
@@ -215,7 +215,7 @@ class Supervisor:
 
     def __init__(
         self,
-        seen: Seen,
+        seen: CycleState,
         guard: JointGuard | None,
         patch_from: Callable[[TactileSample], Patch] | None,
         push: PushWitness | None = None,
@@ -348,7 +348,7 @@ class Supervisor:
         sample = measurement.tactile
         if self._patch_from is not None and sample is not None:
             patch = self._patch_from(sample)
-            self._contact.feel(patch, sample.t_sample_ns)
+            self._contact.update_force(patch, sample.t_sample_ns)
             if measurement.q is not None and self._guard is not None:
                 self._contact.look(sample, patch, self._guard.T_base_tip(measurement.q)[:3, 3])
         self._contact.tactile_age = measurement.tactile_age

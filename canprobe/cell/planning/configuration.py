@@ -4,8 +4,9 @@ The configuration of a node is an explicit list: one `Write` is an object, its v
 PDOs first, then the objects of every node, then those of a drive or the array.
 
 A write is *required*, or it is *wished* and says what its absence means. What the EDS excludes (no such object,
-read-only with another value, limits) is left out where it is wished, `NodeSetup.left_out`, and makes the plan
-impossible where it is required, `NodeSetup.problems`. What the EDS allows and the device refuses is for bring-up.
+read-only with another value, limits) is left out where it is wished, `NodeConfiguration.left_out`, and makes the plan
+impossible where it is required, `NodeConfiguration.problems`. What the EDS allows and the device refuses is for
+bring-up.
 """
 
 from __future__ import annotations
@@ -141,7 +142,7 @@ class FixedEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class NodeSetup:
+class NodeConfiguration:
     """Requirements on one node, and its configuration.
 
     Attributes:
@@ -190,12 +191,12 @@ class NodeSetup:
         return {1: 1 + zlib.crc32(text) % MOST_DAYS, 2: 1 + zlib.adler32(text) % DAY_MS}
 
 
-def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
+def make_configurations(plan: Plan) -> tuple[NodeConfiguration, ...]:
     """Make the configuration of every planned node, drives first."""
     return tuple(_setup(plan, node) for node in plan.nodes)
 
 
-def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
+def _setup(plan: Plan, node: PlannedNode) -> NodeConfiguration:
     device = DeviceCapabilities(node.eds, Description(node.dictionary))
     arm = plan.setup.arm if node.kind == "drive" else None
     axis = arm.node_ids.index(node.node_id) if arm is not None else 0
@@ -208,7 +209,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     homing, not_homing, no_homing = _possible(device, _homing_writes(arm, axis, device) if arm is not None else ())
     if homing and arm is not None and drive is not None and drive.zero is not None:
         no_homing += _unhomed(arm, axis, drive.zero, device)
-    return NodeSetup(
+    return NodeConfiguration(
         node_id=node.node_id,
         name=node.role,
         channel=node.channel,

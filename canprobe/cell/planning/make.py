@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from canprobe.cell.planning.array import array_problems, as_supported, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
-from canprobe.cell.planning.configuration import make_setups
+from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities, missing_bitrate, missing_objects
 from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes
 from canprobe.cell.planning.identifiers import identifier_problems, order_by_deadline
@@ -98,7 +98,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         not_available=(*bus.not_available, *unavailable_bridges(setup)),
         warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
     )
-    return _with_configuration(plan)
+    return _with_configurations(plan)
 
 
 def _ways_out(bus: _BusPlan) -> list[str]:
@@ -141,17 +141,17 @@ def _shared(problems: Sequence[str]) -> list[str]:
     return [f"node{'s' * (',' in its)} {its}: {text}" if its else text for text, its in lists.items()]
 
 
-def _with_configuration(plan: Plan) -> Plan:
-    """The plan with the wished writes that its devices cannot take, as not available.
+def _with_configurations(plan: Plan) -> Plan:
+    """The plan with the configuration of each node; wished writes that its device cannot take are not available.
 
     Raises:
         PlanError: when a device cannot take a required write.
     """
-    setups = make_setups(plan)
-    if problems := [problem for setup in setups for problem in setup.problems]:
+    nodes = make_configurations(plan)
+    if problems := [problem for node in nodes for problem in node.problems]:
         raise PlanError(_shared(problems))
-    lacks = [(one.what, f"{setup.eds}: {one.why}: {one.write.absence}") for setup in setups for one in setup.left_out]
-    return replace(plan, not_available=tuple(dict.fromkeys((*plan.not_available, *lacks))))
+    lacks = [(one.what, f"{node.eds}: {one.why}: {one.write.absence}") for node in nodes for one in node.left_out]
+    return replace(plan, configurations=nodes, not_available=tuple(dict.fromkeys((*plan.not_available, *lacks))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,17 +259,30 @@ def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, DeviceCapabil
     changes = dict(bus.untaken).get(problem)
     if not changes:
         return problem
-    known, fitting = set(bus.problems) - {problem}, []
+    known, elsewhere = set(bus.problems) - {problem}, _keys(_problems_beside_bus(bus.setup))
+    fitting, in_turn = [], []
     for text, changed in changes:
         other = _plan_bus(changed, devices)
-        if not other.overload and known.issuperset(other.problems):
-            fitting.append(text)
+        if other.overload or not known.issuperset(other.problems):
+            continue
+        if further := _keys(_problems_beside_bus(other.setup)) - elsewhere:
+            in_turn.append((text, ", which asks for another " + " and ".join(sorted(further))))
+            continue
+        fitting.append(text)
         if len(fitting) == _OFFERED_RATES:
             break
-    offered = fitting or [text for text, _ in changes[:_OFFERED_RATES]]
-    unit = "" if "=" in offered[-1] else " Hz"
-    none_fits = "" if fitting else ", which the bus has no room for as it is"
-    return f"{problem}; take {' or '.join(offered)}{unit}{none_fits}"
+    none_fits = ""
+    if not fitting and in_turn:
+        fitting, none_fits = [in_turn[0][0]], in_turn[0][1]
+    elif not fitting:
+        fitting, none_fits = [text for text, _ in changes[:_OFFERED_RATES]], ", which the bus has no room for as it is"
+    unit = "" if "=" in fitting[-1] else " Hz"
+    return f"{problem}; take {' or '.join(fitting)}{unit}{none_fits}"
+
+
+def _keys(problems: Sequence[str]) -> set[str]:
+    """The keys that problems begin with: another rate changes the figures behind them."""
+    return {problem.partition(" ")[0] for problem in problems}
 
 
 def _counts_syncs(device: DeviceCapabilities) -> bool:

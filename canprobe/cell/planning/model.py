@@ -15,6 +15,8 @@ from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 if TYPE_CHECKING:
     from canopen import ObjectDictionary
 
+    from canprobe.cell.planning.configuration import NodeConfiguration
+
 MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100
 HEARTBEAT_CONSUMED_MS = 250
@@ -338,6 +340,7 @@ class Plan:
         left_out: what this scene does not bring up, and why.
         not_available: what the devices lack by their EDS files, and what that means.
         warnings: what is carried out although a number of the plan does not hold for it.
+        configurations: configuration of each node, drives first.
     """
 
     setup: Setup
@@ -352,6 +355,7 @@ class Plan:
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
+    configurations: tuple[NodeConfiguration, ...] = ()
 
     @property
     def scene(self) -> Scene:

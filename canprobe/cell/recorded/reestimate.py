@@ -20,7 +20,7 @@ from canprobe.cell.results.summary import finite_or_none, summarise_shape
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import SAVED_AS, load_scene
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.scene.offers import find_offer
+from canprobe.cell.scene.plugins import find_plugin
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.from_plan import estimates_of
@@ -307,6 +307,6 @@ def _methods(scene: Scene, method: str | Sequence[str] | None) -> tuple[str, ...
         return (scene.shape.method, *scene.shape.also)
     names = (method,) if isinstance(method, str) else tuple(method)
     for name in names:
-        if name not in METHODS and find_offer("estimator", name) is None:
+        if name not in METHODS and find_plugin("estimator", name) is None:
             raise unknown_method(name)
     return names or (scene.shape.method,)

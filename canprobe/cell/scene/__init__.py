@@ -16,7 +16,7 @@ whole for its task).
 - `resolve` is the only place where millimetres, degrees and kilopascals become SI and defaults become values. `setup`
   is its result; `arms` makes chain, joints and drive units. Planning, cell, tasks and emulator read a `Setup` and
   never a `Scene`.
-- `offers` finds cells, scenes, arrays and estimators of other packages by their entry points.
+- `plugins` finds cells, scenes, arrays and estimators of other packages by their entry points.
 - `calibrations` reads and writes calibration files of arrays, which `sensor.calibration` names; `surface_files` and
   `stl_files` read the surface of an object from a file.
 - `geometry` turns the object, the probe and the path of a scene into frames and surfaces; it is used by `resolve` and

@@ -20,7 +20,7 @@ from typing import Any
 from canprobe.cell.scene.checks import annotations_of, values_of
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
 from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, CellFile, Scene
-from canprobe.cell.scene.offers import find_offer, offers
+from canprobe.cell.scene.plugins import find_plugin, plugins
 from canprobe.cell.scene.reader import Reader
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
 from canprobe.cell.scene.toml_files import (
@@ -291,9 +291,9 @@ def find_file(name: str, *kinds: str) -> tuple[Path, str]:
     if isfile(name) or name.endswith(".toml") or "/" in name:
         return Path(name), name
     for kind in kinds:
-        if (offer := find_offer(kind, name)) is not None:
-            return offer.path(), name
-    packaged, others = [*packaged_files(f"{kinds[0]}s")], [offer.name for offer in offers(kinds[0])]
+        if (plugin := find_plugin(kind, name)) is not None:
+            return plugin.path(), name
+    packaged, others = [*packaged_files(f"{kinds[0]}s")], [plugin.name for plugin in plugins(kinds[0])]
     hint = did_you_mean(name, packaged + others)
     of_others = f"; of other packages: {', '.join(others)}" if others else ""
     raise SceneError(
@@ -321,18 +321,18 @@ def offered(kind: str, warn: Callable[[str], None]) -> list[dict[str, str]]:
         kind: ``scene``, ``cell`` or ``array``.
         warn: called with a line for each that cannot be read; the others are given.
     """
-    found, own = offers(kind), packaged_files(f"{kind}s")
-    taken = Counter([*own, *(offer.name for offer in found)])
+    found, own = plugins(kind), packaged_files(f"{kind}s")
+    taken = Counter([*own, *(plugin.name for plugin in found)])
     rows = []
-    for offer in found:
-        name = offer.name if taken[offer.name] == 1 else offer.whole_name
+    for plugin in found:
+        name = plugin.name if taken[plugin.name] == 1 else plugin.whole_name
         try:
-            path = offer.path()
+            path = plugin.path()
             title = read_toml(path, str(path)).get(kind, {}).get("title", "")
         except SceneError as error:
-            warn(f"warning: {offer.package}: {error}")
+            warn(f"warning: {plugin.package}: {error}")
             continue
-        rows.append({"name": name, "title": str(title), "path": str(path), "package": offer.package})
+        rows.append({"name": name, "title": str(title), "path": str(path), "package": plugin.package})
     return rows
 
 

@@ -28,12 +28,12 @@ from canprobe.cell.scene.hardware import (
     TactileModeName,
     Vec3,
 )
-from canprobe.cell.scene.offers import find_offer
+from canprobe.cell.scene.plugins import find_plugin
 from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle", "explore"]
-OFFERED_ESTIMATOR = Check("that another package offers", lambda name: find_offer("estimator", name) is not None)
+OFFERED_ESTIMATOR = Check("that another package offers", lambda name: find_plugin("estimator", name) is not None)
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"] | Annotated[str, OFFERED_ESTIMATOR]
 ObjectKind = Literal[
     "plane",

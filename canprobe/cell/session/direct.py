@@ -24,7 +24,7 @@ from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import DriveCommand, DriveGroup
 from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeSetup, Write, make_setups
+from canprobe.cell.planning.configuration import NodeConfiguration, Write
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.errors import NodeError
@@ -57,7 +57,7 @@ class DirectNodes:
     def __init__(self, world: World, plan: Plan, hear: Hear, see: Callable[[TactileFrame], None]) -> None:
         self._nodes = world.nodes
         self._recorder = world.recorder
-        self._setups = {setup.node_id: setup for setup in make_setups(plan)}
+        self._setups = {setup.node_id: setup for setup in plan.configurations}
         self._hear = hear
         self._see = see
         self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
@@ -150,7 +150,7 @@ def tactile_frame(
     return frame_of(header, content[row : row + rows, col : col + columns], shape, t_ns)
 
 
-def configure(node: SlaveNode, setup: NodeSetup) -> None:
+def configure(node: SlaveNode, setup: NodeConfiguration) -> None:
     """Write a node's configuration into its dictionary, as bring-up does by SDO.
 
     A node does not watch for its master, which is in the same process and cannot fall silent.

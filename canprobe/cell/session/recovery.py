@@ -7,7 +7,7 @@
    encoder that may have been without power has to be homed, and ends the recovery.
 4. The drives are enabled where they stand, but for a joint that reports another place than before.
 5. The arm is held until motion is asked for. A controller goes on only if it says that it can
-   (`Controller.can_go_on`); another one has ended with its error at the loss, as without this.
+   (`Controller.resumable`); another one has ended with its error at the loss, as without this.
 
 Losses are the conditions of `PASSING`, and a lost interface. What a person must look at ends the cell as ever.
 """
@@ -24,7 +24,7 @@ from canprobe.cell.master.homing import TOLERANCE_RAD, UnhomedError
 from canprobe.cell.master.notes import nodes_text
 from canprobe.cell.master.options import Say
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeSetup, make_setups
+from canprobe.cell.planning.configuration import NodeConfiguration
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan
 from canprobe.cell.session.buses import SessionBuses
 from canprobe.cell.tasks.paused import LastPlace, PausedController
@@ -47,7 +47,7 @@ MASTER_QUIET_S = 2.0
 """Time for which another master has to be silent: somebody works at the nodes, and may go on."""
 REOPEN_S = 0.5
 """Time between two attempts to open an interface."""
-TRIES = 5
+BRING_UP_ATTEMPTS = 5
 """Number of times that a cell may fail to come back, one after the other."""
 STEADY_NS = 1_000_000_000
 """Time after which a cell has come back: a loss before that counts as a failure."""
@@ -118,7 +118,7 @@ class Recovery:
                 self._report_back("")
             while (error := self._attempt(lambda: self.cell.advance(None, progress))) is not None:
                 self._lose(error)
-                if not runs.can_go_on:
+                if not runs.resumable:
                     raise error
                 self._come_back(PausedController(runs, self._place, lambda: self._asked, self._note_resumed))
                 self._asked = False
@@ -192,7 +192,7 @@ class Recovery:
         assert self._lost is not None
         while True:
             self._tries += 1
-            if self._tries > TRIES:
+            if self._tries > BRING_UP_ATTEMPTS:
                 raise self._lost
             self._wait()
             cell = self._make_cell(self._port, self.cell)
@@ -206,7 +206,11 @@ class Recovery:
                 cell.stop()
                 self._doubted |= cell.bring_up.booted_again()
                 self._released |= cell.bring_up.released
-                if isinstance(error, UnhomedError) or not isinstance(error, BusError) or self._tries == TRIES:
+                if (
+                    isinstance(error, UnhomedError)
+                    or not isinstance(error, BusError)
+                    or self._tries == BRING_UP_ATTEMPTS
+                ):
                     raise
                 self._say(f"not back yet: {error}")
                 if isinstance(error, InterfaceError):
@@ -259,7 +263,7 @@ class _Wait:
 
     def __init__(self, plan: Plan, foreign: bool) -> None:
         self._plan, self._settings = plan, plan.setup.bring_up
-        self._setups = {setup.node_id: setup for setup in make_setups(plan)}
+        self._setups = {setup.node_id: setup for setup in plan.configurations}
         self._watch = NodeWatch(plan.node_ids)
         self._absent: set[int] = set()
         self._listen_s = MASTER_QUIET_S if foreign else max(self._settings.listen_s, ANSWER_S)
@@ -297,7 +301,7 @@ class _Wait:
         hold_dialogues(network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
         return lost
 
-    def _compare(self, setup: NodeSetup, lost: set[int]) -> Dialogue:
+    def _compare(self, setup: NodeConfiguration, lost: set[int]) -> Dialogue:
         written = {w.value for w in setup.writes if w.index == HEARTBEAT_CONSUMER}
         try:
             kept = (yield from read_entry(setup, HEARTBEAT_CONSUMER, 1)) in written

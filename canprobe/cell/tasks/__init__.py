@@ -15,8 +15,8 @@
 - `trajectory` follows points, for own scripts and for ROS 2: `canprobe.cell.tasks.Trajectory`.
 - `task` has the results that a task leaves for the summary.
 
-A task guards its own contact (`lets_go`): it decides by the same table of conditions as the cell when to let go. A
-task reads its setup (`canprobe.cell.scene.setup`) and nothing of a scene.
+A task guards its own contact (`retreats_itself`): it decides by the same table of conditions as the cell when to let
+go. A task reads its setup (`canprobe.cell.scene.setup`) and nothing of a scene.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class CalibrateTask(ProbingTask):
         return replace(super().record(), tool=self.estimate)
 
     def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
-        self._touch.feel(patch, sample.t_sample_ns)
+        self._touch.update_force(patch, sample.t_sample_ns)
         contact = self.sensing.contact(sample, patch) if patch.force > TOUCH_FORCE / 2 else None
         if contact is not None and self.phase in (Phase.APPROACH, Phase.SETTLE):
             self._push.add(self._pushed(contact.T_base_probe[:3, 3]), contact.force_n)

@@ -54,7 +54,7 @@ class ListenTask(Task):
         period_s: period of the cycle.
     """
 
-    can_go_on = True
+    resumable = True
 
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
         self._reader = PatchReader(calibration)
@@ -87,7 +87,7 @@ class ListenTask(Task):
 class HoldTask(Task):
     """Stay where the drives are."""
 
-    can_go_on = True
+    resumable = True
 
     def step(self, _: Measurement) -> Command:
         """Do nothing."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.offers import find_offer
+from canprobe.cell.scene.plugins import find_plugin
 from canprobe.cell.scene.setup import Array, Calibrate, Free, Probe, Setup, Touch
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
@@ -86,10 +86,10 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         "correlation": contact_correlation(task.array),
         "coupling": centroid_coupling(task.probe),
     }
-    if method not in METHODS and (offer := find_offer("estimator", method)) is not None:
+    if method not in METHODS and (plugin := find_plugin("estimator", method)) is not None:
         from canprobe.cell.tasks.own_estimators import OfferedEstimator, RenewedEstimator
 
-        return RenewedEstimator(lambda: OfferedEstimator(offer, settings))
+        return RenewedEstimator(lambda: OfferedEstimator(plugin, settings))
     motion = make_estimator(method, **settings)
     if method not in REFINED_METHODS:
         return motion

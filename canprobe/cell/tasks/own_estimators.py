@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from canprobe.cell.scene.offers import Offer
+from canprobe.cell.scene.plugins import Plugin
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.mechanics.touch import ContactSample, SurfaceEstimate
 from canprobe.mechanics.touch.estimate.gate import Dropped
@@ -43,7 +43,7 @@ class OfferedEstimator:
     """An estimator of another package, whose errors name it.
 
     Args:
-        offer: the entry point of a function that takes the settings by name and returns the estimator.
+        plugin: the entry point of a function that takes the settings by name and returns the estimator.
         settings: keyword arguments of that function, those of `make_estimator`.
 
     Raises:
@@ -51,9 +51,9 @@ class OfferedEstimator:
         UsageError: the estimator cannot be made.
     """
 
-    def __init__(self, offer: Offer, settings: dict[str, Any]) -> None:
-        make = offer.load()
-        self._offer = offer
+    def __init__(self, plugin: Plugin, settings: dict[str, Any]) -> None:
+        make = plugin.load()
+        self._plugin = plugin
 
         def methods() -> tuple[Callable[[ContactSample], None], Callable[[], SurfaceEstimate | None]]:
             inner = make(**settings)
@@ -69,7 +69,7 @@ class OfferedEstimator:
         """The shape at the last contact; None before there is an answer."""
         answer = self._guarded(self._estimate)
         if answer is not None and not isinstance(answer, SurfaceEstimate):
-            raise UsageError(f"{self._offer}: expected a SurfaceEstimate or None from estimate(), got {answer!r:.60}")
+            raise UsageError(f"{self._plugin}: expected a SurfaceEstimate or None from estimate(), got {answer!r:.60}")
         return answer
 
     def _guarded(self, act: Callable[[], Any]) -> Any:
@@ -78,4 +78,4 @@ class OfferedEstimator:
         except CanprobeError:
             raise
         except Exception as error:  # whatever a foreign package raises; the cell stops for it
-            raise UsageError(f"{self._offer}: {type(error).__name__}: {error}") from error
+            raise UsageError(f"{self._plugin}: {type(error).__name__}: {error}") from error

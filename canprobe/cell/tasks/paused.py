@@ -89,9 +89,9 @@ class PausedController(WrappingController):
             self.inner.update()
 
     @property
-    def lets_go(self) -> bool:  # type: ignore[override]
+    def retreats_itself(self) -> bool:  # type: ignore[override]
         """Whether the controller lets go by itself; in the hold the cell does."""
-        return not self.held and self.inner.lets_go
+        return not self.held and self.inner.retreats_itself
 
     @property
     def trail(self) -> TakenWay | None:

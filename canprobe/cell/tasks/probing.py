@@ -70,7 +70,7 @@ class ProbingTask(Task):
         depth: the depth of the probe in what it has touched before, as a witness of the force.
     """
 
-    lets_go = True
+    retreats_itself = True
 
     def __init__(self, plan: Plan, lag_s: float, sensing: ContactSensing, *, holds: bool = False) -> None:
         self.phase = Phase.MOVE

@@ -132,9 +132,9 @@ class RequestedTask(WrappingController):
             self.inner.update()
 
     @property
-    def can_go_on(self) -> bool:  # type: ignore[override]
+    def resumable(self) -> bool:  # type: ignore[override]
         """Whether there is something to do after a loss: the next task that is asked for, or what goes on itself."""
-        return self.inner is None or self._make is not None or self.inner.can_go_on
+        return self.inner is None or self._make is not None or self.inner.resumable
 
     def asks_to_go_on(self) -> bool:
         """Whether a request asks for motion after a loss; the others are refused meanwhile: they came too early."""
@@ -147,14 +147,14 @@ class RequestedTask(WrappingController):
         """Wait for the next start, or let the task go on that can."""
         self._targets, self._stopping = [], False
         self._time = MotionTime(round(1e9 * self._period_s))
-        if self.inner is not None and not self.inner.can_go_on:
+        if self.inner is not None and not self.inner.resumable:
             self.inner = None
         elif self.inner is not None:
             self.inner.go_on(measurement)
 
     @property
-    def lets_go(self) -> bool:  # type: ignore[override]
-        return self.inner is not None and self.inner.lets_go
+    def retreats_itself(self) -> bool:  # type: ignore[override]
+        return self.inner is not None and self.inner.retreats_itself
 
     @property
     def trail(self) -> TakenWay | None:

@@ -126,7 +126,7 @@ class RollTask(ProbingTask):
             self._let_go()
 
     def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
-        self._touch.feel(patch, sample.t_sample_ns)
+        self._touch.update_force(patch, sample.t_sample_ns)
         pose = self.sensing.probe_at(sample.t_sample_ns)
         if self.phase is Phase.MOVE and not self._number and self._t < self._rest_s:
             self.unloaded.append(sample.frame.taxels)

@@ -161,7 +161,7 @@ class TouchTask(ProbingTask):
     # sensing and supervision
 
     def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
-        self._touch.feel(patch, sample.t_sample_ns, known=patch.saturated and self.learned.stiffness_known)
+        self._touch.update_force(patch, sample.t_sample_ns, known=patch.saturated and self.learned.stiffness_known)
         if self.phase is Phase.SCAN:
             self.taxels = sample.frame.taxels
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3

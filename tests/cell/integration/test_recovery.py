@@ -14,7 +14,7 @@ from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.controller import Command, Controller
 from canprobe.cell.master.monitor import Monitor
 from canprobe.cell.npz import read_npz
-from canprobe.cell.session.recovery import PASSING, TRIES
+from canprobe.cell.session.recovery import BRING_UP_ATTEMPTS, PASSING
 from canprobe.cell.session.session import Session
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, NodeError, SafetyStop, UsageError
@@ -274,7 +274,7 @@ def test_a_node_that_is_lost_again_and_again_ends_it():
 
     run = Flapping("node 3: reboot for 100 ms")
     assert isinstance(run.errors[0], NodeError) and run.errors[0].node_id == 3
-    assert len(run.steps("not back yet: ")) == TRIES - 1
+    assert len(run.steps("not back yet: ")) == BRING_UP_ATTEMPTS - 1
 
 
 def test_resume_needs_a_cell_that_recovers():

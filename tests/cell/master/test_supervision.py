@@ -13,7 +13,7 @@ from puma_arm import UPENN
 import canprobe
 from canprobe.cell.master.conditions import BY_KEY, CONDITIONS, COUNTERS
 from canprobe.cell.master.controller import Measurement
-from canprobe.cell.master.supervision import Limits, Reaction, Seen, TouchState
+from canprobe.cell.master.supervision import CycleState, Limits, Reaction, TouchState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.scene.setup import SafetyLimits
@@ -32,7 +32,7 @@ PASSIVE = {"controller_state": ControllerState.PASSIVE}
 
 
 def seen(limits=LIMITS, **fields):
-    return Seen(limits, NodeWatch((1, 2)), None, None, PortCounters(), **fields)
+    return CycleState(limits, NodeWatch((1, 2)), None, None, PortCounters(), **fields)
 
 
 def with_ages(*ages):
@@ -213,13 +213,13 @@ def test_only_an_unbroken_run_of_saturated_samples_counts():
     contact = TouchState(LIMITS)
     told = []
     for k, saturated in enumerate((True, True, True, False, True, True)):
-        contact.feel(felt(force=2.0, saturated=saturated, off_pad=False, bridged=0.0), k * PERIOD_NS)
+        contact.update_force(felt(force=2.0, saturated=saturated, off_pad=False, bridged=0.0), k * PERIOD_NS)
         told.append(contact.hidden_s)
     assert told == pytest.approx([0.0, 0.005, 0.01, 0.0, 0.0, 0.005])
 
 
 def supervisor(patches):
-    seen = Seen(LIMITS, NodeWatch(()), None, None, PortCounters())
+    seen = CycleState(LIMITS, NodeWatch(()), None, None, PortCounters())
     return Supervisor(seen, None, lambda sample: patches[sample.cycle])
 
 
@@ -270,7 +270,9 @@ def test_a_press_between_two_retreats_is_not_forgotten():
             return T
 
     watched = Supervisor(
-        Seen(LIMITS, NodeWatch(()), None, None, PortCounters()), Guard(), lambda _: SimpleNamespace(force=force[0])
+        CycleState(LIMITS, NodeWatch(()), None, None, PortCounters()),
+        Guard(),
+        lambda _: SimpleNamespace(force=force[0]),
     )
     for cycle in range(80):
         force[0] = 4.0 if 4 <= cycle < 16 else 0.3 * (cycle >= 16)

@@ -11,7 +11,7 @@ from puma_arm import ELBOW_FORM
 
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement
-from canprobe.cell.master.supervision import Limits, Seen
+from canprobe.cell.master.supervision import CycleState, Limits
 from canprobe.cell.master.supervisor import JointGuard, PressDetector, Supervisor, outside_workspace
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.scene.setup import SafetyLimits
@@ -66,7 +66,7 @@ class Run:
     """A supervisor of two nodes without an arm, cycle by cycle."""
 
     def __init__(self, patch_from=None):
-        self.seen = Seen(LIMITS, NodeWatch((1, 2)), None, None, PortCounters())
+        self.seen = CycleState(LIMITS, NodeWatch((1, 2)), None, None, PortCounters())
         self.supervisor = Supervisor(self.seen, None, patch_from)
         self.cycle = 0
 
@@ -255,7 +255,7 @@ def test_a_target_outside_of_the_workspace_is_not_sent(plan, guard):
 
 def test_the_command_that_may_be_sent(plan, guard):
     """As it is, nearer where it is too far, and without a target where that is out of bounds."""
-    seen = Seen(LIMITS, NodeWatch((1, 2)), None, None, PortCounters())
+    seen = CycleState(LIMITS, NodeWatch((1, 2)), None, None, PortCounters())
     supervisor = Supervisor(seen, guard, None)
     seen.measurement = at(ELBOW_FORM, 0)
     near = Command(ELBOW_FORM, columns={"mine": 1.0})

@@ -12,7 +12,7 @@ from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.controller import Command, Controller
 from canprobe.cell.master.homing import UnhomedError
 from canprobe.cell.session import recovery
-from canprobe.cell.session.recovery import STEADY_NS, TRIES, Recovery, may_pass
+from canprobe.cell.session.recovery import BRING_UP_ATTEMPTS, STEADY_NS, Recovery, may_pass
 from canprobe.errors import InterfaceError, NodeError, SafetyStop
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
@@ -62,7 +62,7 @@ def test_a_loss_that_may_pass(error, cell, passes):
 
 
 class Going(Controller):
-    can_go_on = True
+    resumable = True
 
     def step(self, measurement):
         return Command()
@@ -149,9 +149,9 @@ def test_a_cell_that_fails_to_come_up_is_stopped_and_another_one_tried(monkeypat
 
 @pytest.mark.parametrize("lasts_ns", [STEADY_NS, STEADY_NS + 1])
 def test_the_last_of_so_many_tries_may_succeed(monkeypatch, lasts_ns):
-    bench = Bench(monkeypatch, [*[{"fails": LOST}] * (TRIES - 1), {}], lasts_ns)
+    bench = Bench(monkeypatch, [*[{"fails": LOST}] * (BRING_UP_ATTEMPTS - 1), {}], lasts_ns)
     bench.run()
-    assert bench.told()[1:] == [FAILED] * (TRIES - 1) + [UP]
+    assert bench.told()[1:] == [FAILED] * (BRING_UP_ATTEMPTS - 1) + [UP]
 
 
 @pytest.mark.parametrize("error", [UnhomedError(3, "is not homed"), STOP])
@@ -164,27 +164,29 @@ def test_what_a_person_must_look_at_is_not_tried_again(monkeypatch, error):
 
 @pytest.mark.parametrize("again", [False, True])
 def test_after_so_many_failures_it_ends_and_a_new_request_begins_anew(monkeypatch, again):
-    bench = Bench(monkeypatch, [{"fails": LOST}] * (2 * TRIES))
+    bench = Bench(monkeypatch, [{"fails": LOST}] * (2 * BRING_UP_ATTEMPTS))
     with pytest.raises(NodeError):
         bench.run()
     if again:
         with pytest.raises(NodeError):
             bench.recovery.resume()
-    assert bench.told()[1:] == [FAILED] * (TRIES * (1 + again)) + [[]] * (TRIES * (1 - again))
+    assert bench.told()[1:] == [FAILED] * (BRING_UP_ATTEMPTS * (1 + again)) + [[]] * (BRING_UP_ATTEMPTS * (1 - again))
 
 
 def test_a_lost_cell_is_brought_up_on_request(monkeypatch):
-    bench = Bench(monkeypatch, [*[{"fails": LOST}] * TRIES, {}])
+    bench = Bench(monkeypatch, [*[{"fails": LOST}] * BRING_UP_ATTEMPTS, {}])
     with pytest.raises(NodeError):
         bench.run()
     bench.recovery.resume()
     assert bench.told()[-1] == ["enter"] and bench.said[-1].startswith("the cell is back after 0.0 s")
 
 
-@pytest.mark.parametrize(("lasts_ns", "returns"), [(STEADY_NS, TRIES), (STEADY_NS + 1, TRIES + 3)])
+@pytest.mark.parametrize(
+    ("lasts_ns", "returns"), [(STEADY_NS, BRING_UP_ATTEMPTS), (STEADY_NS + 1, BRING_UP_ATTEMPTS + 3)]
+)
 def test_a_loss_within_a_second_of_the_return_is_a_failure_to_return(monkeypatch, lasts_ns, returns):
-    bench = Bench(monkeypatch, [{"lasts_ns": lasts_ns}] * (TRIES + 2) + [{}])
-    if returns == TRIES:
+    bench = Bench(monkeypatch, [{"lasts_ns": lasts_ns}] * (BRING_UP_ATTEMPTS + 2) + [{}])
+    if returns == BRING_UP_ATTEMPTS:
         with pytest.raises(NodeError):
             bench.run()
     else:

@@ -31,7 +31,7 @@ class Mine(Controller):
 def test_nothing_is_commanded_before_motion_is_asked_for():
     asked, mine, resumed = [], Mine(), []
     held = PausedController(mine, None, lambda: bool(asked), lambda: resumed.append(1))
-    assert held.step(Measurement(0, 0)).q_target is None and not held.lets_go and mine.steps == 0
+    assert held.step(Measurement(0, 0)).q_target is None and not held.retreats_itself and mine.steps == 0
     asked.append(True)
     assert held.step(Measurement(1, 0)).q_target is not None
     assert (mine.went_on, mine.steps, resumed) == (1, 1, [1])
@@ -43,7 +43,7 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
     asked, done = [], []
 
     class Working(Mine):
-        lets_go, restarts = True, 3
+        retreats_itself, restarts = True, 3
 
         def update(self):
             done.append("update")
@@ -53,14 +53,14 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
 
     held = PausedController(Working(), None, lambda: bool(asked))
     held.update()
-    assert done == [] and not held.lets_go and held.restarts == 3
+    assert done == [] and not held.retreats_itself and held.restarts == 3
     held.step(Measurement(0, 0))
     asked.append(True)
     held.step(Measurement(1, 0))
     held.update()
     held.retreat("the force")
-    assert done == ["update", "the force"] and held.lets_go
-    assert PausedController(Working(), None, None).lets_go, "a controller that is new begins at once"
+    assert done == ["update", "the force"] and held.retreats_itself
+    assert PausedController(Working(), None, None).retreats_itself, "a controller that is new begins at once"
 
 
 @pytest.mark.parametrize(("moved_deg", "words"), [(0.9, None), (1.1, "joint 2 reports")])
@@ -137,4 +137,4 @@ def test_a_controller_that_does_not_let_go_leaves_that_to_the_cell_after_the_hol
     held = PausedController(Mine(), None, lambda: True)
     for cycle in range(2):
         held.step(Measurement(cycle, cycle * 2_500_000))
-    assert not held.held and not held.lets_go
+    assert not held.held and not held.retreats_itself

@@ -155,7 +155,7 @@ def test_what_a_task_does_once_its_commands_are_out_is_passed_on():
     worked = []
 
     class Working(Controller):
-        lets_go = True
+        retreats_itself = True
 
         def update(self):
             worked.append("update")
@@ -165,9 +165,9 @@ def test_what_a_task_does_once_its_commands_are_out_is_passed_on():
 
     requested = RequestedTask(Working(), None, (), 2.5e-3)
     requested.update()
-    assert requested.lets_go
+    assert requested.retreats_itself
     requested.retreat("enough")
     assert worked == ["update", "enough"]
     idle = RequestedTask(None, None, (), 2.5e-3)
     idle.update()
-    assert not idle.lets_go
+    assert not idle.retreats_itself

@@ -10,7 +10,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.scene.load import load_array, load_scene, packaged_files
-from canprobe.cell.scene.offers import find_offer, offers
+from canprobe.cell.scene.plugins import find_plugin, plugins
 from canprobe.cli import main
 from canprobe.errors import SceneError, UsageError
 
@@ -171,4 +171,4 @@ def test_an_unknown_method_has_the_words_that_it_could_be():
         SceneError, match=r'expected one of recursive, ml, .* or text that another package offers, got "m1"'
     ):
         load_scene("sphere", {"shape.method": "m1"})
-    assert find_offer("cell", "nothing") is None and offers("calibration") == []
+    assert find_plugin("cell", "nothing") is None and plugins("calibration") == []

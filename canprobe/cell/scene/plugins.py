@@ -26,7 +26,7 @@ GROUPS = {kind: f"canprobe.{kind}s" for kind in ("scene", "cell", "array", "esti
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
+class Plugin:
     """What one entry point offers.
 
     Attributes:
@@ -84,22 +84,22 @@ class Offer:
         return f"{self.kind} {self.name} of the package {self.package}"
 
 
-def offers(kind: str) -> list[Offer]:
+def plugins(kind: str) -> list[Plugin]:
     """What other packages offer of a kind, by name; nothing of theirs is imported."""
     from importlib.metadata import entry_points  # here, as it takes longer than to read a scene
 
     found = entry_points(group=GROUPS[kind]) if kind in GROUPS else ()
-    made = [Offer(kind, point.name, point.dist.name if point.dist else "unknown", point) for point in found]
-    return sorted(made, key=lambda offer: (offer.name, offer.package))
+    made = [Plugin(kind, point.name, point.dist.name if point.dist else "unknown", point) for point in found]
+    return sorted(made, key=lambda plugin: (plugin.name, plugin.package))
 
 
-def find_offer(kind: str, name: str) -> Offer | None:
+def find_plugin(kind: str, name: str) -> Plugin | None:
     """The offer of a name, or of `package:name`; None where no package has it.
 
     Raises:
         SceneError: two packages have the name.
     """
-    found = [offer for offer in offers(kind) if name in (offer.name, offer.whole_name)]
+    found = [plugin for plugin in plugins(kind) if name in (plugin.name, plugin.whole_name)]
     if len(found) > 1:
         names, packages = " or ".join(one.whole_name for one in found), " and ".join(one.package for one in found)
         raise SceneError([f"{name}: the packages {packages} each offer {_a(kind)} of this name; type {names}"])
