@@ -167,6 +167,9 @@ def box(
     for (axis, (low, high)), label in zip(sides.items(), labels, strict=True):
         axis.set_label_text(label)
         axis.labelpad = 5
+        if axis is axes.zaxis:
+            axis.set_rotate_label(False)  # seen from some sides it stood on its head
+            axis.label.set_rotation("vertical")
         axis.set_tick_params(pad=0)
         count, inset = round(5 * (high - low) / longest), 0.25 * (high - low)
         two = count == 2 or part.bbox.height > 4.0 * DPI
