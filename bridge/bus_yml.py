@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from canprobe.cell.planning.configuration import SYNC_START_VALUE, NodeConfiguration, Write
+from canprobe.cell.planning.configuration import SYNC_START_VALUE
 from canprobe.cell.planning.device_capabilities import INVALID, MAPPING
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
@@ -29,6 +29,7 @@ from canprobe.cell.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.scene.toml_files import MAX_BYTES
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text

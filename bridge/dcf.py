@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from canprobe.cell.planning.configuration import NodeConfiguration
 from canprobe.cell.planning.model import (
     Plan,
 )
+from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file

@@ -20,7 +20,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.node_bringup import IDENTITY, NodeBringUp
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import TARE, TARE_COMMAND, NodeConfiguration, Write
+from canprobe.cell.planning.configuration import TARE, TARE_COMMAND
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import DEVICE_TYPE_REQUEST, SECOND_ANSWER_S

@@ -8,7 +8,7 @@ from typing import Any
 from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.planning.configuration import NodeConfiguration, Write
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.sdo import Dialogue, download, read_value
 

@@ -27,8 +27,9 @@ from canprobe.cell.master.node_bringup import IDENTITY
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, NodeConfiguration, Write
+from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.eds.description import Description

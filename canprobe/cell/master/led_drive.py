@@ -13,8 +13,9 @@ from typing import Any
 from canprobe.cell.master.bringup import MODE_DISPLAY
 from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import MODE, NodeConfiguration, Write
+from canprobe.cell.planning.configuration import MODE
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork

@@ -11,7 +11,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.cell.master.entries import RefusedError, read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeConfiguration, Write
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.sdo import Dialogue, SdoTimeoutError, decode_text, upload

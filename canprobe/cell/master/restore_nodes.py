@@ -12,7 +12,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.cell.master.entries import read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeConfiguration, Write
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork

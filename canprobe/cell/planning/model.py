@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.cell.scene.load import SAVED_AS, dump_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
@@ -15,7 +16,6 @@ from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 if TYPE_CHECKING:
     from canopen import ObjectDictionary
 
-    from canprobe.cell.planning.configuration import NodeConfiguration
 
 MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
+from canprobe.cell.planning.node_configuration import TurnUnits
 from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
 from canprobe.fieldbus.protocol.si_unit import VELOCITY_UNIT_INDEX, rate_unit
 from canprobe.mechanics.robot.model import ArmModel
@@ -33,43 +34,6 @@ LAG_BANDWIDTH = math.sqrt(math.sqrt(2.0) - 1.0) / math.pi
 ROUNDING_COUNTS = 2
 """Counts by which rounding may move two targets apart."""
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
-_TOLERANCE = 1e-3
-"""Share by which units may differ: a factor of the device is a quotient of integers."""
-
-
-@dataclass(frozen=True, slots=True)
-class TurnUnits:
-    """Position units of a motor turn as the cell states them, and the objects in which the device states them.
-
-    Attributes:
-        units: units of the cell per turn of the motor.
-        gear: turns of the motor per turn of the joint.
-        feed: index of the units per turn, 6092h, or 608Fh where the device has no 6092h; the quotient of :01 and :02.
-        ratio: index of the motor turns per shaft turn, 6091h; None where the device lacks it, or 6092h.
-    """
-
-    units: float
-    gear: float
-    feed: int
-    ratio: int | None
-
-    def mismatch(self, feed: float, ratio: float) -> str | None:
-        """Difference of a device's quotients from the cell, in words; None where they fit.
-
-        The shaft of a device may be that of the motor, or that of the joint.
-
-        Args:
-            feed: value of the object `feed`, a quotient.
-            ratio: value of the object `ratio`, a quotient; 1 without.
-        """
-        by_motor, by_joint = feed / ratio / self.units, feed / (self.units * self.gear)
-        if min(abs(by_motor - 1), abs(by_joint - 1)) <= _TOLERANCE:
-            return None
-        objects = f"{self.feed:04X}h" + (f" and {self.ratio:04X}h" if self.ratio is not None else "")
-        return (
-            f"counts {feed / ratio:g} units a motor turn by its {objects}, the cell {self.units:g} (counts_per_turn):"
-            " check which is right before it moves"
-        )
 
 
 def turn_units(device: DeviceCapabilities, units: float | None, gear: float) -> TurnUnits | None:

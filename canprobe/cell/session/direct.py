@@ -24,8 +24,8 @@ from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import DriveCommand, DriveGroup
 from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeConfiguration, Write
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.port import Port, nothing

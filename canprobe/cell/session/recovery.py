@@ -24,8 +24,8 @@ from canprobe.cell.master.homing import TOLERANCE_RAD, UnhomedError
 from canprobe.cell.master.notes import nodes_text
 from canprobe.cell.master.options import Say
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.configuration import NodeConfiguration
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan
+from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.cell.session.buses import SessionBuses
 from canprobe.cell.tasks.paused import LastPlace, PausedController
 from canprobe.errors import BusError, CanprobeError, InterfaceError, NodeError

@@ -1,0 +1,160 @@
+"""The configuration of a node as data: what it must be, and the writes that make it so."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+from canopen import ObjectDictionary
+
+MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
+_TOLERANCE = 1e-3
+"""Share by which units may differ: a factor of the device is a quotient of integers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """One entry that bring-up writes and reads back.
+
+    Attributes:
+        index, subindex: the entry.
+        value: integer value.
+        purpose: what the device needs it for.
+        absence: what follows where the device lacks the entry; None: the write is required.
+        read_back: False for commands, whose entry answers another value than the written one.
+        own_bits: bits that the device sets: it may refuse other values of them, or keep its own.
+    """
+
+    index: int
+    subindex: int
+    value: int
+    purpose: str
+    absence: str | None = None
+    read_back: bool = True
+    own_bits: int = 0
+
+    @property
+    def place(self) -> str:
+        """The entry for messages, such as ``60C2h:01``."""
+        return f"{self.index:04X}h:{self.subindex:02X}"
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A wished write that the EDS excludes.
+
+    Attributes:
+        write: the write that is not made.
+        why: what the EDS offers instead.
+    """
+
+    write: Write
+    why: str
+
+    @property
+    def what(self) -> str:
+        """Purpose and entry, for people."""
+        return f"{self.write.purpose} ({self.write.place})"
+
+
+@dataclass(frozen=True, slots=True)
+class FixedEntry:
+    """One entry that the device cannot change and the scene relies on.
+
+    Attributes:
+        index, subindex: the entry.
+        value: value that it must hold.
+        says: who states the value.
+        otherwise: what would be wrong, and what puts it right.
+    """
+
+    index: int
+    subindex: int
+    value: int
+    says: str
+    otherwise: str
+
+
+@dataclass(frozen=True, slots=True)
+class TurnUnits:
+    """Position units of a motor turn as the cell states them, and the objects in which the device states them.
+
+    Attributes:
+        units: units of the cell per turn of the motor.
+        gear: turns of the motor per turn of the joint.
+        feed: index of the units per turn, 6092h, or 608Fh where the device has no 6092h; the quotient of :01 and :02.
+        ratio: index of the motor turns per shaft turn, 6091h; None where the device lacks it, or 6092h.
+    """
+
+    units: float
+    gear: float
+    feed: int
+    ratio: int | None
+
+    def mismatch(self, feed: float, ratio: float) -> str | None:
+        """Difference of a device's quotients from the cell, in words; None where they fit.
+
+        The shaft of a device may be that of the motor, or that of the joint.
+
+        Args:
+            feed: value of the object `feed`, a quotient.
+            ratio: value of the object `ratio`, a quotient; 1 without.
+        """
+        by_motor, by_joint = feed / ratio / self.units, feed / (self.units * self.gear)
+        if min(abs(by_motor - 1), abs(by_joint - 1)) <= _TOLERANCE:
+            return None
+        objects = f"{self.feed:04X}h" + (f" and {self.ratio:04X}h" if self.ratio is not None else "")
+        return (
+            f"counts {feed / ratio:g} units a motor turn by its {objects}, the cell {self.units:g} (counts_per_turn):"
+            " check which is right before it moves"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NodeConfiguration:
+    """Requirements on one node, and its configuration.
+
+    Attributes:
+        node_id: the node.
+        name: its name in messages, such as ``joint 3``.
+        channel: channel of its bus.
+        eds: name of its EDS file, for messages.
+        dictionary: its object dictionary, from the EDS.
+        identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
+        writes: its configuration, in order.
+        given: what it must hold by itself.
+        otherwise: other writes of the same interpolation time, tried in this order where the device refuses 60C2h.
+        left_out: wished writes that the EDS excludes.
+        problems: why required writes are excluded by the EDS; empty in a plan.
+        mode: mode of operation, which 6061h must confirm; None: the node is no drive.
+        homing: writes for homing, in order; empty: the drive is not homed. Where the drive is coupled to other
+            joints, the home offset depends on their positions; here they are in the start posture.
+        turn: position units of a motor turn, to compare with those that the device states; None: not known.
+        speed_unit: position units/s in one velocity unit of the drive.
+    """
+
+    node_id: int
+    name: str
+    channel: str
+    eds: str
+    dictionary: ObjectDictionary
+    identity: dict[int, int]
+    writes: tuple[Write, ...]
+    given: tuple[FixedEntry, ...] = ()
+    otherwise: tuple[tuple[Write, ...], ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+    problems: tuple[str, ...] = ()
+    mode: int | None = None
+    homing: tuple[Write, ...] = ()
+    turn: TurnUnits | None = None
+    speed_unit: float = 1.0
+
+    @property
+    def configuration_date(self) -> dict[int, int]:
+        """Value of 1020h in a node with this configuration: days since 1984, milliseconds after midnight.
+
+        They follow from the values, so that any change of them, of the EDS or of the scene, gives another date.
+        """
+        values = [(write.index, write.subindex, write.value) for write in self.writes if write.read_back]
+        text = repr((self.eds, self.identity, values)).encode()
+        return {1: 1 + zlib.crc32(text) % MOST_DAYS, 2: 1 + zlib.adler32(text) % DAY_MS}
