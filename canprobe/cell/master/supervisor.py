@@ -330,7 +330,7 @@ class Supervisor:
 
     def witness_grows(self, measurement: Measurement) -> bool:
         """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
-        return self._growing.grows(measurement.cycle, math.inf if self.shows_a_part else self.felt())
+        return self._growing.grows(measurement.cycle, self.felt(), a_part=self.shows_a_part)
 
     def pressing(self) -> float:
         """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""

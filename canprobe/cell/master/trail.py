@@ -6,6 +6,7 @@ what the probe has run into; a way that is computed leads there only as far as t
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 
@@ -126,10 +127,18 @@ class GrowingForce:
         self._begin: int | None = None
         self._highest = 0.0
 
-    def grows(self, cycle: int, force: float) -> bool:
-        """Take the force of a cycle, N; whether it has grown beyond what it was as the way back began."""
+    def grows(self, cycle: int, force: float, *, a_part: bool) -> bool:
+        """Take the force of a cycle; whether it has grown beyond what it was as the way back began.
+
+        Args:
+            cycle: number of the cycle.
+            force: measured force, N.
+            a_part: it is a part of the true one: the array is saturated, or the contact runs off it.
+        """
         if self._begin is None:
             self._begin = cycle
+        if a_part and force > GROWTH_N:  # noise in a taxel at the edge runs off the array, too
+            force = math.inf
         if cycle - self._begin < self._cycles:
             self._highest = max(self._highest, force)
         return force > self._highest * (1.0 + GROWTH_SHARE) + GROWTH_N

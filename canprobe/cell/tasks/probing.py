@@ -292,8 +292,7 @@ class ProbingTask(Task):
         """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
         if self._growing is None:
             self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
-        bound = math.isinf(self._touch.force_sigma)  # an array that leaves saturation may measure more than before
-        return self._growing.grows(self._cycle, math.inf if bound else self._touch.force)
+        return self._growing.grows(self._cycle, self._touch.force, a_part=math.isinf(self._touch.force_sigma))
 
     def _off(self) -> None:
         """The probe is off the object."""

@@ -115,6 +115,13 @@ def test_the_memory_is_bounded_where_the_probe_turns_about_its_tip_or_rests():
 
 def test_what_was_pressed_before_the_way_back_took_effect_is_no_growth():
     witness = GrowingForce(14)
-    assert not any(witness.grows(100 + k, 2.0 + 0.1 * k) for k in range(14))
+    assert not any(witness.grows(100 + k, 2.0 + 0.1 * k, a_part=False) for k in range(14))
     most = 3.3 * (1.0 + GROWTH_SHARE) + GROWTH_N
-    assert not witness.grows(114, most) and witness.grows(115, most + 1e-3) and not witness.grows(116, 0.0)
+    assert not witness.grows(114, most, a_part=False) and witness.grows(115, most + 1e-3, a_part=False)
+    assert not witness.grows(116, 0.0, a_part=False)
+
+
+def test_a_part_of_a_force_has_grown_unless_it_is_noise_at_the_edge_of_the_array():
+    witness = GrowingForce(1)
+    witness.grows(0, 2.0, a_part=False)
+    assert witness.grows(1, 1.0, a_part=True) and not witness.grows(2, 0.9 * GROWTH_N, a_part=True)
