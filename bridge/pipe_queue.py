@@ -5,13 +5,13 @@ The kernel's buffer is the queue. There is no thread, so that nothing competes w
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import os
 import select
 import struct
 from collections.abc import Iterator
 from typing import BinaryIO
+
+from canprobe.fieldbus.bus.system import system
 
 CAPACITY = 1 << 20
 """Requested size of the kernel's buffer, bytes: above a second of a whole cell at 400 Hz. The kernel may grant less."""
@@ -45,8 +45,7 @@ class Feed:
         self._rest = memoryview(b"")
         self._leaving = 0
         os.set_blocking(fd, False)
-        with contextlib.suppress(OSError, AttributeError):  # less where the system grants less
-            fcntl.fcntl(fd, fcntl.F_SETPIPE_SZ, CAPACITY)
+        system.enlarge_pipe(fd, CAPACITY)
 
     def put(self, record: bytes) -> None:
         """Take one record; it is dropped and counted where the queue is full."""

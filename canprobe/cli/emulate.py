@@ -7,6 +7,7 @@ one node: it answers with the values of the file; where the file describes a CiA
 from __future__ import annotations
 
 import argparse
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -83,11 +84,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
-    from canprobe.cell.session.child_process import end_with_parent
+    from canprobe.fieldbus.bus.system import system
 
     with left_by_ctrl_c():
         if args.parent is not None:
-            end_with_parent(args.parent)
+            system.end_with_parent(args.parent, signal.SIGTERM)
         serve()
     return 0
 

@@ -9,9 +9,11 @@ the command runs there as root. CANPROBE_VCAN names the way that was taken: here
 from __future__ import annotations
 
 import argparse
+import sys
 
 from canprobe.cli.argument_types import seconds
 from canprobe.cli.parser import Parser
+from canprobe.errors import UsageError
 
 HELP = "run a command with a virtual CAN interface vcan0"
 EXAMPLE = """\
@@ -44,7 +46,10 @@ def add_arguments(parser: Parser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command; return its exit status."""
     command = args.command[1:] if args.command[:1] == ["--"] else args.command
-
+    if not sys.platform.startswith("linux"):
+        raise UsageError(
+            "vcan: SocketCAN is Linux's: run this in a Linux, or take --bus lockstep or --bus udp_multicast"
+        )
     from canprobe.fieldbus.vcan.launch import run_with_vcan
 
     return run_with_vcan(command, timeout_s=args.timeout, install=args.install, realtime=args.realtime)

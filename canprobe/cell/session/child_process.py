@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -25,9 +23,8 @@ from canprobe.cell.session.folder import write_scene
 from canprobe.errors import BusError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port, nothing
+from canprobe.fieldbus.bus.system import system
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE
-
-_PR_SET_PDEATHSIG = 1
 
 
 def with_our_imports() -> dict[str, str]:
@@ -35,17 +32,8 @@ def with_our_imports() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path)}
 
 
-def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
-    """Called in the child: get a signal when the parent is killed. Linux only, a second line of defence.
-
-    Args:
-        parent: process id of the parent; if it has ended already, this process gets the signal at once.
-        number: number of the signal.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
-        if os.getppid() != parent:
-            os.kill(os.getpid(), number)
+ERRORS = "errors.txt"
+"""File of the standard error of a process, in its folder."""
 
 
 class ChildProcess:
@@ -73,14 +61,14 @@ class ChildProcess:
             stdin, stdout: as for `subprocess.Popen`.
         """
         write_scene(plan, self.folder)
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by remove
+        self._errors = (self.folder / ERRORS).open("w+b")  # closed by remove
         self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
             [sys.executable, "-P", "-m", *words],
             env=with_our_imports(),
             stdin=stdin,
             stdout=stdout,
             stderr=self._errors,
-            start_new_session=True,
+            **system.OWN_SESSION,
         )
 
     @property
@@ -109,9 +97,9 @@ class ChildProcess:
 
     def remove(self) -> None:
         """Remove the files of the process, which has ended. Twice is allowed."""
-        shutil.rmtree(self.folder, ignore_errors=True)
         if self._errors is not None:
             self._errors.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 REPORT_EVERY_S = 10.0
@@ -213,8 +201,7 @@ class EmulatorChild(ChildProcess):
         """Whether an array of raw frames is served: it sends no boot-up, and the process says so."""
         if self._scene.sensor is None or self._scene.array_is_node or not self._scene.sensor.emulated:
             return True
-        assert self._errors is not None
-        return SERVING_WORD.encode() in os.pread(self._errors.fileno(), 1 << 16, 0)  # leaves the child's place in it
+        return SERVING_WORD.encode() in (self.folder / ERRORS).read_bytes()  # leaves the child's place in it
 
     def _raise_late(self, node_id: int) -> NoReturn:
         raise NodeError(
@@ -227,9 +214,8 @@ class EmulatorChild(ChildProcess):
         """Stop the process, by stronger signals where it does not end; the plant's truth where it left any."""
         if self._process is not None:
             patience_s = END_TIMEOUT_S + TRUTH_SHARE * (self._clock.now_ns() - self._started_ns) * 1e-9
-            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGKILL):  # SIGINT is ignored in the background
-                self._process.send_signal(number)
-                self._process.send_signal(signal.SIGCONT)  # a stopped process receives the signal only then
+            for number in system.END_SIGNALS:
+                system.end_process(self._process, number)
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
                     self._process.wait(patience_s)
                     break

@@ -8,7 +8,6 @@ Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import re
 import shlex
 from collections import Counter
@@ -21,6 +20,7 @@ from types import TracebackType
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.port import Port, TimedFrame, nothing
+from canprobe.fieldbus.bus.system import system
 from canprobe.fieldbus.bus.tapped import TappedPort
 from canprobe.fieldbus.eds.foreign_files import HEAD_BYTES, file_kind
 from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
@@ -186,7 +186,7 @@ def _opened_alone(path: str | Path) -> FileIO:
     """An empty file to write to, locked against other runs until it is closed."""
     file = open(path, "ab", buffering=0)  # noqa: SIM115 - the caller's
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        system.lock(file)
     except BlockingIOError:
         file.close()
         raise UsageError(f"{path}: another run writes this file; choose another folder") from None

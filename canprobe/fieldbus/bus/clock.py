@@ -12,6 +12,8 @@ import os
 import time
 from typing import Protocol
 
+from canprobe.fieldbus.bus.system import system
+
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
 
@@ -132,7 +134,7 @@ class MonotonicClock:
 
     def __init__(self) -> None:
         self._request = Timespec()
-        self._clock_nanosleep = getattr(ctypes.CDLL(None), "clock_nanosleep", None)
+        self._clock_nanosleep = getattr(system.c_library(), "clock_nanosleep", None)
 
     def now_ns(self) -> int:
         """Return CLOCK_MONOTONIC in ns."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import hashlib
 import json
@@ -24,6 +23,7 @@ import canprobe
 from canprobe.errors import ResultsError, StudyError
 from canprobe.fieldbus.bus.files import make_folder, writing
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held
+from canprobe.fieldbus.bus.system import system
 
 PACKAGE = Path(canprobe.__file__).parent
 _SOURCES = (".py", ".toml", ".eds")
@@ -95,7 +95,7 @@ class CellStore:
         with writing(self.path):
             self._file: IO[str] = self.path.open("a+", encoding="utf-8", errors="replace")
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            system.lock(self._file)
         except OSError as error:
             self._file.close()
             raise StudyError(

@@ -6,7 +6,6 @@ import contextlib
 import multiprocessing
 import os
 import re
-import signal
 import sys
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -15,9 +14,9 @@ from multiprocessing.process import BaseProcess
 from time import perf_counter
 from types import ModuleType
 
-from canprobe.cell.session.child_process import end_with_parent
 from canprobe.errors import StudyError, UsageError, install_line
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
+from canprobe.fieldbus.bus.system import system
 
 _DASK_WAIT = "10s"
 _GRACE_S = 1.0
@@ -35,10 +34,10 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
     """
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(
-        workers or len(os.sched_getaffinity(0)),
+        workers or system.processors(),
         multiprocessing.get_context("spawn"),
-        initializer=end_with_parent,
-        initargs=(os.getpid(), signal.SIGKILL),  # nothing in a worker moves, and whatever it does cannot ignore that
+        initializer=system.end_with_parent,
+        initargs=(os.getpid(), system.KILL),  # nothing in a worker moves, and whatever it does cannot ignore that
     )
     try:
         with _one_blas_thread():  # workers start when cells are submitted
@@ -92,13 +91,12 @@ class _Deaf(Executor):
 
     def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]  # as its base has it
         """See `Executor.submit`."""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
-            return self._pool.submit(fn, *args, **kwargs)
+            with system.interrupts_blocked():
+                return self._pool.submit(fn, *args, **kwargs)
         finally:
             sys.modules["__main__"] = script
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end(workers: Collection[BaseProcess]) -> None:

@@ -297,9 +297,7 @@ def test_a_killed_process_leaves_no_worker(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_child_whose_parent_is_gone_before_it_asks_ends_at_once(number):
-    command = (
-        f"from canprobe.cell.session.child_process import end_with_parent; end_with_parent(1 << 22, {int(number)})"
-    )
+    command = f"from canprobe.fieldbus.bus.system import system; system.end_with_parent(1 << 22, {int(number)})"
     assert subprocess.run([sys.executable, "-c", command], check=False, timeout=patience_s(60)).returncode == -number
 
 

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any
 
-TERMINATION_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a process from outside: a service is stopped, a terminal is closed."""
+from canprobe.fieldbus.bus.system import system
+
+TERMINATION_SIGNALS = system.TERMINATION_SIGNALS
 REPEAT_PERIOD_S = 0.1
 """Time between two repetitions of an interrupt."""
 

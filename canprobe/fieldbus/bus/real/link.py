@@ -15,6 +15,8 @@ import subprocess
 from dataclasses import dataclass
 from typing import Any
 
+from canprobe.fieldbus.bus.system import system
+
 VIRTUAL_KINDS = ("vcan", "vxcan")
 MAX_SLOW_BITRATE = 500_000
 SLOW_SAMPLE_POINTS, FAST_SAMPLE_POINTS = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
@@ -162,7 +164,7 @@ def missing_ip() -> str | None:
 
 def sudo() -> str:
     """Beginning of a line to type: `sudo` for users who are not root."""
-    return "" if os.geteuid() == 0 else "sudo "
+    return "" if system.is_root() else "sudo "
 
 
 def _table(parent: dict[str, Any], key: str) -> dict[str, Any]:

@@ -6,6 +6,9 @@ import contextlib
 import ctypes
 import os
 from collections.abc import Callable, Iterator
+from typing import Any
+
+from canprobe.fieldbus.bus.system import system
 
 NICE_VALUE = -15
 """Nice value that is asked for."""
@@ -73,7 +76,7 @@ def _pinned(from_last: int) -> Callable[[], None]:
 
 
 def _locked() -> Callable[[], object]:
-    libc = ctypes.CDLL(None, use_errno=True)
+    libc: Any = system.c_library()  # without one mlockall is no attribute
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))

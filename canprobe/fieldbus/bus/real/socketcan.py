@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import fcntl
 import os
 import select
 import socket
@@ -38,6 +37,7 @@ from canprobe.fieldbus.bus.real.link import (
     sudo,
 )
 from canprobe.fieldbus.bus.real.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
+from canprobe.fieldbus.bus.system import system
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
 
@@ -358,7 +358,7 @@ class SocketCanPort:
         if error.errno != errno.ENOBUFS:
             return ""
         try:
-            length = struct.unpack("=16si12x", fcntl.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
+            length = struct.unpack("=16si12x", system.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
         except OSError:  # the interface has gone meanwhile
             return ""
         if length >= TX_QUEUE_FRAMES:
@@ -432,7 +432,7 @@ def check_interface(channel: str, setting: str | None = None) -> None:
         )
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:
-            flags = struct.unpack("=16sH14x", fcntl.ioctl(probe, _SIOCGIFFLAGS, _ifreq(channel)))[1]
+            flags = struct.unpack("=16sH14x", system.ioctl(probe, _SIOCGIFFLAGS, _ifreq(channel)))[1]
         except OSError as error:
             raise InterfaceError(f"{channel}: no such interface; {how_to_make(channel)}") from error
         try:
@@ -447,7 +447,7 @@ def _check_fd(channel: str, setting: str) -> None:
     """Return if the interface carries CAN FD frames; else raise InterfaceError."""
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:
-            mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
+            mtu = struct.unpack("=16si12x", system.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
         except OSError as error:
             raise InterfaceError(f"{channel}: no such interface; {how_to_make(channel)}") from error
     if mtu < FD_MTU_BYTES:

@@ -41,6 +41,8 @@ def _name(channel: str) -> str:
 
 def _names(channel: str) -> list[str]:
     """Names of the sockets of a channel."""
+    if not _SOCKETS.exists():
+        raise InterfaceError("faults reach another process by a socket of Linux only; here give them to it: --inject")
     start = f"@{_name(channel)}"
     fields = (line.split() for line in _SOCKETS.read_text(encoding="ascii", errors="replace").splitlines())
     found = {words[-1][1:] for words in fields if words and re.fullmatch(f"{re.escape(start)}[0-9]+", words[-1])}
@@ -67,6 +69,8 @@ class ControlServer:
     def __init__(self, channel: str, nodes: FaultyNodes) -> None:
         self._nodes = nodes
         self._lines: dict[socket.socket, int] = {}
+        if not _SOCKETS.exists():
+            raise OSError("its sockets are Linux's; give faults with --inject")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         self._socket.bind(f"\0{_name(channel)}{os.getpid()}")
         self._socket.listen(_MAX_WAITING)

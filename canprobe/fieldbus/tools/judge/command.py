@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import signal
 import subprocess
 import time
@@ -13,8 +11,9 @@ from typing import IO
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.files import writing
+from canprobe.fieldbus.bus.system import system
 
-_FORCES = ((0.0, signal.SIGINT), (5.0, signal.SIGTERM), (7.0, signal.SIGKILL))
+_FORCES = ((0.0, signal.SIGINT), (5.0, signal.SIGTERM), (7.0, system.KILL))
 """Signals that end a command, and after how many seconds each is sent."""
 
 
@@ -37,7 +36,7 @@ class MasterCommand:
             self._file: IO[bytes] = output.open("wb")
         try:
             self._process = subprocess.Popen(
-                self.words, stdin=subprocess.DEVNULL, stdout=self._file, stderr=self._file, start_new_session=True
+                self.words, stdin=subprocess.DEVNULL, stdout=self._file, stderr=self._file, **system.OWN_SESSION
             )
         except OSError as error:
             self._file.close()
@@ -62,8 +61,7 @@ class MasterCommand:
         now_s = time.monotonic()
         self._ending_s = now_s if self._ending_s is None else self._ending_s
         while self._sent < len(_FORCES) and now_s - self._ending_s >= _FORCES[self._sent][0]:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, _FORCES[self._sent][1])
+            system.end_session(self._process, _FORCES[self._sent][1])
             self._sent += 1
         return False
 
@@ -77,5 +75,4 @@ class MasterCommand:
             self._file.close()
 
     def _kill(self) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+        system.end_session(self._process, system.KILL)

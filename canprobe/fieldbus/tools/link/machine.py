@@ -5,11 +5,11 @@ A value that the machine does not give is `NOT_AVAILABLE`: a guest has no govern
 
 from __future__ import annotations
 
-import os
-import resource
+import platform
 from pathlib import Path
 
 from canprobe.fieldbus.bus.clock import Clock
+from canprobe.fieldbus.bus.system import system
 
 NOT_AVAILABLE = "not available"
 
@@ -21,8 +21,8 @@ def machine_facts(channel: str | None = None) -> dict[str, str]:
         channel: SocketCAN interface; None leaves its facts out.
     """
     facts = {
-        "kernel": f"{os.uname().release}, {'PREEMPT_RT' if _read('/sys/kernel/realtime') == '1' else _preemption()}",
-        "processors": str(len(os.sched_getaffinity(0))),
+        "kernel": f"{platform.release()}, {'PREEMPT_RT' if _read('/sys/kernel/realtime') == '1' else _preemption()}",
+        "processors": str(system.processors()),
         "governor": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"),
         "frequency_khz": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_cur_freq"),
         "load": _read("/proc/loadavg").split(" ")[0],
@@ -49,7 +49,7 @@ def wake_lateness(clock: Clock, period_ns: int, cycles: int) -> list[int]:
 
 
 def _preemption() -> str:
-    version = os.uname().version
+    version = platform.version()
     return next((word for word in ("PREEMPT_DYNAMIC", "PREEMPT") if word in version), "no PREEMPT_RT")
 
 
@@ -62,10 +62,5 @@ def _read(path: str) -> str:
 
 def _limit(name: str) -> str:
     """Soft limit of a resource: for real time, the highest priority that may be asked for; root may take any."""
-    number = getattr(resource, name, None)
-    if number is None:
-        return NOT_AVAILABLE
-    if os.geteuid() == 0:
-        return "any, as root"
-    soft = resource.getrlimit(number)[0]
-    return "unlimited" if soft == resource.RLIM_INFINITY else str(soft)
+    soft = system.soft_limit(name)
+    return NOT_AVAILABLE if soft is None else "any, as root" if system.is_root() else soft

@@ -1,0 +1,75 @@
+"""What needs neither SocketCAN nor a call of POSIX works where those are hidden, and what needs them says so.
+
+`other_system` imitates Windows in a child process. What is asked for here runs there as a user would type it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+IMITATION = Path(__file__).parents[1] / "support" / "other_system"
+FAULT = "this is a fault of canprobe itself"
+
+
+def typed(folder: Path, *words: str) -> tuple[int, str]:
+    """Status and output of a command on the imitated system."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(IMITATION), *sys.path]), "PYTHONIOENCODING": "cp1252"}
+    env.pop("PYTEST_VERSION", None)
+    done = subprocess.run(
+        [sys.executable, "-m", "canprobe", *words], cwd=folder, env=env, capture_output=True, check=False, timeout=120
+    )
+    return done.returncode, (done.stdout + done.stderr).decode("cp1252")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run in `first`."""
+    folder = tmp_path_factory.mktemp("there")
+    status, said = typed(folder, "run", "cylinder", "--duration", "0.5", "--no-figures", "--out", "first")
+    assert status == 0, said
+    return folder
+
+
+SHORT = ("--duration", "0.2", "--no-figures", "--out")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("plan", "cylinder"),
+        ("run", "free", "--bus", "direct", *SHORT, "direct"),
+        ("init", "cell", "--eds", "puma260_joint"),
+        ("replay", "first"),
+        ("judge", "--record", "first/bus.log", "cylinder"),
+        ("adapters",),
+        ("move", "puma260", "--joint", "1", "--by", "1deg", "--yes"),
+        pytest.param(("check", "free"), marks=pytest.mark.slow(reason="another command in a process")),
+        pytest.param(("tare", "puma260", "--yes"), marks=pytest.mark.slow(reason="another command in a process")),
+        pytest.param(("schema", "scene"), marks=pytest.mark.slow(reason="another command in a process")),
+        pytest.param(("eds", "list"), marks=pytest.mark.slow(reason="another command in a process")),
+        pytest.param(
+            ("study", "estimators", "--quick", "--out", "study"), marks=pytest.mark.slow(reason="a study in processes")
+        ),
+    ],
+)
+def test_what_needs_no_posix_works_without_it(folder, words):
+    status, said = typed(folder, *words)
+    assert status == 0, said
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("scan", "--bus", "pcan", "--channel", "PCAN_USBBUS1"), "PCAN-Basic of peak-system.com is not installed"),
+        (("run", "free", "--bridge", "mcap", *SHORT, "fed"), "bridge mcap: its process is fed by a pipe"),
+        (("up", "free", "--bus", "socketcan", "--channel", "can0"), "no SocketCAN"),
+    ],
+)
+def test_what_is_missing_is_named(folder, words, says):
+    status, said = typed(folder, *words)
+    assert status in (2, 3) and says in said and FAULT not in said
