@@ -24,8 +24,8 @@ NAMES: tuple[tuple[Any, tuple[str, ...]], ...] = (
     (os, ("sched_getaffinity", "sched_setaffinity", "sched_getscheduler", "sched_setscheduler", "sched_param")),
     (os, ("SCHED_FIFO", "setpriority", "getpriority", "nice", "getuid", "geteuid", "killpg", "setsid")),
     (os, ("pread", "mkfifo", "getloadavg", "openpty", "O_CLOEXEC", "O_NONBLOCK", "register_at_fork", "fork")),
-    (signal, ("SIGHUP", "SIGKILL", "SIGQUIT", "SIGSTOP", "SIGCONT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGPIPE")),
-    (signal, ("pthread_sigmask", "SIG_BLOCK", "SIG_SETMASK", "setitimer", "sigwait", "ITIMER_REAL")),
+    (signal, ("SIGHUP", "SIGKILL", "SIGQUIT", "SIGSTOP", "SIGCONT", "SIGUSR1", "SIGUSR2", "SIGPIPE")),
+    (signal, ("pthread_sigmask", "SIG_BLOCK", "SIG_SETMASK", "sigwait")),
     (socket, ("AF_UNIX", "AF_CAN", "CAN_RAW", "PF_CAN", "SO_PEERCRED")),
 )
 STANDARD = (
@@ -33,7 +33,7 @@ STANDARD = (
     *("multiprocessing.popen_spawn_posix", "platform", "shutil", "subprocess", "uuid"),
 )
 """Modules of the standard library that have other ways on Windows: they keep those of this machine."""
-TESTS = ("pytest", "_pytest.tmpdir", "_pytest.pytester", "xdist.workermanage", "execnet")
+TESTS = ("_pytest.compat", "_pytest.tmpdir", "execnet", "platformdirs", "trimesh", "matplotlib.pyplot")
 
 
 def hide() -> None:
