@@ -2,7 +2,7 @@
 
 With --eds each file is an emulated node, with a SCENE or a cell its nodes are; COMMAND is your master, which is started
 once they are served, with no input, and its output goes into a file. Without COMMAND a master that runs elsewhere is
-awaited, and Ctrl-C ends the judgement. With --record a candump log is judged for what can be seen in it.
+awaited, and Ctrl-C ends the judgement. With --record a log is judged for what can be seen in it.
 
 Once a drive has been enabled for two seconds, faults are thrown at it, one after the other, and the reaction is judged:
 slow SDO answers, a lost heartbeat, a mute node, a fault of the drive, a reboot. --inject names others, and --passive
@@ -57,7 +57,7 @@ def add_arguments(parser: Parser) -> None:
     add_scene(parser, optional=True)
     add_options(parser, *BUS)
     add_eds_nodes(parser)
-    parser.add_argument("--record", metavar="FILE", type=Path, help="judge a candump log, and serve nothing")
+    parser.add_argument("--record", metavar="FILE", type=Path, help="judge a log, and serve nothing")
     parser.add_argument(
         "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"
     )

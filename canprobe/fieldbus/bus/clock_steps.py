@@ -16,7 +16,8 @@ from pathlib import Path
 from statistics import median
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.candump import CandumpLine, CandumpReader
+from canprobe.fieldbus.bus.candump import CandumpLine
+from canprobe.fieldbus.bus.logs import open_log
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 
 MAX_DISORDER_NS = 10_000_000
@@ -111,10 +112,10 @@ def _are_early(syncs: list[_Sync], i: int, period: int) -> bool:
 
 
 class RecordedBus:
-    """The frames of a candump log, in the order of its lines, with stamps on one clock. It is read twice.
+    """The frames of a log, in the order of its lines, with stamps on one clock. It is read twice.
 
     Args:
-        path: path of the log, as for `CandumpReader`.
+        path: path of the log, as for `open_log`.
 
     Attributes:
         steps: steps of the clock, by line.
@@ -127,7 +128,7 @@ class RecordedBus:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._reader = CandumpReader(path)
+        self._reader = open_log(path)
         channels: dict[str, _ChannelSyncs] = {}
         for t_ns, name, can_id, _ in self._reader:
             channel = channels.get(name)

@@ -34,7 +34,7 @@ def test_virtual_time_stands_still_and_jumps() -> None:
 @pytest.mark.parametrize("native", [True, False])
 def test_monotonic_sleep_never_ends_early(native: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not native:  # a C library without clock_nanosleep
-        monkeypatch.setattr("canprobe.fieldbus.bus.clock.ctypes.CDLL", lambda _: object())
+        monkeypatch.setattr("canprobe.fieldbus.bus.posix.c_library", lambda: None)
     clock = MonotonicClock()
     for ahead_ns in (-5, 0, 1, 300_000):
         target_ns = time.monotonic_ns() + ahead_ns
@@ -78,7 +78,7 @@ def test_a_time_that_is_past_asks_nothing_of_the_kernel(monkeypatch: pytest.Monk
         def clock_nanosleep(self, *request: object) -> int:
             return asked.append(request) or 0  # type: ignore[func-returns-value]
 
-    monkeypatch.setattr("canprobe.fieldbus.bus.clock.ctypes.CDLL", lambda _: Library())
+    monkeypatch.setattr("canprobe.fieldbus.bus.posix.c_library", Library)
     clock = MonotonicClock()
     clock.sleep_until_ns(clock.now_ns())
     assert not asked

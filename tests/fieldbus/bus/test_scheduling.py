@@ -57,7 +57,7 @@ def test_what_is_refused_is_told_with_the_way_to_it(monkeypatch):
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_setaffinity", refuse)
-    monkeypatch.setattr("canprobe.fieldbus.bus.real.processor.ctypes.CDLL", refuse)
+    monkeypatch.setattr("canprobe.fieldbus.bus.posix.c_library", refuse)
     before, said = os.sched_getaffinity(0), []
     with realtime(40, said.append):
         pass

@@ -1,4 +1,4 @@
-"""A log of candump, judged after the fact."""
+"""A log of a bus, judged after the fact."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from heapq import heappop, heappush
 from pathlib import Path
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.logs import open_log
 from canprobe.fieldbus.bus.port import ERR_FLAG
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, EMCY_BASE, HEARTBEAT_BASE, SDO_TX_BASE
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
@@ -18,7 +18,7 @@ _OUT_OF_ORDER = 1000
 
 
 def read_record(path: Path, channel: str | None = None) -> Iterator[BusFrame]:
-    """Read the frames of one channel of a candump log in the order of their times; error frames are left out.
+    """Read the frames of one channel of a log in the order of their times; error frames are left out.
 
     A log that was written by a master has the frames that it sent before those that it read later.
 
@@ -46,7 +46,7 @@ def nodes_of(frames: Iterable[BusFrame]) -> tuple[int, ...]:
 
 def _frames(path: Path, channel: str | None) -> Iterator[BusFrame]:
     seen: set[str] = set()
-    for t_ns, on, can_id, data in read_candump(path):
+    for t_ns, on, can_id, data in open_log(path):
         seen.add(on)
         if channel is None and len(seen) > 1:
             names = " and ".join(sorted(seen))
