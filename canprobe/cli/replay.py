@@ -24,7 +24,9 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument("log", metavar="LOG", type=Path, help="folder of a run, or a log of candump or, by its suffix, of another tool")
+    parser.add_argument(
+        "log", metavar="LOG", type=Path, help="folder of a run, or a log of candump or, by its suffix, of another tool"
+    )
     parser.add_argument(
         "--scene", metavar="SCENE", help="packaged scene or path of a TOML file [the scene.toml of the run]"
     )

@@ -350,6 +350,11 @@ class DriveGroup:
         self._targets = self._aimed = None
         self._following.forget()
 
+    @property
+    def aimed(self) -> Floats:
+        """Targets (n,) of the last RPDOs, counts; before the first ones the positions."""
+        return np.array(self._aimed or [track.counts for track in self._tracks], dtype=float)
+
     def beyond_lag(self) -> dict[int, float]:
         """Drives, by number from 0, that follow their targets less than their lag explains, and how much less, counts.
 

@@ -32,7 +32,7 @@ def test_the_way_is_straight_back_and_fast_at_first(still):
     free = np.arange(6) != (9 if still is None else still)
     way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, free)
     joints = [ELBOW_FORM]
-    while (q := way.step(joints[-1])) is not None:
+    while (q := way.step(joints[-1], joints_to_units(MODEL, ELBOW_FORM))) is not None:
         joints.append(q)
     T = [forward(MODEL.chain, q) @ T_FLANGE_PROBE for q in joints]
     ways = np.array([one[:3, 3] - T[0][:3, 3] for one in T])
@@ -50,7 +50,16 @@ def test_the_way_is_straight_back_and_fast_at_first(still):
 
 def test_a_way_that_the_remaining_drives_cannot_make_ends():
     way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, np.arange(6) == 5)
-    assert way.step(ELBOW_FORM) is None
+    assert way.step(ELBOW_FORM, joints_to_units(MODEL, ELBOW_FORM)) is None
+
+
+def test_a_way_begins_at_the_last_targets_and_a_motor_that_is_far_from_its_own_where_it_is():
+    here, per_rad = joints_to_units(MODEL, ELBOW_FORM), np.diag(MODEL.units_per_q)
+    ahead = per_rad * np.array([5e-3, 0, -9e-3, 0, 50e-3, 0])
+    way = WayBack(MODEL, T_FLANGE_PROBE, PERIOD_S, np.ones(6, dtype=bool))
+    begun = joints_to_units(MODEL, way.step(ELBOW_FORM, here + ahead))
+    ahead[4] = 0.0
+    assert (np.abs(begun - here - ahead) < 1e-3 * np.abs(per_rad)).all()
 
 
 class Drives:
@@ -72,6 +81,8 @@ class Drives:
 
     def beyond_lag(self):
         return self.beyond
+
+    aimed = joints_to_units(MODEL, ELBOW_FORM)
 
 
 def a_watch():
