@@ -146,7 +146,7 @@ class _Describer:
         counter = self._signal("counter", 0, 8, readers, comment="1 to 1019h")
         period_ms = self._plan.sync.period_ns / 1e6
         return self._message(
-            SYNC_ID, "SYNC", 1, MASTER_NODE_ID, [counter], comment="synchronisation object", period_ms=period_ms
+            SYNC_ID, "SYNC", 1, MASTER_NODE_ID, [counter], period_ms=period_ms, comment="synchronisation object"
         )
 
     def _pdos(self, pdos: list[PlannedPdo]) -> Any:
@@ -163,7 +163,7 @@ class _Describer:
             signals,
             comment=f"transmission type {first.transmission_type}, {first.rate_hz:g} a second",
             period_ms=1000 / first.rate_hz if first.transmission_type <= SYNCHRONOUS else None,
-            channel=first.channel,
+            bus_name=identifier(first.channel),
         )
 
     def _pdo_signals(self, pdo: PlannedPdo, *, several: bool) -> Iterator[Any]:
@@ -174,7 +174,9 @@ class _Describer:
             comment = f"{entry.index:04X}h:{entry.subindex:02X} {entry.name}".strip()
             for name, bits, signed, unit in _fields(entry):
                 if not entry.is_dummy:
-                    yield self._signal(name + suffix, start, bits, readers, signed=signed, unit=unit, comment=comment)
+                    yield self._signal(
+                        name + suffix, start, bits, readers, is_signed=signed, unit=unit or None, comment=comment
+                    )
                 start += bits
 
     def _emergency(self, node_id: int) -> Any:
@@ -199,44 +201,22 @@ class _Describer:
         sender: int,
         signals: list[Any],
         *,
-        comment: str,
         period_ms: float | None = None,
-        channel: str | None = None,
+        **more: Any,
     ) -> Any:
+        """A message; `more` are arguments of cantools."""
+        more = {"bus_name": identifier(self._channels[sender])} | more
         return self._can.Message(
-            frame_id=cob_id,
-            name=name,
-            length=length,
-            signals=signals,
-            comment=comment,
-            senders=[self._names[sender]],
-            cycle_time=None if period_ms is None else max(1, round(period_ms)),
-            is_fd=length > CLASSIC_BYTES,
-            bus_name=identifier(channel or self._channels[sender]),
-        )
+            cob_id, name, length, signals, senders=[self._names[sender]], is_fd=length > CLASSIC_BYTES,
+            cycle_time=None if period_ms is None else max(1, round(period_ms)), **more,
+        )  # fmt: skip
 
     def _signal(
-        self,
-        name: str,
-        start: int,
-        bits: int,
-        receivers: list[str],
-        *,
-        signed: bool = False,
-        unit: str = "",
-        comment: str = "",
-        choices: dict[int, str] | None = None,
+        self, name: str, start: int, bits: int, receivers: list[str], choices: dict[int, str] | None = None, **more: Any
     ) -> Any:
-        return self._can.Signal(
-            name=name,
-            start=start,
-            length=bits,
-            is_signed=signed,
-            conversion=self._conversion.factory(choices=choices),
-            unit=unit or None,
-            comment=comment or None,
-            receivers=receivers,
-        )
+        """A signal; `more` are arguments of cantools."""
+        conversion = self._conversion.factory(choices=choices)
+        return self._can.Signal(name, start, bits, receivers=receivers, conversion=conversion, **more)
 
 
 def _fields(entry: PdoEntry) -> tuple[_Field, ...]:

@@ -10,9 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from canprobe.cell.planning.configuration import NodeSetup, make_setups
-from canprobe.cell.planning.model import (
-    Plan,
-)
+from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file

@@ -12,10 +12,8 @@ import foxglove
 
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.front import Front, hidden_address
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.messages import Encoder
-from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
+from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 
 ORIGINS = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "https://embed.foxglove.dev", "file://")
 """Origins of Foxglove's pages; its desktop application is a page from a file. A page of a website is none."""

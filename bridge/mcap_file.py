@@ -23,10 +23,8 @@ from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.lab.bridge.database import plan_database
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.messages import Encoder
-from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.topics import CLOCK, TOPICS, Messages, Topic
+from canprobe.lab.bridge.messages import CLOCK, TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 
 
 class McapSink:

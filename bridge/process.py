@@ -21,8 +21,7 @@ from canprobe.cell.session.child_process import ChildProcess
 from canprobe.cell.tasks.requested import Request
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns, epoch_now_ns
-from canprobe.lab.bridge.codec import pack_observation
-from canprobe.lab.bridge.pipe_queue import Feed
+from canprobe.lab.bridge.pipe import Feed, pack_observation
 
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0

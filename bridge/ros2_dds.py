@@ -26,10 +26,8 @@ from cyclonedds.util import duration
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.commands import refuse, trajectory_of
 from canprobe.lab.bridge.dds_types import DdsTypes
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.messages import Encoder
-from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
+from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 from canprobe.mechanics.types import Floats
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"

@@ -18,7 +18,7 @@ from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.lab.bridge.codec import Received
+from canprobe.lab.bridge.pipe import Received
 from canprobe.lab.bridge.sample import ContactFrame, Diagnostic, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.touch.contact import pad_to_direction
 from canprobe.mechanics.touch.stops import TOUCH_FORCE

@@ -24,10 +24,9 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import BridgeSettings
 from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import CanprobeError, ResultsError
-from canprobe.lab.bridge.codec import unpack_observation
-from canprobe.lab.bridge.interface import Context, Sink
-from canprobe.lab.bridge.pipe_queue import read_records
+from canprobe.lab.bridge.pipe import read_records, unpack_observation
 from canprobe.lab.bridge.process import END
+from canprobe.lab.bridge.sample import Context, Sink
 from canprobe.lab.bridge.sampling import SampleSource
 
 NICE = 10

@@ -12,9 +12,8 @@ import numpy as np
 
 from canprobe.cell.scene.model import Scene
 from canprobe.lab.bridge.view.array_dome import taxel_image
-from canprobe.lab.bridge.view.instants import Moment
+from canprobe.lab.bridge.view.instants import Curves, Moment
 from canprobe.lab.bridge.view.path import DeviationScale
-from canprobe.lab.bridge.view.plots import Curves
 from canprobe.lab.bridge.view.stage import Stage, legend_of
 
 INK, FIRST_INK, SECOND_INK, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"

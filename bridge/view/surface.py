@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from canprobe.lab.bridge.sample import ContactFrame
-from canprobe.lab.bridge.view.path import DeviationScale, Trail
-from canprobe.lab.bridge.view.path_nodes import Parts
+from canprobe.lab.bridge.view.path import DeviationScale, Parts, Trail
 from canprobe.mechanics.touch.map.noise import PAD_NOISE
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.meshing import Mesh

@@ -7,8 +7,7 @@ import pinocchio
 import pytest
 
 import canprobe
-from canprobe.lab.bridge.description import axis_transforms, robot_description
-from canprobe.lab.bridge.frames import link_transforms
+from canprobe.lab.bridge.description import axis_transforms, link_transforms, robot_description
 from canprobe.mechanics.robot.urdf import from_urdf
 
 MESH = """<visual><geometry><mesh filename="arm.stl" scale="2 2 2"/></geometry></visual>
