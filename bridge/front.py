@@ -97,7 +97,10 @@ class Front:
         host, origin = _name(f"//{found['host'][0]}"), next(iter(found["origin"]), None)
         if host is None or not (_is_address(host) or _is_local(host) or host in self._hosts):
             return f"Host {found['host'][0]} is not this machine; bridge.origins allows further ones"
-        if origin is None or origin in self._origins or _same(_name(origin), host):
+        if origin is None or origin in self._origins:
+            return None
+        of_origin = _name(origin)
+        if of_origin is not None and (of_origin == host or (_is_local(of_origin) and _is_local(host))):
             return None
         return f"Origin {origin} may not see the cell; bridge.origins allows further ones"
 
@@ -173,8 +176,3 @@ def _is_local(host: str) -> bool:
     if _is_address(host):
         return ipaddress.ip_address(host).is_loopback
     return host == "localhost" or host.endswith(".localhost")
-
-
-def _same(origin: str | None, host: str) -> bool:
-    """Whether an origin's host is the host that is asked."""
-    return origin is not None and (origin == host or (_is_local(origin) and _is_local(host)))

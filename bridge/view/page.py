@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.lab.bridge.view.colours import MAGMA, scale
+from canprobe.lab.bridge.view.array_dome import taxel_colours
 from canprobe.lab.bridge.view.instants import NAMES, curves_of, row_of
 from canprobe.lab.bridge.view.path import deviation_scale
 from canprobe.lab.bridge.view.recorded import RecordedRun
@@ -96,7 +96,7 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
             "text": errors.text,
             "colours": errors.colours(np.linspace(0, errors.high, 64)).tolist(),
         },
-        "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),
+        "heat": taxel_colours(np.arange(256, dtype=np.uint8)).tolist(),
         "legend": legend_of(run.scene),
         "centre": place_of(run.setup).tolist(),
     }

@@ -65,7 +65,7 @@ def summarise(
         map_summary: section of the surface map.
         bridges: status of each bridge.
     """
-    scene, cell = session.scene, session.cell
+    scene, cell, observers = session.scene, session.cell, session.observers
     cycle, direct = cell.cycle, scene.bus.direct
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
@@ -95,13 +95,14 @@ def summarise(
         ),
         "calibration": summarise_calibration(scene, record.tool),
         "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
-        "cycle": _cycle(cell, record) | {"observe_us": _observed(session)},
+        "cycle": _cycle(cell, record)
+        | {"observe_us": None if observers is None else _percentiles([*observers.cost_ns])},
         "bus_load": None if direct else _bus_load(session),
         "traffic": None if direct else _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
         "bridges": bridges,
-        "faults": [*cell.notes.lines(), *(session.observers.faults if session.observers is not None else ())],
+        "faults": [*cell.notes.lines(), *(observers.faults if observers is not None else ())],
     }
     if record.explored is not None:
         summary["explore"] = record.explored.summarised()
@@ -316,12 +317,8 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
     }
 
 
-def _observed(session: Session) -> dict[str, float | None] | None:
-    """Time that observers and bridges added to a cycle, after its work; None without observers."""
-    return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
-
-
 def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
+    """Percentiles of times, µs; `observe_us` is the time that observers and bridges add to a cycle, after its work."""
     if not values_ns:
         return dict.fromkeys(("p50", "p99", "p999", "max"))
     us = np.asarray(values_ns) / 1000

@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import re
 import tempfile
-import traceback
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -45,6 +44,7 @@ from canprobe.lab.studies.fault_cases import (
     seeded_plan,
     task_plan,
 )
+from canprobe.lab.studies.sweep import error_text
 from canprobe.lab.studies.witnessed_run import Witness, longest_above, run_to_end
 
 FORCE_SHARE, USUAL_SHARE = 1.5, 1.2
@@ -232,8 +232,7 @@ class FaultRun:
         if self.outcome != "crash":
             return []
         assert self.error is not None
-        place = traceback.extract_tb(self.error.__traceback__)[-1]
-        return [f"crash: {type(self.error).__name__}: {reason} ({Path(place.filename).name}:{place.lineno})"]
+        return [f"crash: {error_text(self.error)}"]
 
     def _rest_problems(self) -> list[str]:
         """Motion after the stop, once all must be at rest and no master is there; and drives that are not disabled."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -75,13 +74,11 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def measure(seeds: Sequence[int]) -> list[dict[str, Any]]:
     """The runs of some seeds; a case that fails is shrunk."""
-    return [_one(seed) for seed in seeds]
-
-
-def _one(seed: int) -> dict[str, Any]:
-    case = draw_case(seed)
-    outcome = run_case(case)
-    return {**outcome, "shrunk": str(shrink(case, run_case)) if outcome["failures"] else ""}
+    runs = []
+    for case in map(draw_case, seeds):
+        outcome = run_case(case)
+        runs.append({**outcome, "shrunk": str(shrink(case, run_case)) if outcome["failures"] else ""})
+    return runs
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
@@ -103,19 +100,13 @@ def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 
 def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
-    sums: Counter[str] = Counter()
-    for run in runs:
-        sums.update({key: int(run[key]) for key in ("lost", "back", "refused", "rows_lost")})
-        sums["failures"] += bool(run["failures"])
-    most = {
-        key: max((run[key] for run in runs), default=0)
-        for key in ("jump_counts", "force_max_n", "force_calm_n", "late_s")
-    }
+    most = ("jump_counts", "force_max_n", "force_calm_n", "late_s")
     return {
         "work": name,
         "runs": len(runs),
-        **{key: sums[key] for key in ("lost", "back", "refused", "rows_lost", "failures")},
-        **most,
+        **{key: sum(int(run[key]) for run in runs) for key in ("lost", "back", "refused", "rows_lost")},
+        "failures": sum(bool(run["failures"]) for run in runs),
+        **{key: max((run[key] for run in runs), default=0) for key in most},
     }
 
 
