@@ -21,9 +21,8 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.target import VIRTUAL
 from canprobe.errors import UsageError
 from canprobe.lab.gym.episode import Episode
-from canprobe.lab.gym.objects import START_MM, overrides_of
 from canprobe.lab.gym.observations import KINDS, Kind, Observations
-from canprobe.lab.gym.randomise import Values
+from canprobe.lab.gym.randomise import START_MM, Values, overrides_of
 from canprobe.mechanics.touch.linear_algebra import checked
 
 DEFAULT_SCENE: Mapping[str, Any] = {

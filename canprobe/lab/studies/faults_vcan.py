@@ -10,6 +10,7 @@ it is and in a patient one (`--patient`), and the true force of the plant.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -361,27 +362,25 @@ class _ServedRun:
 
     def _look(self) -> str:
         """The states of the drives, where their process still answers."""
-        if not Path(f"/proc/{self.child.pid}").exists() or not self._answers():
+        first: dict[int, int] = {}
+        if Path(f"/proc/{self.child.pid}").exists():
+            with contextlib.suppress(CanprobeError):
+                first = self._ask(0x6041)
+        if not first:
             if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
                 self.failures.append("the nodes ended with a master that is not their parent")
             return "gone"
-        before, first = self._ask(0x6064), self._ask(0x6041)
+        before = self._ask(0x6064)
         self._sleep(APART_S)
         after = self._ask(0x6064)
         states = {node_id: state_of(word) for node_id, word in first.items()}
         for node_id, state in states.items():
             if state in POWERED_STATES:
                 self.failures.append(f"node {node_id} is {state.name} after the stop")
-            if abs(_signed(after[node_id]) - _signed(before[node_id])) > MOST_COUNTS:
+            if abs(after[node_id] - before[node_id]) > MOST_COUNTS:
                 self.failures.append(f"node {node_id} moves after the stop")
         codes = self._ask(0x603F) if DriveState.FAULT in states.values() else {}
         return ", ".join(sorted({_text_of(state, codes.get(node_id)) for node_id, state in states.items()}))
-
-    def _answers(self) -> bool:
-        try:
-            return bool(self._ask(0x6041))
-        except CanprobeError:
-            return False
 
     def _ask(self, index: int) -> dict[int, int]:
         """An object of each drive; empty where one does not answer."""
@@ -418,17 +417,13 @@ def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str
 
 def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
     try:
-        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little"))
+        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little", signed=index == 0x6064))
     except SdoCommunicationError:
         return
 
 
 def _text_of(state: DriveState, code: int | None) -> str:
     return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
-
-
-def _signed(value: int) -> int:
-    return value - (1 << 32) if value >> 31 else value
 
 
 def link(state: str) -> None:
