@@ -50,11 +50,7 @@ class McapSink:
         self._channels: dict[str, int] = {}
         self._counts = Counter[str]()
         self._last_ns = 0
-
-    @property
-    def where(self) -> str:
-        """Path of the file."""
-        return str(self._path)
+        self.where = str(self._path)
 
     def start(self, epoch_ns: int) -> None:
         """Take the epoch, and register every channel, even those that will have no message."""

@@ -35,7 +35,7 @@ class LiveView:
         shape = setup.truth.object
         errors = deviation_scale(shape, setup.scan)
         self._stack = ExitStack()
-        server, self._address = self._stack.enter_context(
+        server, self.where = self._stack.enter_context(
             open_server(settings.view_port, settings.view_host, settings.origins)
         )
         self._server = server
@@ -48,11 +48,6 @@ class LiveView:
         self._rows: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / ROW_S))
         self._clock = MonotonicClock()
         self._frame_ns = self._plot_ns = self._surface_ns = 0
-
-    @property
-    def where(self) -> str:
-        """Address of the page."""
-        return self._address
 
     def start(self, epoch_ns: int) -> None:
         """Do nothing: times are shown from the opening of the bus."""

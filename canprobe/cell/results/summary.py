@@ -334,27 +334,13 @@ def write_files(result: RunData, out: Path) -> None:
     """
     found = result.summary["calibration"]
     tool = None if found is None else tool_text(found, result.plan.scene.name)
-    _write_each(
-        lambda: write_summary(result.summary, out),
-        lambda: write_text(out / FILE, tool) if tool is not None else None,
-        lambda: _write_map(result, out),
-    )
-
-
-def _write_map(result: RunData, out: Path) -> None:
-    if result.surface_map is not None:
+    writers: list[Callable[[], None]] = [lambda: write_summary(result.summary, out)]
+    if tool is not None:
+        writers.append(lambda: write_text(out / FILE, tool))
+    if (surface_map := result.surface_map) is not None:
         from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
 
-        save_surface_map(result.surface_map, out / SURFACE)
-
-
-def write_summary(summary: Mapping[str, Any], out: Path) -> None:
-    """Write ``summary.json``, whole, in the place of an earlier one."""
-    write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-
-
-def _write_each(*writers: Callable[[], None]) -> None:
-    """Write the files one by one; where one cannot be written, the others still are."""
+        writers.append(lambda: save_surface_map(surface_map, out / SURFACE))
     failed = []
     for write in writers:
         try:
@@ -363,3 +349,8 @@ def _write_each(*writers: Callable[[], None]) -> None:
             failed.append(str(error))
     if failed:
         raise ResultsError("\n".join(failed))
+
+
+def write_summary(summary: Mapping[str, Any], out: Path) -> None:
+    """Write ``summary.json``, whole, in the place of an earlier one."""
+    write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")

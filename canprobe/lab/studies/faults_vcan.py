@@ -198,7 +198,7 @@ def _throw_all(quick: bool) -> StudyResult:
 def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
     """Run a task, throw a fault in a phase of it, and score the true force."""
     scene = load_scene(task_scene(task, "ideal"), {"bus.interface": "socketcan", "bus.channel": CHANNEL})
-    session = Session(make_plan(resolve(patient(scene, MISSED_SYNCS) if is_patient else scene)))
+    session = Session(patient(scene, MISSED_SYNCS) if is_patient else scene)
     work = make_task(session.plan)
     with ThreadPoolExecutor(1) as others:
         thrown: list[Future[Any]] = []

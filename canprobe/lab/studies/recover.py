@@ -18,12 +18,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import canprobe
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import MASTER_NODE_ID
 from canprobe.cell.results.picture import BLUE, picture
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import Port
@@ -192,7 +190,7 @@ class RecoverRun:
     def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path | None) -> None:
         self._case = case
         changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
-        plan = make_plan(resolve(load_scene(SCENES[case.work], changes)))
+        plan = canprobe.plan(SCENES[case.work], changes)
         self._score = RecoverScore(case, plan, say)
         self._session = session = Session(plan, RunOptions(out, self._say, recover=True))
         self._faulty = session.buses.world.make_faulty()

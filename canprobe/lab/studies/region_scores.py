@@ -16,9 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.scores import RUN_IN_M, curvature_tensor
-from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord
@@ -102,7 +100,7 @@ def measure(seed: int) -> ScoredScan:
     with TemporaryDirectory() as folder:
         drawn = random_scene(seed, Path(folder))
         try:
-            session = Session(make_plan(resolve(drawn.scene)))
+            session = Session(drawn.scene)
             if drawn.array is not None:
                 session.buses.world.plant.array = drawn.array
             task: Any = make_task(session.plan)
