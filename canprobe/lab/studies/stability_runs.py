@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from canprobe.cell.master.supervision import Limits, limits_of
+from canprobe.cell.master.supervision import limits_of
 from canprobe.cell.plant.ideal_arm import natural_frequency
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import PlantSettings, Scene, ServoSettings
@@ -30,8 +30,7 @@ from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.lab.studies.linear_loop import ForceLoop
 from canprobe.lab.studies.result import Row
 from canprobe.lab.studies.witnessed_run import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
-from canprobe.mechanics.touch.contact import Slope, indentation_from_force
-from canprobe.mechanics.touch.image.image_model import make_patch_calibration
+from canprobe.mechanics.touch import Slope, indentation_from_force, make_patch_calibration
 
 
 class LateNode(WrappedNode):
@@ -228,7 +227,10 @@ def run_touch(session: Session, task: TouchTask, force_n: float, late_ms: float 
     reason = str(error or "") if plain else f"{type(error).__name__}: {error}"
     force_error, spread = error_and_spread(session, task, force_n)
     forces = np.array([force for _, force in witness.rows])
-    above_ns, allowed_ns = longest_above(witness.rows, limits.safety.force_max), allowed_above(limits, late_ms)
+    above_ns = longest_above(witness.rows, limits.safety.force_max)
+    # the stated reaction, by the force or by an array that hides it, the delay on the bus both ways, and the retreat
+    late_ns = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
+    allowed_ns = max(reaction_ns("force", limits), reaction_ns("force_hidden", limits)) + late_ns + RELEASE_NS
     if not np.isfinite(forces).all():
         ended, reason = "failed", "the force is not finite"
     elif above_ns > allowed_ns:
@@ -248,12 +250,3 @@ def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple
     if not half.size:
         return None, None
     return 100.0 * float(np.sqrt(np.mean((half - 1.0) ** 2))), 100.0 * float(np.std(half))
-
-
-def allowed_above(limits: Limits, late_ms: float) -> int:
-    """Longest time that a force may be above the limit, ns.
-
-    The stated reaction, by the force or by an array that hides it, the delay on the bus both ways, and the retreat.
-    """
-    late = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
-    return max(reaction_ns("force", limits), reaction_ns("force_hidden", limits)) + late + RELEASE_NS
