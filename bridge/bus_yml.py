@@ -289,10 +289,13 @@ def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[
     eds = _find(path, dcf, str(keys.get("dcf_path", options.get("dcf_path", "."))))
     if eds is None:
         raise UsageError(f"{path}: {name}: {key}: no file {dcf} beside the bus.yml, nor in its dcf_path")
-    stated = keys.get("node_id")
+    stated: Any = keys.get("node_id")
     if stated is None:  # that of the DCF
         stated = commissioned_node(split_sections(decode(eds.read_bytes(), EdsFindings()), EdsFindings()))
-    node_id = _integer(path, name, stated)
+    try:
+        node_id = int(stated, 0) if isinstance(stated, str) else operator.index(stated)
+    except (TypeError, ValueError):
+        raise UsageError(f"{path}: {name}: node_id: expected an integer, got {stated!r}") from None
     if not 1 <= node_id <= 127:
         raise UsageError(f"{path}: {name}: node_id: expected 1 to 127, got {node_id}")
     return ListedNode(name, node_id, eds)
@@ -304,10 +307,3 @@ def _find(path: Path, dcf: str, dcf_path: str) -> Path | None:
     folder = beside / dcf_path.replace(_FOLDER_VARIABLE, str(beside.resolve()))
     tried = (folder / named, beside / named, folder / named.name, beside / named.name)
     return next((candidate for candidate in tried if candidate.is_file()), None)
-
-
-def _integer(path: Path, name: str, value: Any) -> int:
-    try:
-        return int(value, 0) if isinstance(value, str) else operator.index(value)
-    except (TypeError, ValueError):
-        raise UsageError(f"{path}: {name}: node_id: expected an integer, got {value!r}") from None

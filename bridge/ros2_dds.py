@@ -73,7 +73,8 @@ class Ros2Node:
 
     def writer(self, topic: Topic) -> Any:
         """A writer of `rt/…` with the topic's quality of service."""
-        return DataWriter(self._publisher, self._dds_topic(topic), qos=self._qos(topic, _AUTODISPOSE))
+        kept = Policy.WriterDataLifecycle(autodispose=False)
+        return DataWriter(self._publisher, self._dds_topic(topic), qos=self._qos(topic, kept))
 
     def reader(self, topic: Topic) -> Any:
         """A reader of `rt/…` with the topic's quality of service."""
@@ -92,9 +93,6 @@ class Ros2Node:
             Policy.Userdata(f"typehash={self._encoder.type_hash(topic.type_name)};".encode()),
             *more,
         )
-
-
-_AUTODISPOSE = Policy.WriterDataLifecycle(autodispose=False)
 
 
 class Ros2Sink:

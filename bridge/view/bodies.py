@@ -194,13 +194,7 @@ def probe_parts(radius: float, T_flange_probe: Floats) -> tuple[TriangleMesh, Tr
     return holder, dome(radius, math.radians(110.0))
 
 
-def _axes(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Floats:
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([x, y, z])
-    return T
-
-
-_UP = _axes((0, 0, 1), (1, 0, 0), (0, 1, 0))
+_UP = homogeneous(np.array(((0, 1, 0), (0, 0, 1), (1, 0, 0))), (0.0, 0.0, 0.0))
 """Carries a body along z to one along y."""
-_ZX = _axes((1, 0, 0), (0, 0, 1), (0, -1, 0))
+_ZX = homogeneous(np.array(((1, 0, 0), (0, 0, -1), (0, 1, 0))), (0.0, 0.0, 0.0))
 """Carries an outline in x, y to one in x, z."""

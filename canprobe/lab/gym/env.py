@@ -133,7 +133,11 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
             asked = {"objects": None} | asked
         overrides = overrides_of(self._options | asked, self.np_random)
         overrides["scene.seed"] = int(self.np_random.integers(2**31))
-        self.episode = Episode(self._plan(overrides), self._cycles, self._folder())
+        folder = None
+        if self._record is not None:
+            self._recorded += 1
+            folder = self._record / f"episode-{self._recorded:04d}"
+        self.episode = Episode(self._plan(overrides), self._cycles, folder)
         return self._observe(self.episode), self.episode.info() | {"overrides": overrides}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -163,13 +167,6 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
 
     def _observe(self, episode: Episode) -> Any:
         return self._observations.observe(episode.task, episode.origin, episode.coverage, episode.forces, episode.truth)
-
-    def _folder(self) -> Path | None:
-        """The folder of the next recorded episode; None where none is recorded."""
-        if self._record is None:
-            return None
-        self._recorded += 1
-        return self._record / f"episode-{self._recorded:04d}"
 
     def _plan(self, overrides: Mapping[str, Any]) -> Plan:
         scene = load_scene(self._base, overrides)
