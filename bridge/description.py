@@ -13,8 +13,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.geometry import transform
-from canprobe.cell.scene.setup import Probe
+from canprobe.cell.scene.geometry import T_flange_probe, transform
 from canprobe.errors import PlanError
 from canprobe.lab.bridge.sample import BASE, FLANGE, PROBE
 from canprobe.mechanics.robot import chain as serial
@@ -111,8 +110,9 @@ def robot_description(plan: Plan) -> str | None:
         Xml.SubElement(robot, "link", name=_link(i))
         _origin(_joint(robot, f"{axis_frame(i)}_to_{_link(i)}", "fixed", axis_frame(i), _link(i)), T)
     _fix(robot, FLANGE, _link(chain.n), np.eye(4))
-    if plan.scene.probe is not None:
-        _probe(robot, plan.setup.probe)
+    if (probe := plan.scene.probe) is not None:  # not that of the setup, which is a large sphere with a flat array
+        link = _fix(robot, PROBE, FLANGE, T_flange_probe(probe))
+        _visual(link, np.eye(4), DARK, "sphere", radius=f"{probe.radius_mm * 1e-3:.12g}")
     if not _shown_by_urdf(plan, frames, chain):
         _plain(frames, chain)
     return Xml.tostring(robot, encoding="unicode")
@@ -134,11 +134,6 @@ def _fix(robot: Xml.Element, name: str, parent: str, T: Floats) -> Xml.Element:
     link = Xml.SubElement(robot, "link", name=name)
     _origin(_joint(robot, f"{name}_fixed", "fixed", parent, name), T)
     return link
-
-
-def _probe(robot: Xml.Element, probe: Probe) -> None:
-    link = _fix(robot, PROBE, FLANGE, probe.T_flange_probe)
-    _visual(link, np.eye(4), DARK, "sphere", radius=f"{probe.radius:.12g}")
 
 
 def _shown_by_urdf(plan: Plan, frames: dict[int, Xml.Element], chain: Chain) -> bool:
