@@ -30,16 +30,15 @@ from canprobe.cell.planning.model import (
     PlannedPdo,
 )
 from canprobe.cell.scene.toml_files import MAX_BYTES
-from canprobe.errors import UsageError, regular_file
+from canprobe.errors import UsageError, needed_module, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
 from canprobe.fieldbus.eds.device_info import commissioned_node
 from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import decode, split_sections
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
-from canprobe.lab.bridge.database import need
 
-_PURPOSE = "a bus.yml"
+_NEED = "a bus.yml needs yaml; type:"
 _DRIVERS = {
     "drive": ("ros2_canopen::Cia402Driver", "canopen_402_driver"),
     "tactile": ("ros2_canopen::ProxyDriver", "canopen_proxy_driver"),
@@ -94,7 +93,7 @@ def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
     Raises:
         UsageError: PyYAML is not installed.
     """
-    yaml = need("yaml", "can", _PURPOSE)
+    yaml = needed_module("yaml", "can", _NEED)
     files = {node.eds: folder / eds_file(node.eds).name for node in plan.nodes}
     for eds, path in files.items():
         if not path.exists() or not path.samefile(eds_file(eds)):
@@ -208,7 +207,7 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     Raises:
         UsageError: PyYAML is missing, or the file is no bus.yml; with the node and the key.
     """
-    yaml = need("yaml", "can", _PURPOSE)
+    yaml = needed_module("yaml", "can", _NEED)
     path = Path(path)
     try:
         text = regular_file(path, MAX_BYTES).read_text(encoding="utf-8")

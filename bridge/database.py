@@ -6,7 +6,6 @@ field of what the array packs. Bit positions count from the least significant bi
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
 from canprobe.cell.planning.traffic import SYNCHRONOUS
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import needed_module
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
 from canprobe.fieldbus.protocol.pdo import PdoEntry
@@ -54,23 +53,6 @@ BA_DEF_DEF_ "BusType" "CAN";
 BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
 BA_ "BusType" "CAN FD";
 """
-
-
-def need(module: str, extra: str, purpose: str) -> Any:
-    """Import a package that belongs to an extra.
-
-    Args:
-        module: its import name.
-        extra: extra of canprobe that installs the package.
-        purpose: purpose of the package, for the message.
-
-    Raises:
-        UsageError: when it is not installed; with the line that installs it.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise UsageError(f"{purpose} needs {module.partition('.')[0]}; type: {install_line(extra)}") from error
 
 
 def identifier(text: str) -> str:
@@ -117,8 +99,9 @@ class _Describer:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._can = need("cantools.database.can", "can", "a DBC or KCD file")
-        self._conversion = need("cantools.database.conversion", "can", "a DBC or KCD file").BaseConversion
+        cantools = needed_module("cantools.database", "can", "a DBC or KCD file needs cantools; type:")
+        self._can, self._conversion = cantools.can, cantools.conversion.BaseConversion
+        self._load = cantools.load_string
         self._names = {MASTER_NODE_ID: _MASTER} | {node.node_id: identifier(node.role) for node in plan.nodes}
         self._channels = {node.node_id: node.channel for node in plan.nodes} | {MASTER_NODE_ID: plan.buses[0].channel}
 
@@ -132,7 +115,7 @@ class _Describer:
         messages += [self._heartbeat(node_id) for node_id in (*plan.node_ids, MASTER_NODE_ID)]
         specifics = None
         if any(message.is_fd for message in messages):
-            specifics = importlib.import_module("cantools.database").load_string(_FD_ATTRIBUTES, "dbc").dbc
+            specifics = self._load(_FD_ATTRIBUTES, "dbc").dbc
         return can.Database(
             messages=sorted(messages, key=lambda message: message.frame_id),
             nodes=[can.Node(name) for name in self._names.values()],
