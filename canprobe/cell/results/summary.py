@@ -156,7 +156,9 @@ def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) ->
     measured: float | None = None
     error: dict[str, Any] = dict.fromkeys(FORCE_ERRORS)
     if scan is not None and scan[1] > scan[0]:
-        measured = _rms_off(log["force_n"][scan[0] : scan[1]], task.force_n)
+        force = log["force_n"][scan[0] : scan[1]]
+        known = force[np.isfinite(force)]  # a cycle in which the cell held has none
+        measured = float(np.sqrt(np.mean((known - task.force_n) ** 2))) if len(known) else None
         if "force_sigma_n" in log:
             error |= state_force_sigma(log, *scan)
         if truth := truth_of(session):
@@ -206,12 +208,6 @@ def _hidden_force(session: Session, highest: float | None, log: Mapping[str, Flo
         f"the true force rose to {highest:.2f} N, above limits.force_max_n = {limit:g}: the array measured at most"
         f" {np.nanmax(log['force_n'], initial=0.0):.2f} N"
     ]
-
-
-def _rms_off(values: Floats, target: float) -> float | None:
-    """RMS distance from the target over the cycles with a value: a cycle in which the cell held has none."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean((known - target) ** 2))) if len(known) else None
 
 
 def summarise_shape(
