@@ -10,10 +10,9 @@ from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
-from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.probing import Phase
-from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtState
@@ -39,7 +38,10 @@ class SampleSource:
     def __init__(self, plan: Plan) -> None:
         arm, probe = plan.setup.arm, plan.setup.probe
         self._health = Health(plan)
-        self._sensing = _sensing(plan.setup)
+        touch = plan.setup.touch
+        if isinstance(touch, Touch):
+            touch = replace(touch, shape=None)  # contacts need no second moments
+        self._sensing = None if touch is None else make_sensing(touch)
         self._has_arm = arm is not None
         self._radius = probe.radius
         # one reader: that of the contacts, or that of an array without them
@@ -89,14 +91,6 @@ class SampleSource:
             force=force,
             contact=placed,
         )
-
-
-def _sensing(setup: Setup) -> ContactSensing | None:
-    """Sensing that places contacts, where there is an arm; it needs no second moments."""
-    touch = setup.touch
-    if touch is None:
-        return None
-    return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
 
 
 class Health:

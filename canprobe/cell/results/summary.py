@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
@@ -96,7 +97,7 @@ def summarise(
         "calibration": summarise_calibration(scene, record.tool),
         "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
         "cycle": _cycle(cell, record)
-        | {"observe_us": None if observers is None else _percentiles([*observers.cost_ns])},
+        | {"observe_us": None if observers is None else percentiles([*observers.cost_ns])},
         "bus_load": None if direct else _bus_load(session),
         "traffic": None if direct else _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
@@ -307,15 +308,15 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
         "slowed_cycles": record.slowed,
         "dropped_frames": cell.port.counters.overruns,
         "clock_steps": cell.port.counters.clock_steps,
-        "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
-        "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
-        "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),
+        "period_error_us": percentiles(statistics.period_error_ns if statistics is not None else []),
+        "response_us": percentiles(statistics.response_ns if statistics is not None else []),
+        "compute_us": percentiles(statistics.compute_ns if statistics is not None else []),
     }
 
 
-def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
+def percentiles(values_ns: Sequence[int] | NDArray[np.int64]) -> dict[str, float | None]:
     """Percentiles of times, µs; `observe_us` is the time that observers and bridges add to a cycle, after its work."""
-    if not values_ns:
+    if not len(values_ns):
         return dict.fromkeys(("p50", "p99", "p999", "max"))
     us = np.asarray(values_ns) / 1000
     p50, p99, p999 = np.percentile(us, (50, 99, 99.9)).tolist()

@@ -41,7 +41,6 @@ from canprobe.lab.studies.fault_cases import (
     FaultCase,
     Windows,
     WrongFile,
-    seeded_plan,
     task_plan,
 )
 from canprobe.lab.studies.sweep import error_text
@@ -82,7 +81,7 @@ def phase_windows(task: str, plant: str) -> Windows:
 
 def run_case(case: FaultCase) -> dict[str, Any]:
     """Carry out and score a case."""
-    plan = seeded_plan(case.task, case.plant, case.number)
+    plan = task_plan(case.task, case.plant).with_seed(case.number)
     setup = plan.setup
     assert setup.arm is not None and setup.array is not None
     fault = case.fault(setup.arm.node_ids, setup.array.node_id, phase_windows(case.task, case.plant))

@@ -289,7 +289,7 @@ class _ServedRun:
             if not self._await_enabled(port, self.master):
                 self.failures.append("the drives were never enabled")
                 return self.master.poll(), 0.0, ""
-            self._sleep(self.case.after_s)
+            sleep(self.case.after_s)
         finally:
             port.close()
         fault_ns = self.clock.now_ns()
@@ -300,7 +300,7 @@ class _ServedRun:
         except subprocess.TimeoutExpired:
             self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
         ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
-        self._sleep(REACTION_S - ended_s)
+        sleep(REACTION_S - ended_s)
         link("up")
         drives = self._look()
         self.failures += score_end(self.case.fault, status, self.folder)
@@ -315,9 +315,6 @@ class _ServedRun:
 
     def _open(self) -> Port:
         return open_port("socketcan", CHANNEL, 1_000_000, self.clock)
-
-    def _sleep(self, seconds: float) -> None:
-        self.clock.sleep_until_ns(self.clock.now_ns() + max(0, round(seconds * 1e9)))
 
     def _start_master(self) -> subprocess.Popen[bytes]:
         scene = with_real_nodes(served_scene())
@@ -350,7 +347,7 @@ class _ServedRun:
                 master.kill()
             case ProcessFault.MASTER_STALLED:
                 master.send_signal(signal.SIGSTOP)
-                self._sleep(STALL_S)
+                sleep(STALL_S)
                 master.send_signal(signal.SIGCONT)
             case ProcessFault.NODES_KILLED:
                 os.kill(self.child.pid, signal.SIGKILL)
@@ -371,7 +368,7 @@ class _ServedRun:
                 self.failures.append("the nodes ended with a master that is not their parent")
             return "gone"
         before = self._ask(0x6064)
-        self._sleep(APART_S)
+        sleep(APART_S)
         after = self._ask(0x6064)
         states = {node_id: state_of(word) for node_id, word in first.items()}
         for node_id, state in states.items():
@@ -424,6 +421,12 @@ def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generat
 
 def _text_of(state: DriveState, code: int | None) -> str:
     return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
+
+
+def sleep(seconds: float) -> None:
+    """Sleep for some time, s; not at all for a negative one."""
+    clock = MonotonicClock()
+    clock.sleep_until_ns(clock.now_ns() + max(0, round(seconds * 1e9)))
 
 
 def link(state: str) -> None:
