@@ -36,7 +36,7 @@ from canprobe.fieldbus.protocol.frames import SYNC_ID
 from canprobe.lab.studies.random_scenes import CELLS
 from canprobe.lab.studies.region_scores import scores_of
 from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
-from canprobe.lab.studies.stability_runs import LateNode, refused_row, run_touch
+from canprobe.lab.studies.stability_runs import delay, refused_row, run_touch
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import inverse_near
@@ -244,8 +244,7 @@ def measure(case: ExtremeCase) -> Row:
     assert isinstance(task, TouchTask) and world.nodes
     if case.extreme == "jitter of the period":
         jitter_ns = 1e-2 * case.value * 1e9 / scene.cycle.rate_hz
-        shaken = [LateNode(node, {SYNC_ID}, partial(sync_delay_ns, jitter_ns)) for node in world.nodes]
-        world.participants[: len(shaken)] = shaken
+        delay(world, {SYNC_ID}, partial(sync_delay_ns, jitter_ns))
     found = row | run_touch(session, task, scene.task.force_n) | none
     scores = np.zeros((0, 5))
     if task.shape is not None:
