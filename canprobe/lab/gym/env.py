@@ -63,6 +63,9 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         record: folder in which each episode writes the files of a run, in `episode-N`, for `canprobe view`.
         render_mode: None; there is no other.
 
+    Attributes:
+        names: names of the entries of an observation's vector, with their units.
+
     Raises:
         UsageError: when an argument is wrong.
         SceneError, PlanError: when the scene is wrong, or does not fit.
@@ -99,15 +102,10 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         if self._cycles < 1 or not math.isclose(self._cycles * control_hz, rate_hz):
             raise UsageError(f"control_hz: expected a whole part of cycle.rate_hz = {rate_hz:g}, got {control_hz:g}")
         self._observations = Observations(observation, plan, shape=estimate)
-        self.observation_space = self._observations.space
+        self.names, self.observation_space = self._observations.names, self._observations.space
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.episode: Episode | None = None
         self._recorded = 0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the entries of an observation's vector, with their units."""
-        return self._observations.names
 
     def reset(self, *, seed: int | None = None, options: Values | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw a scene, bring its cell up, approach and touch.
