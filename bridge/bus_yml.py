@@ -31,16 +31,15 @@ from canprobe.cell.planning.model import (
 )
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.scene.toml_files import MAX_BYTES
-from canprobe.errors import UsageError, regular_file
+from canprobe.errors import UsageError, needed_module, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
 from canprobe.fieldbus.eds.device_info import commissioned_node
 from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import decode, split_sections
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
-from canprobe.lab.bridge.database import need
 
-_PURPOSE = "a bus.yml"
+_NEED = "a bus.yml needs yaml; type:"
 _DRIVERS = {
     "drive": ("ros2_canopen::Cia402Driver", "canopen_402_driver"),
     "tactile": ("ros2_canopen::ProxyDriver", "canopen_proxy_driver"),
@@ -95,7 +94,7 @@ def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
     Raises:
         UsageError: PyYAML is not installed.
     """
-    yaml = need("yaml", "can", _PURPOSE)
+    yaml = needed_module("yaml", "can", _NEED)
     files = {node.eds: folder / eds_file(node.eds).name for node in plan.nodes}
     for eds, path in files.items():
         if not path.exists() or not path.samefile(eds_file(eds)):
@@ -209,7 +208,7 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     Raises:
         UsageError: PyYAML is missing, or the file is no bus.yml; with the node and the key.
     """
-    yaml = need("yaml", "can", _PURPOSE)
+    yaml = needed_module("yaml", "can", _NEED)
     path = Path(path)
     try:
         text = regular_file(path, MAX_BYTES).read_text(encoding="utf-8")
@@ -290,10 +289,13 @@ def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[
     eds = _find(path, dcf, str(keys.get("dcf_path", options.get("dcf_path", "."))))
     if eds is None:
         raise UsageError(f"{path}: {name}: {key}: no file {dcf} beside the bus.yml, nor in its dcf_path")
-    stated = keys.get("node_id")
+    stated: Any = keys.get("node_id")
     if stated is None:  # that of the DCF
         stated = commissioned_node(split_sections(decode(eds.read_bytes(), EdsFindings()), EdsFindings()))
-    node_id = _integer(path, name, stated)
+    try:
+        node_id = int(stated, 0) if isinstance(stated, str) else operator.index(stated)
+    except (TypeError, ValueError):
+        raise UsageError(f"{path}: {name}: node_id: expected an integer, got {stated!r}") from None
     if not 1 <= node_id <= 127:
         raise UsageError(f"{path}: {name}: node_id: expected 1 to 127, got {node_id}")
     return ListedNode(name, node_id, eds)
@@ -305,10 +307,3 @@ def _find(path: Path, dcf: str, dcf_path: str) -> Path | None:
     folder = beside / dcf_path.replace(_FOLDER_VARIABLE, str(beside.resolve()))
     tried = (folder / named, beside / named, folder / named.name, beside / named.name)
     return next((candidate for candidate in tried if candidate.is_file()), None)
-
-
-def _integer(path: Path, name: str, value: Any) -> int:
-    try:
-        return int(value, 0) if isinstance(value, str) else operator.index(value)
-    except (TypeError, ValueError):
-        raise UsageError(f"{path}: {name}: node_id: expected an integer, got {value!r}") from None

@@ -6,7 +6,6 @@ field of what the array packs. Bit positions count from the least significant bi
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
 from canprobe.cell.planning.traffic import SYNCHRONOUS
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import needed_module
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
 from canprobe.fieldbus.protocol.pdo import PdoEntry
@@ -54,23 +53,6 @@ BA_DEF_DEF_ "BusType" "CAN";
 BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
 BA_ "BusType" "CAN FD";
 """
-
-
-def need(module: str, extra: str, purpose: str) -> Any:
-    """Import a package that belongs to an extra.
-
-    Args:
-        module: its import name.
-        extra: extra of canprobe that installs the package.
-        purpose: purpose of the package, for the message.
-
-    Raises:
-        UsageError: when it is not installed; with the line that installs it.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise UsageError(f"{purpose} needs {module.partition('.')[0]}; type: {install_line(extra)}") from error
 
 
 def identifier(text: str) -> str:
@@ -117,8 +99,9 @@ class _Describer:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._can = need("cantools.database.can", "can", "a DBC or KCD file")
-        self._conversion = need("cantools.database.conversion", "can", "a DBC or KCD file").BaseConversion
+        cantools = needed_module("cantools.database", "can", "a DBC or KCD file needs cantools; type:")
+        self._can, self._conversion = cantools.can, cantools.conversion.BaseConversion
+        self._load = cantools.load_string
         self._names = {MASTER_NODE_ID: _MASTER} | {node.node_id: identifier(node.role) for node in plan.nodes}
         self._channels = {node.node_id: node.channel for node in plan.nodes} | {MASTER_NODE_ID: plan.buses[0].channel}
 
@@ -132,7 +115,7 @@ class _Describer:
         messages += [self._heartbeat(node_id) for node_id in (*plan.node_ids, MASTER_NODE_ID)]
         specifics = None
         if any(message.is_fd for message in messages):
-            specifics = importlib.import_module("cantools.database").load_string(_FD_ATTRIBUTES, "dbc").dbc
+            specifics = self._load(_FD_ATTRIBUTES, "dbc").dbc
         return can.Database(
             messages=sorted(messages, key=lambda message: message.frame_id),
             nodes=[can.Node(name) for name in self._names.values()],
@@ -146,7 +129,7 @@ class _Describer:
         counter = self._signal("counter", 0, 8, readers, comment="1 to 1019h")
         period_ms = self._plan.sync.period_ns / 1e6
         return self._message(
-            SYNC_ID, "SYNC", 1, MASTER_NODE_ID, [counter], comment="synchronisation object", period_ms=period_ms
+            SYNC_ID, "SYNC", 1, MASTER_NODE_ID, [counter], period_ms=period_ms, comment="synchronisation object"
         )
 
     def _pdos(self, pdos: list[PlannedPdo]) -> Any:
@@ -163,7 +146,7 @@ class _Describer:
             signals,
             comment=f"transmission type {first.transmission_type}, {first.rate_hz:g} a second",
             period_ms=1000 / first.rate_hz if first.transmission_type <= SYNCHRONOUS else None,
-            channel=first.channel,
+            bus_name=identifier(first.channel),
         )
 
     def _pdo_signals(self, pdo: PlannedPdo, *, several: bool) -> Iterator[Any]:
@@ -174,7 +157,9 @@ class _Describer:
             comment = f"{entry.index:04X}h:{entry.subindex:02X} {entry.name}".strip()
             for name, bits, signed, unit in _fields(entry):
                 if not entry.is_dummy:
-                    yield self._signal(name + suffix, start, bits, readers, signed=signed, unit=unit, comment=comment)
+                    yield self._signal(
+                        name + suffix, start, bits, readers, is_signed=signed, unit=unit or None, comment=comment
+                    )
                 start += bits
 
     def _emergency(self, node_id: int) -> Any:
@@ -199,44 +184,22 @@ class _Describer:
         sender: int,
         signals: list[Any],
         *,
-        comment: str,
         period_ms: float | None = None,
-        channel: str | None = None,
+        **more: Any,
     ) -> Any:
+        """A message; `more` are arguments of cantools."""
+        more = {"bus_name": identifier(self._channels[sender])} | more
         return self._can.Message(
-            frame_id=cob_id,
-            name=name,
-            length=length,
-            signals=signals,
-            comment=comment,
-            senders=[self._names[sender]],
-            cycle_time=None if period_ms is None else max(1, round(period_ms)),
-            is_fd=length > CLASSIC_BYTES,
-            bus_name=identifier(channel or self._channels[sender]),
-        )
+            cob_id, name, length, signals, senders=[self._names[sender]], is_fd=length > CLASSIC_BYTES,
+            cycle_time=None if period_ms is None else max(1, round(period_ms)), **more,
+        )  # fmt: skip
 
     def _signal(
-        self,
-        name: str,
-        start: int,
-        bits: int,
-        receivers: list[str],
-        *,
-        signed: bool = False,
-        unit: str = "",
-        comment: str = "",
-        choices: dict[int, str] | None = None,
+        self, name: str, start: int, bits: int, receivers: list[str], choices: dict[int, str] | None = None, **more: Any
     ) -> Any:
-        return self._can.Signal(
-            name=name,
-            start=start,
-            length=bits,
-            is_signed=signed,
-            conversion=self._conversion.factory(choices=choices),
-            unit=unit or None,
-            comment=comment or None,
-            receivers=receivers,
-        )
+        """A signal; `more` are arguments of cantools."""
+        conversion = self._conversion.factory(choices=choices)
+        return self._can.Signal(name, start, bits, receivers=receivers, conversion=conversion, **more)
 
 
 def _fields(entry: PdoEntry) -> tuple[_Field, ...]:

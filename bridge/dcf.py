@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from canprobe.cell.planning.model import (
-    Plan,
-)
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.eds.findings import EdsFindings

@@ -1,4 +1,4 @@
-"""The arm of a cell as a URDF whose links are the frames of the bridges, for RViz and Foxglove.
+"""The arm of a cell: its frames for viewers with tf, and a URDF whose links are these frames, for RViz and Foxglove.
 
 `link_i` is the frame behind joint i, as `/tf` has it. The solids of an arm from a URDF hang on `axis_i`, the frame that
 the joint turns; `/tf_static` has it behind `link_i`. Any other arm is a drum along every axis and bars between them.
@@ -6,16 +6,17 @@ the joint turns; `/tf_static` has it behind `link_i`. Any other arm is a drum al
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.geometry import transform
-from canprobe.cell.scene.setup import Probe
+from canprobe.cell.scene.geometry import T_flange_probe, transform
 from canprobe.errors import PlanError
 from canprobe.lab.bridge.sample import BASE, FLANGE, PROBE
+from canprobe.mechanics.robot import chain as serial
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
@@ -26,6 +27,25 @@ DRUM_RADIUS_M = 0.045
 """Radius of the first drum, m; they get thinner towards the flange."""
 
 
+def link_transforms(chain: Chain, q: Floats) -> list[tuple[str, str, Floats]]:
+    """Frame of every link in the frame of the link before.
+
+    Args:
+        chain: the arm.
+        q: joint positions (n,), rad or m.
+
+    Returns:
+        (parent, child, (4, 4) T_parent_child) of the n links, m, base_link first; the last link and the flange are the
+        same.
+    """
+    return [(_link(i), _link(i + 1), T) for i, T in enumerate(serial.link_transforms(chain, q))]
+
+
+def flange_transform(chain: Chain) -> tuple[str, str, Floats]:
+    """The flange lies in the last link's frame."""
+    return (_link(chain.n), FLANGE, np.eye(4))
+
+
 def axis_frame(number: int) -> str:
     """Name of the frame that joint `number`, from 1, turns about its z axis or slides along it."""
     return f"axis_{number}"
@@ -34,7 +54,29 @@ def axis_frame(number: int) -> str:
 def axis_transforms(chain: Chain) -> list[tuple[str, str, Floats]]:
     """Parent, child and T_parent_child (4, 4), m, of each joint's frame behind its link."""
     behind = (*chain.fixed[1:], chain.T_last_flange)
-    return [(f"link_{i}", axis_frame(i), np.linalg.inv(T)) for i, T in enumerate(behind, start=1)]
+    return [(_link(i), axis_frame(i), np.linalg.inv(T)) for i, T in enumerate(behind, start=1)]
+
+
+def quaternion_of(R: Floats) -> tuple[float, float, float, float]:
+    """Unit quaternion x, y, z, w of a rotation (3, 3), w ≥ 0.
+
+    Source: Shepperd's choice of the largest of the four squares, which divides by no small number.
+    """
+    m = R.tolist()
+    trace = m[0][0] + m[1][1] + m[2][2]
+    squares = (1 - trace + 2 * m[0][0], 1 - trace + 2 * m[1][1], 1 - trace + 2 * m[2][2], 1 + trace)
+    i = squares.index(max(squares))
+    big = math.sqrt(squares[i]) / 2
+    if i == 3:
+        q = [(m[2][1] - m[1][2]), (m[0][2] - m[2][0]), (m[1][0] - m[0][1]), 4 * big * big]
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = [0.0] * 4
+        q[i] = 4 * big * big
+        q[j], q[k] = m[i][j] + m[j][i], m[i][k] + m[k][i]
+        q[3] = m[k][j] - m[j][k]
+    scale = math.copysign(1 / (4 * big), q[3])
+    return (q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale)
 
 
 def robot_description(plan: Plan) -> str | None:
@@ -68,8 +110,9 @@ def robot_description(plan: Plan) -> str | None:
         Xml.SubElement(robot, "link", name=_link(i))
         _origin(_joint(robot, f"{axis_frame(i)}_to_{_link(i)}", "fixed", axis_frame(i), _link(i)), T)
     _fix(robot, FLANGE, _link(chain.n), np.eye(4))
-    if plan.scene.probe is not None:
-        _probe(robot, plan.setup.probe)
+    if (probe := plan.scene.probe) is not None:  # not that of the setup, which is a large sphere with a flat array
+        link = _fix(robot, PROBE, FLANGE, T_flange_probe(probe))
+        _visual(link, np.eye(4), DARK, "sphere", radius=f"{probe.radius_mm * 1e-3:.12g}")
     if not _shown_by_urdf(plan, frames, chain):
         _plain(frames, chain)
     return Xml.tostring(robot, encoding="unicode")
@@ -91,11 +134,6 @@ def _fix(robot: Xml.Element, name: str, parent: str, T: Floats) -> Xml.Element:
     link = Xml.SubElement(robot, "link", name=name)
     _origin(_joint(robot, f"{name}_fixed", "fixed", parent, name), T)
     return link
-
-
-def _probe(robot: Xml.Element, probe: Probe) -> None:
-    link = _fix(robot, PROBE, FLANGE, probe.T_flange_probe)
-    _visual(link, np.eye(4), DARK, "sphere", radius=f"{probe.radius:.12g}")
 
 
 def _shown_by_urdf(plan: Plan, frames: dict[int, Xml.Element], chain: Chain) -> bool:

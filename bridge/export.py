@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from canprobe.cell.planning.model import (
-    Plan,
-)
+from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.files import make_folder
 from canprobe.lab.bridge.bus_yml import write_bus_yml
 from canprobe.lab.bridge.database import write_database

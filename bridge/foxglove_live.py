@@ -12,10 +12,8 @@ import foxglove
 
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.front import Front, hidden_address
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.messages import Encoder
-from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
+from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 
 ORIGINS = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "https://embed.foxglove.dev", "file://")
 """Origins of Foxglove's pages; its desktop application is a page from a file. A page of a website is none."""
@@ -49,12 +47,9 @@ class FoxgloveSink:
         except (RuntimeError, OSError) as error:
             raise UsageError(f"{where}: {error}; set bridge.foxglove_port, 0 takes any that is free") from error
         self._front.forward_to(hidden, self._server.port)
-        self._host = settings.foxglove_host
-
-    @property
-    def where(self) -> str:
-        """The address for Foxglove's “open connection”, and the layout to import there."""
-        return f"ws://{self._host}:{self._front.port}, layout {resources.files('canprobe') / 'bridge' / LAYOUT}"
+        # the address for Foxglove's “open connection”, and the layout to import there
+        layout = resources.files("canprobe") / "bridge" / LAYOUT
+        self.where = f"ws://{settings.foxglove_host}:{self._front.port}, layout {layout}"
 
     def start(self, epoch_ns: int) -> None:
         """Take the epoch."""

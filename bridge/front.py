@@ -95,9 +95,12 @@ class Front:
         if len(found["host"]) != 1 or len(found["origin"]) > 1:
             return "expected one Host and at most one Origin"
         host, origin = _name(f"//{found['host'][0]}"), next(iter(found["origin"]), None)
-        if host is None or not (_is_address(host) or _is_local(host) or host in self._hosts):
+        if host is None or not (_address(host) is not None or _is_local(host) or host in self._hosts):
             return f"Host {found['host'][0]} is not this machine; bridge.origins allows further ones"
-        if origin is None or origin in self._origins or _same(_name(origin), host):
+        if origin is None or origin in self._origins:
+            return None
+        of_origin = _name(origin)
+        if of_origin is not None and (of_origin == host or (_is_local(of_origin) and _is_local(host))):
             return None
         return f"Origin {origin} may not see the cell; bridge.origins allows further ones"
 
@@ -160,21 +163,13 @@ def _name(url: str) -> str | None:
         return None
 
 
-def _is_address(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host)
+    return None
 
 
 def _is_local(host: str) -> bool:
     """Whether this is a name or an address of the loopback interface (RFC 6761: without DNS)."""
-    if _is_address(host):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost" or host.endswith(".localhost")
-
-
-def _same(origin: str | None, host: str) -> bool:
-    """Whether an origin's host is the host that is asked."""
-    return origin is not None and (origin == host or (_is_local(origin) and _is_local(host)))
+    address = _address(host)
+    return host == "localhost" or host.endswith(".localhost") if address is None else address.is_loopback

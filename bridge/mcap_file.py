@@ -23,10 +23,8 @@ from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.lab.bridge.database import plan_database
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.messages import Encoder
-from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.topics import CLOCK, TOPICS, Messages, Topic
+from canprobe.lab.bridge.messages import CLOCK, TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 
 
 class McapSink:
@@ -52,11 +50,7 @@ class McapSink:
         self._channels: dict[str, int] = {}
         self._counts = Counter[str]()
         self._last_ns = 0
-
-    @property
-    def where(self) -> str:
-        """Path of the file."""
-        return str(self._path)
+        self.where = str(self._path)
 
     def start(self, epoch_ns: int) -> None:
         """Take the epoch, and register every channel, even those that will have no message."""

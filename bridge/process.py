@@ -22,8 +22,7 @@ from canprobe.cell.tasks.requested import Request
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns, epoch_now_ns
 from canprobe.fieldbus.bus.system import system
-from canprobe.lab.bridge.codec import pack_observation
-from canprobe.lab.bridge.pipe_queue import Feed
+from canprobe.lab.bridge.pipe import Feed, pack_observation
 
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0

@@ -26,10 +26,8 @@ from cyclonedds.util import duration
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.commands import refuse, trajectory_of
 from canprobe.lab.bridge.dds_types import DdsTypes
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.messages import Encoder
-from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
+from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 from canprobe.mechanics.types import Floats
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
@@ -75,7 +73,8 @@ class Ros2Node:
 
     def writer(self, topic: Topic) -> Any:
         """A writer of `rt/…` with the topic's quality of service."""
-        return DataWriter(self._publisher, self._dds_topic(topic), qos=self._qos(topic, _AUTODISPOSE))
+        kept = Policy.WriterDataLifecycle(autodispose=False)
+        return DataWriter(self._publisher, self._dds_topic(topic), qos=self._qos(topic, kept))
 
     def reader(self, topic: Topic) -> Any:
         """A reader of `rt/…` with the topic's quality of service."""
@@ -94,9 +93,6 @@ class Ros2Node:
             Policy.Userdata(f"typehash={self._encoder.type_hash(topic.type_name)};".encode()),
             *more,
         )
-
-
-_AUTODISPOSE = Policy.WriterDataLifecycle(autodispose=False)
 
 
 class Ros2Sink:

@@ -1,4 +1,4 @@
-"""The neutral sample of a cell in SI units, which every bridge gets.
+"""The neutral sample of a cell in SI units, which every bridge gets, and the interface of a bridge's module.
 
 A sample belongs to one cycle and holds what was new in it; a part without news is None. It knows neither tools nor
 message types. Times are in nanoseconds. z of the contact frame is the inward normal.
@@ -6,12 +6,16 @@ message types. Times are in nanoseconds. z of the contact frame is the inward no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.model import BridgeSettings
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.mechanics.types import Floats
 
@@ -165,3 +169,45 @@ class Sample:
     frames: Sequence[TimedFrame] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """Plan and settings that a sink gets at its start.
+
+    Attributes:
+        plan: plan of the run.
+        settings: settings of section `[bridge]`.
+        out: folder of the run; None where no files are written.
+        send: hands a request (see `canprobe.cell.tasks.requested.RequestedTask`) back to the cell.
+    """
+
+    plan: Plan
+    settings: BridgeSettings
+    out: Path | None
+    send: Callable[[dict[str, object]], None]
+
+
+class Sink(Protocol):
+    """One tool at the other end. Its module has `open_sink(context) -> Sink`."""
+
+    @property
+    def where(self) -> str:
+        """Place of the output, for people: a file, an address."""
+        ...
+
+    def start(self, epoch_ns: int) -> None:
+        """Take the epoch: time 0 of the samples is `epoch_ns` after the Unix epoch, or 0 in virtual time."""
+        ...
+
+    def write(self, sample: Sample) -> None:
+        """Take one sample."""
+        ...
+
+    def close(self, summary: str | None) -> None:
+        """End the output at the end of the run.
+
+        Args:
+            summary: content of `summary.json`; None where the cell ended without one.
+        """
+        ...

@@ -10,16 +10,14 @@ from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
-from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.probing import Phase
-from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.lab.bridge.codec import Received
-from canprobe.lab.bridge.sample import ContactFrame, Diagnostic, Sample, SurfacePatch, TouchFrame
+from canprobe.lab.bridge.pipe import Received
+from canprobe.lab.bridge.sample import ContactFrame, Diagnostic, Sample, TouchFrame
 from canprobe.mechanics.touch.contact import pad_to_direction
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
@@ -27,7 +25,6 @@ from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotatio
 PERIOD_NS = 1_000_000_000
 OK, WARN, ERROR, STALE = range(4)
 """Levels of `diagnostic_msgs/msg/DiagnosticStatus`."""
-_SUPERVISED = (0x080, 0x700)
 _PHASES = {float(phase): phase.name.lower() for phase in Phase}
 
 
@@ -41,7 +38,10 @@ class SampleSource:
     def __init__(self, plan: Plan) -> None:
         arm, probe = plan.setup.arm, plan.setup.probe
         self._health = Health(plan)
-        self._sensing = _sensing(plan.setup)
+        touch = plan.setup.touch
+        if isinstance(touch, Touch):
+            touch = replace(touch, shape=None)  # contacts need no second moments
+        self._sensing = None if touch is None else make_sensing(touch)
         self._has_arm = arm is not None
         self._radius = probe.radius
         # one reader: that of the contacts, or that of an array without them
@@ -54,7 +54,10 @@ class SampleSource:
         sample = Sample(t_ns, frames=received.frames, diagnostics=diagnostics, dropped=received.dropped)
         if measurement is None:
             return sample
-        self._place_on(received.patch)  # before the contact, as the task does
+        patch = received.patch
+        if patch is not None and self._sensing is not None and all(patch.observed):  # before the contact, as the task
+            low, high = np.linalg.eigvalsh(patch.K).tolist()
+            self._sensing.set_kappa(np.array([high, low]))
         if received.depth is not None and self._sensing is not None:
             self._sensing.set_depth_at_1_n(received.depth * 1e-3)
         return replace(
@@ -63,7 +66,7 @@ class SampleSource:
             phase=_PHASES.get(received.phase) if received.phase is not None else None,
             q=measurement.q if self._has_arm else None,
             touch=self._touch(measurement, t_ns - measurement.t_ns),
-            patch=received.patch,
+            patch=patch,
             ahead=None if received.ahead is None else 1e-3 * received.ahead,
         )
 
@@ -89,20 +92,6 @@ class SampleSource:
             contact=placed,
         )
 
-    def _place_on(self, patch: SurfacePatch | None) -> None:
-        """Place contacts on the estimated curvature from now on."""
-        if patch is not None and self._sensing is not None and all(patch.observed):
-            low, high = np.linalg.eigvalsh(patch.K).tolist()
-            self._sensing.set_kappa(np.array([high, low]))
-
-
-def _sensing(setup: Setup) -> ContactSensing | None:
-    """Sensing that places contacts, where there is an arm; it needs no second moments."""
-    touch = setup.touch
-    if touch is None:
-        return None
-    return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
-
 
 class Health:
     """State of the nodes of a plan, about once a second: from heartbeats, emergencies and statuswords.
@@ -114,34 +103,24 @@ class Health:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._watch = NodeWatch(plan.node_ids)
-        self._heard: dict[int, int] = {}
         self._due_ns: int | None = None
 
     def step(self, t_ns: int, received: Received) -> tuple[Diagnostic, ...]:
         """Take one observation; the states of all nodes where they are due, else none."""
         for frame in received.frames:
-            self._push(frame)
+            self._watch.push(*frame)
         if received.measurement is None or (self._due_ns is not None and t_ns < self._due_ns):
             return ()
         self._due_ns = t_ns + PERIOD_NS
         nodes = tuple(self._node(node, received.measurement, t_ns) for node in self._plan.nodes)
         return (*nodes, _cell(received))
 
-    def _push(self, frame: TimedFrame) -> None:
-        can_id, data, t_ns = frame
-        node_id = can_id & 0x7F
-        if can_id > 0x7FF or can_id & 0x780 not in _SUPERVISED or node_id not in self._watch.boot_ups:
-            return
-        self._watch.push(can_id, data, t_ns)
-        if can_id & 0x780 == 0x700:
-            self._heard[node_id] = t_ns
-
     def _node(self, node: PlannedNode, measurement: Measurement, t_ns: int) -> Diagnostic:
         node_id, watch = node.node_id, self._watch
         state = watch.states.get(node_id)
         drive = self._drive(node, measurement)
         event = watch.last_emcy.get(node_id)
-        silent = t_ns - self._heard.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
+        silent = t_ns - watch.heard_ns.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
         if silent:
             level, message = STALE, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
         elif event is not None and event.emcy.code != NO_ERROR_CODE:

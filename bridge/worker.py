@@ -14,9 +14,8 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from canprobe.cell.planning.bridges import BRIDGES
 from canprobe.cell.planning.make import make_plan
@@ -24,10 +23,9 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import BridgeSettings
 from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import CanprobeError, ResultsError
-from canprobe.lab.bridge.codec import unpack_observation
-from canprobe.lab.bridge.interface import Context, Sink
-from canprobe.lab.bridge.pipe_queue import read_records
+from canprobe.lab.bridge.pipe import read_records, unpack_observation
 from canprobe.lab.bridge.process import END
+from canprobe.lab.bridge.sample import Context, Sink
 from canprobe.lab.bridge.sampling import SampleSource
 
 NICE = 10
@@ -50,7 +48,9 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
         os.write(fd, (json.dumps(document) + "\n").encode())
 
     try:
-        context = _context(marshal.loads(next(records)), send)
+        config = marshal.loads(next(records))
+        plan, out = make_plan(resolve(load_scene(config["scene"]))), config["out"]
+        context = Context(plan, plan.scene.bridge or BridgeSettings(), None if out is None else Path(out), send)
         sink: Sink = importlib.import_module(f"canprobe.lab.bridge.{BRIDGES[name].module}").open_sink(context)
         send({"ready": sink.where})
         received, summary = _serve(sink, SampleSource(context.plan), records)
@@ -70,12 +70,6 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
         send({"error": repr(error)})
         return 1
     return 0
-
-
-def _context(config: dict[str, Any], send: Callable[[dict[str, object]], None]) -> Context:
-    plan = make_plan(resolve(load_scene(config["scene"])))
-    out = Path(config["out"]) if config["out"] is not None else None
-    return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
 
 
 def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> tuple[int, str | None]:

@@ -220,6 +220,25 @@ def install_line(extra: str) -> str:
     return f"{_tool()} install {editable}'{wanted}'"
 
 
+def needed_module(module: str, extra: str, need: str) -> Any:
+    """A module of an extra, imported.
+
+    Args:
+        module: its import name.
+        extra: extra of canprobe that installs it.
+        need: what needs it, in words that end before the line to type.
+
+    Raises:
+        UsageError: it is not installed; the message has the line that installs it.
+    """
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UsageError(f"{need} {install_line(extra)}") from error
+
+
 def _tool() -> str:
     """The command that installs packages where canprobe is installed."""
     if os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json")):

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from canprobe.lab.bridge.frames import link_transforms
 from canprobe.lab.bridge.view.meshes import TriangleMesh, cylinder, dome, link, merged, revolved
-from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.robot.chain import Chain, link_transforms
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step
-from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
 WHITE, GREY, DARK = (236, 233, 224), (150, 156, 163), (76, 84, 94)
@@ -63,11 +63,7 @@ def link_frames(chain: Chain, q: ArrayLike) -> Floats:
     Returns:
         Poses T_base_link (n + 1, 4, 4); the last is the flange.
     """
-    frames = np.empty((chain.n + 1, 4, 4))
-    frames[0] = np.eye(4)
-    for i, (_, _, T) in enumerate(link_transforms(chain, np.asarray(q, dtype=np.float64))):
-        frames[i + 1] = frames[i] @ T
-    return frames
+    return np.array([*accumulate(link_transforms(chain, q), np.matmul, initial=np.eye(4))])
 
 
 def arm_parts(chain: Chain) -> list[Part]:
@@ -86,11 +82,9 @@ def _plain(chain: Chain) -> list[Part]:
         back = np.linalg.inv(T)[:3, 3]  # the bar stands in the frame of the next joint
         length = float(np.linalg.norm(back))
         if length > radius:
-            bar = np.eye(4)
-            bar[:3, :3] = tangent_rotation(back / length)
-            parts.append(
-                Part(f"link_{i + 1}", i + 1, cylinder(0.7 * radius, (0.0, length), RIM_RADIUS_M).moved(bar), WHITE)
-            )
+            bar = cylinder(0.7 * radius, (0.0, length), RIM_RADIUS_M)
+            turn = homogeneous(tangent_rotation(back / length), (0.0, 0.0, 0.0))
+            parts.append(Part(f"link_{i + 1}", i + 1, bar.moved(turn), WHITE))
         here = np.eye(4)
     return parts
 
@@ -200,13 +194,7 @@ def probe_parts(radius: float, T_flange_probe: Floats) -> tuple[TriangleMesh, Tr
     return holder, dome(radius, math.radians(110.0))
 
 
-def _axes(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Floats:
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([x, y, z])
-    return T
-
-
-_UP = _axes((0, 0, 1), (1, 0, 0), (0, 1, 0))
+_UP = homogeneous(np.array(((0, 1, 0), (0, 0, 1), (1, 0, 0))), (0.0, 0.0, 0.0))
 """Carries a body along z to one along y."""
-_ZX = _axes((1, 0, 0), (0, 0, 1), (0, -1, 0))
+_ZX = homogeneous(np.array(((1, 0, 0), (0, 0, -1), (0, 1, 0))), (0.0, 0.0, 0.0))
 """Carries an outline in x, y to one in x, z."""

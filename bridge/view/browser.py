@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections import deque
 from contextlib import ExitStack
 
-from canprobe.cell.scene.geometry import true_object
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.view.instants import Follower, Moment
+from canprobe.lab.bridge.sample import Context, Sample
+from canprobe.lab.bridge.view.instants import Follower, Moment, curves_of, row_of
 from canprobe.lab.bridge.view.panel import Panel
-from canprobe.lab.bridge.view.path import OFF_PATH, Trail, deviation_scale
-from canprobe.lab.bridge.view.path_nodes import GrowingPath, PathAhead
-from canprobe.lab.bridge.view.plots import curves_of, row_of
+from canprobe.lab.bridge.view.path import OFF_PATH, GrowingPath, PathAhead, Trail, deviation_scale
 from canprobe.lab.bridge.view.server import open_server
 from canprobe.lab.bridge.view.stage import Stage
 from canprobe.lab.bridge.view.surface import GrowingSurface
@@ -35,29 +31,23 @@ class LiveView:
     """
 
     def __init__(self, context: Context) -> None:
-        scene, settings = context.plan.scene, context.settings
-        shape = None if scene.object is None else true_object(scene.object)
-        errors = deviation_scale(shape, context.plan.setup.scan)
+        setup, settings = context.plan.setup, context.settings
+        shape = setup.truth.object
+        errors = deviation_scale(shape, setup.scan)
         self._stack = ExitStack()
-        server, self._address = self._stack.enter_context(
+        server, self.where = self._stack.enter_context(
             open_server(settings.view_port, settings.view_host, settings.origins)
         )
         self._server = server
-        self._stage = Stage(server, context.plan.setup)
-        self._panel = Panel(server, scene, errors, self._stage)
+        self._stage = Stage(server, setup)
+        self._panel = Panel(server, setup.scene, errors, self._stage)
         self._trail = Trail()
         self._path, self._ahead = GrowingPath(server.scene, self._trail), PathAhead(server.scene)
-        setup = context.plan.setup
         self._surface = None if setup.shape is None else GrowingSurface(server.scene, errors, setup.probe.radius)
         self._follower = Follower(shape)
         self._rows: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / ROW_S))
         self._clock = MonotonicClock()
         self._frame_ns = self._plot_ns = self._surface_ns = 0
-
-    @property
-    def where(self) -> str:
-        """Address of the page."""
-        return self._address
 
     def start(self, epoch_ns: int) -> None:
         """Do nothing: times are shown from the opening of the bus."""

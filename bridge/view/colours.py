@@ -35,9 +35,7 @@ def scale(values: ArrayLike, low: float, high: float, stops: Floats = VIRIDIS) -
     x = np.asarray(values, dtype=np.float64)
     known = np.isfinite(x)
     place = np.clip((np.where(known, x, low) - low) / (high - low), 0.0, 1.0) * (len(stops) - 1)
-    first = np.minimum(place.astype(np.int64), len(stops) - 2)
-    share = (place - first)[..., None]
-    mixed = (1.0 - share) * stops[first] + share * stops[first + 1]
+    mixed = np.stack([np.interp(place, np.arange(len(stops)), channel) for channel in stops.T], axis=-1)
     return np.where(known[..., None], mixed.round(), UNKNOWN).astype(np.uint8)
 
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.hardware import ArmSettings
-from canprobe.errors import PlanError
-from canprobe.lab.bridge.database import need
+from canprobe.errors import PlanError, needed_module
 from canprobe.lab.bridge.view.bodies import WHITE, Part, arm_parts
 from canprobe.lab.bridge.view.meshes import TriangleMesh
 from canprobe.mechanics.robot.chain import Chain
@@ -73,7 +72,7 @@ class _LostError(Exception):
 
 def _solids(urdf: Path, visual: Visual) -> list[tuple[TriangleMesh, tuple[int, int, int]]]:
     """Triangles and colours of one solid, in its own frame."""
-    trimesh = need("trimesh", "view", "the view")
+    trimesh = needed_module("trimesh", "view", "the view needs trimesh; type:")
     size: Sequence[float] = visual.size
     if visual.kind == "box":
         return [(_mesh(trimesh.creation.box(size)), WHITE)]

@@ -17,15 +17,13 @@ from typing import Any
 import numpy as np
 
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.lab.bridge.view.colours import MAGMA, scale
+from canprobe.lab.bridge.view.array_dome import taxel_colours
+from canprobe.lab.bridge.view.instants import NAMES, curves_of, row_of
 from canprobe.lab.bridge.view.path import deviation_scale
-from canprobe.lab.bridge.view.path_nodes import LoadedPath
-from canprobe.lab.bridge.view.plots import NAMES, curves_of, row_of
 from canprobe.lab.bridge.view.recorded import RecordedRun
-from canprobe.lab.bridge.view.replay import FRAME_S, shape_of, trail_of
+from canprobe.lab.bridge.view.replay import FRAME_S, RecordedScene
 from canprobe.lab.bridge.view.server import open_server
-from canprobe.lab.bridge.view.stage import Stage, legend_of, place_of
-from canprobe.lab.bridge.view.surface import LoadedSurface
+from canprobe.lab.bridge.view.stage import legend_of, place_of
 from canprobe.mechanics.types import Floats
 
 MOST_FRAMES = 900
@@ -59,29 +57,23 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
 def _record(run: RecordedRun, times: Floats) -> tuple[str, list[str]]:
     """Viser's page with every frame in it, and lines about parts that cannot be drawn."""
     with open_server(0) as (server, _):
-        stage = Stage(server, run.setup)
-        errors = deviation_scale(shape_of(run), run.setup.scan)
-        path = LoadedPath(server.scene, trail := trail_of(run))
-        surface = LoadedSurface(server.scene, run.surface_map, trail, errors)
+        scene = RecordedScene(server, run)
         recorder = server.get_scene_serializer()
         before = 0.0  # the page's time is that of the run: the first picture stands until its first cycle
         with server.atomic():  # nobody listens: nothing is sent
-            stage.show(run.at(0.0))
+            scene.show(0.0)
             for t in times.tolist():
                 recorder.insert_sleep(t - before)
                 before = t
-                stage.show(run.at(t))
-                path.until(t)
-                surface.until(t)
-        return str(recorder.as_html()), stage.notes
+                scene.show(t)
+        return str(recorder.as_html()), scene.stage.notes
 
 
 def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, Any]:
     """Data of the panel: columns, taxel images, colours; None for a value that is not finite."""
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))
-    shape = shape_of(run)
-    errors = deviation_scale(shape, run.setup.scan)
+    errors = deviation_scale(run.setup.truth.object, run.setup.scan)
     task = run.scene.task
     sensor = run.scene.sensor
     blank = np.zeros((1, 1) if sensor is None else (sensor.rows, sensor.columns), np.uint8)
@@ -93,7 +85,7 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
         "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
         "phases": [m.phase for m in moments],
         "target": task.force_n if task.kind in ("scan", "press") else None,
-        "truth": shape is not None,
+        "truth": run.setup.truth.object is not None,
         "shape": run.scene.shape is not None,
         "sensor": sensor is not None,
         "rows": blank.shape[0],
@@ -104,9 +96,9 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
             "text": errors.text,
             "colours": errors.colours(np.linspace(0, errors.high, 64)).tolist(),
         },
-        "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),
+        "heat": taxel_colours(np.arange(256, dtype=np.uint8)).tolist(),
         "legend": legend_of(run.scene),
-        "centre": place_of(run.scene).tolist(),
+        "centre": place_of(run.setup).tolist(),
     }
 
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 import html
 import importlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from canprobe.cell.scene.model import Scene
 from canprobe.lab.bridge.view.array_dome import taxel_image
-from canprobe.lab.bridge.view.instants import Moment
+from canprobe.lab.bridge.view.instants import Curves, Moment
 from canprobe.lab.bridge.view.path import DeviationScale
-from canprobe.lab.bridge.view.plots import Curves
 from canprobe.lab.bridge.view.stage import Stage, legend_of
 
 INK, FIRST_INK, SECOND_INK, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
@@ -39,7 +38,8 @@ class Panel:
         gui.set_panel_label(f"canprobe · {scene.name}")
         self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
         self._status = gui.add_html("")
-        gui.add_html(_PHONE + _legend(scene, stage.notes))
+        rows = [_KEY.format(colour, html.escape(text)) for colour, text in legend_of(scene)]
+        gui.add_html(_PHONE + _STYLED.format("<br>".join([" &ensp; ".join(rows), *map(html.escape, stage.notes)])))
         stage.add_switches(gui)
         self._plots: list[tuple[Any, tuple[str, ...]]] = []
         self._taxels = None
@@ -110,11 +110,6 @@ _PHONE = """<style>
 </style>"""
 _STYLED = '<div style="padding: 0 0.6em 0.4em; font-size: 0.9em; line-height: 1.5">{}</div>'
 _KEY = '<span style="white-space: nowrap"><span style="color: rgb{}">&#9632;</span> {}</span>'
-
-
-def _legend(scene: Scene, notes: Sequence[str]) -> str:
-    rows = [_KEY.format(colour, html.escape(text)) for colour, text in legend_of(scene)]
-    return _STYLED.format("<br>".join([" &ensp; ".join(rows), *map(html.escape, notes)]))
 
 
 def _scales(times: Any, columns: list[Any]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from canprobe.lab.bridge.view.instants import JudgedAnswer, Moment, judge
 from canprobe.lab.bridge.view.path import OFF_PATH
 from canprobe.lab.bridge.view.surface import map_of_points
 from canprobe.mechanics.touch.map.surface_map import SurfaceMap
-from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
 ROWS_SHOWN, ANSWERS_SHOWN = 72_000, 4_000
@@ -117,10 +117,8 @@ class RecordedRun:
     def _contact(self, row: int) -> ContactFrame | None:
         if "contact_mm" not in self.log or not np.isfinite(self.log["contact_mm"][row]).all():
             return None
-        T = np.eye(4)
-        T[:3, :3] = tangent_rotation(-self.log["normal"][row])
-        T[:3, 3] = self.log["contact_mm"][row] * 1e-3
-        return ContactFrame(T)
+        turn = tangent_rotation(-self.log["normal"][row])
+        return ContactFrame(homogeneous(turn, self.log["contact_mm"][row] * 1e-3))
 
 
 def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:

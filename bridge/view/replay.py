@@ -7,17 +7,14 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-from canprobe.cell.scene.geometry import true_object
 from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.lab.bridge.view.instants import Moment, curves_of, row_of
 from canprobe.lab.bridge.view.panel import Panel
-from canprobe.lab.bridge.view.path import Trail, deviation_scale
-from canprobe.lab.bridge.view.path_nodes import LoadedPath
-from canprobe.lab.bridge.view.plots import curves_of, row_of
+from canprobe.lab.bridge.view.path import LoadedPath, Trail, deviation_scale
 from canprobe.lab.bridge.view.recorded import RecordedRun
 from canprobe.lab.bridge.view.server import open_server
 from canprobe.lab.bridge.view.stage import Stage
 from canprobe.lab.bridge.view.surface import LoadedSurface
-from canprobe.mechanics.touch.shapes import PlacedShape
 
 FRAME_S = 0.04
 MOST_POINTS = 600
@@ -56,6 +53,37 @@ def serve_run(
             clock.sleep_until_ns(next_ns)
 
 
+class RecordedScene:
+    """Stage, path and surface of a recorded run.
+
+    Args:
+        server: a `viser.ViserServer`.
+        run: run to show.
+
+    Attributes:
+        stage: arm, probe, object and contact.
+        errors: scale of the surface's colours.
+    """
+
+    def __init__(self, server: Any, run: RecordedRun) -> None:
+        self._run = run
+        self.stage, self.errors, trail = (
+            Stage(server, run.setup),
+            deviation_scale(run.setup.truth.object, run.setup.scan),
+            trail_of(run),
+        )
+        self._path = LoadedPath(server.scene, trail)
+        self._surface = LoadedSurface(server.scene, run.surface_map, trail, self.errors)
+
+    def show(self, t_s: float) -> Moment:
+        """Show an instant, s; returns its moment."""
+        moment = self._run.at(t_s)
+        self.stage.show(moment)
+        self._path.until(t_s)
+        self._surface.until(t_s)
+        return moment
+
+
 class Player:
     """The slider and what follows it; `step` moves the time on.
 
@@ -70,18 +98,14 @@ class Player:
     def __init__(self, server: Any, run: RecordedRun) -> None:
         self._server = server
         self._run = run
-        errors = deviation_scale(shape_of(run), run.setup.scan)
-        self._stage = Stage(server, run.setup)
-        trail = trail_of(run)
-        self._path = LoadedPath(server.scene, trail)
-        self._surface = LoadedSurface(server.scene, run.surface_map, trail, errors)
+        self._scene = RecordedScene(server, run)
         gui = server.gui
         start = round(float(run.log["t_s"][0]), 2)
         self._slider = gui.add_slider("time (s)", start, max(round(run.duration_s, 2), start + 0.01), 0.01, start)
         self._play = gui.add_checkbox("play", True)
         self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
-        self.notes = self._stage.notes
-        self._panel = Panel(server, run.scene, errors, self._stage)
+        self.notes = self._scene.stage.notes
+        self._panel = Panel(server, run.scene, self._scene.errors, self._scene.stage)
         times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
         self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
         self._shown = math.nan
@@ -96,17 +120,8 @@ class Player:
         if t == self._shown:
             return
         self._shown = t
-        moment = self._run.at(t)
         with self._server.atomic():
-            self._stage.show(moment)
-            self._path.until(t)
-            self._surface.until(t)
-            self._panel.show(moment)
-
-
-def shape_of(run: RecordedRun) -> PlacedShape | None:
-    """The true object of a run's scene."""
-    return None if run.scene.object is None else true_object(run.scene.object)
+            self._panel.show(self._scene.show(t))
 
 
 def trail_of(run: RecordedRun) -> Trail:

@@ -8,8 +8,7 @@ import io
 from collections.abc import Collection, Iterator
 from typing import Any
 
-from canprobe.errors import InterfaceError
-from canprobe.lab.bridge.database import need
+from canprobe.errors import InterfaceError, needed_module
 from canprobe.lab.bridge.front import Front, hidden_address
 
 _MAX_PORT = 65_535
@@ -28,7 +27,7 @@ def open_server(port: int, host: str = "127.0.0.1", origins: Collection[str] = (
         UsageError: when viser is not installed.
         InterfaceError: when no port is free.
     """
-    viser = need("viser", "view", "the view")
+    viser = needed_module("viser", "view", "the view needs viser; type:")
     front = _front(port, host, origins)
     try:
         hidden = hidden_address()

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.scene.geometry import T_flange_probe, true_object
+from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.lab.bridge.frames import quaternion_of
+from canprobe.lab.bridge.description import quaternion_of
 from canprobe.lab.bridge.view.array_dome import taxel_colours, taxel_poses, tile
 from canprobe.lab.bridge.view.bodies import link_frames, probe_parts
 from canprobe.lab.bridge.view.colours import linear_light
@@ -20,7 +20,7 @@ from canprobe.lab.bridge.view.instants import Moment
 from canprobe.lab.bridge.view.links import arm_links
 from canprobe.lab.bridge.view.meshes import TriangleMesh
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
-from canprobe.lab.bridge.view.path_nodes import AHEAD, PATH
+from canprobe.lab.bridge.view.path import AHEAD, PATH
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.pad import Pad
@@ -55,11 +55,11 @@ def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
     return rows
 
 
-def place_of(scene: Scene) -> Floats:
+def place_of(setup: Setup) -> Floats:
     """Place of the object's surface (3,), or the place where it is searched for, base frame, m."""
-    if scene.object is None:
-        return np.array(scene.task.start_mm) * 1e-3
-    return true_object(scene.object).T_base_object[:3, 3]
+    if setup.truth.object is None:
+        return np.array(setup.scene.task.start_mm) * 1e-3
+    return setup.truth.object.T_base_object[:3, 3]
 
 
 class Stage:
@@ -77,13 +77,13 @@ class Stage:
         self._api = server.scene
         scene, arm, array = setup.scene, setup.arm, setup.array
         self._model = None if arm is None else arm.model
-        self._shape = None if scene.object is None else true_object(scene.object)
+        self._shape = setup.truth.object
         self._probe = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
         self.notes: list[str] = (
             [] if array is None or array.newtons != NO_FORCE_REFERENCE else [f"force in {NO_FORCE_REFERENCE}"]
         )
-        self._place, self._moved, self._met = place_of(scene), dict[int, Floats](), dict[int, float]()
+        self._place, self._moved, self._met = place_of(setup), dict[int, Floats](), dict[int, float]()
         self._clock = MonotonicClock()
         self._truth: list[Any] = []
         self._follows = None
@@ -167,7 +167,7 @@ class Stage:
         """Look at probe and contact, across the line from the base to them: there the arm hides nothing."""
         camera = server.initial_camera
         if self._shape is not None or scene.task.kind in ("scan", "press"):
-            place = place_of(scene)
+            place = self._place
             out, heading = math.atan2(place[1], place[0]), math.radians(scene.task.heading_deg)
             across = max((out - LOOK_ASIDE_RAD, out + LOOK_ASIDE_RAD), key=lambda angle: abs(math.sin(angle - heading)))
             target = place + np.array((0.0, 0.0, 0.012))

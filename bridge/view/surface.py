@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from canprobe.lab.bridge.sample import ContactFrame
-from canprobe.lab.bridge.view.path import DeviationScale, Trail
-from canprobe.lab.bridge.view.path_nodes import Parts
-from canprobe.mechanics.touch.map.noise import PAD_NOISE
-from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
-from canprobe.mechanics.touch.meshing import Mesh
+from canprobe.lab.bridge.view.path import DeviationScale, Parts, Trail
+from canprobe.mechanics.touch import PAD_NOISE, Mesh, SurfaceMap
+from canprobe.mechanics.touch.map.surface_map import REACH_M
 from canprobe.mechanics.types import Floats
 
 CELL_M, NODES_IN_DETAIL = 1e-3, 10_000

@@ -52,6 +52,7 @@ class NodeWatch:
         alarmed: nodes that have sent such an alarm since the start.
         communication: count of alarms about frames.
         foreign: first frame of another master, in words; None without one.
+        heard_ns: time of each node's last heartbeat, on the clock of the frames.
     """
 
     def __init__(self, node_ids: tuple[int, ...]) -> None:
@@ -65,7 +66,7 @@ class NodeWatch:
         self.communication = 0
         self.foreign: str | None = None
         self._untold: deque[EmcyEvent] = deque(maxlen=MAX_NEW_ALARMS)
-        self._heard: dict[int, int] = {}
+        self.heard_ns: dict[int, int] = {}
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> bool:
         """Take a frame that is no PDO; True where it was a frame of error control, EMCY or another master."""
@@ -88,7 +89,7 @@ class NodeWatch:
             state = unpack_heartbeat(data)
         except ProtocolError:
             return
-        self._heard[node_id] = t_ns
+        self.heard_ns[node_id] = t_ns
         self.states[node_id] = state
         if state is NmtState.INITIALISING:
             self.boot_ups[node_id] += 1
@@ -129,21 +130,21 @@ class NodeWatch:
 
     def forget(self) -> None:
         """Start the heartbeat supervision afresh: no heartbeat has been received yet."""
-        self._heard.clear()
+        self.heard_ns.clear()
         self.states.clear()
 
     def start(self, t_ns: int) -> None:
         """Expect every node's heartbeat from now on; what a device reported until now is over."""
         self.device_alarm = None
         self.alarmed.clear()
-        self._heard = dict.fromkeys(self.node_ids, t_ns)
+        self.heard_ns = dict.fromkeys(self.node_ids, t_ns)
 
     def silent(self, t_ns: int) -> int | None:
         """A node that has been silent for longer than the time-out, or None."""
         limit = t_ns - HEARTBEAT_CONSUMED_MS * 1_000_000
-        if min(self._heard.values(), default=limit) >= limit:
+        if min(self.heard_ns.values(), default=limit) >= limit:
             return None  # as in every cycle
-        return next((node_id for node_id, heard in self._heard.items() if heard < limit), None)
+        return next((node_id for node_id, heard in self.heard_ns.items() if heard < limit), None)
 
     def not_in(self, state: NmtState) -> int | None:
         """A node whose last heartbeat has another state than `state`, or None."""

@@ -8,7 +8,6 @@ Tables need the extra `data` (pandas, pyarrow).
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.npz import read_npz
 from canprobe.cell.results.run_files import READERS
-from canprobe.errors import UsageError, install_line, regular_file
+from canprobe.errors import UsageError, needed_module, regular_file
 from canprobe.fieldbus.bus.files import whole_file
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ def to_frame(columns: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any] | Non
         UsageError: pandas is missing, or columns differ in length.
     """
     values, units = _scalars(columns)
-    frame = needed_module("pandas", "a table").DataFrame(values)
+    frame = needed_module("pandas", "data", "a table needs pandas:").DataFrame(values)
     if "t_s" in values:
         frame = frame.set_index("t_s")
     frame.attrs = {**(attrs or {}), "units": units}
@@ -73,7 +72,10 @@ def load_table(path: Path | str) -> pandas.DataFrame:
     source = Path(path)
     if source.suffix == ".npz":
         return to_frame(READERS.get(source.name, read_npz)(source))
-    reader, arrow = needed_module("pandas", "a table"), needed_module("pyarrow", "Parquet")
+    reader, arrow = (
+        needed_module("pandas", "data", "a table needs pandas:"),
+        needed_module("pyarrow", "data", "Parquet needs pyarrow:"),
+    )
     try:
         frame: pandas.DataFrame = reader.read_parquet(regular_file(source), engine="pyarrow")
     except (OSError, arrow.ArrowException) as error:
@@ -90,7 +92,10 @@ def write_parquet(
         UsageError: the extra is missing, or columns differ in length.
         ResultsError: the file cannot be written.
     """
-    arrow, parquet = needed_module("pyarrow", "Parquet"), needed_module("pyarrow.parquet", "Parquet")
+    arrow, parquet = (
+        needed_module("pyarrow", "data", "Parquet needs pyarrow:"),
+        needed_module("pyarrow.parquet", "data", "Parquet needs pyarrow:"),
+    )
     values, units = _scalars(columns)
     arrays = {name: arrow.array(column) for name, column in values.items()}
     fields = [arrow.field(name, array.type, metadata={"unit": units[name]}) for name, array in arrays.items()]
@@ -112,15 +117,3 @@ def _scalars(columns: Mapping[str, NDArray[Any]]) -> tuple[dict[str, NDArray[Any
             name = "_".join((of, *map(str, index)))
             found[name], units[name] = values[(slice(None), *index)], unit_of(of)
     return found, units
-
-
-def needed_module(module: str, purpose: str) -> Any:
-    """A module of the extra `data`, imported.
-
-    Raises:
-        UsageError: it is missing; the message says what for, and the line to type.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise UsageError(f"{purpose} needs {module}: {install_line('data')}") from error

@@ -29,11 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.log import joint_positions
-from canprobe.cell.results.files import needed_module
 from canprobe.cell.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, needed_module
 from canprobe.fieldbus.bus.files import make_folder, writing
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 
@@ -93,7 +92,7 @@ def export_lerobot(runs: Sequence[Path | str], folder: Path | str, *, fps: int |
         ResultsError: the dataset cannot be written; nothing of it is left.
     """
     for module in ("pyarrow", "pandas"):
-        needed_module(module, "a LeRobot dataset")
+        needed_module(module, "data", f"a LeRobot dataset needs {module}:")
     target, sources = Path(folder), [Path(run) for run in runs]
     if not sources:
         raise UsageError("expected folders of runs, got none")

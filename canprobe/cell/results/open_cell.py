@@ -22,15 +22,8 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE
-from canprobe.cell.results.scores import score_shape
-from canprobe.cell.results.summary import (
-    methods_table,
-    summarise,
-    truth_of,
-    without_nan,
-    write_files,
-    write_summary,
-)
+from canprobe.cell.results.scores import score_shape, summarise_map
+from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_files, write_summary
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.home import home_joints
@@ -39,7 +32,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.hand_motion import HandMotion
 from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_way, joint_way, refuse, share_of_speed
-from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
+from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
 from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
@@ -47,13 +40,15 @@ from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import Patch, SurfaceMap
+    from canprobe.mechanics.touch import Patch
 
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,
 answers that are nearer to each other than a memory rest on the same contacts."""
 
-
+REPORT = "report.png"
+PICTURES = (REPORT, "surface.png")
+"""Pictures of a run of at least one cycle."""
 READ_S = 0.1
 """Time of cycles until each drive has said where it stands, s."""
 READ_IMAGES = 3
@@ -347,10 +342,10 @@ class OpenCell:
         self._estimate_again(data)
         summary["bridges"] = self._bridges.end(summary)
         self._write(lambda out: write_summary(summary, out))
-        if self._out is not None:
-            for name, draw in _drawings(data, self._out).items():
+        for name in PICTURES if len(data.log["t_s"]) else ():
+            if self._out is not None and name in data.plan.outputs:
                 self._say(f"draw {name}")
-                if (why := _draw(name, draw)) is not None:
+                if (why := _draw(data, self._out / name)) is not None:
                     files.note_unwritten(why)
         summary["faults"] += [line for line in lines if line not in summary["faults"]]
         if lines and failure is None:
@@ -369,7 +364,10 @@ class OpenCell:
         estimates: dict[str, list[ShapeRecord]] = {}
         if record.shape is not None and setup.shape is not None:
             estimates[setup.shape.method] = record.shape.records
-        surface_map, map_summary = self._mapped(record.shape)
+        surface_map = None if record.shape is None else record.shape.surface_map
+        map_summary = None
+        if surface_map is not None:
+            map_summary = summarise_map(surface_map, setup.truth.object if truth_of(self.session) else None)
         summary = summarise(
             self.session,
             record,
@@ -419,43 +417,23 @@ class OpenCell:
                 if line not in self.session.files.unwritten:  # the summary is written twice
                     self.session.files.note_unwritten(line)
 
-    def _mapped(self, tracker: ShapeTracker | None) -> tuple[SurfaceMap | None, dict[str, Any] | None]:
-        """The surface map of a scan, and its section of the summary."""
-        if tracker is None or tracker.surface_map is None:
-            return None, None
-        from canprobe.cell.results.scores import summarise_map
 
-        shape = self.plan.setup.truth.object if truth_of(self.session) else None
-        return tracker.surface_map, summarise_map(tracker.surface_map, shape)
-
-
-def _drawings(data: RunData, out: Path) -> dict[str, Callable[[], None]]:
-    """Functions that draw the pictures of a run of at least one cycle."""
-
-    def report() -> None:
-        from canprobe.cell.results.figures import draw_run
-
-        draw_run(data, out / "report.png")
-
-    def surface() -> None:
-        from canprobe.cell.results.surface_figure import draw_surface
-
-        draw_surface(data, out / "surface.png")
-
-    outputs = data.plan.outputs if len(data.log["t_s"]) else ()
-    known = {"report.png": report, "surface.png": surface}
-    return {name: draw for name, draw in known.items() if name in outputs}
-
-
-def _draw(name: str, draw: Callable[[], None]) -> str | None:
+def _draw(data: RunData, path: Path) -> str | None:
     """Draw one picture; returns why that failed. Whatever a drawing library raises, the results are written."""
     try:
         with interrupts_repeated():
-            draw()
+            if path.name == REPORT:
+                from canprobe.cell.results.figures import draw_run
+
+                draw_run(data, path)
+            else:
+                from canprobe.cell.results.surface_figure import draw_surface
+
+                draw_surface(data, path)
     except (CanprobeError, OSError) as error:
         return str(error)
     except Exception as error:
-        return f"{name}: cannot be drawn: {type(error).__name__}: {error}"
+        return f"{path.name}: cannot be drawn: {type(error).__name__}: {error}"
     return None
 
 

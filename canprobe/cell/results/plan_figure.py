@@ -10,17 +10,7 @@ from matplotlib.patches import Patch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.timeline import Part, timeline
 from canprobe.cell.planning.traffic import on_the_wire
-from canprobe.cell.results.picture import (
-    AMBER,
-    BLUE,
-    GREY,
-    INK,
-    ORANGE,
-    SHADE,
-    SKY,
-    legend,
-    picture,
-)
+from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, SHADE, SKY, legend, picture
 
 COLOURS: dict[Part, str] = {
     "SYNC": INK, "feedback": BLUE, "controller": GREY, "command": AMBER, "tactile": SKY,

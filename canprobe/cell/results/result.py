@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import importlib
-import importlib.util
 import os
 import sys
 import tempfile
@@ -30,7 +29,7 @@ from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.folder import write_scene
 from canprobe.cell.tasks.shape import ShapeRecord
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import UsageError, needed_module
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
@@ -168,8 +167,7 @@ class RunResult:
         Raises:
             UsageError: when matplotlib is missing, or nothing was measured.
         """
-        if importlib.util.find_spec("matplotlib") is None:
-            raise UsageError(f"plot needs matplotlib: {install_line('study')}")
+        needed_module("matplotlib", "study", "plot needs matplotlib:")
         from canprobe.cell.results.figures import run_figure
 
         return run_figure(self.data)

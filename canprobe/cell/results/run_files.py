@@ -41,48 +41,33 @@ _WHOLE_NUMBERS = {"q_age": 1 << 31, "statusword": 0xFFFF, "tactile_age": 1 << 31
 """Columns of ``log.npz`` and their largest value."""
 
 Columns = dict[str, NDArray[Any]]
-_Shapes = Mapping[str, tuple[str, tuple[int | str, ...]]]
-"""By column: kinds of its numbers, as numpy's `dtype.kind` names them, and the shape of a row; sizes of the cell stand
-there by name."""
+_Shapes = Mapping[str, tuple[int | str, ...]]
+"""By column: the shape of a row; sizes of the cell stand there by name."""
 
 _OF_LOG: _Shapes = {
-    "t_s": ("f", ()),
-    "q_rad": ("f", ("joints",)),
-    "q_m": ("f", ("joints",)),
-    "q_age": ("f", ("joints",)),
-    "statusword": ("f", ("joints",)),
-    "torque_permille": ("f", ("joints",)),
-    "tactile_age": ("f", ()),
-    "phase": ("f", ()),
-    "force_n": ("f", ()),
-    "force_sigma_n": ("f", ()),
-    "force_sigma_parts_n": ("f", (4,)),
-    "contact_mm": ("f", (3,)),
-    "normal": ("f", (3,)),
-    "kappa_per_m": ("f", (2,)),
-    "T_base_contact_m": ("f", (4, 4)),
-    "K_per_m": ("f", (2, 2)),
-    "K_covariance_per_m2": ("f", (3, 3)),
+    **dict.fromkeys(("t_s", "tactile_age", "phase", "force_n", "force_sigma_n"), ()),
+    **dict.fromkeys(("q_rad", "q_m", "q_age", "statusword", "torque_permille"), ("joints",)),
+    **dict.fromkeys(("contact_mm", "normal"), (3,)),
+    "force_sigma_parts_n": (4,),
+    "kappa_per_m": (2,),
+    "T_base_contact_m": (4, 4),
+    "K_per_m": (2, 2),
+    "K_covariance_per_m2": (3, 3),
 }
 _OF_TACTILE: _Shapes = {
-    "t_s": ("f", ()),
-    "t_sample_s": ("f", ()),
-    "t_sigma_s": ("f", ()),
-    "taxels": ("u", ("rows", "columns")),
-    "window": ("i", (4,)),
-    "features": ("f", (7,)),
+    **dict.fromkeys(("t_s", "t_sample_s", "t_sigma_s"), ()),
+    "taxels": ("rows", "columns"),
+    "window": (4,),
+    "features": (7,),
 }
 _OF_TRUTH: _Shapes = {
-    "t_s": ("f", ()),
-    "q_rad": ("f", ("joints",)),
-    "q_m": ("f", ("joints",)),
-    "force_n": ("f", ()),
-    "kappa_per_m": ("f", (2,)),
-    "direction1": ("f", (3,)),
-    "direction2": ("f", (3,)),
-    "contact_normal": ("f", (3,)),
-    "contact_point_m": ("f", (3,)),
+    **dict.fromkeys(("t_s", "force_n"), ()),
+    **dict.fromkeys(("q_rad", "q_m"), ("joints",)),
+    **dict.fromkeys(("direction1", "direction2", "contact_normal", "contact_point_m"), (3,)),
+    "kappa_per_m": (2,),
 }
+_OF_INTEGERS = {"taxels": "u", "window": "i"}
+"""Kinds of numbers, as numpy's `dtype.kind` names them, of known columns that are no floats."""
 
 
 def read_summary(folder: Path) -> dict[str, Any] | None:
@@ -230,7 +215,8 @@ def _checked(columns: Columns, file: Path, shapes: _Shapes, setup: Setup | None)
     sizes = _sizes(setup)
     rows = next((len(column) for column in columns.values() if column.ndim), 0)
     for name, column in columns.items():
-        kinds, row = shapes[name] if setup is not None and rows and name in shapes else ("biuf", column.shape[1:])
+        known = setup is not None and rows and name in shapes
+        kinds, row = (_OF_INTEGERS.get(name, "f"), shapes[name]) if known else ("biuf", column.shape[1:])
         wanted = (rows, *(sizes.get(size) if isinstance(size, str) else size for size in row))
         fits = len(column.shape) == len(wanted) and all(
             size in (None, got) for size, got in zip(wanted, column.shape, strict=True)

@@ -11,12 +11,11 @@ import numpy as np
 
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch import ContactSample, Correlation, SurfaceMatrix
+from canprobe.mechanics.touch import ContactSample, Correlation, SurfaceMap, SurfaceMatrix
 from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.map import nodes as column
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 

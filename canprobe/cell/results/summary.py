@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
@@ -65,7 +66,7 @@ def summarise(
         map_summary: section of the surface map.
         bridges: status of each bridge.
     """
-    scene, cell = session.scene, session.cell
+    scene, cell, observers = session.scene, session.cell, session.observers
     cycle, direct = cell.cycle, scene.bus.direct
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
@@ -95,13 +96,14 @@ def summarise(
         ),
         "calibration": summarise_calibration(scene, record.tool),
         "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
-        "cycle": _cycle(cell, record) | {"observe_us": _observed(session)},
+        "cycle": _cycle(cell, record)
+        | {"observe_us": None if observers is None else percentiles([*observers.cost_ns])},
         "bus_load": None if direct else _bus_load(session),
         "traffic": None if direct else _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
         "bridges": bridges,
-        "faults": [*cell.notes.lines(), *(session.observers.faults if session.observers is not None else ())],
+        "faults": [*cell.notes.lines(), *(observers.faults if observers is not None else ())],
     }
     if record.explored is not None:
         summary["explore"] = record.explored.summarised()
@@ -155,7 +157,9 @@ def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) ->
     measured: float | None = None
     error: dict[str, Any] = dict.fromkeys(FORCE_ERRORS)
     if scan is not None and scan[1] > scan[0]:
-        measured = _rms_off(log["force_n"][scan[0] : scan[1]], task.force_n)
+        force = log["force_n"][scan[0] : scan[1]]
+        known = force[np.isfinite(force)]  # a cycle in which the cell held has none
+        measured = float(np.sqrt(np.mean((known - task.force_n) ** 2))) if len(known) else None
         if "force_sigma_n" in log:
             error |= state_force_sigma(log, *scan)
         if truth := truth_of(session):
@@ -205,12 +209,6 @@ def _hidden_force(session: Session, highest: float | None, log: Mapping[str, Flo
         f"the true force rose to {highest:.2f} N, above limits.force_max_n = {limit:g}: the array measured at most"
         f" {np.nanmax(log['force_n'], initial=0.0):.2f} N"
     ]
-
-
-def _rms_off(values: Floats, target: float) -> float | None:
-    """RMS distance from the target over the cycles with a value: a cycle in which the cell held has none."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean((known - target) ** 2))) if len(known) else None
 
 
 def summarise_shape(
@@ -310,19 +308,15 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
         "slowed_cycles": record.slowed,
         "dropped_frames": cell.port.counters.overruns,
         "clock_steps": cell.port.counters.clock_steps,
-        "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
-        "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
-        "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),
+        "period_error_us": percentiles(statistics.period_error_ns if statistics is not None else []),
+        "response_us": percentiles(statistics.response_ns if statistics is not None else []),
+        "compute_us": percentiles(statistics.compute_ns if statistics is not None else []),
     }
 
 
-def _observed(session: Session) -> dict[str, float | None] | None:
-    """Time that observers and bridges added to a cycle, after its work; None without observers."""
-    return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
-
-
-def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
-    if not values_ns:
+def percentiles(values_ns: Sequence[int] | NDArray[np.int64]) -> dict[str, float | None]:
+    """Percentiles of times, µs; `observe_us` is the time that observers and bridges add to a cycle, after its work."""
+    if not len(values_ns):
         return dict.fromkeys(("p50", "p99", "p999", "max"))
     us = np.asarray(values_ns) / 1000
     p50, p99, p999 = np.percentile(us, (50, 99, 99.9)).tolist()
@@ -337,27 +331,13 @@ def write_files(result: RunData, out: Path) -> None:
     """
     found = result.summary["calibration"]
     tool = None if found is None else tool_text(found, result.plan.scene.name)
-    _write_each(
-        lambda: write_summary(result.summary, out),
-        lambda: write_text(out / FILE, tool) if tool is not None else None,
-        lambda: _write_map(result, out),
-    )
-
-
-def _write_map(result: RunData, out: Path) -> None:
-    if result.surface_map is not None:
+    writers: list[Callable[[], None]] = [lambda: write_summary(result.summary, out)]
+    if tool is not None:
+        writers.append(lambda: write_text(out / FILE, tool))
+    if (surface_map := result.surface_map) is not None:
         from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
 
-        save_surface_map(result.surface_map, out / SURFACE)
-
-
-def write_summary(summary: Mapping[str, Any], out: Path) -> None:
-    """Write ``summary.json``, whole, in the place of an earlier one."""
-    write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-
-
-def _write_each(*writers: Callable[[], None]) -> None:
-    """Write the files one by one; where one cannot be written, the others still are."""
+        writers.append(lambda: save_surface_map(surface_map, out / SURFACE))
     failed = []
     for write in writers:
         try:
@@ -366,3 +346,8 @@ def _write_each(*writers: Callable[[], None]) -> None:
             failed.append(str(error))
     if failed:
         raise ResultsError("\n".join(failed))
+
+
+def write_summary(summary: Mapping[str, Any], out: Path) -> None:
+    """Write ``summary.json``, whole, in the place of an earlier one."""
+    write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")

@@ -39,11 +39,9 @@ from numpy.typing import NDArray
 
 from canprobe.cell.npz import read_npz, write_npz
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch import MapNoise, PadLayer, SurfaceMap
 from canprobe.mechanics.touch.map import nodes as column
-from canprobe.mechanics.touch.map.local_fits import PadLayer
-from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.stiffness import Stiffness
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.types import Floats
 
 SURFACE, FORMAT_VERSION = "surface.npz", 2

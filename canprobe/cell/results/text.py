@@ -93,17 +93,13 @@ def force_lines(contact: Mapping[str, Any]) -> list[str]:
         )
     if error is None:
         return [*lines, "             no true force is known here: how wrong the measured one is does not show"]
-    bias = contact["force_true_bias_n"]
+    bias, share = contact["force_true_bias_n"], contact.get("force_within_2_sigma_fraction")
+    within = "" if share is None else f", within 2σ in {100 * share:.0f} % of the seconds"
     return [
         *lines,
         f"             measured less true: mean {bias:+.3f} N ({100 * bias / target:+.1f} %),"
-        f" RMS {error:.3f} N ({100 * error / target:.1f} %)" + _within(contact),
+        f" RMS {error:.3f} N ({100 * error / target:.1f} %){within}",
     ]
-
-
-def _within(contact: Mapping[str, Any]) -> str:
-    share = contact.get("force_within_2_sigma_fraction")
-    return "" if share is None else f", within 2σ in {100 * share:.0f} % of the seconds"
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:

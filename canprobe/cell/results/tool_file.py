@@ -15,14 +15,13 @@ from canprobe.cell.scene.reader import Reader
 from canprobe.cell.scene.toml_files import read_toml, with_writer, written_by_line
 from canprobe.errors import SceneError
 from canprobe.mechanics.robot.tool_calibration import ToolEstimate
-from canprobe.mechanics.types import Floats
 
 FILE = "tool.toml"
 KEYS = ("centre_offset_mm", "centre_lateral_mm")
 
 
 def summarise_calibration(scene: Scene, estimate: ToolEstimate | None) -> dict[str, Any] | None:
-    """The section ``calibration`` of ``summary.json``; None without an estimate."""
+    """The section ``calibration`` of ``summary.json``, not finite where not observed; None without an estimate."""
     if estimate is None or scene.probe is None:
         return None
     believed, found = T_flange_probe(scene.probe)[:3, 3] * 1e3, estimate.t_flange * 1e3
@@ -30,25 +29,21 @@ def summarise_calibration(scene: Scene, estimate: ToolEstimate | None) -> dict[s
     true = believed + np.array((scene.plant or PlantSettings()).tool_error_mm) if emulated else None
     return {
         "touches": estimate.touches,
-        "tool_centre_mm": _known(found),
-        "sigma_mm": _known(estimate.sigma * 1e3),
+        "tool_centre_mm": found.tolist(),
+        "sigma_mm": (estimate.sigma * 1e3).tolist(),
         "observed": [bool(one) for one in estimate.observed],
         "believed_mm": believed.tolist(),
         "true_mm": None if true is None else true.tolist(),
-        "error_mm": None if true is None else _known(found - true),
+        "error_mm": None if true is None else (found - true).tolist(),
         "ball_centre_mm": (estimate.c_base * 1e3).tolist(),
         "ball_moved_mm": ((estimate.c_base - expected_ball(scene.task)[0]) * 1e3).tolist(),
         "radii_error_mm": estimate.radii_error * 1e3,
         "array_tilt_mrad": (estimate.tilt * 1e3).tolist(),
-        "condition_number": estimate.condition_number if np.isfinite(estimate.condition_number) else None,
+        "condition_number": estimate.condition_number,
         "residual_along_mm": estimate.along_rms * 1e3,
         "residual_across_mm": estimate.across_rms * 1e3,
         "chi2_per_dof": estimate.chi2_per_dof,
     }
-
-
-def _known(values: Floats) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def calibration_lines(found: Mapping[str, Any]) -> list[str]:

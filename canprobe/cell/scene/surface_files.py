@@ -16,7 +16,7 @@ from canprobe.cell.npz import unpack_npz
 from canprobe.cell.scene.hardware import MM
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.stl_files import stl_damage
-from canprobe.errors import UsageError, install_line, regular_file
+from canprobe.errors import needed_module, regular_file
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.mesh_curvature import CurvatureError
 from canprobe.mechanics.touch.mesh_fit import HeightGrid, MeshHeights, fit_mesh
@@ -118,10 +118,7 @@ def _mesh(
     path: Path, changed_ns: int, unit: float, spacing: float | None, origin_mm: tuple[float, float] | None
 ) -> HeightGrid:
     """The surface of a mesh; of a file that has not changed it is fitted once."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise UsageError(f"object.file: a mesh needs trimesh: {install_line('mesh')}") from error
+    trimesh = needed_module("trimesh", "mesh", "object.file: a mesh needs trimesh:")
     _refuse_other_content(path)
     try:
         damage = stl_damage(path.read_bytes()) if path.suffix.lower() == ".stl" else None

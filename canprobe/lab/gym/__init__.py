@@ -10,7 +10,7 @@ Between two actions the whole cell runs: drives, array, supervision and the tact
 in virtual time without a bus. `env` is the environment; start reading there. `episode` is one cell that is led step by
 step, `led` the touch task whose path and force are set from outside. `observations` makes an agent's vectors, `region`
 the touched part of the surface. `randomise` draws the values that differ between episodes, with the keys of
-a scene file; `objects` are those to train on and those that are held out.
+a scene file, and has the objects to train on and those that are held out.
 
 An episode begins in contact: approach, touch-down and settling are part of `reset`. It ends by itself (`terminated`)
 where the supervision of the cell ends a scan: contact lost, force too high, a joint at its stop. It is cut off
@@ -27,8 +27,7 @@ except ImportError as error:
     raise UsageError(f"canprobe.lab.gym needs the package gymnasium: {install_line('gym')}") from error
 
 from canprobe.lab.gym.env import TouchScan
-from canprobe.lab.gym.objects import OBJECTS
-from canprobe.lab.gym.randomise import OneOf, Uniform
+from canprobe.lab.gym.randomise import OBJECTS, OneOf, Uniform
 
 __all__ = ["OBJECTS", "Choice", "OneOf", "TouchScan", "Uniform"]
 

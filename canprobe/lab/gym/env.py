@@ -21,9 +21,8 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.target import VIRTUAL
 from canprobe.errors import UsageError
 from canprobe.lab.gym.episode import Episode
-from canprobe.lab.gym.objects import START_MM, overrides_of
 from canprobe.lab.gym.observations import KINDS, Kind, Observations
-from canprobe.lab.gym.randomise import Values
+from canprobe.lab.gym.randomise import START_MM, Values, overrides_of
 from canprobe.mechanics.touch.linear_algebra import checked
 
 DEFAULT_SCENE: Mapping[str, Any] = {
@@ -64,6 +63,9 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         record: folder in which each episode writes the files of a run, in `episode-N`, for `canprobe view`.
         render_mode: None; there is no other.
 
+    Attributes:
+        names: names of the entries of an observation's vector, with their units.
+
     Raises:
         UsageError: when an argument is wrong.
         SceneError, PlanError: when the scene is wrong, or does not fit.
@@ -100,15 +102,10 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         if self._cycles < 1 or not math.isclose(self._cycles * control_hz, rate_hz):
             raise UsageError(f"control_hz: expected a whole part of cycle.rate_hz = {rate_hz:g}, got {control_hz:g}")
         self._observations = Observations(observation, plan, shape=estimate)
-        self.observation_space = self._observations.space
+        self.names, self.observation_space = self._observations.names, self._observations.space
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.episode: Episode | None = None
         self._recorded = 0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the entries of an observation's vector, with their units."""
-        return self._observations.names
 
     def reset(self, *, seed: int | None = None, options: Values | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw a scene, bring its cell up, approach and touch.
@@ -134,7 +131,11 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
             asked = {"objects": None} | asked
         overrides = overrides_of(self._options | asked, self.np_random)
         overrides["scene.seed"] = int(self.np_random.integers(2**31))
-        self.episode = Episode(self._plan(overrides), self._cycles, self._folder())
+        folder = None
+        if self._record is not None:
+            self._recorded += 1
+            folder = self._record / f"episode-{self._recorded:04d}"
+        self.episode = Episode(self._plan(overrides), self._cycles, folder)
         return self._observe(self.episode), self.episode.info() | {"overrides": overrides}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -164,13 +165,6 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
 
     def _observe(self, episode: Episode) -> Any:
         return self._observations.observe(episode.task, episode.origin, episode.coverage, episode.forces, episode.truth)
-
-    def _folder(self) -> Path | None:
-        """The folder of the next recorded episode; None where none is recorded."""
-        if self._record is None:
-            return None
-        self._recorded += 1
-        return self._record / f"episode-{self._recorded:04d}"
 
     def _plan(self, overrides: Mapping[str, Any]) -> Plan:
         scene = load_scene(self._base, overrides)

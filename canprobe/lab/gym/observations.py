@@ -101,8 +101,12 @@ class Observations:
             coverage.share,
             *coverage.left(np.array((along, across))).tolist(),
         ]
-        if self._shape:
-            values += self._estimated(task)
+        if self._shape:  # estimated curvature, and the share of it that was observed
+            estimate, found = task.estimate, [0.0] * 4
+            if estimate is not None:
+                found[:3] = _in_frame(estimate.curvature_tensor_base(), task.frame(contact.n_base))
+                found[3] = float(np.mean(estimate.observed))
+            values += found
         if self._kind == "oracle":
             tensor = truth["kappa"][0] * np.outer(truth["direction1"], truth["direction1"])
             tensor += truth["kappa"][1] * np.outer(truth["direction2"], truth["direction2"])
@@ -117,14 +121,6 @@ class Observations:
             return vector
         taxels = np.zeros(self._pad) if task.taxels is None else task.taxels
         return {"features": vector, "taxels": (taxels / COUNTS_MAX).astype(np.float32)}
-
-    def _estimated(self, task: LedTask) -> list[float]:
-        """Estimated curvature, and the share of it that was observed."""
-        estimate = task.estimate
-        if estimate is None:
-            return [0.0] * 4
-        frame = task.frame(task.last_contact.n_base)
-        return [*_in_frame(estimate.curvature_tensor_base(), frame), float(np.mean(estimate.observed))]
 
 
 def _where(which: str, near: float) -> dict[str, tuple[float, float]]:

@@ -84,14 +84,17 @@ class Presses:
         rng: generator of gains and noise.
 
     Attributes:
-        config: the array.
+        config, stiffness: the array, and the stiffness of its layer, N/m³.
         forces: (n,) true force at each image of the last touch, N.
     """
 
     def __init__(self, config: TaxelConfig, stiffness: float, rng: np.random.Generator) -> None:
-        self.config, self._stiffness, self._rng = config, stiffness, rng
+        self.config, self.stiffness, self._rng = config, stiffness, rng
         self.forces: Floats = np.empty(0)
-        self._array, self._t = TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness), 0.0
+        self._array, self._t = self._new_array(), 0.0
+
+    def _new_array(self) -> TaxelArray:
+        return TaxelArray(self.config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self.stiffness)
 
     def dwell(  # noqa: PLR0917
         self,
@@ -124,7 +127,7 @@ class Presses:
             measured: whether the true force is given, with the error of a scale.
         """
         array, began = self._array, self._t
-        rng, depth = self._rng, depth_for_force(force, kappa, RADIUS_M, self._stiffness)
+        rng, depth = self._rng, depth_for_force(force, kappa, RADIUS_M, self.stiffness)
         c, s = math.cos(angle), math.sin(angle)
         axes, origin = np.array([[c, s], [-s, c]]), (4, 4)
         c, s = math.cos(heading), math.sin(heading)
@@ -167,7 +170,7 @@ class Presses:
 
     def rest(self) -> None:
         """Wait until the array has recovered from the presses before."""
-        array = TaxelArray(self.config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self._stiffness)
+        array = self._new_array()
         array.take_gains(self._array)
         self._array, self._t = array, 0.0
 
@@ -214,17 +217,12 @@ class Presses:
         rng = self._rng
         k1, k2 = sorted(rng.uniform(-12.0, 60.0, 2).tolist(), reverse=True)
         x, y = rng.uniform(-1.5e-3, 1.5e-3, 2).tolist()
-        half = float(rng.uniform(0.0, 1.5e-3))
+        half, force, angle = (
+            float(rng.uniform(low, high)) for low, high in ((0.0, 1.5e-3), (0.5, 3.0), (0.0, math.pi))
+        )
+        seconds, heading = float(rng.choice(HOLD_S)), float(rng.uniform(0.0, 2.0 * math.pi))
+        roll, hz = (half, 0.4 * half), (float(rng.uniform(0.05, 0.5)),)
         dwell = self.dwell(
-            "quadric",
-            float(rng.uniform(0.5, 3.0)),
-            (k1, k2),
-            0,
-            (x, y),
-            float(rng.uniform(0.0, math.pi)),
-            seconds=float(rng.choice(HOLD_S)),
-            heading=float(rng.uniform(0.0, 2.0 * math.pi)),
-            roll=(half, 0.4 * half),
-            hz=(float(rng.uniform(0.05, 0.5)),),
+            "quadric", force, (k1, k2), 0, (x, y), angle, seconds=seconds, heading=heading, roll=roll, hz=hz
         )
         return dwell, self.forces

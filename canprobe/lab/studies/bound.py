@@ -38,9 +38,7 @@ from canprobe.lab.studies.result import (
     sigma_values,
 )
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch.estimate.fit import fit_surface
-from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch import Prior, cramer_rao, fit_surface
 from canprobe.mechanics.types import Floats
 
 METHODS = ("ml", "recursive")

@@ -117,16 +117,11 @@ def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
     return StudyResult("calibration", COLUMNS, rows, findings(rows), facts, partial(draw_arrays, rows), more)
 
 
-def _presses(seed: int) -> tuple[Presses, float]:
-    """Presses on the array of a seed, and the stiffness of its layer, N/m³."""
-    config, stiffness, rng = random_array(seed)
-    return Presses(config, stiffness, rng), stiffness
-
-
 def measure(seed: int) -> Row:
     """Calibrate one array and press on it."""
-    presses, stiffness = _presses(seed)
-    fit, pad, config = calibrated(presses, f"emulated, seed {seed}"), pad_of(presses.config), presses.config
+    presses = Presses(*random_array(seed))
+    config, stiffness, pad = presses.config, presses.stiffness, pad_of(presses.config)
+    fit = calibrated(presses, f"emulated, seed {seed}")
     found = fit.calibration
     patch = make_patch_calibration(found, pad)
     model = make_image_model(found, patch, seen=WINDOW)
@@ -159,7 +154,7 @@ def measure(seed: int) -> Row:
 
 def measure_forces(seed: int) -> list[Row]:
     """Hold quadrics on one array, and read their forces with its own calibration and with another one: two rows."""
-    presses, other = _presses(seed)[0], _presses(seed + OTHER_ARRAY)[0]
+    presses, other = (Presses(*random_array(number)) for number in (seed, seed + OTHER_ARRAY))
     fits = calibrated(presses, f"emulated, seed {seed}"), calibrated(other, "make", own_gains=False)
     holds = [presses.held() for _ in range(HOLDS)]
     return [

@@ -14,7 +14,6 @@ import functools
 import hashlib
 import json
 import platform
-from collections.abc import Set
 from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
@@ -80,6 +79,7 @@ class CellStore:
 
     Attributes:
         path: path of the file.
+        answers: the answers as JSON text, by key.
         damaged: number of lines that were left out because they were cut short or changed.
 
     Raises:
@@ -91,7 +91,7 @@ class CellStore:
         make_folder(folder)
         self.path = folder / "cells.jsonl"
         self.damaged = 0
-        self._answers: dict[str, str] = {}
+        self.answers: dict[str, str] = {}
         with writing(self.path):
             self._file: IO[str] = self.path.open("a+", encoding="utf-8", errors="replace")
         try:
@@ -111,14 +111,6 @@ class CellStore:
         with contextlib.suppress(OSError):  # `put` has reported it
             self._file.close()
 
-    def keys(self) -> Set[str]:
-        """The keys of all answers."""
-        return self._answers.keys()
-
-    def get(self, key: str) -> str | None:
-        """The answer as JSON text; None for an unknown key."""
-        return self._answers.get(key)
-
     def put(self, key: str, what: object, answer: str) -> None:
         """Keep an answer (JSON text) with what it answers; nothing happens where its key has one.
 
@@ -127,7 +119,7 @@ class CellStore:
         Raises:
             ResultsError: it cannot be written; what was kept before is whole.
         """
-        if key in self._answers:
+        if key in self.answers:
             return
         document = as_json({"key": key, "what": what, "answer": json.loads(answer)})
         with interrupts_held():
@@ -136,7 +128,7 @@ class CellStore:
                 self._file.flush()
             except OSError as error:
                 raise ResultsError(f"{self.path}: cannot be written: {error.strerror or error}") from error
-            self._answers[key] = answer
+            self.answers[key] = answer
 
     def _read(self) -> None:
         last = "\n"
@@ -146,7 +138,7 @@ class CellStore:
                 self.damaged += 1
                 continue
             found = json.loads(document)
-            self._answers[found["key"]] = as_json(found["answer"])
+            self.answers[found["key"]] = as_json(found["answer"])
         if not last.endswith("\n"):  # cut short: the next answer begins a new line
             self._file.write("\n")
             self._file.flush()

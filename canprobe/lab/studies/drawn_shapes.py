@@ -92,11 +92,6 @@ def scene_of(shape: DrawnShape, folder: Path, seconds: float) -> Scene:
 
 def object_of(shape: DrawnShape, folder: Path) -> ObjectSettings:
     """`[object]` of a shape; its heights are written into a folder."""
-    turn = 37.0 * (1000 + shape.number) % 180
-    return ObjectSettings(position_mm=PLACE_MM, rotation_deg=(0.0, 0.0, turn), **_keys(shape, folder))
-
-
-def _keys(shape: DrawnShape, folder: Path) -> dict[str, Any]:
     rng = np.random.default_rng([262, *shape])
 
     def mm(low: float, high: float) -> float:
@@ -113,9 +108,10 @@ def _keys(shape: DrawnShape, folder: Path) -> dict[str, Any]:
         {"kind": "wave", "amplitude_mm": mm(1.5, 2.2), "wavelength_mm": mm(85, 95)},
         {"kind": "fillet", "radius_mm": mm(22, 28), "angle_deg": mm(32, 40)},
     ]
-    if shape.kind < len(forms):
-        return forms[shape.kind]
-    return heights_file(folder, form_heights_mm(shape.name, seed))
+    formula = shape.kind < len(forms)
+    keys = forms[shape.kind] if formula else heights_file(folder, form_heights_mm(shape.name, seed))
+    turn = 37.0 * (1000 + shape.number) % 180
+    return ObjectSettings(position_mm=PLACE_MM, rotation_deg=(0.0, 0.0, turn), **keys)
 
 
 def form_heights_mm(form: str, seed: int) -> Floats:

@@ -14,7 +14,7 @@ from multiprocessing.process import BaseProcess
 from time import perf_counter
 from types import ModuleType
 
-from canprobe.errors import StudyError, UsageError, install_line
+from canprobe.errors import StudyError, needed_module
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 from canprobe.fieldbus.bus.system import system
 
@@ -61,14 +61,11 @@ def dask_executor(address: str) -> Iterator[Executor]:
         UsageError: package `distributed` is missing.
         StudyError: not an address, or no scheduler answers.
     """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise UsageError(f"a Dask cluster needs the package distributed: {install_line('dask')}") from error
+    distributed = needed_module("distributed", "dask", "a Dask cluster needs the package distributed:")
     if not re.search(r":[0-9]+$", address):  # a Client that fails at once takes twenty seconds to end
         raise StudyError(f"Dask scheduler {address}: expected its address and port, as tcp://10.0.0.1:8786")
     try:
-        client = Client(address, timeout=_DASK_WAIT, set_as_default=False)
+        client = distributed.Client(address, timeout=_DASK_WAIT, set_as_default=False)
     except (OSError, ValueError) as error:
         raise StudyError(f"Dask scheduler {address}: expected an answer, got: {error}") from error
     executor = client.get_executor(pure=False)

@@ -16,9 +16,8 @@ from canprobe.cell.results.picture import BLUE, GREEN, GREY, INK, ORANGE, PINK, 
 from canprobe.lab.studies.drawn_shapes import LENGTH_MM, WIDTH_MM, TrueGround
 from canprobe.lab.studies.result import Column, Row, drawn_anew, interval_of
 from canprobe.lab.studies.surface_methods import evaluate_map
-from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch import ContactSample, SurfaceMap
 from canprobe.mechanics.touch.estimate.path_length import PathLength
-from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.strategies import Circle, Strategy, Weave
 from canprobe.mechanics.types import Floats
 

@@ -141,14 +141,6 @@ def task_plan(task: str, plant: str) -> Plan:
     return make_plan(resolve(task_scene(task, plant)))
 
 
-def seeded_plan(task: str, plant: str, seed: int) -> Plan:
-    """The plan of one run."""
-    plan = task_plan(task, plant)
-    setup = plan.setup
-    scene = replace(setup.scene, scene=replace(setup.scene.scene, seed=seed))
-    return replace(plan, setup=replace(setup, scene=scene, seed=seed))
-
-
 # Files that are wrong: the emulated arm, tool, layer or array is not what its file says.
 
 DEEP_MM = 25.0

@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import re
 import tempfile
-import traceback
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -42,9 +41,9 @@ from canprobe.lab.studies.fault_cases import (
     FaultCase,
     Windows,
     WrongFile,
-    seeded_plan,
     task_plan,
 )
+from canprobe.lab.studies.sweep import error_text
 from canprobe.lab.studies.witnessed_run import Witness, longest_above, run_to_end
 
 FORCE_SHARE, USUAL_SHARE = 1.5, 1.2
@@ -82,7 +81,7 @@ def phase_windows(task: str, plant: str) -> Windows:
 
 def run_case(case: FaultCase) -> dict[str, Any]:
     """Carry out and score a case."""
-    plan = seeded_plan(case.task, case.plant, case.number)
+    plan = task_plan(case.task, case.plant).with_seed(case.number)
     setup = plan.setup
     assert setup.arm is not None and setup.array is not None
     fault = case.fault(setup.arm.node_ids, setup.array.node_id, phase_windows(case.task, case.plant))
@@ -154,7 +153,11 @@ class FaultRun:
         session.buses.lockstep.recorder = None  # the log is closed
         limit = self.plan.setup.limits.force_max
         highest, left = max((force for _, force in rows), default=0.0), rows[-1][1] if rows else 0.0
-        failures = self._ends(reason) + self._log_problems() + self._summary_problems(reason)
+        failures = [f"hang: {reason}"] if self.outcome == "hang" else []
+        if self.outcome == "crash":
+            assert self.error is not None
+            failures.append(f"crash: {error_text(self.error)}")
+        failures += self._log_problems() + self._summary_problems(reason)
         if highest > FORCE_SHARE * limit:
             failures.append(f"true force of {highest:.2f} N, limit {limit:g} N")
         lie = self._lie_n()
@@ -180,14 +183,10 @@ class FaultRun:
             "failures": failures,
         }
 
-    def _begin_ns(self) -> int | None:
-        """Time at which the first fault began; 0 without faults, None where none did."""
-        times = [t_ns for node in self.faulty.nodes for t_ns, what, _ in node.history if what == "begins"]
-        return min(times, default=None) if self.faults else 0
-
     def _noticed_ns(self) -> int | None:
         """Time from the beginning of the fault until it was noticed, ns; None where it was not, or never began."""
-        begin_ns = self._begin_ns()
+        begun = [t_ns for node in self.faulty.nodes for t_ns, what, _ in node.history if what == "begins"]
+        begin_ns = min(begun, default=None) if self.faults else 0
         if begin_ns is None:
             return None
         times = [] if self.reason_ns is None else [self.reason_ns]
@@ -224,16 +223,6 @@ class FaultRun:
         if len(off) < length:
             return 0.0
         return float(np.lib.stride_tricks.sliding_window_view(off, length).min(axis=1).max())
-
-    def _ends(self, reason: str) -> list[str]:
-        """Failures to end as an error of canprobe."""
-        if self.outcome == "hang":
-            return [f"hang: {reason}"]
-        if self.outcome != "crash":
-            return []
-        assert self.error is not None
-        place = traceback.extract_tb(self.error.__traceback__)[-1]
-        return [f"crash: {type(self.error).__name__}: {reason} ({Path(place.filename).name}:{place.lineno})"]
 
     def _rest_problems(self) -> list[str]:
         """Motion after the stop, once all must be at rest and no master is there; and drives that are not disabled."""

@@ -10,8 +10,7 @@ what arm, tool, layer or array are differs from what their file says, and the ce
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -66,24 +65,16 @@ FILE_COLUMNS = (
 MOST_FAILURES = 20
 
 
-@dataclass(frozen=True, slots=True)
-class Numbers:
-    """One cell of the sweep: some runs in a row."""
-
-    numbers: tuple[int, ...]
-
-
-def measure(cell: Numbers) -> list[dict[str, Any]]:
-    """The runs of some numbers."""
-    return [run_case(FaultCase.of(number)) for number in cell.numbers]
+def measure(numbers: Sequence[int]) -> list[dict[str, Any]]:
+    """The runs of some numbers: one cell of the sweep."""
+    return [run_case(FaultCase.of(number)) for number in numbers]
 
 
 def quick_numbers() -> list[int]:
     """Kinds that are hard to notice, in the approach of a press and in the contact of a weave."""
-    first = [FaultCase.of(number) for number in range(CASES)]
     return [
         case.number
-        for case in first
+        for case in map(FaultCase.of, range(CASES))
         if case.plant == "ideal" and case.kind.name in QUICK_KINDS and (case.task, case.phase) in _QUICK_PLACES
     ]
 
@@ -91,7 +82,7 @@ def quick_numbers() -> list[int]:
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Carry out the campaign."""
     numbers = quick_numbers() if quick else range(REPEATS * CASES)
-    cells = [Numbers(tuple(numbers[i : i + NUMBERS_A_CELL])) for i in range(0, len(numbers), NUMBERS_A_CELL)]
+    cells = [list(numbers[i : i + NUMBERS_A_CELL]) for i in range(0, len(numbers), NUMBERS_A_CELL)]
     runs = [one for answer in sweep.map(measure, cells) for one in answer]
     touches = sweep.map(run_wrong_file, QUICK_FILES if quick else wrong_files(JOINTS))
     facts = measuring_facts(quick, len(numbers))
@@ -102,8 +93,13 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
     """A row for each kind of fault that ran, and one for all."""
-    kinds = [(kind.name, [one for one in runs if one["kind"] == kind.name]) for kind in KINDS]
-    return [_row(name, some) for name, some in [*kinds, ("all", list(runs))] if some]
+    return [_row(name, some) for name, some in {**by_kind(runs), "all": runs}.items() if some]
+
+
+def by_kind(runs: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """The runs of each kind of fault that ran."""
+    found = {kind.name: [one for one in runs if one["kind"] == kind.name] for kind in KINDS}
+    return {name: some for name, some in found.items() if some}
 
 
 def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
@@ -117,7 +113,10 @@ def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
         "runs": len(runs),
         "force_max_n": worst["force_max_n"],
         "worst": f"{worst['task']}, {worst['phase']}, {worst['plant']}",
-        **{f"{task}_n": _highest(one for one in runs if one["task"] == task) for task in TASKS},
+        **{
+            f"{task}_n": max((one["force_max_n"] for one in runs if one["task"] == task), default=None)
+            for task in TASKS
+        },
         "above_ms": max(one["above_ms"] for one in runs),
         "noticed_ms": float(np.median(noticed)) if noticed else None,
         "noticed_max_ms": max(noticed, default=None),
@@ -128,10 +127,6 @@ def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
         "named": 100.0 * sum(one["named"] for one in stopped) / len(stopped) if stopped else None,
         "failures": sum(bool(one["failures"]) for one in runs),
     }
-
-
-def _highest(runs: Iterable[Mapping[str, Any]]) -> float | None:
-    return max((one["force_max_n"] for one in runs), default=None)
 
 
 def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -178,8 +173,7 @@ def draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
         f"How {len(runs)} runs with a fault of a node, a link, a drive or the array ended; {failed} failed:\n"
         "force, motion, power, log or report were not as promised"
     )
-    of_kind = {kind.name: [one for one in runs if one["kind"] == kind.name] for kind in KINDS}
-    found = {kind: some for kind, some in of_kind.items() if some}
+    found = by_kind(runs)
     with picture(path, title, 1.5 + 0.16 * len(found)) as figure:
         sides = parts(figure, 1, 2)
         left, right = (part.subplots() for part in sides)

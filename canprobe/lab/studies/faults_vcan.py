@@ -10,6 +10,7 @@ it is and in a patient one (`--patient`), and the true force of the plant.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -197,7 +198,7 @@ def _throw_all(quick: bool) -> StudyResult:
 def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
     """Run a task, throw a fault in a phase of it, and score the true force."""
     scene = load_scene(task_scene(task, "ideal"), {"bus.interface": "socketcan", "bus.channel": CHANNEL})
-    session = Session(make_plan(resolve(patient(scene, MISSED_SYNCS) if is_patient else scene)))
+    session = Session(patient(scene, MISSED_SYNCS) if is_patient else scene)
     work = make_task(session.plan)
     with ThreadPoolExecutor(1) as others:
         thrown: list[Future[Any]] = []
@@ -288,7 +289,7 @@ class _ServedRun:
             if not self._await_enabled(port, self.master):
                 self.failures.append("the drives were never enabled")
                 return self.master.poll(), 0.0, ""
-            self._sleep(self.case.after_s)
+            sleep(self.case.after_s)
         finally:
             port.close()
         fault_ns = self.clock.now_ns()
@@ -299,7 +300,7 @@ class _ServedRun:
         except subprocess.TimeoutExpired:
             self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
         ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
-        self._sleep(REACTION_S - ended_s)
+        sleep(REACTION_S - ended_s)
         link("up")
         drives = self._look()
         self.failures += score_end(self.case.fault, status, self.folder)
@@ -314,9 +315,6 @@ class _ServedRun:
 
     def _open(self) -> Port:
         return open_port("socketcan", CHANNEL, 1_000_000, self.clock)
-
-    def _sleep(self, seconds: float) -> None:
-        self.clock.sleep_until_ns(self.clock.now_ns() + max(0, round(seconds * 1e9)))
 
     def _start_master(self) -> subprocess.Popen[bytes]:
         scene = with_real_nodes(served_scene())
@@ -349,7 +347,7 @@ class _ServedRun:
                 master.kill()
             case ProcessFault.MASTER_STALLED:
                 master.send_signal(signal.SIGSTOP)
-                self._sleep(STALL_S)
+                sleep(STALL_S)
                 master.send_signal(signal.SIGCONT)
             case ProcessFault.NODES_KILLED:
                 os.kill(self.child.pid, signal.SIGKILL)
@@ -361,27 +359,25 @@ class _ServedRun:
 
     def _look(self) -> str:
         """The states of the drives, where their process still answers."""
-        if not Path(f"/proc/{self.child.pid}").exists() or not self._answers():
+        first: dict[int, int] = {}
+        if Path(f"/proc/{self.child.pid}").exists():
+            with contextlib.suppress(CanprobeError):
+                first = self._ask(0x6041)
+        if not first:
             if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
                 self.failures.append("the nodes ended with a master that is not their parent")
             return "gone"
-        before, first = self._ask(0x6064), self._ask(0x6041)
-        self._sleep(APART_S)
+        before = self._ask(0x6064)
+        sleep(APART_S)
         after = self._ask(0x6064)
         states = {node_id: state_of(word) for node_id, word in first.items()}
         for node_id, state in states.items():
             if state in POWERED_STATES:
                 self.failures.append(f"node {node_id} is {state.name} after the stop")
-            if abs(_signed(after[node_id]) - _signed(before[node_id])) > MOST_COUNTS:
+            if abs(after[node_id] - before[node_id]) > MOST_COUNTS:
                 self.failures.append(f"node {node_id} moves after the stop")
         codes = self._ask(0x603F) if DriveState.FAULT in states.values() else {}
         return ", ".join(sorted({_text_of(state, codes.get(node_id)) for node_id, state in states.items()}))
-
-    def _answers(self) -> bool:
-        try:
-            return bool(self._ask(0x6041))
-        except CanprobeError:
-            return False
 
     def _ask(self, index: int) -> dict[int, int]:
         """An object of each drive; empty where one does not answer."""
@@ -418,7 +414,7 @@ def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str
 
 def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
     try:
-        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little"))
+        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little", signed=index == 0x6064))
     except SdoCommunicationError:
         return
 
@@ -427,8 +423,10 @@ def _text_of(state: DriveState, code: int | None) -> str:
     return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
 
 
-def _signed(value: int) -> int:
-    return value - (1 << 32) if value >> 31 else value
+def sleep(seconds: float) -> None:
+    """Sleep for some time, s; not at all for a negative one."""
+    clock = MonotonicClock()
+    clock.sleep_until_ns(clock.now_ns() + max(0, round(seconds * 1e9)))
 
 
 def link(state: str) -> None:

@@ -89,11 +89,8 @@ def sample_map(loop: ForceLoop) -> Floats:
         move[:3, :3] = drive[:, :3]
         move[:3, 4 + delay - 1] = drive[:, 3]  # the target that is latched now
         move[3, 3] = move[4, 3] = 1.0  # this cycle's target is a
-        for i in range(1, delay):
-            move[4 + i, 4 + i - 1] = 1.0
-        move[4 + delay, 0] = 1.0
-        for i in range(1, oldest):
-            move[4 + delay + i, 4 + delay + i - 1] = 1.0
+        move[range(5, size), range(4, size - 1)] = 1.0  # all others age
+        move[4 + delay] = np.eye(size)[0]
         whole = move @ sense @ whole
     return whole
 

@@ -131,63 +131,42 @@ class Loud(Participant):
         return [(LOUD_ID, bytes(8))]
 
 
-@dataclass(slots=True)
-class LateClock:
-    """A clock whose sleeps end late now and then.
+class DisturbedClock:
+    """A clock whose sleeps end late.
 
-    Attributes:
+    Args:
         clock: the clock behind it.
         rng: generator of the lateness.
-        share: share of the sleeps that end late.
-        mean_ns: their mean lateness.
+        often: how often it happens.
+        mean_ns: mean of how long it lasts.
     """
 
-    clock: Clock
-    rng: Random
-    share: float
-    mean_ns: float
+    def __init__(self, clock: Clock, rng: Random, often: float, mean_ns: float) -> None:
+        self.clock, self.rng, self.often, self.mean_ns = clock, rng, often, mean_ns
 
     def now_ns(self) -> int:
         """Present time, ns."""
         return self.clock.now_ns()
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Sleep, and oversleep."""
+        """Sleep, and now and then oversleep: `often` is the share of these sleeps."""
         if t_ns > self.clock.now_ns():
             self.clock.sleep_until_ns(t_ns)
-            if self.rng.random() < self.share:
+            if self.rng.random() < self.often:
                 self.clock.sleep_until_ns(t_ns + round(self.rng.expovariate(1.0 / self.mean_ns)))
 
 
-@dataclass(slots=True)
-class StandingClock:
-    """A clock on a machine that stands still for some times: a sleep that ends in one ends behind it.
+class StandingClock(DisturbedClock):
+    """A clock on a machine that stands still for some times, `often` in a second; a sleep ends behind such a time."""
 
-    Attributes:
-        clock: the clock behind it.
-        rng: generator of the times.
-        per_s: standstills in a second.
-        mean_ns: their mean length.
-        begin_ns, end_ns: the last standstill.
-    """
-
-    clock: Clock
-    rng: Random
-    per_s: float
-    mean_ns: float
-    begin_ns: int = 0
-    end_ns: int = 0
-
-    def now_ns(self) -> int:
-        """Present time, ns."""
-        return self.clock.now_ns()
+    begin_ns = end_ns = 0
 
     def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep; a standstill goes on."""
         if t_ns <= self.clock.now_ns():
             return
         while self.end_ns < t_ns:
-            self.begin_ns = self.end_ns + round(self.rng.expovariate(self.per_s * 1e-9))
+            self.begin_ns = self.end_ns + round(self.rng.expovariate(self.often * 1e-9))
             self.end_ns = self.begin_ns + round(self.rng.expovariate(1.0 / self.mean_ns))
         self.clock.sleep_until_ns(self.end_ns if self.begin_ns <= t_ns else t_ns)
 
@@ -208,7 +187,7 @@ class DisturbedPort(PlainPort):
         self._period_ns = round(1e9 / setup.rate_hz)
         self.channel = port.channel
         self.clock: Clock = port.clock
-        clocks = {"machine": LateClock, "still": StandingClock}
+        clocks = {"machine": DisturbedClock, "still": StandingClock}
         if setup.kind in clocks:
             self.clock = clocks[setup.kind](port.clock, rng, setup.share, setup.size * self._period_ns)
         self._arriving: list[tuple[int, int, Frame]] = []  # a heap: time of arrival, number, frame

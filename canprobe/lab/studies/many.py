@@ -29,7 +29,7 @@ from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.target import VIRTUAL, Target
 from canprobe.cell.session.terminal import StepReport
-from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
+from canprobe.errors import CanprobeError, SafetyStop, UsageError, needed_module
 from canprobe.fieldbus.bus.files import make_folder, whole_file
 from canprobe.lab.studies.cell_store import model_digest
 from canprobe.lab.studies.result import Row
@@ -264,10 +264,7 @@ class Runs:
         Raises:
             UsageError: the extra `data` is missing, or no run has a column of that name.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise UsageError(f"to_xarray needs xarray: {install_line('data')}") from error
+        arrays = needed_module("xarray", "data", "to_xarray needs xarray:")
         known = {name for outcome in self.outcomes for name in outcome["columns"]}
         found = [{name: np.array(s, dtype=float) for name, s in o["series"].items()} for o in self.outcomes]
         length = max((len(column) for columns in found for column in columns.values()), default=0)
@@ -288,7 +285,8 @@ class Runs:
         told["status"] = [outcome["status"] for outcome in self.outcomes]
         coordinates = {key: ("run", [v if np.isscalar(v) else str(v) for v in column]) for key, column in told.items()}
         time = ("time", self.every_s * np.arange(length), {"units": "s"})
-        return xarray.Dataset(variables, {"time": time, **coordinates}, {"scene": self.scene.name})
+        dataset: xarray.Dataset = arrays.Dataset(variables, {"time": time, **coordinates}, {"scene": self.scene.name})
+        return dataset
 
     def __len__(self) -> int:
         return len(self.rows)

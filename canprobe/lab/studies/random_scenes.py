@@ -25,7 +25,6 @@ from canprobe.cell.scene.resolve import LAYER_STIFFNESS
 from canprobe.errors import UsageError
 from canprobe.lab.studies.array_presses import RADIUS_M, Presses, calibrated, pad_of, random_array
 from canprobe.lab.studies.drawn_shapes import centred, heights_file, waves_mm
-from canprobe.mechanics.types import Floats
 
 CELLS = {
     "puma260": ((-170.0, -175.0, 300.0), 35.0),
@@ -211,20 +210,16 @@ def _fillet(rng: np.random.Generator) -> dict[str, Any]:
     return {"kind": "fillet", "radius_mm": _spread(rng, 12, 40), "angle_deg": _within(rng, 15, 45), "sharpest_mm": 60.0}
 
 
-def heights_mm(rng: np.random.Generator, shortest_mm: float, longest_mm: float) -> Floats:
-    """Heights (n, n) over a square, mm: a dome of radius 90 mm with six waves of any direction.
-
-    Args:
-        rng: generator of directions, lengths and phases.
-        shortest_mm, longest_mm: bounds of the wavelengths; curvature changes within a quarter of one.
-    """
-    x, y, waves = waves_mm(rng, shortest_mm, longest_mm)
-    # the six curvatures add up to their largest value nearly nowhere
-    return centred(1e-3 * MOST_CURVED_PER_M / 3.0 * waves - (x**2 + y**2) / (2.0 * 90.0))
-
-
 def _heights(shortest_mm: float, longest_mm: float) -> Callable[[np.random.Generator], dict[str, Any]]:
-    return lambda rng: {"heights": heights_mm(rng, shortest_mm, longest_mm), "sharpest_mm": 60.0}
+    """A dome of radius 90 mm with six waves of any direction, whose lengths have bounds."""
+
+    def keys(rng: np.random.Generator) -> dict[str, Any]:
+        x, y, waves = waves_mm(rng, shortest_mm, longest_mm)
+        # the six curvatures add up to their largest value nearly nowhere
+        heights = 1e-3 * MOST_CURVED_PER_M / 3.0 * waves - (x**2 + y**2) / (2.0 * 90.0)
+        return {"heights": centred(heights), "sharpest_mm": 60.0}
+
+    return keys
 
 
 _OBJECTS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,6 +17,7 @@ from matplotlib.figure import SubFigure
 
 from canprobe.cell.planning.traffic import LAST_LOOK
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
+from canprobe.cell.results.summary import percentiles
 from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
@@ -119,11 +119,8 @@ def _verdict(m: Measured) -> LinkVerdict:
     return judge_link(figures, LinkLimits())
 
 
-def _percentiles(name: str, values_ns: Any) -> dict[str, float | None]:
-    keys = [f"{name}_{what}_us" for what in ("p50", "p99", "p999", "max")]
-    if not len(values_ns):
-        return dict.fromkeys(keys)
-    return dict(zip(keys, (np.percentile(values_ns, (50, 99, 99.9, 100)) / 1e3).tolist(), strict=True))
+def _percentiles(name: str, values_ns: Times) -> dict[str, float | None]:
+    return {f"{name}_{what}_us": value for what, value in percentiles(values_ns).items()}
 
 
 def per_10000(times: CycleTimes) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import functools
+import math
 import os
 import re
 import shutil
@@ -158,7 +159,7 @@ def measure_scan(seconds: float) -> Measured:
 def measure_bare(seconds: float) -> Measured:
     """A loop that wakes at every deadline and does nothing: the machine's own lateness."""
     period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
-    with realtime(MASTER_PRIORITY, _unheard):
+    with realtime(MASTER_PRIORITY, lambda _: None):  # the first case has reported missing permissions
         deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
     times = CycleTimes(period_ns, np.array(lateness, np.int64), (deadlines[-1] - deadlines[0]) * 1e-9)
     return Measured("bare clock", "none", RATE_HZ, times)
@@ -199,14 +200,10 @@ def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:
     return replace(scene, arm=replace(scene.arm, missed_syncs=missed_syncs), limits=limits)
 
 
-def _unheard(_: str) -> None:
-    """Ignore reports of missing permissions: the first case has reported them."""
-
-
 class Hold(Controller):
-    """Hold the joints at their first position for some cycles."""
+    """Hold the joints at their first position, for some cycles or for ever."""
 
-    def __init__(self, cycles: int) -> None:
+    def __init__(self, cycles: float = math.inf) -> None:
         self._cycles = cycles
         self._q: Any = None
 

@@ -20,10 +20,8 @@ from typing import Any, NamedTuple
 
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.check import measure_link, options_of_check
 from canprobe.cell.session.session import Session
 from canprobe.errors import CanprobeError
@@ -137,8 +135,7 @@ def hold(session: Session, seconds: float) -> Held:
 def measure(seed: int) -> dict[str, Any]:
     """Check one set-up, and hold it for a minute."""
     setup = draw_setup(seed)
-    plan = make_plan(resolve(scene_of(setup)))
-    session = Session(plan, options_of_check())
+    session = Session(scene_of(setup), options_of_check())
     construct(session, setup, 0)
     try:
         report = measure_link(session, CHECK_S)
@@ -146,7 +143,7 @@ def measure(seed: int) -> dict[str, Any]:
         missed, late = sum(one.missed for one in report.figures.answers), report.figures.late_share()
     except CanprobeError:
         verdict, cause, missed, late = Fitness.UNFIT, "", 0, 0.0
-    session = Session(plan, RunOptions(rows_kept=100))
+    session = Session(session.plan, RunOptions(rows_kept=100))
     construct(session, setup, 1)
     held = hold(session, MINUTE_S)
     if held.ended or held.overruns > UNFIT_SHARE:
@@ -172,13 +169,13 @@ def measure(seed: int) -> dict[str, Any]:
 def measure_machine(case: RateCase) -> list[Row]:
     """Check a machine at one rate, and hold the cell at each rate."""
     machine = draw_machine(case.seed)
-    session = Session(_patient_plan(MACHINE_HZ), options_of_check())
+    session = Session(_patient_scene(MACHINE_HZ), options_of_check())
     construct(session, machine, 0)
     report = measure_link(session, CHECK_S)
     late = report.figures.late_share() * report.figures.cycles
     rows: list[Row] = []
     for rate_hz in RATES_HZ:
-        session = Session(_patient_plan(rate_hz), RunOptions(rows_kept=100))
+        session = Session(_patient_scene(rate_hz), RunOptions(rows_kept=100))
         construct(session, machine, rate_hz)
         predicted, held = report.verdict.overruns[float(rate_hz)], hold(session, case.minute_s)
         if held.ended:
@@ -190,9 +187,9 @@ def measure_machine(case: RateCase) -> list[Row]:
     return rows
 
 
-def _patient_plan(rate_hz: float) -> Plan:
+def _patient_scene(rate_hz: float) -> Scene:
     changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "scene.figures": False}
-    return make_plan(resolve(patient(on_any_bitrate(load_scene("free", changes), BITRATE))))
+    return patient(on_any_bitrate(load_scene("free", changes), BITRATE))
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

@@ -12,13 +12,13 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.picture import BLUE, GREEN, ORANGE, legend, parts, picture
@@ -30,7 +30,7 @@ from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.lab.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
+from canprobe.lab.studies.realtime_cases import PATIENCE, Hold, patient, served, with_real_nodes
 from canprobe.lab.studies.result import CHANNEL, Column, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
@@ -53,25 +53,23 @@ COLUMNS = (
 )
 
 
-class Soaker(Controller):
+class Soaker(Hold):
     """Holds the joints, and takes a sample periodically, with the memory of the processes beside it."""
 
     def __init__(self, session: Session, nodes_pid: int, monitor_pid: int, seconds: float) -> None:
+        super().__init__()
         self.samples: list[Row] = []
         self._session, self._nodes_pid, self._monitor_pid, self._seconds = session, nodes_pid, monitor_pid, seconds
         self._next_s = 0.0
-        self._q: Any = None
         self._first_packets = self._first_counted = 0
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
-        if self._q is None:
-            self._q = measurement.q
         t_s = measurement.t_ns * 1e-9
         if t_s >= self._next_s:
             self._next_s += self._seconds / SAMPLES
             self._look(t_s)
-        return Command(q_target=self._q, done=t_s >= self._seconds)
+        return replace(super().step(measurement), done=t_s >= self._seconds)
 
     def _look(self, t_s: float) -> None:
         cell = self._session.cell

@@ -13,18 +13,15 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import canprobe
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import MASTER_NODE_ID
 from canprobe.cell.results.picture import BLUE, picture
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import Port
@@ -75,13 +72,11 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def measure(seeds: Sequence[int]) -> list[dict[str, Any]]:
     """The runs of some seeds; a case that fails is shrunk."""
-    return [_one(seed) for seed in seeds]
-
-
-def _one(seed: int) -> dict[str, Any]:
-    case = draw_case(seed)
-    outcome = run_case(case)
-    return {**outcome, "shrunk": str(shrink(case, run_case)) if outcome["failures"] else ""}
+    runs = []
+    for case in map(draw_case, seeds):
+        outcome = run_case(case)
+        runs.append({**outcome, "shrunk": str(shrink(case, run_case)) if outcome["failures"] else ""})
+    return runs
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
@@ -103,19 +98,13 @@ def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 
 def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
-    sums: Counter[str] = Counter()
-    for run in runs:
-        sums.update({key: int(run[key]) for key in ("lost", "back", "refused", "rows_lost")})
-        sums["failures"] += bool(run["failures"])
-    most = {
-        key: max((run[key] for run in runs), default=0)
-        for key in ("jump_counts", "force_max_n", "force_calm_n", "late_s")
-    }
+    most = ("jump_counts", "force_max_n", "force_calm_n", "late_s")
     return {
         "work": name,
         "runs": len(runs),
-        **{key: sums[key] for key in ("lost", "back", "refused", "rows_lost", "failures")},
-        **most,
+        **{key: sum(int(run[key]) for run in runs) for key in ("lost", "back", "refused", "rows_lost")},
+        "failures": sum(bool(run["failures"]) for run in runs),
+        **{key: max((run[key] for run in runs), default=0) for key in most},
     }
 
 
@@ -201,7 +190,7 @@ class RecoverRun:
     def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path | None) -> None:
         self._case = case
         changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
-        plan = make_plan(resolve(load_scene(SCENES[case.work], changes)))
+        plan = canprobe.plan(SCENES[case.work], changes)
         self._score = RecoverScore(case, plan, say)
         self._session = session = Session(plan, RunOptions(out, self._say, recover=True))
         self._faulty = session.buses.world.make_faulty()

@@ -22,13 +22,12 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.fieldbus.tools.faults.control import request_faults
-from canprobe.lab.studies.faults_vcan import link
+from canprobe.lab.studies.faults_vcan import link, sleep
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
 from canprobe.lab.studies.recover_score import (
@@ -99,7 +98,7 @@ class ServedRun:
         now_s = self._now_s()
         for begin_s, end_s in [one for one in self._stalls if one[0] <= now_s]:
             self._stalls.remove((begin_s, end_s))
-            _sleep(end_s - now_s)
+            sleep(end_s - now_s)
         return now_s
 
     def _begin(self) -> None:
@@ -162,12 +161,7 @@ class FirstTargets:
 
 def _replug(after_s: float, lasts_s: float) -> None:
     """Take the interface down for a time."""
-    _sleep(after_s)
+    sleep(after_s)
     link("down")
-    _sleep(lasts_s)
+    sleep(lasts_s)
     link("up")
-
-
-def _sleep(seconds: float) -> None:
-    clock = MonotonicClock()
-    clock.sleep_until_ns(clock.now_ns() + round(seconds * 1e9))

@@ -16,9 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.scores import RUN_IN_M, curvature_tensor
-from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord
@@ -102,7 +100,10 @@ def measure(seed: int) -> ScoredScan:
     with TemporaryDirectory() as folder:
         drawn = random_scene(seed, Path(folder))
         try:
-            session, task = open_scan(drawn)
+            session = Session(drawn.scene)
+            if drawn.array is not None:
+                session.buses.world.plant.array = drawn.array
+            task: Any = make_task(session.plan)
         except PlanError as refusal:
             return as_scan(drawn, f"refused: {str(refusal).splitlines()[0]}", [], [])
         ended = ""
@@ -112,19 +113,6 @@ def measure(seed: int) -> ScoredScan:
         except SafetyStop as stop:
             ended = f"stopped: {stop.reason}"
     return as_scan(drawn, ended, *scores_of(session, task.shape.records))._replace(noticed=bool(task.remarks))
-
-
-def open_scan(drawn: DrawnScene) -> tuple[Session, Any]:
-    """The session of a scan, with the scene's own array in its plant, and its task.
-
-    Raises:
-        PlanError: the plan refuses the scene.
-    """
-    plan = make_plan(resolve(drawn.scene))
-    session = Session(plan)
-    if drawn.array is not None:
-        session.buses.world.plant.array = drawn.array
-    return session, make_task(plan)
 
 
 def as_scan(drawn: DrawnScene, ended: str, late: list[list[float]], behind: list[list[float]]) -> ScoredScan:
@@ -147,16 +135,11 @@ def scores_of(session: Session, records: list[ShapeRecord]) -> tuple[list[list[f
     if records:
         times, jumped = session.cell.log.arrays()["t_s"], behind_jump(session.buses.truth)
         for record in (r for r in records if r.travelled_m >= RUN_IN_M):
-            row = row_of(record, times)
+            row = int(np.searchsorted(times, record.t_s - 1e-6))  # of the truth at its last contact
             (behind if jumped[row] else late).append(
                 scored(record, session.buses.truth, row) if record.estimate.rank == 3 else []
             )
     return late, behind
-
-
-def row_of(record: ShapeRecord, times: Floats) -> int:
-    """Row of the truth at the last contact of an answer."""
-    return int(np.searchsorted(times, record.t_s - 1e-6))
 
 
 def scored(record: ShapeRecord, truth: Mapping[str, Floats], row: int) -> list[float]:

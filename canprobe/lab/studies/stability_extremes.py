@@ -36,27 +36,11 @@ from canprobe.fieldbus.protocol.frames import SYNC_ID
 from canprobe.lab.studies.random_scenes import CELLS
 from canprobe.lab.studies.region_scores import scores_of
 from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
-from canprobe.lab.studies.stability_runs import LateNode, refused_row, run_touch
+from canprobe.lab.studies.stability_runs import delay, refused_row, run_touch
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import inverse_near
 
-EXTREMES: Mapping[str, tuple[tuple[float, ...], str]] = {
-    "dead rows": ((1, 2, 4, 8), "{:g}"),
-    "bits of a count": ((4, 6), "{:g}"),
-    "K/h": (tuple(10.0**n for n in range(4, 13)), "{:.0e} N/m³"),
-    "servo": ((50, 100, 200, 500, 1000), "{:g} Hz"),
-    "drives": ((3, 10, 100, 300), "{:g} Hz"),
-    "radius": ((5, 12, 100, 1000, 10_000), "{:g} mm"),
-    "probe": ((1, 5, 10_000), "{:g} mm"),
-    "coarser encoders": ((10, 100), "{:g} ×"),
-    "speed": ((50, 100, 250), "{:g} mm/s"),
-    "reach": ((120, 135, 350, 358, 400), "{:g} mm"),
-    "joint 5": ((0, 3), "{:g} deg"),
-    "jitter of the period": ((5, 20, 50), "{:g} %"),
-}
-"""Thing → its values, and the form of one in words. `reach` is the distance of the touch from the first joint's axis:
-at 127 mm the shoulder is singular, at 360 mm the elbow; `joint 5` at 0 is the singular wrist."""
 SENSOR_HZ = {500.0: 250.0}
 """Rate of the tactile frames where 200 Hz does not divide the servo's."""
 HOLD_S, SCAN_S = 1.0, 2.0
@@ -101,7 +85,7 @@ def run_extremes(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Carry out all cases."""
     cases = [
         ExtremeCase(name, value, scan)
-        for name, (values, _) in (list(EXTREMES.items())[:1] if quick else EXTREMES.items())
+        for name, (values, *_) in (list(EXTREMES.items())[:1] if quick else EXTREMES.items())
         for value in (values[:1] if quick else values)
         for scan in (False, True)
         if scan or name != "speed"
@@ -118,7 +102,7 @@ def extreme_scene(case: ExtremeCase) -> Scene:
     scene = load_scene(name, {"task.duration_s": seconds, "task.clearance_mm": 0.5, "bus.timed": False})
     if scene.shape is not None:
         scene = replace(scene, shape=replace(scene.shape, also=()))
-    return CHANGES[case.extreme](scene, case.value) if case.extreme in CHANGES else scene
+    return EXTREMES[case.extreme][2](scene, case.value)
 
 
 def _with_plant(scene: Scene, **keys: Any) -> Scene:
@@ -219,20 +203,26 @@ def _with_coarser_encoders(scene: Scene, times: float) -> Scene:
     return replace(scene, joints=joints)
 
 
-CHANGES: Mapping[str, Callable[[Scene, float], Scene]] = {
-    "dead rows": _with_dead_rows,
-    "bits of a count": lambda scene, bits: _with_plant(scene, adc_bits=int(bits)),
-    "K/h": lambda scene, stiffness: _with_plant(scene, stiffness_n_m3=stiffness),
-    "servo": _with_rate,
-    "drives": lambda scene, bandwidth: _with_plant(scene, drive_bandwidth_hz=bandwidth),
-    "radius": _on_sphere,
-    "probe": _with_probe,
-    "coarser encoders": _with_coarser_encoders,
-    "speed": lambda scene, speed: replace(scene, task=replace(scene.task, speed_mm_s=speed)),
-    "reach": _at_reach,
-    "joint 5": _with_wrist,
-}
-"""Extreme thing → change of a scene to a value of it; jitter changes the bus."""
+EXTREMES: Mapping[str, tuple[tuple[float, ...], str, Callable[[Scene, float], Scene]]] = {
+    "dead rows": ((1, 2, 4, 8), "{:g}", _with_dead_rows),
+    "bits of a count": ((4, 6), "{:g}", lambda scene, bits: _with_plant(scene, adc_bits=int(bits))),
+    "K/h": (
+        tuple(10.0**n for n in range(4, 13)), "{:.0e} N/m³",
+        lambda scene, stiffness: _with_plant(scene, stiffness_n_m3=stiffness),
+    ),
+    "servo": ((50, 100, 200, 500, 1000), "{:g} Hz", _with_rate),
+    "drives": ((3, 10, 100, 300), "{:g} Hz", lambda scene, hz: _with_plant(scene, drive_bandwidth_hz=hz)),
+    "radius": ((5, 12, 100, 1000, 10_000), "{:g} mm", _on_sphere),
+    "probe": ((1, 5, 10_000), "{:g} mm", _with_probe),
+    "coarser encoders": ((10, 100), "{:g} ×", _with_coarser_encoders),
+    "speed": ((50, 100, 250), "{:g} mm/s", lambda scene, v: replace(scene, task=replace(scene.task, speed_mm_s=v))),
+    "reach": ((120, 135, 350, 358, 400), "{:g} mm", _at_reach),
+    "joint 5": ((0, 3), "{:g} deg", _with_wrist),
+    "jitter of the period": ((5, 20, 50), "{:g} %", lambda scene, _: scene),
+}  # fmt: skip
+"""Thing → its values, the form of one in words, and the change of a scene to one; jitter changes the bus. `reach` is
+the distance of the touch from the first joint's axis: at 127 mm the shoulder is singular, at 360 mm the elbow; `joint
+5` at 0 is the singular wrist."""
 
 
 def value_in_words(case: ExtremeCase) -> str:
@@ -254,8 +244,7 @@ def measure(case: ExtremeCase) -> Row:
     assert isinstance(task, TouchTask) and world.nodes
     if case.extreme == "jitter of the period":
         jitter_ns = 1e-2 * case.value * 1e9 / scene.cycle.rate_hz
-        shaken = [LateNode(node, {SYNC_ID}, partial(sync_delay_ns, jitter_ns)) for node in world.nodes]
-        world.participants[: len(shaken)] = shaken
+        delay(world, {SYNC_ID}, partial(sync_delay_ns, jitter_ns))
     found = row | run_touch(session, task, scene.task.force_n) | none
     scores = np.zeros((0, 5))
     if task.shape is not None:
@@ -334,10 +323,10 @@ def draw_extremes(rows: Sequence[Row], path: Path) -> None:
                 title=task,
                 xticks=[],
                 ylim=(len(names) - 0.35, -0.5),
-                xlim=(-0.6, max(len(v) for v, _ in EXTREMES.values()) - 0.4),
+                xlim=(-0.6, max(len(v) for v, *_ in EXTREMES.values()) - 0.4),
             )
             axes.grid(visible=False)
-        units = {name: form.partition(" ")[2] for name, (_, form) in EXTREMES.items()}
+        units = {name: form.partition(" ")[2] for name, (_, form, _) in EXTREMES.items()}
         panels[0].set_yticks(range(len(names)), [f"{n} ({units[n]})" if units[n] else n for n in names])
         legend(figure, end_marks(END_MARKS))
 

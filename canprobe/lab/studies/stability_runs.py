@@ -8,13 +8,13 @@ above the limit for longer than the stated reaction time and the retreat.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from canprobe.cell.master.supervision import Limits, limits_of
+from canprobe.cell.emulated.world import World
+from canprobe.cell.master.supervision import limits_of
 from canprobe.cell.plant.ideal_arm import natural_frequency
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import PlantSettings, Scene, ServoSettings
@@ -24,71 +24,12 @@ from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.errors import PlanError, SafetyStop
-from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.node.wrapped import WrappedNode
 from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault
 from canprobe.lab.studies.linear_loop import ForceLoop
 from canprobe.lab.studies.result import Row
 from canprobe.lab.studies.witnessed_run import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
-from canprobe.mechanics.touch.contact import Slope, indentation_from_force
-from canprobe.mechanics.touch.image.image_model import make_patch_calibration
-
-
-class LateNode(WrappedNode):
-    """Delays some frames to and from a node, as a bus or a gateway does, in their order; all others pass at once.
-
-    Args:
-        node: the node.
-        late_ids: COB-IDs that come late, both ways.
-        late_ns: delay of these frames, of the time at which each comes, ns.
-    """
-
-    def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: Callable[[int], int]) -> None:
-        super().__init__(node)
-        self._late_ids, self._late_ns = late_ids, late_ns
-        self._in: deque[tuple[int, Frame]] = deque()
-        self._out: deque[tuple[int, Frame]] = deque()
-
-    @property
-    def next_deadline_ns(self) -> int | None:
-        """Deadline of the node, or of the next late frame."""
-        due = [queue[0][0] for queue in (self._in, self._out) if queue]
-        own = self.node.next_deadline_ns
-        return min(due if own is None else [*due, own], default=None)
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        """Power on."""
-        return self._sent(self.node.start(t_ns), t_ns)
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """Take a frame from the bus, now or later."""
-        if can_id in self._late_ids:
-            self._in.append((t_ns + self._late_ns(t_ns), (can_id, data)))
-            return ()
-        return self._sent(self.node.receive(can_id, data, t_ns), t_ns)
-
-    def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Do what is due."""
-        ready: list[Frame] = []
-        while self._out and self._out[0][0] <= t_ns:
-            ready.append(self._out.popleft()[1])
-        while self._in and self._in[0][0] <= t_ns:
-            _, frame = self._in.popleft()
-            ready += self._sent(self.node.receive(*frame, t_ns), t_ns)
-        own = self.node.next_deadline_ns
-        if own is not None and own <= t_ns:
-            ready += self._sent(self.node.advance(t_ns), t_ns)
-        return ready
-
-    def _sent(self, frames: Sequence[Frame], t_ns: int) -> list[Frame]:
-        now: list[Frame] = []
-        for frame in frames:
-            if frame[0] in self._late_ids:
-                self._out.append((t_ns + self._late_ns(t_ns), frame))
-            else:
-                now.append(frame)
-        return now
-
+from canprobe.mechanics.touch import Slope, indentation_from_force, make_patch_calibration
 
 LOOK_NS = 1_250_000
 HUNTING_SPREAD = 0.2
@@ -181,6 +122,29 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     return kind(setup.arm.model, probe.T_flange_probe, patch, probe.radius, probe.stiffness)
 
 
+def delay(world: World, late_ids: Container[int], late_ns: Callable[[int], int]) -> None:
+    """Delay some frames to and from all nodes, as a bus or a gateway does, in their order.
+
+    Args:
+        world: the emulated nodes.
+        late_ids: COB-IDs that come late, both ways.
+        late_ns: delay of these frames, of the time at which each comes, ns.
+    """
+
+    class Late(Effect):
+        """Frames with some identifiers come later; all others pass at once."""
+
+        incoming = None
+
+        def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+            if frame[0] not in late_ids:
+                return None
+            self.host.later(frame, t_ns + late_ns(t_ns), incoming=self.fault.hears)
+            return ()
+
+    world.make_faulty(Fault(Late, node.node_id, incoming=way) for node in world.nodes for way in (True, False))
+
+
 FIGURES = ("force_max_n", "above_ms", "allowed_ms", "error_percent", "spread_percent")
 
 
@@ -200,8 +164,7 @@ def carry_out(case: LoopCase) -> Row:
         late_ids = {pdo.cob_id for pdo in session.plan.pdos if pdo.direction == "rpdo"}
         late_ids |= {pdo.cob_id for pdo in session.plan.pdos_of(session.scene.sensor.node_id, "tpdo")}
         delay_ns = round(case.late_ms * 1e6)
-        late = [LateNode(node, late_ids, lambda _: delay_ns) for node in world.nodes]
-        world.participants[: len(late)] = late
+        delay(world, late_ids, lambda _: delay_ns)
     return run_touch(session, task, FORCE_N, case.late_ms)
 
 
@@ -228,7 +191,10 @@ def run_touch(session: Session, task: TouchTask, force_n: float, late_ms: float 
     reason = str(error or "") if plain else f"{type(error).__name__}: {error}"
     force_error, spread = error_and_spread(session, task, force_n)
     forces = np.array([force for _, force in witness.rows])
-    above_ns, allowed_ns = longest_above(witness.rows, limits.safety.force_max), allowed_above(limits, late_ms)
+    above_ns = longest_above(witness.rows, limits.safety.force_max)
+    # the stated reaction, by the force or by an array that hides it, the delay on the bus both ways, and the retreat
+    late_ns = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
+    allowed_ns = max(reaction_ns("force", limits), reaction_ns("force_hidden", limits)) + late_ns + RELEASE_NS
     if not np.isfinite(forces).all():
         ended, reason = "failed", "the force is not finite"
     elif above_ns > allowed_ns:
@@ -248,12 +214,3 @@ def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple
     if not half.size:
         return None, None
     return 100.0 * float(np.sqrt(np.mean((half - 1.0) ** 2))), 100.0 * float(np.std(half))
-
-
-def allowed_above(limits: Limits, late_ms: float) -> int:
-    """Longest time that a force may be above the limit, ns.
-
-    The stated reaction, by the force or by an array that hides it, the delay on the bus both ways, and the retreat.
-    """
-    late = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
-    return max(reaction_ns("force", limits), reaction_ns("force_hidden", limits)) + late + RELEASE_NS

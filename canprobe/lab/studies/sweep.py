@@ -92,7 +92,7 @@ class Sweep:
     ) -> list[Any]:
         name, model = f"{measure.__module__}:{measure.__qualname__}", model_digest(parts)
         keys = [cell_key(name, [cell, machine] if machine else cell, model) for cell in cells]
-        todo = {key: cell for key, cell in zip(keys, cells, strict=True) if self._store.get(key) is None}
+        todo = {key: cell for key, cell in zip(keys, cells, strict=True) if key not in self._store.answers}
         total = len(set(keys))
         done = total - len(todo)
         if done:
@@ -101,13 +101,13 @@ class Sweep:
         def keep(key: str, answer: str) -> None:
             self._store.put(key, {"measure": name, "cell": todo[key], "model": model, "machine": machine}, answer)
             if self._progress is not None:
-                self._progress(total - len(todo.keys() - self._store.keys()), total)
+                self._progress(total - len(todo.keys() - self._store.answers.keys()), total)
 
         if todo:
             with self._executor() if machine is None else process_pool(1) as executor:
                 for batch in [todo] if machine is None else [{key: cell} for key, cell in todo.items()]:
                     _collect(executor, partial(_compute, measure, parts, model), batch, keep)
-        return [json.loads(self._store.get(key) or "null") for key in keys]
+        return [json.loads(self._store.answers[key]) for key in keys]
 
 
 @contextmanager

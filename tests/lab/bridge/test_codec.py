@@ -10,7 +10,7 @@ from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.observers import Observation
 from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
-from canprobe.lab.bridge.codec import pack_observation, unpack_observation
+from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
 from canprobe.lab.bridge.sampling import SampleSource
 
 WINDOW = TactileFrame(

@@ -1,5 +1,6 @@
 """The URDF of a cell's arm, read by Pinocchio and by our own reader, and held against the arm's own kinematics."""
 
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -7,10 +8,10 @@ import pinocchio
 import pytest
 
 import canprobe
-from canprobe.lab.bridge.description import axis_transforms, robot_description
-from canprobe.lab.bridge.frames import link_transforms
+from canprobe.lab.bridge.description import axis_transforms, link_transforms, robot_description
 from canprobe.mechanics.robot.urdf import from_urdf
 
+ARRAYS = Path(canprobe.__file__).parent / "arrays"
 MESH = """<visual><geometry><mesh filename="arm.stl" scale="2 2 2"/></geometry></visual>
           <visual><geometry><mesh filename="absent.stl"/></geometry></visual>"""
 
@@ -48,6 +49,14 @@ def test_an_arm_is_seen_and_ends_in_its_probe(plan, press_plan):
     assert len(ElementTree.fromstring(robot_description(plan)).findall("link/visual")) >= plan.setup.arm.model.n
     press = ElementTree.fromstring(robot_description(press_plan))
     assert float(press.find("link[@name='probe']/visual/geometry/sphere").get("radius")) == 0.04
+
+
+def test_a_flat_array_is_drawn_on_the_probe_of_its_scene():
+    changes = {"sensor.array": str(ARRAYS / "poweron6x6.toml"), "task.approach_mm_s": 3.0}
+    flat = canprobe.plan("press", changes)
+    assert flat.setup.array.pad.is_flat
+    link = ElementTree.fromstring(robot_description(flat)).find("link[@name='probe']")
+    assert float(link.find("visual/geometry/sphere").get("radius")) == 0.04
 
 
 def test_meshes_of_a_urdf_are_named_by_absolute_paths_where_they_are_found(tmp_path):

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.lab.bridge import pipe_queue as feed_module
-from canprobe.lab.bridge.pipe_queue import Feed, read_records
+from canprobe.lab.bridge import pipe as feed_module
+from canprobe.lab.bridge.pipe import Feed, read_records
 
 
 @pytest.fixture

@@ -25,8 +25,8 @@ import canprobe
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.lab.bridge.messages import TOPICS
 from canprobe.lab.bridge.process import END_TIMEOUT_S, BridgeProcess
-from canprobe.lab.bridge.topics import TOPICS
 
 PROTOCOL = "foxglove.sdk.v1"
 

@@ -20,9 +20,8 @@ from canprobe.cell.recorded.into_bridges import replay_into
 from canprobe.cli import main
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.eds.packaged import eds_path
-from canprobe.lab.bridge.messages import Encoder
+from canprobe.lab.bridge.messages import Encoder, Messages
 from canprobe.lab.bridge.sample import Sample
-from canprobe.lab.bridge.topics import Messages
 
 RADIUS = 0.036
 

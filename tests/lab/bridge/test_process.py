@@ -121,7 +121,7 @@ def test_one_that_cannot_begin_stops_the_run_before_anything_is_sent(tmp_path):
 
 def test_samples_count_what_was_dropped_before_them(plan):
     """What the viewer is shown of losses: the number travels with the next sample."""
-    from canprobe.lab.bridge.codec import pack_observation, unpack_observation
+    from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
     from canprobe.lab.bridge.sampling import SampleSource
 
     sample = SampleSource(plan).sample(unpack_observation(pack_observation(Observation(0, None, None, []), 17)))

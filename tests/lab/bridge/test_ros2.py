@@ -22,12 +22,21 @@ from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.tasks.requested import Request, RequestedTask
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.lab.bridge.codec import pack_observation, unpack_observation
 from canprobe.lab.bridge.commands import refuse, trajectory_of
 from canprobe.lab.bridge.dds_types import DdsTypes, dds_name
 from canprobe.lab.bridge.description import robot_description
-from canprobe.lab.bridge.interface import Context
-from canprobe.lab.bridge.messages import Encoder, encode_can_frame
+from canprobe.lab.bridge.messages import (
+    CLOCK,
+    JOINT_STATES,
+    ROBOT_DESCRIPTION,
+    TAXELS,
+    TF_STATIC,
+    TOPICS,
+    Encoder,
+    Messages,
+    encode_can_frame,
+)
+from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
 from canprobe.lab.bridge.process import BridgeProcess
 from canprobe.lab.bridge.ros2_dds import (
     EMPTY,
@@ -43,9 +52,8 @@ from canprobe.lab.bridge.ros2_dds import (
     Ros2Sink,
     domain_of,
 )
-from canprobe.lab.bridge.sample import Sample
+from canprobe.lab.bridge.sample import Context, Sample
 from canprobe.lab.bridge.sampling import SampleSource
-from canprobe.lab.bridge.topics import CLOCK, JOINT_STATES, ROBOT_DESCRIPTION, TAXELS, TF_STATIC, TOPICS, Messages
 
 DOMAIN = 90 + os.getpid() % 100  # of this test alone; 232 is the highest
 SINK_DOMAIN = DOMAIN - 90

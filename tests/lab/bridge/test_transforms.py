@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from puma_arm import MODELS
 from scipy.spatial.transform import Rotation
 
-from canprobe.lab.bridge.frames import flange_transform, link_transforms, quaternion_of
+from canprobe.lab.bridge.description import flange_transform, link_transforms, quaternion_of
 from canprobe.mechanics.robot.chain import forward
 
 

@@ -16,8 +16,7 @@ from canprobe.lab.bridge.view import array_dome as taxels
 from canprobe.lab.bridge.view import bodies as arm
 from canprobe.lab.bridge.view import colours, meshes
 from canprobe.lab.bridge.view import object_sheet as objects
-from canprobe.lab.bridge.view.path import deviation_scale
-from canprobe.lab.bridge.view.path_nodes import PathAhead
+from canprobe.lab.bridge.view.path import PathAhead, deviation_scale
 from canprobe.lab.bridge.view.surface import LIFT_M, GrowingSurface, drawn, map_of_points
 from canprobe.mechanics.robot.chain import forward, posture
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset

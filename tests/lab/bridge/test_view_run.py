@@ -17,12 +17,11 @@ import canprobe
 from canprobe.cell.results.result import write_page_of
 from canprobe.cell.scene.geometry import true_object
 from canprobe.errors import CanprobeError
-from canprobe.lab.bridge.codec import pack_observation, unpack_observation
+from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch
 from canprobe.lab.bridge.sampling import SampleSource
-from canprobe.lab.bridge.view.instants import SILENT_NS, Follower, Moment, judge
+from canprobe.lab.bridge.view.instants import SILENT_NS, Follower, Moment, curves_of, judge, kappa_sigmas, row_of
 from canprobe.lab.bridge.view.path import GAP_M, LIFT_M, Trail, deviation_scale
-from canprobe.lab.bridge.view.plots import curves_of, kappa_sigmas, row_of
 from canprobe.lab.bridge.view.recorded import read_run
 from canprobe.lab.bridge.view.replay import trail_of
 from canprobe.lab.bridge.view.stage import FORCE_HEAD_M, FORCE_M_PER_N

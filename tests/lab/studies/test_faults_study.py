@@ -21,7 +21,7 @@ from canprobe.lab.studies.fault_cases import (
     TASKS,
     FaultCase,
     WrongFile,
-    seeded_plan,
+    task_plan,
     wrong_files,
 )
 from canprobe.lab.studies.fault_runs import FaultRun, phase_windows, run_case, run_wrong_file
@@ -39,7 +39,7 @@ BEYOND = {"stuck-image", "replayed-image", "gain-lost", "brake-stuck"}
 def thrown(kind, node, phase, *, for_s=0.25, task="press", number=1, **values):
     """A run of a task with one fault from the beginning of a phase on."""
     fault = Fault(CELL_FAULTS[kind], node, phase_windows(task, "ideal")[phase][0], round(for_s * S), values, seed=7)
-    return FaultRun(seeded_plan(task, "ideal", number), (fault,))
+    return FaultRun(task_plan(task, "ideal").with_seed(number), (fault,))
 
 
 def test_a_number_is_the_same_run_again():
@@ -114,7 +114,7 @@ def test_the_score_sees_a_force_above_the_limit_and_when_a_fault_is_noticed(monk
 
 
 def test_a_fault_that_mattered_is_not_reported_as_completed():
-    run = FaultRun(seeded_plan("press", "ideal", 0))
+    run = FaultRun(task_plan("press", "ideal").with_seed(0))
     assert run.result()["failures"] == []
     highest = max(range(len(run.witness.rows)), key=lambda k: run.witness.rows[k][1])
     t_ns, force = run.witness.rows[highest]
@@ -131,12 +131,12 @@ def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
     monkeypatch.setattr("canprobe.cell.master.bringup.BringUp.release", lambda self: None)
     monkeypatch.setattr("canprobe.fieldbus.drive.self_stop.Supervision._lose", lambda self, code, t_ns: None)
     monkeypatch.setattr("canprobe.fieldbus.node.slave_node.SlaveNode._communication_error", lambda self, t_ns: None)
-    run = FaultRun(seeded_plan("press", "ideal", 0)).result()
+    run = FaultRun(task_plan("press", "ideal").with_seed(0)).result()
     assert any("OPERATION_ENABLED after the stop" in failure for failure in run["failures"])
 
 
 def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch, tmp_path):
-    plan = seeded_plan("press", "ideal", 0)
+    plan = task_plan("press", "ideal").with_seed(0)
     monkeypatch.setattr(witnessed_run, "LONGEST_S", 0.5)
     assert any(f.startswith("hang") for f in FaultRun(plan).result()["failures"])
     monkeypatch.undo()
@@ -177,7 +177,7 @@ def test_a_corrupted_target_is_not_followed():
     """Bit errors behind the CRC of a drive's controller: it refuses the target, and the cell stops."""
     start_ns = phase_windows("press", "ideal")["contact"][0]
     corrupt = Fault(CELL_FAULTS["corrupt"], 2, start_ns, S // 2, incoming=True, seed=3)
-    run = FaultRun(seeded_plan("press", "ideal", 2), (corrupt,)).result()
+    run = FaultRun(task_plan("press", "ideal").with_seed(2), (corrupt,)).result()
     assert run["outcome"] != "completed" and run["failures"] == [] and run["force_max_n"] < 5.0
 
 

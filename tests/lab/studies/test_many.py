@@ -230,7 +230,7 @@ def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
     monkeypatch.undo()
     assert [outcome["summary"]["seed"] for outcome in run().outcomes] == list(range(60))
     store = CellStore(tmp_path)
-    assert len(store.keys()) == 60 == kept.read_bytes().count(b"\n") - store.damaged  # no run twice
+    assert len(store.answers) == 60 == kept.read_bytes().count(b"\n") - store.damaged  # no run twice
     store.close()
 
 

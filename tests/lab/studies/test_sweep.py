@@ -200,8 +200,8 @@ def test_a_damaged_file_is_noticed_and_the_rest_kept(tmp_path, damage):
     store.path.write_bytes(damage(store.path.read_bytes()))
     store = CellStore(tmp_path)
     assert store.damaged == 1
-    wrong = [i for i in range(3) if store.get(f"key{i}") != str(i)]
-    assert all(store.get(f"key{i}") is None for i in wrong) and len(wrong) <= 1
+    wrong = [i for i in range(3) if store.answers.get(f"key{i}") != str(i)]
+    assert all(store.answers.get(f"key{i}") is None for i in wrong) and len(wrong) <= 1
     said = []
     here(store, said)
     assert "1 damaged lines left out" in said[0]
@@ -209,7 +209,7 @@ def test_a_damaged_file_is_noticed_and_the_rest_kept(tmp_path, damage):
         store.put(f"key{i}", {"cell": i}, as_json(i))
     store.close()
     store = CellStore(tmp_path)
-    assert [store.get(f"key{i}") for i in range(3)] == ["0", "1", "2"]
+    assert [store.answers.get(f"key{i}") for i in range(3)] == ["0", "1", "2"]
     store.close()
 
 
