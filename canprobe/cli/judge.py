@@ -109,14 +109,14 @@ def _judge_record(args: argparse.Namespace) -> int:
         if getattr(args, option):
             name = "COMMAND" if option == "command" else f"--{option}"
             raise UsageError(f"judge: {name} belongs to served nodes, not to --record")
-    from canprobe.fieldbus.tools.judge import judge_frames, nodes_of, read_record
+    from canprobe.fieldbus.tools.judge import Judge, nodes_of, read_record
 
     named = [name for _, name in args.channel or ()]
     if len(named) > 1:
         raise UsageError("judge: a log is judged for one channel: --channel CH")
     frames = read_record(args.record, named[0] if named else None)
     nodes = _descriptions(args, named[0] if named else None)
-    judge = judge_frames(frames, nodes, bitrate=args.bitrate or 1_000_000, without=args.without)
+    judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without).hear(frames)
     if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
         raise UsageError(_no_such_node(args, nodes, nodes_of(read_record(args.record, named[0] if named else None))))
     facts = {**_facts(args), "frames": str(judge.frame_count)}

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from math import inf
 from typing import Protocol
 
-from canprobe.fieldbus.drive.motor import MotorDynamics
-from canprobe.fieldbus.drive.profile import Profile, Rates, braking, trapezoid
+from canprobe.fieldbus.drive.profile import MotorDynamics, Profile, Rates, braking, trapezoid
 from canprobe.fieldbus.node.timers import Timers
 
 STEP_NS = 2_500_000

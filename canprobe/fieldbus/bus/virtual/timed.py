@@ -18,9 +18,7 @@ from typing import Literal
 
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ERR_BUS, ERR_FLAG, ERR_PROTOCOL
-from canprobe.fieldbus.bus.virtual.bit_errors import WireErrors
-from canprobe.fieldbus.bus.virtual.controllers import Controllers
-from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
+from canprobe.fieldbus.bus.virtual.controllers import Controllers, ErrorCounters, WireErrors
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, LockstepPort, Participant, arbitration_key
 from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
