@@ -57,6 +57,11 @@ class DescribedEntry:
     configured: Value | None
 
     @property
+    def place(self) -> tuple[int, int]:
+        """Index and sub-index."""
+        return self.index, self.subindex
+
+    @property
     def initial(self) -> Value | None:
         """Value at boot: ParameterValue, or else DefaultValue."""
         return self.default if self.configured is None else self.configured

@@ -19,11 +19,11 @@ from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.port import ControllerState, Port, nothing
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, describe_state, known_state
+from canprobe.fieldbus.protocol.cia402 import CONTROLWORD, POWERED_STATES, describe_state, known_state
 from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import CONTROLWORD, RPDOS, ExaminedDevice
+from canprobe.fieldbus.tools.conform.device import RPDOS, ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.hints import HINTS
@@ -168,7 +168,7 @@ class Examination:
             temporary=not settings.keep_snapshot,
         )
         permits.values, bench.noted = device.values, self.journal.note
-        permits.rpdo_ids = {c for pdo in device.pdos(RPDOS) if (c := device.cob_id(pdo)) is not None}
+        permits.rpdo_ids = set(device.valid_pdos(RPDOS))
         if (emcy_id := device.number(0x1014)) and not emcy_id >> 31:
             bench.emcy_id = emcy_id & 0x7FF
         self._boots = bench.boots

@@ -6,7 +6,7 @@ The error that is provoked is a SYNC of the wrong length (8240h), which a right 
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, is_no_error
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, NmtCommand
+from canprobe.fieldbus.protocol.frames import EMCY_BASE
 from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
@@ -23,20 +23,13 @@ _GENERIC, _COMMUNICATION = 0x01, 0x10
 def _provoke(bench: Bench) -> int:
     """Provoke 8240h; return when it came."""
     plain_sync(bench)
-    bench.nmt(NmtCommand.START)
-    bench.pass_time(0.01)
-    bench.sync()
-    bench.pass_time(bench.times.slack_s)
+    bench.start()
+    bench.sync_and_wait()
     bench.sync(1)
     try:
         return bench.emcy(SYNC_LENGTH_CODE, 1.5e-3 * _INHIBIT_MS)[1]
     except Deviation as error:
         raise PointNotApplicable("no EMCY could be provoked: a SYNC of the wrong length brings none") from error
-
-
-def _end(bench: Bench) -> None:
-    bench.sync()
-    bench.pass_time(bench.times.slack_s)
 
 
 @point(42, "history", "CiA 301, 1003h", "the newest error first: its code in the low 16 bits", needs="nmt sync")
@@ -46,7 +39,7 @@ def history(bench: Bench) -> None:
     before = bench.number(0x1003)
     _provoke(bench)
     count, newest = bench.number(0x1003), bench.number(0x1003, 1)
-    _end(bench)
+    bench.sync_and_wait()
     if count not in (before, before + 1) or not count:
         bench.deviates(f"1003h:00 is {count} after an error, it was {before}")
     if newest & 0xFFFF != SYNC_LENGTH_CODE:
@@ -97,7 +90,7 @@ def identifier(bench: Bench) -> None:
         if any(frame.data[:2] == code for can_id in others for frame in bench.taken(can_id)):
             bench.deviates(f"EMCY comes under another identifier than 1014h, {bench.emcy_id:03X}h")
         raise
-    _end(bench)
+    bench.sync_and_wait()
 
 
 @point(43, "inhibit time", "CiA 301, 1015h", "no two messages within the inhibit time", needs="nmt sync")
@@ -131,7 +124,7 @@ def error_register(bench: Bench) -> None:
     if not during & _GENERIC:
         bench.notes.append(f"1001h is {during:02X}h during an error: bit 0 is for any error")
     bench.emergencies.clear()
-    _end(bench)
+    bench.sync_and_wait()
     ended = any(is_no_error(emcy.code) for emcy, _ in bench.emergencies)
     if ended and (after := bench.number(0x1001)) != before:
         bench.deviates(f"1001h is {after:02X}h after the end of the error, it was {before:02X}h")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from canprobe.fieldbus.node.core import NO_RTR_FLAG
-from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.protocol.sdo import ABORT, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
@@ -14,10 +13,12 @@ from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import (
     changeable_pdo,
+    idle_pdo,
     map_entries,
     rpdo_of_dummies,
     switch_off,
     switch_on,
+    word_of,
 )
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
@@ -75,12 +76,10 @@ def count_while_valid(bench: Bench) -> None:
 @point(25, "mapping while counted", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
 def mapping_while_counted(bench: Bench) -> None:
     """An entry of a PDO out of use, whose count is not 0."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     first = bench.number(pdo + 0x200, 1)
-    request = pack_write(
-        pdo + 0x200, 1, (_IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD).to_bytes(4, "little")
-    )
+    other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
+    request = pack_write(pdo + 0x200, 1, other.to_bytes(4, "little"))
     bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), "an entry while the count is not 0")
 
 
@@ -99,8 +98,7 @@ def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.A
 @point(26, "mapping too long", MAPPING, accepted_text(accepted.MAPPING_LENGTH), needs="nmt")
 def mapping_too_long(bench: Bench) -> None:
     """More than eight bytes: the first entry of a TPDO again and again."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     word = bench.device.mapping(pdo)[0]
     places = sum(bench.device.has(pdo + 0x200, n) for n in range(1, 65))
     count = min(64 // max(word & 0xFF, 1) + 1, _LONG_ENTRIES)
@@ -115,8 +113,7 @@ def mapping_too_long(bench: Bench) -> None:
 @point(27, "absent object", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
 def map_absent(bench: Bench) -> None:
     """An object that the device does not have."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     _refused_at_last(bench, pdo, [_ABSENT_WORD], accepted.NOT_MAPPABLE, "mapping of an absent object")
 
 
@@ -142,8 +139,7 @@ def map_unmappable(bench: Bench) -> None:
             continue
         tried += 1
         switch_off(bench, pdo)
-        word = entry.index << 16 | entry.subindex << 8 | entry.bits
-        _refused_at_last(bench, pdo, [word], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
+        _refused_at_last(bench, pdo, [word_of(entry)], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
     if not tried:
         raise PointNotApplicable("no mapping can be changed, or the EDS lets everything be mapped")
 
@@ -178,8 +174,7 @@ def restricted_identifiers_of_pdos(bench: Bench) -> None:
     for area in (RPDOS, TPDOS):
         if not bench.device.pdos(area):
             continue
-        pdo = changeable_pdo(bench, area)
-        switch_off(bench, pdo)
+        pdo = idle_pdo(bench, area)
         for cob_id in _RESTRICTED:
             request = pack_write(pdo, 1, cob_id.to_bytes(4, "little"))
             bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
@@ -206,8 +201,7 @@ def dummies(bench: Bench) -> None:
     allowed = sorted(description.dummies & {0x0005, 0x0006, 0x0007})
     if not allowed:
         raise PointNotApplicable("the EDS allows no dummy")
-    pdo = changeable_pdo(bench, RPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, RPDOS, mapping=True)
     for data_type in allowed:
         map_entries(bench, pdo, [data_type << 16 | 8 << data_type - 5])
     rpdo_of_dummies(bench)
@@ -216,8 +210,7 @@ def dummies(bench: Bench) -> None:
 @point(38, "dummies in a TPDO", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
 def dummies_in_tpdo(bench: Bench) -> None:
     """A dummy entry in a TPDO."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     _refused_at_last(bench, pdo, [_DUMMY_WORD], accepted.NOT_MAPPABLE, "a dummy in a TPDO")
 
 
@@ -242,14 +235,13 @@ def mapped_entries(bench: Bench) -> None:
 @point(83, "heard lengths", MAPPING, "every TPDO that comes is as long as its mapping")
 def heard_lengths(bench: Bench) -> None:
     """Every TPDO that was heard before, and that comes in operational by SYNC, request, event timer or by itself."""
-    pdos = {cob_id: pdo for pdo in bench.device.pdos(TPDOS) if (cob_id := bench.device.cob_id(pdo)) is not None}
+    pdos = bench.device.valid_pdos(TPDOS)
     surroundings = bench.permits.surroundings
     heard = {cob_id: surroundings.lengths_of(cob_id) for cob_id in pdos}
     for cob_id in pdos:
         bench.taken(cob_id)
     if not surroundings.lacks("nmt"):
-        bench.nmt(NmtCommand.START)
-        bench.pass_time(0.01)
+        bench.start()
         _ask_for_tpdos(bench, pdos)
     longest_ms = min(max([bench.device.number(pdo, 5) for pdo in pdos.values()], default=0), _LONGEST_EVENT_MS)
     bench.pass_time(1.5e-3 * longest_ms + bench.times.silence_s)
@@ -285,9 +277,8 @@ def _ask_for_tpdos(bench: Bench, pdos: Mapping[int, int]) -> None:
 @point(84, "mapped anew", MAPPING, "out of use, 0, entries, count, in use: all writes are accepted", needs="nmt")
 def mapped_anew(bench: Bench) -> None:
     """The own mapping of a TPDO, in the order that the standard demands."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     words = bench.device.mapping(pdo)
-    switch_off(bench, pdo)
     map_entries(bench, pdo, words)
     switch_on(bench, pdo)
     if (found := [bench.number(pdo + 0x200, n) for n in range(1, len(words) + 1)]) != words:
@@ -307,4 +298,4 @@ def mappable(bench: Bench) -> None:
             continue
         switch_off(bench, pdo)
         for entry in entries.values():
-            map_entries(bench, pdo, [entry.index << 16 | entry.subindex << 8 | entry.bits])
+            map_entries(bench, pdo, [word_of(entry)])

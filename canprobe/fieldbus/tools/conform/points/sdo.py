@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
-from canprobe.fieldbus.protocol.frames import SDO_RX_BASE
 from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
@@ -35,8 +34,7 @@ def read_write_only(bench: Bench) -> None:
     if not entries:
         raise PointNotApplicable("the EDS describes no entry as wo")
     for entry in entries:
-        request = pack_read(entry.index, entry.subindex)
-        bench.must_refuse(request, accepted.WRITE_ONLY, f"read of {place_text(entry.index, entry.subindex)}")
+        bench.must_refuse(pack_read(*entry.place), accepted.WRITE_ONLY, f"read of {place_text(*entry.place)}")
 
 
 @point(12, "absent object", CODES, accepted_text(accepted.NO_OBJECT))
@@ -81,10 +79,9 @@ def too_short(bench: Bench) -> None:
 def _limited(bench: Bench) -> Iterator[tuple[DescribedEntry, int, bool]]:
     """Entries that may be written, with a value beyond a limit of the EDS and whether it is above."""
     for entry in bench.device.entries():
-        place = entry.index, entry.subindex
-        permitted = rule_of(entry.index) is WriteRule.CHANGED or bench.permits.written.permits(place)
+        permitted = rule_of(entry.index) is WriteRule.CHANGED or bench.permits.written.permits(entry.place)
         permitted = permitted and not is_object(entry.index, *MOTION_OBJECTS)
-        if not (permitted and entry.writable and entry.is_integer and place in bench.device.values):
+        if not (permitted and entry.writable and entry.is_integer and bench.device.has(*entry.place)):
             continue
         least = -(1 << entry.bits - 1) if entry.signed else 0
         for limit, beyond, above in ((entry.high, 1, True), (entry.low, -1, False)):
@@ -98,8 +95,8 @@ def limits(bench: Bench) -> None:
     found = False
     for entry, value, above in _limited(bench):
         found = True
-        request = pack_write(entry.index, entry.subindex, bench.packed(entry.index, entry.subindex, value))
-        what = f"{value} for {place_text(entry.index, entry.subindex)}"
+        request = pack_write(*entry.place, bench.packed(*entry.place, value))
+        what = f"{value} for {place_text(*entry.place)}"
         bench.must_refuse(request, accepted.ABOVE if above else accepted.BELOW, what)
     if not found:
         raise PointNotApplicable("no entry that may be written has a limit; --write names more")
@@ -138,4 +135,4 @@ def two_channels(bench: Bench) -> None:
     segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]
     if segment and segment != name[:7].ljust(7, b"\0"):
         bench.deviates("a segment of 1008h is wrong after a transfer on the other channel")
-    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(0x1008, 0, 0x08000000))
+    bench.send(bench.request_id, pack_abort(0x1008, 0, 0x08000000))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 
-from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_abort, pack_request
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import AbortSet, accepted_text
@@ -47,7 +46,7 @@ def _segment(value: bytes, toggle: int = 0, *, last: bool = True) -> bytes:
 
 def _abort(bench: Bench) -> None:
     """End the transfer from the client's side."""
-    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(_HEARTBEAT, 0, 0x08000000))
+    bench.send(bench.request_id, pack_abort(_HEARTBEAT, 0, 0x08000000))
 
 
 def _own_value(bench: Bench) -> bytes:
@@ -74,8 +73,7 @@ def toggle_up(bench: Bench) -> None:
 def server_timeout(bench: Bench) -> None:
     """A download that is not continued: an abort, if one comes, is the time-out, and the server is free afterwards."""
     _segmented_download(bench)
-    answer_id = SDO_TX_BASE + bench.node_id
-    frame = bench.next(answer_id, _SERVER_TIMEOUT_S)
+    frame = bench.next(bench.answer_id, _SERVER_TIMEOUT_S)
     if frame is not None:
         bench.check_abort(frame.data, accepted.TIMED_OUT, "a download that is not continued")
     else:
@@ -94,7 +92,7 @@ def no_transfer(bench: Bench) -> None:
 def client_abort(bench: Bench) -> None:
     """The client aborts a download."""
     _segmented_download(bench)
-    bench.taken(SDO_TX_BASE + bench.node_id)
+    bench.taken(bench.answer_id)
     _abort(bench)
     if not bench.is_silent():
         bench.deviates("the abort of the client is answered")
@@ -174,11 +172,11 @@ def _block_segments(bench: Bench, index: int) -> tuple[bytes, int, int]:
     answer = _block_answer(bench, pack_request(0xA4, index, 0, bytes((127, 0))))
     if answer[0] >> 5 != 6:
         bench.deviates(f"a block upload is answered with {answer.hex(' ')}")
-    bench.taken(SDO_TX_BASE + bench.node_id)
-    bench.send(SDO_RX_BASE + bench.node_id, b"\xa3" + bytes(7))
+    bench.taken(bench.answer_id)
+    bench.send(bench.request_id, b"\xa3" + bytes(7))
     value, number, last = b"", 0, False
     while not last and number < 127:
-        frame = bench.next(SDO_TX_BASE + bench.node_id, bench.times.sdo_s)
+        frame = bench.next(bench.answer_id, bench.times.sdo_s)
         number += 1
         if frame is None or len(frame.data) != 8 or frame.data[0] & 0x7F != number:
             bench.deviates(f"segment {number} of a block does not come, or has another number")
@@ -196,7 +194,7 @@ def block_upload(bench: Bench) -> None:
     if end[0] & 0xE3 != 0xC1:
         bench.deviates(f"the end of a block upload is {end.hex(' ')}")
     value = value[: len(value) - (end[0] >> 2 & 7)]
-    bench.send(SDO_RX_BASE + bench.node_id, b"\xa1" + bytes(7))
+    bench.send(bench.request_id, b"\xa1" + bytes(7))
     if value != wanted:
         bench.deviates(f"a block upload of {index:04X}h gives {value.hex()}, segments gave {wanted.hex()}")
     if with_crc and int.from_bytes(end[1:3], "little") != crc_hqx(value, 0):
@@ -219,9 +217,8 @@ def _block_download(bench: Bench, value: bytes, *, number: int = 1, crc: int | N
     answer = _block_answer(bench, pack_request(0xC6, _HEARTBEAT, 0, len(value).to_bytes(4, "little")))
     if answer[0] >> 5 != 5 or not 1 <= answer[4] <= 127:
         bench.deviates(f"a block download is answered with {answer.hex(' ')}")
-    request_id, answer_id = SDO_RX_BASE + bench.node_id, SDO_TX_BASE + bench.node_id
-    bench.send(request_id, bytes((0x80 | number,)) + value.ljust(7, b"\0"), segment=True)
-    frame = bench.next(answer_id, bench.times.sdo_s)
+    bench.send(bench.request_id, bytes((0x80 | number,)) + value.ljust(7, b"\0"), segment=True)
+    frame = bench.next(bench.answer_id, bench.times.sdo_s)
     if frame is None:
         bench.deviates("a block is not acknowledged")
     if frame.data[0] == ABORT or frame.data[1] != 1:
