@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import channel, seconds, whole, word
-from canprobe.cli.common_arguments import OPTIONS, add_verbosity
 from canprobe.cli.output import print_answer, print_json, print_table, say
-from canprobe.cli.parser import Parser
+from canprobe.cli.parser import OPTIONS, Parser
 from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
@@ -92,7 +91,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--full", action="store_true", help="print all points below the verdict")
     parser.add_argument("--list", action="store_true", help="list the points, and end")
     add_report_options(parser)
-    add_verbosity(parser)
+    parser.add_shared("-v")
 
 
 def run(args: argparse.Namespace) -> int:

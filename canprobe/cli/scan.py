@@ -14,9 +14,8 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.argument_types import channel, number_of_32_bits, seconds, whole
-from canprobe.cli.common_arguments import OPTIONS, add_options, add_scene, add_verbosity
 from canprobe.cli.output import print_answer, print_table
-from canprobe.cli.parser import Parser
+from canprobe.cli.parser import OPTIONS, Parser
 from canprobe.cli.target import loaded, real_target
 from canprobe.errors import UsageError
 
@@ -40,7 +39,7 @@ Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser, optional=True)
+    parser.add_shared("[SCENE]")
     parser.add_argument(
         "--bus",
         **OPTIONS["--bus"]
@@ -66,8 +65,7 @@ def add_arguments(parser: Parser) -> None:
         help="assign this id to the device with this serial number or VENDOR:PRODUCT:REVISION:SERIAL; may be repeated",
     )
     parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
-    add_options(parser, "--json")
-    add_verbosity(parser)
+    parser.add_shared("--json", "-v")
 
 
 def assignment(text: str) -> Assignment:

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.common_arguments import PATIENT_SYNCS
+from canprobe.cli.parser import PATIENT_SYNCS
 from canprobe.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
 
 
 def loaded(args: argparse.Namespace, more: Mapping[str, Any] | None = None) -> Scene:
-    """The scene of a command with `add_scene`, changed by --cell, --set, --realtime and more overrides."""
+    """The scene of a command with the argument SCENE, changed by --cell, --set, --realtime and more overrides."""
     from canprobe.cell.scene.load import load_scene
 
     overrides = {**dict(args.set), **(more or {})}
