@@ -113,6 +113,10 @@ class Bench(SdoClient):
         """Fail the point."""
         raise Deviation(text)
 
+    def does_not_apply(self, why: str) -> NoReturn:
+        """End the point, which cannot be examined on this device."""
+        raise PointNotApplicable(why)
+
     def nmt(self, command: int) -> int:
         """Send an NMT command to the device; return when. Raises PointNotApplicable where it cannot be followed."""
         if command == NmtCommand.START and self.kept_out:

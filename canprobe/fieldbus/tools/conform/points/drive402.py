@@ -21,7 +21,6 @@ from canprobe.fieldbus.protocol.cia402 import (
 from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
@@ -64,7 +63,7 @@ def _at_rest(bench: Bench, mode: int = 0) -> Iterator[None]:
     modes = _supported(bench)
     mode = mode or next((m for m in (OperationMode.PROFILE_POSITION, 8, 9, 10, 3, 7) if modes >> m - 1 & 1), 0)
     if not mode or (modes and not modes >> mode - 1 & 1):
-        raise PointNotApplicable(f"6502h does not list mode {mode}")
+        bench.does_not_apply(f"6502h does not list mode {mode}")
     _off(bench)
     bench.put(cia402.MODE, 0, mode, 1)
     bench.put(cia402.TARGET_POSITION, 0, bench.number(cia402.POSITION), 4)
@@ -86,7 +85,7 @@ def _off(bench: Bench) -> None:
     """Disable the voltage, and reset a fault that is there."""
     bench.put(cia402.CONTROLWORD, 0, 0, 2)
     if known_state(bench.number(cia402.STATUSWORD)) is DriveState.FAULT:
-        raise PointNotApplicable("the drive is in FAULT; reset it first")
+        bench.does_not_apply("the drive is in FAULT; reset it first")
     _reach(bench, DriveState.SWITCH_ON_DISABLED, "disable voltage")
 
 
@@ -116,7 +115,7 @@ def supported_modes(bench: Bench) -> None:
     """6502h beside the EDS, and the mode that 6061h shows."""
     entry = bench.device.described(cia402.SUPPORTED_MODES)
     if bench.device.description is not None and entry is None:
-        raise PointNotApplicable("the EDS describes no 6502h")
+        bench.does_not_apply("the EDS describes no 6502h")
     modes = bench.number(cia402.SUPPORTED_MODES)
     if entry is not None and isinstance(entry.default, int) and entry.default and entry.default != modes:
         bench.notes.append(f"6502h is {modes:08X}h, the EDS says {entry.default:08X}h")
@@ -210,7 +209,7 @@ def homing(bench: Bench) -> None:
     """Method 37 or 35, which takes the present position as home."""
     with _at_rest(bench, OperationMode.HOMING):
         if not any(bench.takes(cia402.HOMING_METHOD, 0, method) for method in _PRESENT_POSITION):
-            raise PointNotApplicable("the drive has no homing method that takes the present position")
+            bench.does_not_apply("the drive has no homing method that takes the present position")
         _go(bench, DriveState.OPERATION_ENABLED)
         bench.put(cia402.CONTROLWORD, 0, 0x1F, 2)
         until_ns = bench.now_ns + round(_REACH_S * 1e9)

@@ -9,7 +9,6 @@ from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE
 from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync
@@ -46,14 +45,14 @@ def history(bench: Bench) -> None:
         bench.deviates(f"1003h:01 is {newest:08X}h after EMCY 8240h")
 
 
-@point(42, "write to the history", "CiA 301, 1003h", accepted_text(accepted.VALUE))
+@point(42, "write to the history", "CiA 301, 1003h", accepted.VALUE)
 def write_to_history(bench: Bench) -> None:
     """1003h:00 takes nothing but 0."""
     bench.need((0x1003, 0))
     bench.must_refuse(pack_write(0x1003, 0, b"\1"), (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
 
 
-@point(42, "empty entry", "CiA 301, 1003h", accepted_text(accepted.NO_DATA) + ", or 06090011h")
+@point(42, "empty entry", "CiA 301, 1003h", accepted.text(accepted.NO_DATA) + ", or 06090011h")
 def empty_entry(bench: Bench) -> None:
     """The entry behind the last error."""
     bench.need((0x1003, 0), written=False)
@@ -79,7 +78,7 @@ def identifier(bench: Bench) -> None:
     if value & 0x7FF != 0x80 + bench.node_id:
         bench.notes.append(f"1014h is {value:08X}h, the default is {0x80 + bench.node_id:08X}h")
     if value >> 31:
-        raise PointNotApplicable("bit 31 of 1014h says that there is no EMCY")
+        bench.does_not_apply("bit 31 of 1014h says that there is no EMCY")
     others = [can_id for can_id in range(EMCY_BASE + 1, EMCY_BASE + 128) if can_id != bench.emcy_id]
     for can_id in others:
         bench.taken(can_id)

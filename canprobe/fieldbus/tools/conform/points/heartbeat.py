@@ -6,7 +6,6 @@ from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
 from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -57,7 +56,7 @@ def _need_guarding(bench: Bench) -> None:
     if bench.device.writable(0x1017):
         bench.put(0x1017, 0, 0)
     elif bench.device.number(0x1017):
-        raise PointNotApplicable("the heartbeat cannot be switched off, and excludes guarding")
+        bench.does_not_apply("the heartbeat cannot be switched off, and excludes guarding")
 
 
 @point(9, "guarding", "CiA 301, node guarding", "the state, with a bit that toggles, from 0 on", needs="nmt")
@@ -82,7 +81,7 @@ def life_guarding(bench: Bench) -> None:
     """Two requests, then none for the life time."""
     _need_guarding(bench)
     if bench.guarded() is None:
-        raise PointNotApplicable("the device does not answer guarding")
+        bench.does_not_apply("the device does not answer guarding")
     bench.put(0x100C, 0, _GUARD_MS)
     bench.put(0x100D, 0, _LIFE_FACTOR)
     bench.nmt(0x01)
@@ -138,7 +137,7 @@ def consumer(bench: Bench) -> None:
     bench.put(0x1016, 1, 0)
 
 
-@point(44, "duplicate consumer", "CiA 301, 1016h", accepted_text(accepted.DUPLICATE))
+@point(44, "duplicate consumer", "CiA 301, 1016h", accepted.DUPLICATE)
 def duplicate_consumer(bench: Bench) -> None:
     """Two entries for one producer."""
     bench.need((0x1016, 2))

@@ -19,7 +19,6 @@ from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
 from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("hostile")
@@ -84,7 +83,7 @@ def every_command(bench: Bench) -> None:
 def fd_frames(bench: Bench) -> None:
     """A request in a frame of twelve bytes, where the bus carries such frames."""
     if not bench.fd:
-        raise PointNotApplicable("the bus carries no CAN FD frames")
+        bench.does_not_apply("the bus carries no CAN FD frames")
     if not bench.ignores(bench.request_id, _READ_TYPE.ljust(_FD_BYTES, b"\0")):
         bench.deviates("an SDO request of twelve bytes is answered")
     bench.serves("CAN FD frames")

@@ -8,7 +8,7 @@ from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import QUEUED_NS, Bench
 from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
-from canprobe.fieldbus.tools.conform.outcome import NotPermitted, PointNotApplicable
+from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("nmt")
@@ -37,7 +37,7 @@ def power_on(bench: Bench) -> None:
     """The device announces itself when it gets its power, which a person switches."""
     before = bench.boots
     if not bench.by_hand(f"switch node {bench.node_id} off and on, then confirm"):
-        raise PointNotApplicable("it needs somebody who switches the device off and on")
+        bench.does_not_apply("it needs somebody who switches the device off and on")
     bench.pass_time(bench.times.boot_s)
     if bench.boots == before:
         bench.deviates("no boot-up message after the power came back")
@@ -142,7 +142,7 @@ def pdos_in_operational(bench: Bench) -> None:
     """SYNC and remote requests in pre-operational and stopped; frames that were queued before may still come."""
     tpdos = bench.device.valid_pdos(TPDOS)
     if not tpdos:
-        raise PointNotApplicable("the device has no valid TPDO")
+        bench.does_not_apply("the device has no valid TPDO")
     for state in (NmtState.PRE_OPERATIONAL, NmtState.STOPPED):
         bench.nmt(NmtCommand.START)
         changed_ns = bench.settle(state)

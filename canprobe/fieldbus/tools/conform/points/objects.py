@@ -7,10 +7,8 @@ from collections.abc import Iterator
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.protocol.sdo import ABORT, pack_read, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
@@ -50,7 +48,7 @@ def read_all(bench: Bench) -> None:
         bench.deviates(_named(wrong))
 
 
-@point(78, "write every ro", "CiA 306-1, AccessType", accepted_text(accepted.READ_ONLY), needs="eds")
+@point(78, "write every ro", "CiA 306-1, AccessType", accepted.READ_ONLY, needs="eds")
 def write_every_read_only(bench: Bench) -> None:
     """Every ro and const entry of the EDS gets its own value: 1000h is point 10, the application area needs --write."""
     tried = 0
@@ -64,10 +62,10 @@ def write_every_read_only(bench: Bench) -> None:
             what = f"write to {place_text(*entry.place)}"
             bench.must_refuse(pack_write(*entry.place, value), accepted.READ_ONLY, what)
     if not tried:
-        raise PointNotApplicable("the EDS describes no further entry as ro in the communication area")
+        bench.does_not_apply("the EDS describes no further entry as ro in the communication area")
 
 
-@point(79, "sub-index FFh", "CiA 301, structure of an object", "four bytes, or " + accepted_text(accepted.NO_ENTRY))
+@point(79, "sub-index FFh", "CiA 301, structure of an object", "four bytes, or " + accepted.text(accepted.NO_ENTRY))
 def structure(bench: Bench) -> None:
     """Sub-index FFh of the identity."""
     answer = bench.ask(pack_read(0x1018, 0xFF))
@@ -124,7 +122,7 @@ def sync_identifier(bench: Bench) -> None:
         bench.notes.append(f"SYNC has identifier {value & 0x7FF:03X}h")
 
 
-@point(87, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE))
+@point(87, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE)
 def restricted_identifiers(bench: Bench) -> None:
     """1005h, 1012h and 1014h with restricted identifiers; one that is accepted is put back."""
     found = False
@@ -136,7 +134,7 @@ def restricted_identifiers(bench: Bench) -> None:
             request = pack_write(index, 0, cob_id.to_bytes(4, "little"))
             bench.must_refuse(request, accepted.VALUE, f"{cob_id:03X}h for {index:04X}h")
     if not found:
-        raise PointNotApplicable("none of 1005h, 1012h and 1014h can be written")
+        bench.does_not_apply("none of 1005h, 1012h and 1014h can be written")
 
 
 @point(90, "identity", "CiA 306-1, DeviceInfo; CiA 301, 1018h", "the numbers of the EDS", needs="eds")

@@ -9,7 +9,6 @@ from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import TPDOS
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import (
     EVENT_TYPE,
     changeable_pdo,
@@ -89,7 +88,7 @@ def type_0(bench: Bench) -> None:
     quiet = syncs(bench, cob_id, [None, None])
     bench.put(*entry.place, bench.number(*entry.place) ^ 1)
     if (found := quiet + syncs(bench, cob_id, [None, None])) == [0, 0, 0, 0]:
-        raise PointNotApplicable(_NO_EVENT)
+        bench.does_not_apply(_NO_EVENT)
     if found != [0, 0, 1, 0]:
         bench.deviates(f"two SYNCs, an event and two SYNCs bring {found} TPDOs, expected [0, 0, 1, 0]")
 
@@ -104,7 +103,7 @@ def type_255(bench: Bench) -> None:
     if syncs(bench, cob_id, [None]) != [0]:
         bench.deviates("SYNC brings a TPDO of type 255")
     if at_once is None:
-        raise PointNotApplicable(_NO_EVENT)
+        bench.does_not_apply(_NO_EVENT)
 
 
 @point(30, "remote request", TRANSMISSION, "type 253 answers a remote request, and no SYNC", needs="nmt")
@@ -112,7 +111,7 @@ def remote_request(bench: Bench) -> None:
     """A remote request for a TPDO whose bit 30 permits it."""
     pdo = changeable_pdo(bench, TPDOS)
     if bench.device.number(pdo, 1) & NO_RTR_FLAG:
-        raise PointNotApplicable("bit 30 of the COB-ID permits no remote request")
+        bench.does_not_apply("bit 30 of the COB-ID permits no remote request")
     switch_off(bench, pdo)
     cob_id = put_to_work(bench, pdo, 253)
     bench.start()
@@ -194,7 +193,7 @@ def short_rpdo_applied(bench: Bench) -> None:
     """An entry that the user lets be written keeps its value."""
     entry = permitted_entry(bench, transmits=False)
     if entry.bits < 16:
-        raise PointNotApplicable("the entry has one byte only")
+        bench.does_not_apply("the entry has one byte only")
     cob_id = rpdo_of(bench, entry, EVENT_TYPE)
     bench.start()
     before = bench.number(*entry.place)
@@ -213,7 +212,7 @@ def long_rpdo(bench: Bench) -> None:
     cob_id = rpdo_of(bench, entry, EVENT_TYPE)
     bench.start()
     if entry.bits >= 64:
-        raise PointNotApplicable("the entry fills a whole frame")
+        bench.does_not_apply("the entry fills a whole frame")
     bench.asked.add(PDO_TOO_LONG_CODE)
     before = bench.number(*entry.place)
     _send_value(bench, cob_id, before ^ 1, entry.bits + 8)

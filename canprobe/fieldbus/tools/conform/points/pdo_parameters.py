@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.sdo import ABORT, pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
@@ -48,7 +47,7 @@ def _valid(bench: Bench, area: range, *, mapping: bool = False) -> int:
     return pdo
 
 
-@point(25, "mapping while valid", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
+@point(25, "mapping while valid", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
 def mapping_while_valid(bench: Bench) -> None:
     """An entry of a PDO in use gets another value, and its count 0."""
     pdo = _valid(bench, TPDOS, mapping=True)
@@ -64,7 +63,7 @@ def mapping_while_valid(bench: Bench) -> None:
     25,
     "count while valid",
     MAPPING,
-    "the count stays, or is refused with " + accepted_text(accepted.MAPPING_LOCKED),
+    "the count stays, or is refused with " + accepted.text(accepted.MAPPING_LOCKED),
     needs="nmt",
 )
 def count_while_valid(bench: Bench) -> None:
@@ -73,7 +72,7 @@ def count_while_valid(bench: Bench) -> None:
     bench.must_refuse(pack_write(pdo + 0x200, 0, b"\0"), accepted.MAPPING_LOCKED, "the count of a PDO in use")
 
 
-@point(25, "mapping while counted", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
+@point(25, "mapping while counted", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
 def mapping_while_counted(bench: Bench) -> None:
     """An entry of a PDO out of use, whose count is not 0."""
     pdo = idle_pdo(bench, TPDOS, mapping=True)
@@ -95,7 +94,7 @@ def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.A
     bench.deviates(f"{what}: all writes are accepted")
 
 
-@point(26, "mapping too long", MAPPING, accepted_text(accepted.MAPPING_LENGTH), needs="nmt")
+@point(26, "mapping too long", MAPPING, accepted.MAPPING_LENGTH, needs="nmt")
 def mapping_too_long(bench: Bench) -> None:
     """More than eight bytes: the first entry of a TPDO again and again."""
     pdo = idle_pdo(bench, TPDOS, mapping=True)
@@ -110,14 +109,14 @@ def mapping_too_long(bench: Bench) -> None:
         _refused_at_last(bench, pdo, [word] * count, accepted.MAPPING_LENGTH, f"{count} entries of {word & 0xFF} bits")
 
 
-@point(27, "absent object", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+@point(27, "absent object", MAPPING, accepted.NOT_MAPPABLE, needs="nmt")
 def map_absent(bench: Bench) -> None:
     """An object that the device does not have."""
     pdo = idle_pdo(bench, TPDOS, mapping=True)
     _refused_at_last(bench, pdo, [_ABSENT_WORD], accepted.NOT_MAPPABLE, "mapping of an absent object")
 
 
-@point(27, "not mappable", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt eds")
+@point(27, "not mappable", MAPPING, accepted.NOT_MAPPABLE, needs="nmt eds")
 def map_unmappable(bench: Bench) -> None:
     """An entry that the EDS does not let be mapped, in a TPDO; one that is ro, in an RPDO."""
     tried = 0
@@ -141,10 +140,10 @@ def map_unmappable(bench: Bench) -> None:
         switch_off(bench, pdo)
         _refused_at_last(bench, pdo, [word_of(entry)], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
     if not tried:
-        raise PointNotApplicable("no mapping can be changed, or the EDS lets everything be mapped")
+        bench.does_not_apply("no mapping can be changed, or the EDS lets everything be mapped")
 
 
-@point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted_text(accepted.PDO_LOCKED), needs="nmt")
+@point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
 def identifier_while_valid(bench: Bench) -> None:
     """Another identifier for a PDO in use."""
     for area in (RPDOS, TPDOS):
@@ -155,7 +154,7 @@ def identifier_while_valid(bench: Bench) -> None:
         bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
 
 
-@point(28, "times while valid", "CiA 301, 18xxh:03, :06", accepted_text(accepted.PDO_LOCKED), needs="nmt")
+@point(28, "times while valid", "CiA 301, 18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
 def times_while_valid(bench: Bench) -> None:
     """Inhibit time and SYNC start value of a TPDO in use."""
     pdo, tried = _valid(bench, TPDOS), 0
@@ -165,10 +164,10 @@ def times_while_valid(bench: Bench) -> None:
             value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
             bench.must_refuse(pack_write(pdo, subindex, value), accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
     if not tried:
-        raise PointNotApplicable("the TPDOs have neither inhibit time nor start value")
+        bench.does_not_apply("the TPDOs have neither inhibit time nor start value")
 
 
-@point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE), needs="nmt")
+@point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE, needs="nmt")
 def restricted_identifiers_of_pdos(bench: Bench) -> None:
     """Restricted identifiers for a PDO out of use."""
     for area in (RPDOS, TPDOS):
@@ -180,7 +179,7 @@ def restricted_identifiers_of_pdos(bench: Bench) -> None:
             bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
 
 
-@point(29, "reserved types", "CiA 301, transmission type", accepted_text(accepted.VALUE), needs="nmt")
+@point(29, "reserved types", "CiA 301, transmission type", accepted.VALUE, needs="nmt")
 def reserved_types(bench: Bench) -> None:
     """Reserved transmission types for a PDO out of use."""
     for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):
@@ -200,14 +199,14 @@ def dummies(bench: Bench) -> None:
     assert description is not None
     allowed = sorted(description.dummies & {0x0005, 0x0006, 0x0007})
     if not allowed:
-        raise PointNotApplicable("the EDS allows no dummy")
+        bench.does_not_apply("the EDS allows no dummy")
     pdo = idle_pdo(bench, RPDOS, mapping=True)
     for data_type in allowed:
         map_entries(bench, pdo, [data_type << 16 | 8 << data_type - 5])
     rpdo_of_dummies(bench)
 
 
-@point(38, "dummies in a TPDO", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+@point(38, "dummies in a TPDO", MAPPING, accepted.NOT_MAPPABLE, needs="nmt")
 def dummies_in_tpdo(bench: Bench) -> None:
     """A dummy entry in a TPDO."""
     pdo = idle_pdo(bench, TPDOS, mapping=True)
@@ -255,7 +254,7 @@ def heard_lengths(bench: Bench) -> None:
     if wrong:
         bench.deviates("; ".join(wrong))
     if not any(heard.values()):
-        raise PointNotApplicable("no TPDO is heard")
+        bench.does_not_apply("no TPDO is heard")
     if silent := [f"{cob_id:03X}h" for cob_id, lengths in heard.items() if not lengths]:
         bench.notes.append(f"not heard: TPDO {', '.join(silent)}")
 

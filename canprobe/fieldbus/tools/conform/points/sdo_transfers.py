@@ -9,9 +9,8 @@ from binascii import crc_hqx
 
 from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_abort, pack_request
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import AbortSet, accepted_text
+from canprobe.fieldbus.tools.conform.accepted import AbortSet
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("sdo")
@@ -37,7 +36,7 @@ def _segmented_upload(bench: Bench) -> None:
             if bench.request(0x40, index)[0] & 0xE2 != 0x40:
                 bench.deviates(f"{index:04X}h is longer than four bytes, and comes expedited")
             return
-    raise PointNotApplicable("the device has no text of more than four bytes")
+    bench.does_not_apply("the device has no text of more than four bytes")
 
 
 def _segment(value: bytes, toggle: int = 0, *, last: bool = True) -> bytes:
@@ -53,7 +52,7 @@ def _own_value(bench: Bench) -> bytes:
     return bench.device.values[_HEARTBEAT, 0]
 
 
-@point(18, "toggle of a download", SEGMENTS, accepted_text(accepted.TOGGLE))
+@point(18, "toggle of a download", SEGMENTS, accepted.TOGGLE)
 def toggle_down(bench: Bench) -> None:
     """The first segment has toggle bit 1."""
     _segmented_download(bench)
@@ -61,7 +60,7 @@ def toggle_down(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(18, "toggle of an upload", SEGMENTS, accepted_text(accepted.TOGGLE))
+@point(18, "toggle of an upload", SEGMENTS, accepted.TOGGLE)
 def toggle_up(bench: Bench) -> None:
     """The first request for a segment has toggle bit 1."""
     _segmented_upload(bench)
@@ -81,7 +80,7 @@ def server_timeout(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(20, "no transfer", SEGMENTS, accepted_text(accepted.UNKNOWN_COMMAND))
+@point(20, "no transfer", SEGMENTS, accepted.UNKNOWN_COMMAND)
 def no_transfer(bench: Bench) -> None:
     """Segments while no transfer is open."""
     for command, what in ((0x60, "a request for a segment"), (0x00, "a segment")):
@@ -100,7 +99,7 @@ def client_abort(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(22, "fewer than announced", SEGMENTS, accepted_text(accepted.TOO_SHORT))
+@point(22, "fewer than announced", SEGMENTS, accepted.TOO_SHORT)
 def fewer_than_announced(bench: Bench) -> None:
     """Two bytes are announced, one is sent."""
     _segmented_download(bench)
@@ -108,7 +107,7 @@ def fewer_than_announced(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(22, "more than announced", SEGMENTS, accepted_text(accepted.TOO_LONG))
+@point(22, "more than announced", SEGMENTS, accepted.TOO_LONG)
 def more_than_announced(bench: Bench) -> None:
     """Two bytes are announced, three are sent."""
     _segmented_download(bench)
@@ -156,7 +155,7 @@ def _block_answer(bench: Bench, request: bytes) -> bytes:
     """Begin a block transfer; where the device has none, the point does not apply."""
     answer = bench.ask(request)
     if answer[0] == ABORT and abort_code(answer) == _COMMAND_UNSUPPORTED:
-        raise PointNotApplicable("the device has no block transfer (05040001h)")
+        bench.does_not_apply("the device has no block transfer (05040001h)")
     return answer
 
 
@@ -202,7 +201,7 @@ def block_upload(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(23, "acknowledgement of 128", BLOCKS, accepted_text(accepted.SEQUENCE))
+@point(23, "acknowledgement of 128", BLOCKS, accepted.SEQUENCE)
 def acknowledgement_of_128(bench: Bench) -> None:
     """A block upload, of which more segments are acknowledged than a block can have."""
     index = _text_index(bench)
@@ -238,13 +237,13 @@ def block_download(bench: Bench) -> None:
         bench.deviates("1017h does not have the value of the block")
 
 
-@point(23, "CRC of a block", BLOCKS, accepted_text(accepted.CRC))
+@point(23, "CRC of a block", BLOCKS, accepted.CRC)
 def block_crc(bench: Bench) -> None:
     """A wrong CRC, where the device announces that it checks it."""
     answer = _block_answer(bench, pack_request(0xC6, _HEARTBEAT, 0, bytes((2, 0, 0, 0))))
     _abort(bench)
     if not answer[0] & 4:
-        raise PointNotApplicable("the device does not check a CRC")
+        bench.does_not_apply("the device does not check a CRC")
     value = b"\x10\x27"
     last = _block_download(bench, value, crc=crc_hqx(value, 0) ^ 0xFFFF)
     bench.check_abort(last, accepted.CRC, "a block with a wrong CRC")
@@ -272,13 +271,13 @@ def _refuses_block_size(bench: Bench, size: int, codes: AbortSet) -> None:
     bench.serves("the transfer")
 
 
-@point(23, "block of 0", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
+@point(23, "block of 0", BLOCKS, accepted.BLOCK_SIZE)
 def block_of_0(bench: Bench) -> None:
     """An upload in blocks of no segment."""
     _refuses_block_size(bench, 0, accepted.BLOCK_SIZE)
 
 
-@point(23, "block of 128", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
+@point(23, "block of 128", BLOCKS, accepted.BLOCK_SIZE)
 def block_of_128(bench: Bench) -> None:
     """An upload in blocks of more than 127 segments."""
     _refuses_block_size(bench, 128, accepted.BLOCK_SIZE)

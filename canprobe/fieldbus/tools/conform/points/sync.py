@@ -5,7 +5,6 @@ from __future__ import annotations
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
 from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync, synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -16,7 +15,7 @@ _PERIOD_US = 100_000
 _RESERVED = (1, 241, 248, 255)
 
 
-@point(39, "reserved overflow", "CiA 301, 1019h", accepted_text(accepted.VALUE))
+@point(39, "reserved overflow", "CiA 301, 1019h", accepted.VALUE)
 def reserved_overflow(bench: Bench) -> None:
     """1019h with 1 and with 241 to 255."""
     bench.need((0x1019, 0))
@@ -26,7 +25,7 @@ def reserved_overflow(bench: Bench) -> None:
         bench.must_refuse(pack_write(0x1019, 0, bytes((value,))), accepted.VALUE, f"{value} for 1019h")
 
 
-@point(39, "overflow while a period is set", "CiA 301, 1019h", accepted_text(accepted.SYNC_LOCKED), needs="sync")
+@point(39, "overflow while a period is set", "CiA 301, 1019h", accepted.SYNC_LOCKED, needs="sync")
 def overflow_while_period(bench: Bench) -> None:
     """1019h while 1006h is not 0, and again while it is."""
     bench.need((0x1019, 0), (0x1006, 0))
