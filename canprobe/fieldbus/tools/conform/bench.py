@@ -34,10 +34,10 @@ class Bench(SdoClient):
         device: the device.
         permits: gate for what is sent.
         times: how long is waited.
-        bitrate: bit rate of the bus, bit/s.
-        fd: whether the bus carries CAN FD frames.
 
     Attributes:
+        bitrate: bit rate of the bus, bit/s.
+        fd: whether the bus carries CAN FD frames.
         distributions: measured times by name, ms.
         first_answer: answer to the first read of 1000h, by which is seen that the device serves.
         by_hand: function that asks a person to do something, and returns whether it was done.
@@ -46,18 +46,9 @@ class Bench(SdoClient):
         kept_out: why the device cannot be brought to operational; empty: it can.
     """
 
-    def __init__(
-        self,
-        port: Port,
-        device: ExaminedDevice,
-        permits: Permits,
-        times: BenchTimes,
-        *,
-        bitrate: int = 1_000_000,
-        fd: bool = False,
-    ) -> None:
+    def __init__(self, port: Port, device: ExaminedDevice, permits: Permits, times: BenchTimes) -> None:
         super().__init__(port, device.node_id, permits, times)
-        self.device, self.bitrate, self.fd = device, bitrate, fd
+        self.device, self.bitrate, self.fd = device, 1_000_000, False
         self.notes = []
         self.asked: set[int] = set()
         self.standing: set[int] = set()

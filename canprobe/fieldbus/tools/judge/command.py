@@ -50,10 +50,9 @@ class MasterCommand:
         """Exit status, negative after a signal; None while it runs."""
         return self._process.poll()
 
-    def last_lines(self, count: int = 20) -> list[str]:
+    def last_lines(self) -> list[str]:
         """Last lines of its output."""
-        text = self.output.read_text(encoding="utf-8", errors="replace")
-        return text.splitlines()[-count:]
+        return self.output.read_text(encoding="utf-8", errors="replace").splitlines()[-20:]
 
     def press_on(self) -> bool:
         """End it: send the signals whose time has come since the first call. Whether it has ended."""
