@@ -346,11 +346,11 @@ class TimedBus(LockstepBus):
         self._stale = True
         return node
 
-    def _remove(self, owner: Participant) -> None:
-        for node in [node for node in self._nodes if node.owner is owner]:
+    def detach(self, participant: Participant) -> None:
+        for node in [node for node in self._nodes if node.owner is participant]:
             self._silence(node)
             self._controllers.remove(node)
             if self._flying is not None and self._flying[2] is node:
                 self._flying = None  # the node falls silent in the middle of a frame
-        super()._remove(owner)
+        super().detach(participant)
         self._stale = True

@@ -125,6 +125,10 @@ class SdoClient(FrameLink):
         self.pass_time(self.times.silence_s)
         return not self.taken(self.answer_id)
 
+    def abort(self, index: int) -> None:
+        """End a transfer of an entry from the client's side."""
+        self.send(self.request_id, sdo.pack_abort(index, 0, 0x08000000))
+
     def ignores(self, can_id: int, data: bytes = b"") -> bool:
         """Send a frame; whether no SDO answer comes."""
         self.taken(self.answer_id)

@@ -16,7 +16,7 @@ from canprobe.fieldbus.protocol.frames import (
     NmtState,
 )
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
-from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request
+from canprobe.fieldbus.protocol.sdo import pack_read, pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -73,7 +73,7 @@ def every_command(bench: Bench) -> None:
         frame = bench.next(bench.answer_id, _PACE_S)
         if frame is not None and len(frame.data) != 8:
             bench.deviates(f"command {command:02X}h is answered with {len(frame.data)} bytes")
-    bench.send(bench.request_id, pack_abort(0x1000, 0, 0x08000000))
+    bench.abort(0x1000)
     while not bench.is_silent():
         pass  # answers that come late
     bench.serves("all command bytes")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
-from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request, pack_write, place_text
+from canprobe.fieldbus.protocol.sdo import pack_read, pack_request, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
@@ -133,4 +133,4 @@ def two_channels(bench: Bench) -> None:
     segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]
     if segment and segment != name[:7].ljust(7, b"\0"):
         bench.deviates("a segment of 1008h is wrong after a transfer on the other channel")
-    bench.send(bench.request_id, pack_abort(0x1008, 0, 0x08000000))
+    bench.abort(0x1008)

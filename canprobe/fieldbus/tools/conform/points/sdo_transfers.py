@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 
-from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_abort, pack_request
+from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_request
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import AbortSet
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -41,11 +41,6 @@ def _segmented_upload(bench: Bench) -> None:
 
 def _segment(value: bytes, toggle: int = 0, *, last: bool = True) -> bytes:
     return bytes((toggle | (7 - len(value)) << 1 | last,)) + value.ljust(7, b"\0")
-
-
-def _abort(bench: Bench) -> None:
-    """End the transfer from the client's side."""
-    bench.send(bench.request_id, pack_abort(_HEARTBEAT, 0, 0x08000000))
 
 
 def _own_value(bench: Bench) -> bytes:
@@ -92,7 +87,7 @@ def client_abort(bench: Bench) -> None:
     """The client aborts a download."""
     _segmented_download(bench)
     bench.taken(bench.answer_id)
-    _abort(bench)
+    bench.abort(_HEARTBEAT)
     if not bench.is_silent():
         bench.deviates("the abort of the client is answered")
     bench.must_refuse(_segment(_own_value(bench)), accepted.UNKNOWN_COMMAND, "a segment after the abort")
@@ -132,7 +127,7 @@ def expedited(bench: Bench) -> None:
 def segmented_upload(bench: Bench) -> None:
     """A text in segments, twice the same."""
     _segmented_upload(bench)
-    _abort(bench)
+    bench.abort(_HEARTBEAT)
     for index in (0x1008, 0x1009, 0x100A):
         value = bench.device.values.get((index, 0), b"")
         if len(value) > 4 and bench.upload(index) != value:
@@ -241,7 +236,7 @@ def block_download(bench: Bench) -> None:
 def block_crc(bench: Bench) -> None:
     """A wrong CRC, where the device announces that it checks it."""
     answer = _block_answer(bench, pack_request(0xC6, _HEARTBEAT, 0, bytes((2, 0, 0, 0))))
-    _abort(bench)
+    bench.abort(_HEARTBEAT)
     if not answer[0] & 4:
         bench.does_not_apply("the device does not check a CRC")
     value = b"\x10\x27"
@@ -259,7 +254,7 @@ def block_sequence(bench: Bench) -> None:
     elif answer[0] & 0xE3 != 0xA2 or answer[1] != 0:
         bench.deviates(f"a block that begins with segment 2 is answered with {answer.hex(' ')}")
     else:
-        _abort(bench)
+        bench.abort(_HEARTBEAT)
     bench.serves("the transfer")
 
 
