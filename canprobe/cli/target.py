@@ -14,7 +14,7 @@ from canprobe.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from canprobe.cell.scene.model import Scene
     from canprobe.cell.session.target import Target
-    from canprobe.fieldbus.bus.real.configured import ConfiguredBus
+    from canprobe.fieldbus.bus.real.adapters import ConfiguredBus
 
 CONFIG = "config"
 """Value of --bus for the interface that python-can's configuration names."""
@@ -124,7 +124,7 @@ def real_target(
 
 
 def _configured(bus: str | None) -> ConfiguredBus | None:
-    from canprobe.fieldbus.bus.real.configured import configured_bus
+    from canprobe.fieldbus.bus.real.adapters import configured_bus
 
     found = configured_bus()
     if found is None and bus == CONFIG:

@@ -15,7 +15,6 @@ from canprobe.errors import ProtocolError
 
 # Statusword bit numbers (6041h) outside the state bits 0..3, 5, 6.
 VOLTAGE_ENABLED_BIT = 4
-WARNING_BIT = 7
 REMOTE_BIT = 9
 TARGET_REACHED_BIT = 10
 INTERNAL_LIMIT_BIT = 11

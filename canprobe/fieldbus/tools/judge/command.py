@@ -61,8 +61,7 @@ class MasterCommand:
         now_s = time.monotonic()
         self._ending_s = now_s if self._ending_s is None else self._ending_s
         while self._sent < len(_FORCES) and now_s - self._ending_s >= _FORCES[self._sent][0]:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, _FORCES[self._sent][1])
+            self._signal(_FORCES[self._sent][1])
             self._sent += 1
         return False
 
@@ -72,9 +71,9 @@ class MasterCommand:
             while not self.press_on():
                 time.sleep(0.02)
         finally:  # a second Ctrl-C leaves nothing behind, too
-            self._kill()
+            self._signal(signal.SIGKILL)
             self._file.close()
 
-    def _kill(self) -> None:
+    def _signal(self, number: int) -> None:
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+            os.killpg(self._process.pid, number)
