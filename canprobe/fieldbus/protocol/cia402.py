@@ -91,7 +91,7 @@ _C = DriveCommand
 INITIAL_STATE = _S.NOT_READY_TO_SWITCH_ON  # transition 0, at power on
 
 # (mask, pattern, command). With bit 7 clear every controlword matches exactly one line.
-_CONTROLWORD_PATTERNS: tuple[tuple[int, int, DriveCommand], ...] = (
+CONTROLWORD_PATTERNS: tuple[tuple[int, int, DriveCommand], ...] = (
     (0x82, 0x00, _C.DISABLE_VOLTAGE),
     (0x86, 0x02, _C.QUICK_STOP),
     (0x87, 0x06, _C.SHUTDOWN),
@@ -141,7 +141,7 @@ POWERED_STATES = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT
 _BIT_5_FREE = (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
 _STATES = {state.value: state for state in DriveState} | {state.value | 0x20: state for state in _BIT_5_FREE}
 _COMMANDS = {
-    word: command for mask, pattern, command in _CONTROLWORD_PATTERNS for word in range(0x100) if word & mask == pattern
+    word: command for mask, pattern, command in CONTROLWORD_PATTERNS for word in range(0x100) if word & mask == pattern
 }
 
 

@@ -7,7 +7,7 @@ from typing import NoReturn
 
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
-from canprobe.fieldbus.protocol.frames import NMT_ID, RTR_FLAG, SYNC_ID, NmtCommand, NmtState
+from canprobe.fieldbus.protocol.frames import NMT_GOALS, NMT_ID, RTR_FLAG, SYNC_ID, NmtCommand, NmtState
 from canprobe.fieldbus.protocol.sdo import place_text
 from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
@@ -17,11 +17,7 @@ from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
 
 HEARTBEAT_MS = 50
 """Period of the heartbeat by which points see the NMT state."""
-COMMANDS = {
-    NmtState.PRE_OPERATIONAL: NmtCommand.PRE_OPERATIONAL,
-    NmtState.OPERATIONAL: NmtCommand.START,
-    NmtState.STOPPED: NmtCommand.STOP,
-}
+COMMANDS: dict[NmtState, NmtCommand] = {NMT_GOALS[command]: command for command in tuple(NmtCommand)[:3]}
 QUEUED_NS = 5_000_000
 """Time in which frames may still come that were queued before a change of the state."""
 

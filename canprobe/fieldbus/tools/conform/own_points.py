@@ -40,13 +40,7 @@ FIRST_NUMBER = 201
 """Number of the first point of a file."""
 _KEYS = ("name", "clause", "expected", "hint", "needs", "steps")
 _NEEDS = ("eds", "nmt", "sync", "alone", "drive", "motion")
-_NMT = {
-    "start": NmtCommand.START,
-    "stop": NmtCommand.STOP,
-    "pre-operational": NmtCommand.PRE_OPERATIONAL,
-    "reset-node": NmtCommand.RESET_NODE,
-    "reset-communication": NmtCommand.RESET_COMMUNICATION,
-}
+_NMT = {command.name.lower().replace("_", "-"): command for command in NmtCommand}
 _MAX_BYTES = 1 << 20
 _DEFAULT_MS = 100.0
 _PLACE = re.compile(r"([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2})h?)?")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from canprobe.fieldbus.protocol import cia402
-from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, OperationMode, command_of
+from canprobe.fieldbus.protocol.cia402 import TRANSITIONS, DriveCommand, DriveState, OperationMode, command_of
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import ControlSeen, ModeSeen, StatusSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity, Watch
@@ -21,19 +21,10 @@ _STEPS_UP = (
     (DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION),
 )
 _STATES_FOR = {
-    DriveCommand.SWITCH_ON: frozenset(
-        {DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED}
-    ),
-    DriveCommand.ENABLE_OPERATION: frozenset(
-        {
-            DriveState.READY_TO_SWITCH_ON,  # the drive passes through switched on by itself
-            DriveState.SWITCHED_ON,
-            DriveState.OPERATION_ENABLED,
-            DriveState.QUICK_STOP_ACTIVE,
-        }
-    ),
+    step: {state for (source, command), goal in TRANSITIONS.items() if command is step for state in (source, goal)}
+    for step in (DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION)
 }
-"""States in which a step up may be commanded."""
+"""States in which a step up may be commanded: it leads on from them, or they are its goal."""
 
 
 def enables(event: ControlSeen) -> bool:

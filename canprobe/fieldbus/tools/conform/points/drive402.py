@@ -26,19 +26,10 @@ from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
 point = PointGroup("drive402")
 AUTOMATON = "CiA 402-2, finite state automaton"
-_WORDS = {
-    DriveCommand.SHUTDOWN: 0x06,
-    DriveCommand.SWITCH_ON: 0x07,
-    DriveCommand.ENABLE_OPERATION: 0x0F,
-    DriveCommand.DISABLE_VOLTAGE: 0x00,
-    DriveCommand.QUICK_STOP: 0x02,
-}
-_WAYS = {
-    DriveState.SWITCH_ON_DISABLED: (),
-    DriveState.READY_TO_SWITCH_ON: (DriveCommand.SHUTDOWN,),
-    DriveState.SWITCHED_ON: (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON),
-    DriveState.OPERATION_ENABLED: (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION),
-}
+_WORDS = {command: pattern for _, pattern, command in cia402.CONTROLWORD_PATTERNS}
+_WAY_UP = (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION)
+_STATES = tuple(DriveState)[1:5]
+"""States on the way up, from SWITCH_ON_DISABLED to OPERATION_ENABLED."""
 _REACH_S = 2.0
 _PRESENT_POSITION = (37, 35)
 """Homing methods that take the present position as home."""
@@ -91,7 +82,7 @@ def _off(bench: Bench) -> None:
 
 def _go(bench: Bench, state: DriveState) -> None:
     _off(bench)
-    for command in _WAYS[state]:
+    for command in _WAY_UP[: _STATES.index(state)]:
         _command(bench, command)
     _reach(bench, state, "on the way up")
 
@@ -149,7 +140,7 @@ def transitions(bench: Bench) -> None:
     """Every command that does something, in every state up to operation enabled; quick stop is point 51."""
     with _at_rest(bench):
         for (source, command), goal in TRANSITIONS.items():
-            if source not in _WAYS or command not in _WORDS or goal is DriveState.QUICK_STOP_ACTIVE:
+            if source not in _STATES or command not in _WORDS or goal is DriveState.QUICK_STOP_ACTIVE:
                 continue
             _go(bench, source)
             _command(bench, command)
