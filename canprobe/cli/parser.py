@@ -129,6 +129,13 @@ class Parser(argparse.ArgumentParser):
                 case _:
                     (to or self).add_argument(name, **OPTIONS[name])
 
+    def add_real_bus(self, more: str = "") -> None:
+        """Add --bus, --channel and --bitrate of a real bus without a scene; `more` names what else --bus may be."""
+        what = f"python-can interface{more} [that of CAN_INTERFACE or python-can's configuration files, else socketcan]"
+        self.add_argument("--bus", **OPTIONS["--bus"] | {"help": what})
+        self.add_argument("--channel", metavar="CH", type=word, help="channel of the interface [can0]")
+        self.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
+
     def add_eds_nodes(self, *, more: str = "") -> None:
         """Add --eds and --node-id, which stand in pairs; `more` ends the help of the latter."""
         what = "EDS or DCF file of a node; may be repeated, each with its --node-id"

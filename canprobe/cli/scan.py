@@ -13,9 +13,9 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.argument_types import channel, number_of_32_bits, seconds, whole
+from canprobe.cli.argument_types import number_of_32_bits, seconds, whole
 from canprobe.cli.output import print_answer, print_table
-from canprobe.cli.parser import OPTIONS, Parser
+from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, real_target
 from canprobe.errors import UsageError
 
@@ -40,15 +40,7 @@ Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("[SCENE]")
-    parser.add_argument(
-        "--bus",
-        **OPTIONS["--bus"]
-        | {"help": "python-can interface [that of CAN_INTERFACE or python-can's configuration files, else socketcan]"},
-    )
-    parser.add_argument(
-        "--channel", metavar="CH", type=channel, default=(None, None), help="channel of the interface [can0]"
-    )
-    parser.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
+    parser.add_real_bus()
     parser.add_argument(
         "--timeout",
         metavar="S",
@@ -87,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
     from canprobe import api
 
-    target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
+    target = real_target(args.bus, args.channel, args.bitrate, channel_else="can0")
     if not args.lss:
         nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
         print_answer(args, nodes, lambda: _print_nodes(nodes, target.channel))

@@ -8,13 +8,10 @@ from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import ControlSeen, ModeSeen, NmtSeen, RpdoSeen, StatusSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity, Watch
-from canprobe.fieldbus.tools.judge.seen_node import TARGETS, Known, SeenNode
+from canprobe.fieldbus.tools.judge.seen_node import TARGET_OF_MODE, TARGETS, Known, SeenNode
 
-_POSITION_MODES = (
-    OperationMode.PROFILE_POSITION,
-    OperationMode.INTERPOLATED_POSITION,
-    OperationMode.CYCLIC_SYNC_POSITION,
-)
+_PLACES = (cia402.TARGET_POSITION, cia402.INTERPOLATION_DATA)
+_POSITION_MODES = [mode for mode, target in TARGET_OF_MODE.items() if target in _PLACES]
 _CREEP_SHARE = 0.2
 """Share of the speed of a moving axis below which targets stand, as those that follow a noisy position."""
 _LOST_SHARE = 3.0
@@ -45,7 +42,7 @@ class Onward:
 
     def goes_on(self, event: TargetSeen) -> bool:
         """Take a target; whether a window that is over has at least 90 % of the way of the one before."""
-        found, cyclic = False, event.index in (cia402.TARGET_POSITION, cia402.INTERPOLATION_DATA)
+        found, cyclic = False, event.index in _PLACES
         while event.frame.t_ns >= self._begin_ns + self._window_ns:
             least = self._least if cyclic else 0.0
             before = self._before
