@@ -149,11 +149,10 @@ def _local_way() -> Iterator[tuple[str, list[str]] | None]:
 
 
 def _has_vcan() -> bool:
-    try:
+    with contextlib.suppress(InterfaceError):
         check_interface(CHANNEL)
-    except InterfaceError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _succeeds(command: Sequence[str]) -> bool:

@@ -47,14 +47,20 @@ def _valid(bench: Bench, area: range, *, mapping: bool = False) -> int:
     return pdo
 
 
+def _refused_entry(bench: Bench, pdo: int, what: str) -> int:
+    """Write another word to the first mapped entry, which must be refused; the word that is there."""
+    first = bench.number(pdo + 0x200, 1)
+    other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
+    request = pack_write(pdo + 0x200, 1, other.to_bytes(4, "little"))
+    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), what)
+    return first
+
+
 @point(25, "mapping while valid", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
 def mapping_while_valid(bench: Bench) -> None:
     """An entry of a PDO in use gets another value, and its count 0."""
     pdo = _valid(bench, TPDOS, mapping=True)
-    first = bench.number(pdo + 0x200, 1)
-    other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
-    request = pack_write(pdo + 0x200, 1, other.to_bytes(4, "little"))
-    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), "an entry of a PDO in use")
+    first = _refused_entry(bench, pdo, "an entry of a PDO in use")
     if bench.number(pdo + 0x200, 1) != first:
         bench.deviates("a mapping entry has changed although the write was refused")
 
@@ -75,11 +81,7 @@ def count_while_valid(bench: Bench) -> None:
 @point(25, "mapping while counted", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
 def mapping_while_counted(bench: Bench) -> None:
     """An entry of a PDO out of use, whose count is not 0."""
-    pdo = idle_pdo(bench, TPDOS, mapping=True)
-    first = bench.number(pdo + 0x200, 1)
-    other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
-    request = pack_write(pdo + 0x200, 1, other.to_bytes(4, "little"))
-    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), "an entry while the count is not 0")
+    _refused_entry(bench, idle_pdo(bench, TPDOS, mapping=True), "an entry while the count is not 0")
 
 
 def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.AbortSet, what: str) -> None:
@@ -185,9 +187,8 @@ def reserved_types(bench: Bench) -> None:
     for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):
         if not bench.device.pdos(area):
             continue
-        pdo = changeable_pdo(bench, area)
+        pdo = idle_pdo(bench, area)
         bench.need((pdo, 2))
-        switch_off(bench, pdo)
         for kind in _RESERVED_TYPES[what]:
             bench.must_refuse(pack_write(pdo, 2, bytes((kind,))), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
 
