@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from canprobe.cell.results.lockstep_cell import LockstepCell
     from canprobe.fieldbus.tools.emulated_bus import EmulatedBus, EmulatedNode
-    from canprobe.fieldbus.tools.faults.planned import PlannedFaults
+    from canprobe.fieldbus.tools.faults.injection import PlannedFaults
     from canprobe.fieldbus.tools.judged_bus import JudgedBus
 
 LOCKSTEP, VCAN = "lockstep", "vcan"
@@ -218,7 +218,7 @@ def canopen_network(emulated_bus: EmulatedBus) -> canopen.Network:
 @pytest.fixture
 def faults(request: pytest.FixtureRequest, canprobe_seed: int) -> Iterator[PlannedFaults]:
     """Throws faults at the emulated nodes of the test; those of markers are thrown when the nodes are powered on."""
-    from canprobe.fieldbus.tools.faults.planned import PlannedFaults
+    from canprobe.fieldbus.tools.faults.injection import PlannedFaults
 
     if "lockstep_cell" in request.fixturenames:
         from canprobe.cell.emulated.array_faults import CELL_FAULTS as KINDS

@@ -57,6 +57,11 @@ class DescribedEntry:
     configured: Value | None
 
     @property
+    def place(self) -> tuple[int, int]:
+        """Index and sub-index."""
+        return self.index, self.subindex
+
+    @property
     def initial(self) -> Value | None:
         """Value at boot: ParameterValue, or else DefaultValue."""
         return self.default if self.configured is None else self.configured
@@ -79,7 +84,7 @@ class DescribedEntry:
     @property
     def in_tpdo(self) -> bool:
         """Whether a TPDO may map it."""
-        return self.mappable and self.access not in {"wo", "rww"}
+        return self.index > LAST_DUMMY and self.mappable and self.access not in {"wo", "rww"}
 
     @property
     def in_rpdo(self) -> bool:
@@ -159,16 +164,6 @@ class Description:
     def bitrates(self) -> tuple[int, ...]:
         """Bit rates, bit/s; empty where the file lists none."""
         return tuple(sorted(self.od.device_information.allowed_baudrates))
-
-    @property
-    def simple_boot_up_master(self) -> bool:
-        """Whether the device can boot up others."""
-        return bool(self.od.device_information.simple_boot_up_master)
-
-    @property
-    def simple_boot_up_slave(self) -> bool:
-        """Whether NMT commands take the device through the boot-up."""
-        return bool(self.od.device_information.simple_boot_up_slave)
 
 
 def variable_at(od: ObjectDictionary, index: int, subindex: int) -> ODVariable | None:

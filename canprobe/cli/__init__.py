@@ -4,8 +4,8 @@
 A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`; its docstring is the description
 in its help. It imports everything besides argparse inside `run`, so that `canprobe --help` stays quick.
 
-Commands share `common_arguments` with their `argument_types`, `target` (scene and bus of a command), `output` (stdout),
-`interrupts`, `operator` (questions), `parser` and `completion`.
+Commands share the arguments of `parser`, `argument_types`, `target` (scene and bus of a command), `output` (stdout),
+`interrupts`, `operator` (questions) and `completion`.
 """
 
 from __future__ import annotations

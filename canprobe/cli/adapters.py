@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 
-from canprobe.cli.common_arguments import add_options
 from canprobe.cli.parser import Parser
 
 HELP = "list the CAN interfaces of this machine"
@@ -21,7 +20,7 @@ _READY = "nothing; for example --bus {} --channel {}"
 
 
 def add_arguments(parser: Parser) -> None:
-    add_options(parser, "--json")
+    parser.add_shared("--json")
 
 
 def run(args: argparse.Namespace) -> int:

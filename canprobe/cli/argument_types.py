@@ -46,6 +46,10 @@ def whole(low: int, high: int) -> Callable[[str], int]:
     return parse
 
 
+seed = whole(0, 2**63 - 1)
+"""An argument type: the seed of random numbers."""
+
+
 def node_id(text: str) -> int:
     """An argument type: a node id, or 255 for none."""
     return 255 if text == "255" else whole(1, 127)(text)

@@ -14,8 +14,7 @@ from collections.abc import Callable
 from datetime import date
 
 from canprobe.cell.session.terminal import StepReport
-from canprobe.cli.argument_types import folder_path, positive, word
-from canprobe.cli.common_arguments import BUS, add_options, add_verbosity, seed
+from canprobe.cli.argument_types import folder_path, positive, seed, word
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import target_of
@@ -58,13 +57,12 @@ def add_arguments(parser: Parser) -> None:
         help="with --make: standard deviation of the force from array to array, by its data sheet [5]",
     )  # fmt: skip
     parser.add_argument("--yes", action="store_true", help="do not ask for objects; for an emulated cell only")
-    add_options(parser, *BUS)
+    parser.add_shared("BUS")
     parser.add_argument("--seed", metavar="N", type=seed, default=0, help="seed of the emulation [0]")
     parser.add_argument(
         "--out", metavar="DIR", type=folder_path, help="folder of the files [runs/calibrate-array-<cell>-<time>]"
     )
-    add_options(parser, "--force", "--json")
-    add_verbosity(parser)
+    parser.add_shared("--force", "--json", "-v")
 
 
 def run(args: argparse.Namespace) -> int:

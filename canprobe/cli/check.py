@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 
 from canprobe.cli.argument_types import seconds
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import scene_of
 
@@ -25,11 +24,9 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
-    add_options(parser, *BUS, "--realtime", "--patient")
+    parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
     parser.add_argument("--seconds", metavar="S", type=seconds, default=10.0, help="length of the measurement [10]")
-    add_options(parser, "--json")
-    add_verbosity(parser)
+    parser.add_shared("--json", "-v")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -18,8 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.argument_types import channel, seconds, whole, word
-from canprobe.cli.common_arguments import OPTIONS, add_verbosity
+from canprobe.cli.argument_types import seconds, whole, word
 from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
@@ -55,13 +54,7 @@ _REAL_SLACK_S = 0.05
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("--node", metavar="N", type=whole(1, 127), help="node id of the device")
     parser.add_argument("--eds", metavar="FILE", type=word, help="EDS or DCF file of the device, or a packaged name")
-    parser.add_argument(
-        "--bus",
-        **OPTIONS["--bus"]
-        | {"help": "python-can interface, or lockstep [that of python-can's configuration, else socketcan]"},
-    )
-    parser.add_argument("--channel", metavar="CH", type=channel, default=(None, None), help="channel [can0]")
-    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(50_000, 1_000_000), help="bit rate [1000000]")
+    parser.add_real_bus(", or lockstep")
     parser.add_argument(
         "--data-bitrate",
         metavar="BIT/S",
@@ -92,7 +85,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--full", action="store_true", help="print all points below the verdict")
     parser.add_argument("--list", action="store_true", help="list the points, and end")
     add_report_options(parser)
-    add_verbosity(parser)
+    parser.add_shared("-v")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -200,7 +193,7 @@ def _port(args: argparse.Namespace) -> Iterator[Port]:
             from canprobe.cell.session.target import refuse_virtual
 
             refuse_virtual(args.bus, "conform")
-            target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
+            target = real_target(args.bus, args.channel, args.bitrate, channel_else="can0")
             port = stack.enter_context(open_bus(target, args.report.say, args.data_bitrate))
         if args.log is not None:
             writer = stack.enter_context(CandumpWriter(args.log, port.channel, port.clock.now_ns()))

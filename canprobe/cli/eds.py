@@ -6,7 +6,6 @@ import argparse
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import whole
-from canprobe.cli.common_arguments import add_options
 from canprobe.cli.output import print_answer
 from canprobe.cli.parser import Parser
 
@@ -41,7 +40,7 @@ def add_arguments(parser: Parser) -> None:
         description="List the packaged EDS files.",
         epilog="examples:\n  canprobe eds list\n  canprobe eds list --json\n",
     )
-    add_options(listing, "--json")
+    listing.add_shared("--json")
     listing.set_defaults(run=run, action="list")
     path = actions.add_parser(
         "path",
@@ -61,7 +60,7 @@ def add_arguments(parser: Parser) -> None:
     check.add_argument(
         "--node-id", metavar="N", type=whole(1, 127), help="node id that replaces $NODEID [that of the DCF, or 1]"
     )
-    add_options(check, "--json")
+    check.add_shared("--json")
     check.set_defaults(run=run_check)
 
 

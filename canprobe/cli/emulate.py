@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import node_ids, number_of_32_bits, whole
-from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_inject, add_options, add_scene, add_verbosity
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, real_target, target_of
@@ -41,9 +40,8 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser, optional=True)
-    add_options(parser, *BUS, "--realtime", "--seed")
-    add_eds_nodes(parser, more="; 255: no id, the node waits for LSS")
+    parser.add_shared("[SCENE]", "BUS", "--realtime", "--seed")
+    parser.add_eds_nodes(more="; 255: no id, the node waits for LSS")
     parser.add_argument(
         "--serial",
         metavar="N",
@@ -72,10 +70,10 @@ def add_arguments(parser: Parser) -> None:
         type=Path,
         help="folder that keeps what a master stores by 1010h or LSS [nothing is kept]",
     )
-    add_inject(parser, "throw a fault, as 'node 3: mute at 5 s'")
+    parser.add_inject("throw a fault, as 'node 3: mute at 5 s'")
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times
-    add_verbosity(parser)
+    parser.add_shared("-v")
 
 
 def run(args: argparse.Namespace) -> int:

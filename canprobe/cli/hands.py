@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from canprobe.cli.common_arguments import BUS, add_options, add_verbosity
 from canprobe.cli.parser import Parser
 from canprobe.cli.stdin import LOOK_S, need_terminal
 from canprobe.cli.target import scene_of
@@ -22,9 +21,9 @@ ROWS = 4000
 
 def add_arguments_of_hands(parser: Parser) -> None:
     """Add the options of a command that moves an arm."""
-    add_options(parser, *BUS, "--realtime", "--patient")
+    parser.add_shared("BUS", "--realtime", "--patient")
     parser.add_argument("--yes", action="store_true", help="do not ask before the motion")
-    add_verbosity(parser)
+    parser.add_shared("-v")
     parser.set_defaults(asking=parser.prog.removeprefix("canprobe "))
 
 

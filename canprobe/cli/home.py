@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 
 from canprobe.cli.argument_types import whole
-from canprobe.cli.common_arguments import add_scene
 from canprobe.cli.hands import add_arguments_of_hands
 from canprobe.cli.parser import Parser
 from canprobe.cli.stdin import need_terminal
@@ -23,7 +22,7 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
+    parser.add_shared("SCENE")
     parser.add_argument(
         "joints", metavar="JOINT", nargs="*", type=whole(1, 99), help="numbers of joints, from 1 [all that are homed]"
     )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 
 from canprobe.cli.argument_types import word
-from canprobe.cli.common_arguments import add_options, add_verbosity
 from canprobe.cli.output import print_answer, print_table
 from canprobe.cli.parser import Parser
 from canprobe.errors import UsageError
@@ -30,8 +29,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--list", action="store_true", help="list the kinds of faults, and end")
     parser.add_argument("--clear", action="store_true", help="end the faults that hold, before others are thrown")
     parser.add_argument("--channel", metavar="CH", type=word, default="vcan0", help="channel of the nodes [vcan0]")
-    add_options(parser, "--json")
-    add_verbosity(parser)
+    parser.add_shared("--json", "-v")
 
 
 def run(args: argparse.Namespace) -> int:

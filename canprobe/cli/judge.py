@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import seconds
-from canprobe.cli.common_arguments import BUS, add_eds_nodes, add_inject, add_options, add_scene, add_verbosity
 from canprobe.cli.emulate import eds_files, scene_target
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_answer, print_json, print_table, say
@@ -54,14 +53,13 @@ _SHOWN_FRAMES = 6
 def add_arguments(parser: Parser) -> None:
     parser.takes_command = True
     parser.usage = "canprobe judge [SCENE | --eds FILE --node-id N ...] [--record FILE] [options] [-- COMMAND...]"
-    add_scene(parser, optional=True)
-    add_options(parser, *BUS)
-    add_eds_nodes(parser)
+    parser.add_shared("[SCENE]", "BUS")
+    parser.add_eds_nodes()
     parser.add_argument("--record", metavar="FILE", type=Path, help="judge a log, and serve nothing")
     parser.add_argument(
         "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"
     )
-    add_inject(parser, "throw this fault in the place of the sequence")
+    parser.add_inject("throw this fault in the place of the sequence")
     parser.add_argument("--passive", action="store_true", help="throw no faults")
     parser.add_argument(
         "--without",
@@ -74,7 +72,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--log", metavar="FILE", type=Path, help="write the frames as a candump log")
     parser.add_argument("--list", action="store_true", help="list the rules, and end")
     add_report_options(parser)
-    add_verbosity(parser)
+    parser.add_shared("-v")
 
 
 def rule_numbers(text: str) -> tuple[int, ...]:
@@ -109,14 +107,14 @@ def _judge_record(args: argparse.Namespace) -> int:
         if getattr(args, option):
             name = "COMMAND" if option == "command" else f"--{option}"
             raise UsageError(f"judge: {name} belongs to served nodes, not to --record")
-    from canprobe.fieldbus.tools.judge import judge_frames, nodes_of, read_record
+    from canprobe.fieldbus.tools.judge import Judge, nodes_of, read_record
 
     named = [name for _, name in args.channel or ()]
     if len(named) > 1:
         raise UsageError("judge: a log is judged for one channel: --channel CH")
     frames = read_record(args.record, named[0] if named else None)
     nodes = _descriptions(args, named[0] if named else None)
-    judge = judge_frames(frames, nodes, bitrate=args.bitrate or 1_000_000, without=args.without)
+    judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without).hear(frames)
     if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
         raise UsageError(_no_such_node(args, nodes, nodes_of(read_record(args.record, named[0] if named else None))))
     facts = {**_facts(args), "frames": str(judge.frame_count)}

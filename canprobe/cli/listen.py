@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.argument_types import seconds
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.hands import opened
 from canprobe.cli.parser import Parser
 from canprobe.errors import UsageError
@@ -35,12 +34,11 @@ _CLEAR = "\x1b[H\x1b[J"
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
-    add_options(parser, *BUS, "--realtime", "--patient")
+    parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
     parser.add_argument("--duration", metavar="S", type=seconds, default=10.0, help="end after S seconds [10]")
     parser.add_argument("--every", metavar="S", type=seconds, default=0.1, help="time between two images [0.1]")
     parser.add_argument("--json", action="store_true", help="print one JSON document a line")
-    add_verbosity(parser)
+    parser.add_shared("-v")
 
 
 def array_only(scene: Scene) -> Scene:

@@ -9,7 +9,6 @@ import argparse
 import sys
 
 from canprobe.cli.argument_types import seconds
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, target_of
@@ -25,13 +24,11 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
-    add_options(parser, *BUS)
+    parser.add_shared("SCENE", "BUS")
     parser.add_argument(
         "--duration", metavar="S", type=seconds, help="end after S seconds [at Ctrl-C on a terminal, else 1]"
     )
-    add_options(parser, "--json")
-    add_verbosity(parser)
+    parser.add_shared("--json", "-v")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,7 +12,6 @@ import math
 import re
 from typing import TYPE_CHECKING
 
-from canprobe.cli.common_arguments import add_scene
 from canprobe.cli.hands import add_arguments_of_hands, agreed, opened
 from canprobe.cli.parser import Parser
 from canprobe.cli.stdin import InputOpen
@@ -37,7 +36,7 @@ _WAY = re.compile(r"([+-]?\d+(?:\.\d*)?)(deg|mm)?")
 
 def add_arguments(parser: Parser) -> None:
     parser.takes_ways, parser.late = True, "to"
-    add_scene(parser)
+    parser.add_shared("SCENE")
     parser.add_argument(
         "to",
         metavar="TO",

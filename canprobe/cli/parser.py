@@ -1,15 +1,75 @@
-"""argparse for the commands: one clear line for a wrong command line."""
+"""argparse for the commands: the arguments that they share, and one clear line for a wrong command line."""
 
 from __future__ import annotations
 
 import argparse
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
+from canprobe.cli.argument_types import channel, folder_path, node_id, seconds, seed, setting, whole, word
 from canprobe.errors import did_you_mean
 
+PATIENT_SYNCS = 40
+"""100 ms at 400 Hz: a virtual machine may stand still as long."""
+OPTIONS: Mapping[str, dict[str, Any]] = {
+    "scene": {
+        "metavar": "SCENE",
+        "help": "a packaged scene (`canprobe scenes` lists them), a cell, or the path of a TOML file",
+    },
+    "--cell": {
+        "metavar": "C",
+        "type": word,
+        "help": "a packaged cell (`canprobe cells` lists them) or a path [the scene's]",
+    },
+    "--bus": {
+        "metavar": "B",
+        "type": word,
+        "help": "lockstep, direct (no bus), socketcan or another python-can interface; config: the one that"
+        " CAN_INTERFACE or python-can's configuration files name [the scene's]",
+    },
+    "--channel": {
+        "metavar": "[NAME=]CH",
+        "action": "append",
+        "type": channel,
+        "help": "channel of the interface; NAME=CH replaces the scene's channel NAME and may be repeated [the scene's]",
+    },
+    "--bitrate": {"metavar": "BIT/S", "type": whole(10_000, 1_000_000), "help": "bit rate [the scene's]"},
+    "--set": {
+        "metavar": "KEY=VALUE",
+        "action": "append",
+        "default": [],
+        "type": setting,
+        "help": "a key of the scene, as `--set task.force_n=3`, checked as in a file; may be repeated",
+    },
+    "--realtime": {
+        "action": "store_true",
+        "help": "request SCHED_FIFO, a processor for the cycle and locked memory; what the system does not permit is"
+        " reported [the scene's cycle.realtime]",
+    },
+    "--patient": {
+        "action": "store_true",
+        "help": f"emulated nodes on a slow machine: drives wait for {PATIENT_SYNCS} SYNCs, and late cycles stop"
+        " nothing",
+    },
+    "--bridge": {
+        "metavar": "NAME",
+        "action": "append",
+        "default": [],
+        "help": "send the data to another tool: mcap, foxglove, ros2 or view; may be repeated",
+    },
+    "--out": {"metavar": "DIR", "type": folder_path, "help": "folder of the results [runs/<scene>-<time>]"},
+    "--force": {"action": "store_true", "help": "replace the results of an earlier run in DIR"},
+    "--seed": {"metavar": "N", "type": seed, "help": "seed of all random numbers [the scene's]"},
+    "--duration": {
+        "metavar": "S",
+        "type": seconds,
+        "help": "length of the scan, press, listen or free phase in seconds [the scene's]",
+    },
+    "--json": {"action": "store_true", "help": "print one JSON document on stdout"},
+}
+"""Arguments that commands share."""
 _KEYS = {
     "--bus": "bus.interface",
     "--channel": "bus.channel",
@@ -48,6 +108,53 @@ class Parser(argparse.ArgumentParser):
         settings.setdefault("formatter_class", _Formatter)
         settings.setdefault("allow_abbrev", False)
         super().__init__(**settings)  # type: ignore[arg-type]
+
+    def add_shared(self, *names: str, to: argparse._ActionsContainer | None = None) -> None:
+        """Add arguments of `OPTIONS`, in this order.
+
+        Args:
+            names: their names; SCENE is the scene with --cell and --set, and [SCENE] one that another argument can
+                replace; BUS is --bus, --channel and --bitrate; -v brings -q.
+            to: group of the help in which they stand.
+        """
+        for name in names:
+            match name:
+                case "SCENE" | "[SCENE]":
+                    self.add_argument("scene", nargs="?" if name == "[SCENE]" else None, **OPTIONS["scene"])
+                    self.add_shared("--cell", "--set")
+                case "BUS":
+                    self.add_shared("--bus", "--channel", "--bitrate", to=to)
+                case "-v":
+                    self._add_verbosity()
+                case _:
+                    (to or self).add_argument(name, **OPTIONS[name])
+
+    def add_real_bus(self, more: str = "") -> None:
+        """Add --bus, --channel and --bitrate of a real bus without a scene; `more` names what else --bus may be."""
+        what = f"python-can interface{more} [that of CAN_INTERFACE or python-can's configuration files, else socketcan]"
+        self.add_argument("--bus", **OPTIONS["--bus"] | {"help": what})
+        self.add_argument("--channel", metavar="CH", type=word, help="channel of the interface [can0]")
+        self.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
+
+    def add_eds_nodes(self, *, more: str = "") -> None:
+        """Add --eds and --node-id, which stand in pairs; `more` ends the help of the latter."""
+        what = "EDS or DCF file of a node; may be repeated, each with its --node-id"
+        self.add_argument("--eds", metavar="FILE", action="append", default=[], help=what)
+        what = f"node id for the --eds at the same position{more}"
+        self.add_argument("--node-id", metavar="N", action="append", default=[], type=node_id, help=what)
+
+    def add_inject(self, what: str) -> None:
+        """Add --inject; `what` begins its help."""
+        what += "; may be repeated; `canprobe inject --list` lists them"
+        self.add_argument("--inject", metavar="FAULT", action="append", default=[], type=word, help=what)
+
+    def _add_verbosity(self) -> None:
+        """Add -v and -q to a command that reports its steps."""
+        either = self.add_mutually_exclusive_group()
+        kind: dict[str, Any] = {"dest": "verbosity", "action": "store_const"}
+        what = "report every step on stderr, even without a terminal"
+        either.add_argument("-v", "--verbose", **kind, const=1, default=0, help=what)
+        either.add_argument("-q", "--quiet", **kind, const=-1, help="report only warnings and errors")
 
     def error(self, message: str) -> NoReturn:
         """Report the error in one line and exit with status 2."""

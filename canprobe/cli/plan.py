@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cell.session.terminal import columns
-from canprobe.cli.common_arguments import add_options, add_scene
 from canprobe.cli.output import print_answer, print_json, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, with_scene
@@ -47,7 +46,7 @@ EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
+    parser.add_shared("SCENE")
     parser.add_argument("--full", action="store_true", help="print the tables of nodes, PDOs, times and choices too")
     parser.add_argument(
         "--measured",
@@ -77,7 +76,7 @@ def add_arguments(parser: Parser) -> None:
         "--figure", metavar="FILE.png", type=Path, help="draw the cycles and the response times (extra `study`)"
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the exported files [.]")
-    add_options(parser, "--json")
+    parser.add_shared("--json")
 
 
 def _draw(plan: Plan, path: Path) -> Path:

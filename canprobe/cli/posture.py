@@ -10,7 +10,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.hands import opened
 from canprobe.cli.move import standing
 from canprobe.cli.output import print_json, print_table
@@ -38,13 +37,13 @@ def add_arguments(parser: Parser) -> None:
         ("save", "save the posture in which the arm stands"),
     ):
         one = actions.add_parser(action, help=text, description=f"{text.capitalize()}.")
-        add_scene(one)
+        one.add_shared("SCENE")
         if action == "save":
             one.add_argument("name", metavar="NAME", help="name of the posture")
-            add_options(one, *BUS, "--realtime", "--patient")
+            one.add_shared("BUS", "--realtime", "--patient")
         if action == "list":
-            add_options(one, "--json")
-        add_verbosity(one)
+            one.add_shared("--json")
+        one.add_shared("-v")
         one.set_defaults(run=run, action=action)
 
 

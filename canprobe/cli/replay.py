@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.common_arguments import add_options, add_verbosity
 from canprobe.cli.output import print_answer
 from canprobe.cli.parser import Parser
 from canprobe.errors import ResultsError
@@ -37,8 +36,7 @@ def add_arguments(parser: Parser) -> None:
         help="recursive, ml, chord or chen1996; may be repeated [those of the scene]",
     )
     parser.add_argument("--out", metavar="FILE", type=Path, help="write all estimates to this npz file")
-    add_options(parser, "--bridge", "--json")
-    add_verbosity(parser)
+    parser.add_shared("--bridge", "--json", "-v")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.common_arguments import add_options
-
 if TYPE_CHECKING:
     from canprobe.cli.parser import Parser
     from canprobe.fieldbus.tools.reports import Report, ReportChange
@@ -21,7 +19,7 @@ def add_report_options(parser: Parser) -> None:
     parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
     parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
-    add_options(parser, "--json")
+    parser.add_shared("--json")
 
 
 def read_baseline(args: argparse.Namespace) -> Report | None:

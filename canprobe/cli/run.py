@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.output import print_json, print_lines, print_summary
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import scene_of, with_scene
@@ -34,8 +33,7 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
-    add_options(parser, *BUS, "--realtime", "--patient", "--bridge", "--out", "--force", "--seed", "--duration")
+    parser.add_shared("SCENE", "BUS", "--realtime", "--patient", "--bridge", "--out", "--force", "--seed", "--duration")
     parser.add_argument(
         "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
@@ -47,8 +45,7 @@ def add_arguments(parser: Parser) -> None:
         help="draw no report.png and surface.png [the scene's scene.figures]",
     )
     parser.add_argument("--full", action="store_true", help="print the error of the force and every estimator too")
-    add_options(parser, "--json")
-    add_verbosity(parser)
+    parser.add_shared("--json", "-v")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,8 +13,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.argument_types import channel, number_of_32_bits, seconds, whole
-from canprobe.cli.common_arguments import OPTIONS, add_options, add_scene, add_verbosity
+from canprobe.cli.argument_types import number_of_32_bits, seconds, whole
 from canprobe.cli.output import print_answer, print_table
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, real_target
@@ -40,16 +39,8 @@ Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser, optional=True)
-    parser.add_argument(
-        "--bus",
-        **OPTIONS["--bus"]
-        | {"help": "python-can interface [that of CAN_INTERFACE or python-can's configuration files, else socketcan]"},
-    )
-    parser.add_argument(
-        "--channel", metavar="CH", type=channel, default=(None, None), help="channel of the interface [can0]"
-    )
-    parser.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
+    parser.add_shared("[SCENE]")
+    parser.add_real_bus()
     parser.add_argument(
         "--timeout",
         metavar="S",
@@ -66,8 +57,7 @@ def add_arguments(parser: Parser) -> None:
         help="assign this id to the device with this serial number or VENDOR:PRODUCT:REVISION:SERIAL; may be repeated",
     )
     parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
-    add_options(parser, "--json")
-    add_verbosity(parser)
+    parser.add_shared("--json", "-v")
 
 
 def assignment(text: str) -> Assignment:
@@ -89,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
     from canprobe import api
 
-    target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
+    target = real_target(args.bus, args.channel, args.bitrate, channel_else="can0")
     if not args.lss:
         nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
         print_answer(args, nodes, lambda: _print_nodes(nodes, target.channel))

@@ -10,7 +10,6 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from canprobe.cli.common_arguments import add_options
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser
 
@@ -23,7 +22,7 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_options(parser, "--json")
+    parser.add_shared("--json")
 
 
 def run(args: argparse.Namespace) -> int:

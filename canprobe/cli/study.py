@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cli.argument_types import whole
-from canprobe.cli.common_arguments import add_options, add_verbosity
 from canprobe.cli.output import print_answer, print_json, print_table
 from canprobe.cli.parser import Parser
 from canprobe.errors import did_you_mean
@@ -97,8 +96,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="number of processes [one for each core]")
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
     parser.add_argument("--fresh", action="store_true", help="ignore finished cells in DIR")
-    add_options(parser, "--json")
-    add_verbosity(parser)
+    parser.add_shared("--json", "-v")
     parser.set_defaults(complain=parser.error)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 
-from canprobe.cli.common_arguments import add_scene
 from canprobe.cli.hands import add_arguments_of_hands, agreed, opened
 from canprobe.cli.listen import array_line, array_only
 from canprobe.cli.parser import Parser
@@ -21,7 +20,7 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
+    parser.add_shared("SCENE")
     add_arguments_of_hands(parser)
 
 

@@ -8,13 +8,13 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.common_arguments import PATIENT_SYNCS
+from canprobe.cli.parser import PATIENT_SYNCS
 from canprobe.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from canprobe.cell.scene.model import Scene
     from canprobe.cell.session.target import Target
-    from canprobe.fieldbus.bus.real.configured import ConfiguredBus
+    from canprobe.fieldbus.bus.real.adapters import ConfiguredBus
 
 CONFIG = "config"
 """Value of --bus for the interface that python-can's configuration names."""
@@ -52,7 +52,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
 
 
 def loaded(args: argparse.Namespace, more: Mapping[str, Any] | None = None) -> Scene:
-    """The scene of a command with `add_scene`, changed by --cell, --set, --realtime and more overrides."""
+    """The scene of a command with the argument SCENE, changed by --cell, --set, --realtime and more overrides."""
     from canprobe.cell.scene.load import load_scene
 
     overrides = {**dict(args.set), **(more or {})}
@@ -124,7 +124,7 @@ def real_target(
 
 
 def _configured(bus: str | None) -> ConfiguredBus | None:
-    from canprobe.fieldbus.bus.real.configured import configured_bus
+    from canprobe.fieldbus.bus.real.adapters import configured_bus
 
     found = configured_bus()
     if found is None and bus == CONFIG:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 
-from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
 from canprobe.cli.stdin import need_terminal
@@ -24,8 +23,7 @@ examples:
 
 
 def add_arguments(parser: Parser) -> None:
-    add_scene(parser)
-    add_options(parser, *BUS, "--realtime", "--patient", "--bridge")
+    parser.add_shared("SCENE", "BUS", "--realtime", "--patient", "--bridge")
     parser.add_argument(
         "--check-joints",
         action="store_true",
@@ -41,7 +39,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--yes", action="store_true", help="with --check-joints: do not ask; by 10 deg nothing moves then"
     )
-    add_verbosity(parser)
+    parser.add_shared("-v")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import whole
-from canprobe.cli.common_arguments import BUS, add_options, add_verbosity
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import target_of
@@ -47,8 +46,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--no-open", action="store_true", help="print the address and open no browser")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
     of_scene = parser.add_argument_group("options of a SCENE")
-    add_options(of_scene, "--set", *BUS, "--out", "--force", "--seed", "--duration")
-    add_verbosity(parser)
+    parser.add_shared("--set", "BUS", "--out", "--force", "--seed", "--duration", to=of_scene)
+    parser.add_shared("-v")
 
 
 def run(args: argparse.Namespace) -> int:

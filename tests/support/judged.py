@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.tools.judge import BusFrame, judge_frames
+from canprobe.fieldbus.tools.judge import BusFrame, Judge
 
 
 def rules_raised(plan, frames, *, charges_ns=()):
     """Rules that the master of a plan raises, and what was found; frames are (can_id, data, t_ns)."""
     nodes = {node.node_id: Description(load_eds(node.eds, node.node_id)) for node in plan.nodes}
     ordered = (BusFrame(t_ns, can_id, data) for can_id, data, t_ns in frames)
-    judge = judge_frames(ordered, nodes, served=True, charges_ns=charges_ns)
+    judge = Judge(nodes, served=True, charges_ns=charges_ns).hear(ordered)
     assert sum(rule.looked > 0 for rule in judge.rules) > 5, "there was something to judge"
     return {rule.number: rule.findings[0].what for rule in judge.rules if rule.count}

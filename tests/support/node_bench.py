@@ -13,7 +13,7 @@ from canopen.objectdictionary.eds import import_eds
 from sdo_words import SdoWords
 
 from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.drive.motor import MotorDynamics
+from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 

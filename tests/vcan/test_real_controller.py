@@ -62,9 +62,7 @@ def test_an_interface_that_is_down_is_set_up_by_the_line_that_is_told(make_adapt
 def test_its_setting_and_its_state_are_read(make_adapter: MakeAdapter) -> None:
     adapter = make_adapter(bitrate=250_000, queue=20)
     name = adapter.name
-    assert read_link(name) == LinkState(
-        name, "can", True, 20, 250_000, restart_ms=0, state="ERROR-ACTIVE", bus_errors=0, bus_offs=0
-    )
+    assert read_link(name) == LinkState(name, "can", True, 20, 250_000, restart_ms=0, state="ERROR-ACTIVE", bus_offs=0)
 
 
 @pytest.mark.parametrize(

@@ -38,14 +38,12 @@ class ImageFault(ArrayEffect):
         self._array = self.node.application
         self._begun_ns = 0
 
-    def begin(self, t_ns: int) -> Sequence[Frame]:
+    def begin(self, t_ns: int) -> None:
         self._begun_ns = t_ns
         self._array.distortions.append(self._sampled)
-        return ()
 
-    def end(self, t_ns: int) -> Sequence[Frame]:
+    def end(self, t_ns: int) -> None:
         self._array.distortions.remove(self._sampled)
-        return ()
 
     def _sampled(self, raw: Raw, t_ns: int) -> Raw:
         self.host.hits += 1
@@ -102,11 +100,11 @@ class ReplayedImage(ImageFault):
         noise=Parameter(1.3, 0, 255, "standard deviation of the fresh noise, counts"),
     )
 
-    def begin(self, t_ns: int) -> Sequence[Frame]:
+    def begin(self, t_ns: int) -> None:
         self._recorded: list[Raw] = []
         self._replayed = 0
         self._noise = np.random.default_rng(self.fault.seed)
-        return super().begin(t_ns)
+        super().begin(t_ns)
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
         if len(self._recorded) < int(self.fault.value("images")):

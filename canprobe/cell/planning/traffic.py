@@ -28,10 +28,15 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.scene.hardware import BusSettings
-from canprobe.fieldbus.protocol.fifo_response_times import worst_case_response_fifo
 from canprobe.fieldbus.protocol.frame_bits import best_case_bits, worst_case_bits
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
-from canprobe.fieldbus.protocol.response_times import BusAnalysis, Message, Response, worst_case_response
+from canprobe.fieldbus.protocol.response_times import (
+    BusAnalysis,
+    Message,
+    Response,
+    worst_case_response,
+    worst_case_response_fifo,
+)
 
 FIRST_LOOK, LAST_LOOK = 0.25, 0.6
 """Shares of the period at which the cell looks for TPDOs besides the planned time; after the last one they are late."""

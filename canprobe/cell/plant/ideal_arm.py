@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.cell.plant.ramps import NEVER
-from canprobe.fieldbus.drive.motor import MotorDynamics
+from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.types import Floats
 

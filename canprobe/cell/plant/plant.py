@@ -27,7 +27,7 @@ from canprobe.cell.plant.probe import PressedProbe, ProbeState, in_pad
 from canprobe.cell.plant.several_contacts import MIN_CURVATURE_SHARE, total_force
 from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
-from canprobe.fieldbus.drive.motor import MotorDynamics
+from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
 from canprobe.mechanics.robot.model import ArmModel, units_to_joints
 from canprobe.mechanics.robot.motors import joints_per_motor

@@ -9,7 +9,8 @@ from typing import Any
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, Plan, PlannedNode
 from canprobe.cell.planning.traffic import SYNCHRONOUS
 from canprobe.errors import UsageError
-from canprobe.fieldbus.tools.conform.points.timing import HEARTBEAT_MS, HEARTBEAT_TIME, SDO_TIME, SYNC_TIME
+from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS
+from canprobe.fieldbus.tools.conform.points.timing import HEARTBEAT_TIME, SDO_TIME, SYNC_TIME
 from canprobe.fieldbus.tools.reports import Report, read_json
 
 

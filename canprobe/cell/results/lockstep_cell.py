@@ -17,7 +17,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.target import LOCKSTEP
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.fieldbus.tools.faults import Fault
-from canprobe.fieldbus.tools.faults.planned import PlannedFaults
+from canprobe.fieldbus.tools.faults.injection import PlannedFaults
 
 
 class LockstepCell:

@@ -253,7 +253,7 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
     """A bus in virtual time, with the bit rate of the scene or without one."""
     if not scene.bus.timed:
         return LockstepBus(clock, channel, fd=scene.bus.fd is True)
-    from canprobe.fieldbus.bus.virtual.bit_errors import BitErrors
+    from canprobe.fieldbus.bus.virtual.controllers import BitErrors
     from canprobe.fieldbus.bus.virtual.timed import TimedBus
 
     rate = scene.bus.bit_error_rate

@@ -23,11 +23,9 @@ class Clock(Protocol):
 
     def now_ns(self) -> int:
         """Return the present time in ns; it never decreases."""
-        ...
 
     def sleep_until_ns(self, t_ns: int) -> None:
         """Return when the clock shows `t_ns` or later; at once if it does already."""
-        ...
 
 
 class Driver(Protocol):
@@ -35,15 +33,12 @@ class Driver(Protocol):
 
     def next_deadline_ns(self) -> int | None:
         """Return the time at which it next has something to do; `None` if it only waits for others."""
-        ...
 
     def settle(self) -> None:
         """Do everything due at the present instant; afterwards its next deadline lies in the future."""
-        ...
 
     def run_until_ns(self, until_ns: int) -> None:
         """Do everything due up to and including `until_ns`, and move the clock to each instant on the way."""
-        ...
 
 
 class VirtualClock:

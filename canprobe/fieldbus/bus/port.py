@@ -122,27 +122,22 @@ class Port(Protocol):
     @property
     def clock(self) -> Clock:
         """Clock on which this port waits and stamps."""
-        ...
 
     @property
     def channel(self) -> str:
         """Name of the bus in messages and logs."""
-        ...
 
     @property
     def counters(self) -> PortCounters:
         """Counters since the port was opened."""
-        ...
 
     @property
     def state(self) -> ControllerState:
         """Error state of the CAN controller, as far as the port knows it."""
-        ...
 
     @property
     def stamps_arrival(self) -> bool:
         """Whether a received frame carries the time of its arrival; if not, that of the `drain` that returned it."""
-        ...
 
     @property
     def descriptor(self) -> int | None:
@@ -151,7 +146,6 @@ class Port(Protocol):
         Raises:
             InterfaceError: the port is closed.
         """
-        ...
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` in this order.
@@ -163,7 +157,6 @@ class Port(Protocol):
         Raises:
             InterfaceError: the interface is down, closed, lost or stays full.
         """
-        ...
 
     def drain(self) -> list[TimedFrame]:
         """Return every frame that has arrived, in order, without waiting; the next call starts empty.
@@ -171,7 +164,6 @@ class Port(Protocol):
         Raises:
             InterfaceError: the interface is down, closed or lost.
         """
-        ...
 
     def wait(self, until_ns: int) -> None:
         """Return as soon as `drain` may have something, at `until_ns` at the latest.
@@ -179,7 +171,6 @@ class Port(Protocol):
         Raises:
             InterfaceError: the interface is down, closed or lost.
         """
-        ...
 
     def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
         """Wait for frames, until `until_ns` at the latest, and return them.
@@ -187,7 +178,6 @@ class Port(Protocol):
         Raises:
             InterfaceError: the interface is down, closed or lost.
         """
-        ...
 
     def defer(self, can_ids: Collection[int]) -> None:
         """Let frames with these 11-bit identifiers wake nobody, where the interface can; the next other brings them.
@@ -195,11 +185,9 @@ class Port(Protocol):
         Raises:
             InterfaceError: the port has filters, or the interface is lost.
         """
-        ...
 
     def close(self) -> None:
         """Give the interface back. A second call is allowed; every other call afterwards raises InterfaceError."""
-        ...
 
 
 class PlainPort:

@@ -5,7 +5,7 @@ and a reference goes to one axis of the plant. `drive.DriveApplication` is the a
 table of states in `protocol.cia402` and runs one mode at a time.
 
     drive                   states, faults, options, the table of all modes and which one is active
-    from_eds                a node from an EDS alone, and a drive where the file describes one
+    from_eds                a node from an EDS alone; where the file describes a drive, on an axis without a plant
     parameters              limits, ramps and options, read from the dictionary whenever one is written
     units                   position units of the master ↔ counts of the axis
     feedback                actual and demand values that the drive reports
@@ -17,8 +17,6 @@ table of states in `protocol.cia402` and runs one mode at a time.
     homing                  limit switches, index pulses, or the present position
     profile                 trapezoids and other motion as pieces of constant acceleration
     reference               ramps, trajectories, holds and stops of one axis
-    motor                   how a motor answers to torque
-    ideal_axis              an axis for a drive without a plant
 
 Invariants: outside operation enabled the drive holds. Loss of SYNC, RPDOs or heartbeat quick-stops it (6007h, 605Ah): a
 dead master never leaves it moving. An object that the EDS lacks has a default. Start reading at `drive`, then `mode`.

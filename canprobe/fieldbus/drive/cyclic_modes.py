@@ -174,7 +174,7 @@ class CyclicTorque(CyclicMode):
         self._torque = min(max(wanted, -parameters.max_torque), parameters.max_torque)
         parts.feedback.show_torque(lambda: self._torque)
         here, speed, (low, high) = self._motion.demand(t_ns), self._motion.speed(t_ns), parameters.fence
-        dynamics, limit = parts.plant.motor_dynamics(parts.axis), parameters.max_speed
+        dynamics, limit = self._motion.plant.motor_dynamics(self._motion.axis), parameters.max_speed
         self._motion.follow(torque_run(here, speed, self._torque, dynamics, limit).fenced(low, high), t_ns)
         pushes = abs(self._torque) > dynamics.coulomb
         fenced = pushes and ((here >= high and self._torque > 0) or (here <= low and self._torque < 0))

@@ -17,9 +17,9 @@ from canopen.objectdictionary import ObjectDictionary
 from canprobe.fieldbus.drive.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, InterpolatedPosition
 from canprobe.fieldbus.drive.homing import HomingMode
 from canprobe.fieldbus.drive.mode import DriveMode, DriveParts
-from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS
+from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS, DriveParameters
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
-from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant
+from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
@@ -68,13 +68,7 @@ class DriveApplication(Application):
     """
 
     def __init__(
-        self,
-        axis: int,
-        plant: AxisPlant,
-        *,
-        delivery: Delivery = STAND_ALONE_DELIVERY,
-        incremental: bool = False,
-        noise: Callable[[], float] | None = None,
+        self, axis: int, plant: AxisPlant, *, delivery: Delivery, incremental: bool, noise: Callable[[], float] | None
     ) -> None:
         """Make the drive of one axis.
 
@@ -99,18 +93,11 @@ class DriveApplication(Application):
     def attach(self, node: SlaveNode) -> None:
         """Connect the drive with the objects of the node."""
         self._node, self._core, self._values = node, node.core, node.dictionary.values
-        self.parts = parts = DriveParts(
-            node,
-            self._axis,
-            self._plant,
-            fault=self._find_fault,
-            on_loss=self._abort_connection,
-            show=self._show,
-            delivery=self._delivery,
-            noise=self._noise,
-        )
-        self._parameters, self._motion = parts.parameters, parts.motion
-        self._modes = _make_modes(parts)
+        self._parameters = parameters = DriveParameters(node.dictionary, self._delivery)
+        self._motion = motion = Motion(self._axis, self._plant, node.core.timers)
+        fault, on_loss, show = self._find_fault, self._abort_connection, self._show
+        self.parts = DriveParts(node, motion, parameters, self._noise, fault=fault, on_loss=on_loss, show=show)
+        self._modes = _make_modes(self.parts)
         self._mode = self._modes[0]
         self._take_word_soon = node.core.timers.new(self._take_word)
         self._pass_on_soon = node.core.timers.new(self._pass_on)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from canprobe.fieldbus.drive.reference import AxisPlant, Motion
+from canprobe.fieldbus.drive.reference import Motion
 from canprobe.fieldbus.drive.units import Units
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
@@ -24,8 +24,6 @@ class DriveFeedback:
 
     Args:
         node: node of the drive.
-        axis: number of the axis in the plant, 0-based.
-        plant: plant, which the drives share.
         motion: reference of the axis.
         units: units of the drive.
         noise: function for the noise that the encoder adds to a position, counts; None: there is none.
@@ -36,22 +34,19 @@ class DriveFeedback:
         distortions: functions that make measured counts of true ones, one after the other; faults of the encoder.
     """
 
-    def __init__(
-        self,
-        node: SlaveNode,
-        axis: int,
-        plant: AxisPlant,
-        motion: Motion,
-        units: Units,
-        *,
-        noise: Callable[[], float] | None,
-    ) -> None:
-        self._core, self._axis, self._plant, self._units, self._noise = node.core, axis, plant, units, noise
+    def __init__(self, node: SlaveNode, motion: Motion, units: Units, noise: Callable[[], float] | None) -> None:
+        self._core, self._axis, self._plant, self._units, self._noise = (
+            node.core,
+            motion.axis,
+            motion.plant,
+            units,
+            noise,
+        )
         self.counts = 0.0
         self._velocity = 0.0
         self.distortions: list[Callable[[float], float]] = []
         self._t_ns: int | None = None
-        self.plant_torque = partial(plant.torque_permille, axis)
+        self.plant_torque = partial(motion.plant.torque_permille, motion.axis)
         self._sources: dict[int, Callable[[], float]] = {
             0x6062: lambda: units.position(motion.demand(self._t_ns or 0)),
             0x6064: lambda: (self.counts - units.origin) / units.scale,

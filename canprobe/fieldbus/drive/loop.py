@@ -10,7 +10,7 @@ Source: CiA 402-2, objects 6072h, 60B1h, 60B2h.
 from __future__ import annotations
 
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, DriveParameters
-from canprobe.fieldbus.drive.reference import AxisPlant
+from canprobe.fieldbus.drive.reference import Motion
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
 _LIMIT_INDEX, _SPEED_INDEX, _TORQUE_INDEX = 0x6072, 0x60B1, 0x60B2
@@ -20,18 +20,17 @@ class DriveLoop:
     """Torque limit and feed-forwards of one axis; the plant gets changes only.
 
     Args:
-        axis: number of the axis in the plant, 0-based.
-        plant: plant, which the drives share.
-        parameters: parameters of the drive.
         node: node of the drive.
+        motion: reference of the axis.
+        parameters: parameters of the drive.
 
     Attributes:
         changed: whether a position mode has to call `feed_forward` in this cycle.
     """
 
-    def __init__(self, axis: int, plant: AxisPlant, parameters: DriveParameters, node: SlaveNode) -> None:
+    def __init__(self, node: SlaveNode, motion: Motion, parameters: DriveParameters) -> None:
         dictionary = node.dictionary
-        self._axis, self._plant, self._parameters, self._number = axis, plant, parameters, dictionary.number
+        self._motion, self._parameters, self._number = motion, parameters, dictionary.number
         self._early_ns = node.core.quirks.brake_early_ns
         self._torque_comes = node.core.timers.new(lambda _due_ns: self._give(*self._given[1:]))
         self._given: tuple[int, float, float] = (PEAK_TORQUE_PERMILLE, 0.0, 0.0)
@@ -70,4 +69,4 @@ class DriveLoop:
         wanted = (limit, speed, torque)
         if wanted != self._given:
             self._given = wanted
-            self._plant.set_loop(self._axis, *wanted)
+            self._motion.plant.set_loop(self._motion.axis, *wanted)

@@ -13,9 +13,8 @@ from collections.abc import Callable
 from canprobe.fieldbus.drive.feedback import DriveFeedback
 from canprobe.fieldbus.drive.loop import DriveLoop
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, DriveParameters
-from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
+from canprobe.fieldbus.drive.reference import STEP_NS, Motion
 from canprobe.fieldbus.drive.self_stop import Supervision
-from canprobe.fieldbus.drive.units import Delivery
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol import cia402
@@ -31,33 +30,29 @@ class DriveParts:
 
     Args:
         node: node of the drive.
-        axis: number of the axis in the plant, 0-based.
-        plant: plant, which the drives share.
+        motion: reference of the axis.
+        parameters: parameters of the drive.
+        noise: function for the noise of the encoder, counts; None: there is none.
         fault: function that is called as `fault(code, t_ns)` when a mode has found a fault.
         on_loss: function that is called as `on_loss(code, t_ns)` when the master counts as lost.
         show: function that is called when the mode's part of the statusword may have changed.
-        delivery: settings that the EDS does not state.
-        noise: function for the noise of the encoder, counts; None: there is none.
     """
 
     def __init__(
         self,
         node: SlaveNode,
-        axis: int,
-        plant: AxisPlant,
+        motion: Motion,
+        parameters: DriveParameters,
+        noise: Callable[[], float] | None,
         *,
         fault: Callable[[int, int], None],
         on_loss: Callable[[int, int], None],
         show: Callable[[], None],
-        delivery: Delivery,
-        noise: Callable[[], float] | None,
     ) -> None:
-        self.node, self.axis, self.plant, self.fault, self.show = node, axis, plant, fault, show
-        self.parameters = DriveParameters(node.dictionary, delivery)
-        self.motion = Motion(axis, plant, node.core.timers)
-        self.feedback = DriveFeedback(node, axis, plant, self.motion, self.parameters.units, noise=noise)
-        self.supervision = Supervision(node, self.parameters, on_loss)
-        self.loop = DriveLoop(axis, plant, self.parameters, node)
+        self.node, self.motion, self.parameters, self.fault, self.show = node, motion, parameters, fault, show
+        self.feedback = DriveFeedback(node, motion, parameters.units, noise)
+        self.supervision = Supervision(node, parameters, on_loss)
+        self.loop = DriveLoop(node, motion, parameters)
 
 
 class DriveMode:

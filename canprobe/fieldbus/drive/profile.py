@@ -12,7 +12,21 @@ from __future__ import annotations
 from math import copysign, exp, inf, log, sqrt
 from typing import NamedTuple
 
-from canprobe.fieldbus.drive.motor import MotorDynamics
+
+class MotorDynamics(NamedTuple):
+    """Dynamics of a motor: ``v' = gain (torque - coulomb sign v) - damping v``.
+
+    The velocity v is in counts/s, torques are in 1/1000 of the rated torque.
+
+    Attributes:
+        gain: acceleration per permille of torque, counts/s²; positive.
+        coulomb: friction torque, permille; a smaller torque does not move a motor at rest.
+        damping: viscous friction over inertia, 1/s; positive.
+    """
+
+    gain: float
+    coulomb: float
+    damping: float
 
 
 class Piece(NamedTuple):

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from math import inf
 from typing import Protocol
 
-from canprobe.fieldbus.drive.motor import MotorDynamics
-from canprobe.fieldbus.drive.profile import Profile, Rates, braking, trapezoid
+from canprobe.fieldbus.drive.profile import MotorDynamics, Profile, Rates, braking, trapezoid
 from canprobe.fieldbus.node.timers import Timers
 
 STEP_NS = 2_500_000
@@ -67,13 +66,15 @@ class Motion:
     A trajectory goes to the plant as straight ramps of one step each, whose ends lie on it.
 
     Attributes:
+        axis: number of the axis in the plant, 0-based.
+        plant: plant, which the drives share.
         blocked: whether the motor gets no reference, as with a stuck brake.
     """
 
     blocked = False
 
     def __init__(self, axis: int, plant: AxisPlant, timers: Timers) -> None:
-        self._axis, self._plant = axis, plant
+        self.axis, self.plant = axis, plant
         self._timer = timers.new(self._step)
         self._start = self._end = 0.0
         self._t0 = self._t1 = 0
@@ -91,8 +92,8 @@ class Motion:
     def hold(self, t_ns: int) -> float:
         """Hold the motor where it is; return that position, counts."""
         self._stop()
-        self._plant.advance(t_ns)
-        here = self._plant.motor_counts(self._axis)
+        self.plant.advance(t_ns)
+        here = self.plant.motor_counts(self.axis)
         self._ramp(here, here, t_ns, t_ns + STEP_NS)
         return here
 
@@ -106,7 +107,7 @@ class Motion:
             self._stop()
         self._start, self._end, self._t0, self._t1 = onset, counts, t_ns, end_ns  # inlined `_ramp`, for speed
         if not self.blocked:
-            self._plant.set_ramp(self._axis, onset, counts, t_ns, end_ns)
+            self.plant.set_ramp(self.axis, onset, counts, t_ns, end_ns)
 
     def demand(self, t_ns: int) -> float:
         """The reference at `t_ns`, counts."""
@@ -145,8 +146,8 @@ class Motion:
             self.follow(braking(here, speed, rate), t_ns, done)
             return
         self._stop()
-        self._plant.advance(t_ns)
-        self._was = self._plant.motor_counts(self._axis)
+        self.plant.advance(t_ns)
+        self._was = self.plant.motor_counts(self.axis)
         self._patience, self._done = MAX_WAIT_STEPS, done
         self._ramp(here, here, t_ns, t_ns + STEP_NS)
         self._timer.arm(t_ns + STEP_NS)
@@ -172,8 +173,8 @@ class Motion:
     def _await_standstill(self, due_ns: int) -> None:
         if self._done is None:
             return
-        self._plant.advance(due_ns)
-        here = self._plant.motor_counts(self._axis)
+        self.plant.advance(due_ns)
+        here = self.plant.motor_counts(self.axis)
         moved, self._was = abs(here - self._was), here
         self._patience -= 1
         if moved > STANDSTILL_COUNTS and self._patience > 0:
@@ -188,11 +189,11 @@ class Motion:
     def _ramp(self, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
         self._start, self._end, self._t0, self._t1 = start, end, t0_ns, t1_ns
         if not self.blocked:
-            self._plant.set_ramp(self._axis, start, end, t0_ns, t1_ns)
+            self.plant.set_ramp(self.axis, start, end, t0_ns, t1_ns)
 
     def block(self, t_ns: int) -> None:
         """Let the motor stay where it is, whatever the reference: the brake is stuck."""
-        self._plant.advance(t_ns)
-        here = self._plant.motor_counts(self._axis)
-        self._plant.set_ramp(self._axis, here, here, t_ns, t_ns + STEP_NS)
+        self.plant.advance(t_ns)
+        here = self.plant.motor_counts(self.axis)
+        self.plant.set_ramp(self.axis, here, here, t_ns, t_ns + STEP_NS)
         self.blocked = True

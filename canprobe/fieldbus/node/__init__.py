@@ -17,8 +17,7 @@ Each service of the standard is one module:
     pdo_rules           what may be written to their parameters, and when
     sync                the SYNC consumer
     emcy                emergencies, error register, error history
-    heartbeat           heartbeat producer and consumer
-    guarding            node guarding and life guarding
+    error_control       heartbeat producer and consumer, node guarding and life guarding
     lss                 node ids over the bus, and how a node without one is found
     store, stored_file  stored parameters, in memory and in a file
     quirks              what makes a node difficult

@@ -15,6 +15,8 @@ from canprobe.fieldbus.protocol.frames import INVALID_FLAG, Frame, NmtState, is_
 
 Route = Callable[[bytes, int], None]
 NO_ROUTES: Mapping[int, Route] = {}
+TALKING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+"""States with SDO, SYNC and EMCY."""
 
 
 class NodeCore:

@@ -9,15 +9,14 @@ from collections import deque
 from collections.abc import Hashable
 
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import NodeCore, Service, check_cob_id
+from canprobe.fieldbus.node.core import TALKING_STATES, NodeCore, Service, check_cob_id
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
-from canprobe.fieldbus.protocol.frames import INVALID_FLAG, NmtState
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 
 _GENERIC_FLAG = 0x01
 # Bits of 1001h by the first nibble of the code: current, voltage, temperature, communication/profile, manufacturer.
 _REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: 0x80, 0xF: 0x80}
-_SENDING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 def register_bit(code: int) -> int:
@@ -95,7 +94,7 @@ class Emergency(Service):
             self._send(NO_ERROR_CODE, b"")
 
     def _send(self, code: int, data: bytes) -> None:
-        if self._core.state not in _SENDING_STATES:
+        if self._core.state not in TALKING_STATES:
             return
         self._waiting.append((code, self._register(), data))
         if self._timer.due_ns is None:

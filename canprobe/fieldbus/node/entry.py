@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from operator import attrgetter
 
 from canopen.objectdictionary import ObjectDictionary, datatypes
 
-from canprobe.fieldbus.eds.description import LAST_DUMMY, DescribedEntry, Description
+from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.values import REAL_FORMS
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 
 Value = int | float | bytes
+_STATED = [field.name for field in fields(DescribedEntry)]
+_states = attrgetter(*_STATED)
 
 
 def key_of(index: int, subindex: int = 0) -> int:
@@ -24,35 +27,18 @@ def key_of(index: int, subindex: int = 0) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """One addressable value.
+class Entry(DescribedEntry):
+    """One addressable value, as the EDS describes it.
 
     Attributes:
+        default: value after a reset, that of a DCF where there is one.
         key: index << 8 | subindex.
-        name: name in the EDS.
-        bits: length of a value of fixed size over SDO; 0 for strings and domains.
-        boolean: whether it is a BOOLEAN, which is one bit in a PDO.
-        signed: whether an integer is signed.
         real: struct format of a REAL32 or REAL64; empty for other types.
-        readable, writable: whether SDO may read and write it.
-        in_tpdo, in_rpdo: whether a TPDO, an RPDO may map it.
-        low, high: limits in the EDS, or None.
-        default: value after a reset.
     """
 
-    key: int
-    name: str
-    bits: int
-    boolean: bool
-    signed: bool
-    real: str
-    readable: bool
-    writable: bool
-    in_tpdo: bool
-    in_rpdo: bool
-    low: float | None
-    high: float | None
     default: Value
+    key: int
+    real: str
 
     def to_bytes(self, value: Value) -> bytes:
         """Bytes of a value on the wire."""
@@ -89,31 +75,14 @@ class Entry:
 
 def read_entries(od: ObjectDictionary) -> Iterator[Entry]:
     """Every entry of a parsed EDS, with the dummy types 0001h–0007h that DummyUsage allows."""
-    return map(_entry, Description(od).entries())
+    for described in Description(od).entries():
+        stated = dict(zip(_STATED, _states(described), strict=True)) | {"default": _default(described)}
+        real = REAL_FORMS[described.data_type][0] if described.data_type in REAL_FORMS else ""
+        yield Entry(**stated, key=key_of(*described.place), real=real)
 
 
-def _entry(described: DescribedEntry) -> Entry:
-    data_type = described.data_type
-    bits = 8 if data_type == datatypes.BOOLEAN else described.bits
-    return Entry(
-        key=key_of(described.index, described.subindex),
-        name=described.name,
-        bits=bits,
-        boolean=data_type == datatypes.BOOLEAN,
-        signed=described.signed,
-        real=REAL_FORMS[data_type][0] if data_type in REAL_FORMS else "",
-        readable=described.readable,
-        writable=described.writable,
-        in_tpdo=described.in_tpdo and described.index > LAST_DUMMY,
-        in_rpdo=described.in_rpdo,
-        low=described.low,
-        high=described.high,
-        default=_default(described, bits),
-    )
-
-
-def _default(described: DescribedEntry, bits: int) -> Value:
-    value = described.initial
+def _default(described: DescribedEntry) -> Value:
+    value, bits = described.initial, described.bits
     if value is None:
         return 0 if bits else b""
     if isinstance(value, str):

@@ -95,9 +95,6 @@ class PdoRules:
         """
         target = self.dictionary.entries.get(word >> 8)
         mappable = target is not None and (fixed or (target.in_tpdo if self.transmits else target.in_rpdo))
-        length = word & 0xFF
-        if target is None or not mappable or target.real or not target.bits:
-            raise SdoAbort(Abort.NOT_MAPPABLE)
-        if length != target.bits and not (length == 1 and target.boolean):
+        if target is None or not mappable or target.real or not target.fits_pdo(word & 0xFF):
             raise SdoAbort(Abort.NOT_MAPPABLE)
         return PdoEntry.from_word(word, target.signed, target.name)

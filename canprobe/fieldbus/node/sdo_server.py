@@ -7,12 +7,10 @@ Source: CiA 301, "SDO download", "SDO upload", "SDO block download", "SDO block 
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Mapping
-from functools import partial
 
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import NO_ROUTES, DelayedFrames, NodeCore, Route, Service, check_cob_id
+from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, DelayedFrames, NodeCore, Route, Service, check_cob_id
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
 from canprobe.fieldbus.node.sdo_transfers import (
@@ -24,13 +22,11 @@ from canprobe.fieldbus.node.sdo_transfers import (
     Transfer,
     check_block_size,
 )
-from canprobe.fieldbus.protocol.frames import INVALID_FLAG, SDO_RX_BASE, SDO_TX_BASE, NmtState
+from canprobe.fieldbus.protocol import sdo
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, SDO_RX_BASE, SDO_TX_BASE
 
 SDO_TIMEOUT_NS = 1_000_000_000
 """Time without a frame of the client after which a transfer is aborted with 05040000h."""
-_INITIATE_FORM = struct.Struct("<BHBI")
-_EXPEDITED_PACKERS = {size: partial(struct.Struct("<BHB4s").pack, 0x43 | (4 - size) << 2) for size in (1, 2, 3, 4)}
-_SERVED_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 class SdoServer(Service):
@@ -39,7 +35,7 @@ class SdoServer(Service):
     def __init__(self, core: NodeCore, index: int = 0x1200) -> None:
         self._core = core
         self._index = index
-        self._multiplexer = (0, 0)
+        self._place: sdo.Place = (0, 0)
         self._answer_id = 0
         self._timer = core.timers.new(lambda _due_ns: self._abort(Abort.TIMED_OUT))
         self._slow_ns = core.quirks.sdo_ns
@@ -67,14 +63,14 @@ class SdoServer(Service):
 
     def entered(self, t_ns: int) -> None:
         """End a transfer in the stopped state, which none survives."""
-        if self._core.state not in _SERVED_STATES:
+        if self._core.state not in TALKING_STATES:
             self.reset(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
         """The request identifier, in pre-operational and operational."""
         cob_id, answer_id = self._cob_id(1, SDO_RX_BASE), self._cob_id(2, SDO_TX_BASE)
         self._answer_id = answer_id & 0x7FF
-        if self._core.state not in _SERVED_STATES or (cob_id | answer_id) & INVALID_FLAG:
+        if self._core.state not in TALKING_STATES or (cob_id | answer_id) & INVALID_FLAG:
             return NO_ROUTES
         return {cob_id & 0x7FF: self._receive}
 
@@ -107,7 +103,7 @@ class SdoServer(Service):
         request = request_of(state, data[0])
         initiate = self._initiate.get(request)
         if initiate is not None or (state is SdoState.IDLE and request is not SdoRequest.ABORT):
-            self._multiplexer = _INITIATE_FORM.unpack(data)[1:3]
+            self._place = sdo.place_of(data)
         if initiate is not None:
             self._transfer = None
             return [initiate(data)]
@@ -119,42 +115,39 @@ class SdoServer(Service):
         return self._transfer.step(data)
 
     def _download(self, data: bytes) -> bytes:
-        index, subindex = self._multiplexer
         dictionary = self._core.dictionary
-        entry = dictionary.find_writable(index, subindex)
-        command = data[0]
-        if command & 2:
-            size = 4 - (command >> 2 & 3) if command & 1 else min(entry.bits // 8 or 4, 4)
-            dictionary.write_value(entry, entry.from_bytes(data[4 : 4 + size]))
-            dictionary.configured(index)
+        entry = dictionary.find_writable(*self._place)
+        if data[0] & 2:
+            dictionary.write_value(entry, entry.from_bytes(sdo.expedited_value(data, entry.bits // 8 or 4)))
+            dictionary.configured(self._place[0])
         else:
-            self._transfer = SegmentedDownload(entry, _size_in(data) if command & 1 else None, self._store)
-        return _INITIATE_FORM.pack(0x60, index, subindex, 0)
+            self._transfer = SegmentedDownload(entry, sdo.stated_size(data), self._store)
+        return sdo.pack_request(0x60, *self._place)
 
     def _block_download(self, data: bytes) -> bytes:
-        entry, command = self._core.dictionary.find_writable(*self._multiplexer), data[0]
-        announced, with_crc = _size_in(data) if command & 2 else None, bool(command & 4)
-        self._transfer = BlockDownload(entry, announced, self._store, with_crc)
-        return _INITIATE_FORM.pack(0xA4, *self._multiplexer, MAX_BLOCK_SEGMENTS)
+        entry = self._core.dictionary.find_writable(*self._place)
+        announced = int.from_bytes(data[4:8], "little") if data[0] & 2 else None
+        self._transfer = BlockDownload(entry, announced, self._store, with_crc=bool(data[0] & 4))
+        return sdo.pack_request(0xA4, *self._place, bytes((MAX_BLOCK_SEGMENTS,)))
 
     def _store(self, value: bytes) -> None:
-        self._core.dictionary.write(*self._multiplexer, value)
-        self._core.dictionary.configured(self._multiplexer[0])
+        self._core.dictionary.write(*self._place, value)
+        self._core.dictionary.configured(self._place[0])
 
     def _upload(self, data: bytes) -> bytes:
-        value = self._core.dictionary.read(*self._multiplexer)
+        value = self._core.dictionary.read(*self._place)
         if 1 <= len(value) <= 4:
-            return _EXPEDITED_PACKERS[len(value)](*self._multiplexer, value)
+            return sdo.pack_request(0x43 | (4 - len(value)) << 2, *self._place, value)
         self._transfer = SegmentedUpload(value)
-        return _INITIATE_FORM.pack(0x41, *self._multiplexer, len(value))
+        return sdo.pack_request(0x41, *self._place, len(value).to_bytes(4, "little"))
 
     def _block_upload(self, data: bytes) -> bytes:
-        value = self._core.dictionary.read(*self._multiplexer)
+        value = self._core.dictionary.read(*self._place)
         block_size = check_block_size(data[4])
         if 0 < len(value) <= data[5]:  # the protocol switch threshold
             return self._upload(data)
         self._transfer = BlockUpload(value, block_size, with_crc=bool(data[0] & 4))
-        return _INITIATE_FORM.pack(0xC6, *self._multiplexer, len(value))
+        return sdo.pack_request(0xC6, *self._place, len(value).to_bytes(4, "little"))
 
     def _drop(self) -> None:
         self._transfer = None
@@ -162,12 +155,7 @@ class SdoServer(Service):
 
     def _abort(self, code: Abort) -> None:
         self._drop()
-        self._send(_INITIATE_FORM.pack(0x80, *self._multiplexer, code))
+        self._send(sdo.pack_abort(*self._place, code))
 
     def _send(self, answer: bytes) -> None:
         self._late.send([(self._answer_id, answer)], self._core.now_ns)
-
-
-def _size_in(data: bytes) -> int:
-    """The size that an initiate request announces, bytes."""
-    return int.from_bytes(data[4:8], "little")

@@ -55,20 +55,15 @@ class Exchange(LockstepBus):
             self.attach(node)
         return self._carry(t_ns)
 
-    def step(self, frames: Sequence[TimedFrame], t_ns: int) -> list[Frame]:
-        """Feed frames from the bus, then do what is due by `t_ns`; return the frames for the bus.
+    def batches(self, frames: Sequence[TimedFrame], t_ns: int) -> Iterator[list[Frame]]:
+        """Feed frames from the bus, then do what is due by `t_ns`; yield the frames for the bus.
+
+        Each batch is computed only when the one before it has been sent. Of several SYNCs only the last is answered:
+        nodes that are late miss SYNCs, as busy devices do, instead of answering old ones later and later.
 
         Args:
             frames: received frames, each (can_id, data, time of reception in ns), in order.
             t_ns: present time; a reception after it counts as now, and none counts as earlier than the one before it.
-        """
-        return [frame for batch in self.batches(frames, t_ns) for frame in batch]
-
-    def batches(self, frames: Sequence[TimedFrame], t_ns: int) -> Iterator[list[Frame]]:
-        """Do the same as `step`, but compute each batch only when the one before it has been sent.
-
-        Of several SYNCs only the last is answered: nodes that are late miss SYNCs, as busy devices do, instead of
-        answering old ones later and later.
         """
         self.clock.move_ns(t_ns)
         syncs = [can_id for can_id, _, _ in frames].count(SYNC_ID)

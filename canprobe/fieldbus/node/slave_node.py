@@ -21,8 +21,7 @@ from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.emcy import Emergency
-from canprobe.fieldbus.node.guarding import NodeGuarding
-from canprobe.fieldbus.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from canprobe.fieldbus.node.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding
 from canprobe.fieldbus.node.lss import LssSlave
 from canprobe.fieldbus.node.pdo import PdoEngine
 from canprobe.fieldbus.node.quirks import Quirks

@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
+from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
 from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtState, is_restricted
 
 _PRODUCER_FLAG = 1 << 30
-_LISTENING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 class SyncConsumer(Service):
@@ -49,7 +48,7 @@ class SyncConsumer(Service):
 
     def routes(self) -> Mapping[int, Route]:
         """The SYNC identifier, in pre-operational and operational."""
-        if self._core.state not in _LISTENING_STATES:
+        if self._core.state not in TALKING_STATES:
             return NO_ROUTES
         return {self._core.dictionary.number(0x1005, 0, SYNC_ID) & 0x7FF: self._receive}
 

@@ -16,8 +16,7 @@ one of them shows on both sides of the bus.
     raw_image             images in raw CAN frames, of arrays without CANopen
     period                the sampling instants of a free-running device
     frame_bits            bits of a frame on the wire: exact for given contents, best case and worst case
-    response_times        how late a message can be where each node sends its highest priority first
-    fifo_response_times   the same where nodes send their oldest frame first
+    response_times        how late a message can be, where nodes send their highest priority or their oldest frame first
 
 Invariants: every decoder raises `ProtocolError` and nothing else, whatever the bytes; nothing holds state but the
 assemblers, the SYNC counter and the period fit; the source of each table is cited. Start reading at `frames`, then

@@ -15,7 +15,6 @@ from canprobe.errors import ProtocolError
 
 # Statusword bit numbers (6041h) outside the state bits 0..3, 5, 6.
 VOLTAGE_ENABLED_BIT = 4
-WARNING_BIT = 7
 REMOTE_BIT = 9
 TARGET_REACHED_BIT = 10
 INTERNAL_LIMIT_BIT = 11
@@ -34,6 +33,11 @@ CHANGE_IMMEDIATELY_BIT = 5  # PP
 RELATIVE_BIT = 6  # PP
 FAULT_RESET_BIT = 7
 HALT_BIT = 8
+
+# Objects of the first axis, by index.
+CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY = 0x6040, 0x6041, 0x6060, 0x6061
+POSITION, VELOCITY, TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE = 0x6064, 0x606C, 0x607A, 0x60FF, 0x6071
+HOMING_METHOD, INTERPOLATION_DATA, INTERPOLATION_TIME, SUPPORTED_MODES = 0x6098, 0x60C1, 0x60C2, 0x6502
 
 
 class OperationMode(IntEnum):
@@ -87,7 +91,7 @@ _C = DriveCommand
 INITIAL_STATE = _S.NOT_READY_TO_SWITCH_ON  # transition 0, at power on
 
 # (mask, pattern, command). With bit 7 clear every controlword matches exactly one line.
-_CONTROLWORD_PATTERNS: tuple[tuple[int, int, DriveCommand], ...] = (
+CONTROLWORD_PATTERNS: tuple[tuple[int, int, DriveCommand], ...] = (
     (0x82, 0x00, _C.DISABLE_VOLTAGE),
     (0x86, 0x02, _C.QUICK_STOP),
     (0x87, 0x06, _C.SHUTDOWN),
@@ -137,7 +141,7 @@ POWERED_STATES = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT
 _BIT_5_FREE = (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
 _STATES = {state.value: state for state in DriveState} | {state.value | 0x20: state for state in _BIT_5_FREE}
 _COMMANDS = {
-    word: command for mask, pattern, command in _CONTROLWORD_PATTERNS for word in range(0x100) if word & mask == pattern
+    word: command for mask, pattern, command in CONTROLWORD_PATTERNS for word in range(0x100) if word & mask == pattern
 }
 
 

@@ -171,7 +171,3 @@ class PdoLayout:
             return self.raw_unpack(data)
         except struct.error:
             raise ProtocolError(f"PDO {self.cob_id:#05x}: expected {self.length} bytes, got {len(data)}") from None
-
-    def mapping_words(self) -> tuple[int, ...]:
-        """The values of sub-indices 1.. of the mapping record (1600h or 1A00h)."""
-        return tuple(entry.word for entry in self.entries)

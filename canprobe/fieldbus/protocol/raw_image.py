@@ -159,11 +159,6 @@ class ImageFormat:
         return len(self.ids) * len(self.frames)
 
     @property
-    def longest(self) -> int:
-        """Number of bytes of the longest frame."""
-        return max(frame.length for frame in self.frames)
-
-    @property
     def bits(self) -> int:
         """Number of bits of the narrowest value."""
         return min(4 * len(shifts) for frame in self.frames for shifts in frame.values)

@@ -44,6 +44,14 @@ _LOOK_NS = 50_000_000
 _PATIENCE_S = 5.0
 
 
+def _answer(future: Future[T], act: Callable[[], T]) -> None:
+    """Act, and give the one who waits the result or the error."""
+    try:
+        future.set_result(act())
+    except Exception as error:
+        future.set_exception(error)
+
+
 class EmulatedBus(ABC):
     """The bus of a test. A context manager; leaving it closes everything on it.
 
@@ -109,14 +117,7 @@ class EmulatedBus(ABC):
     def act(self, node: FaultyNode, do: Callable[[SlaveNode], T]) -> T:
         """Let a device do something by itself, now; return what `do` returns. Its frames are sent."""
         done: Future[T] = Future()
-
-        def act(slave: SlaveNode) -> None:
-            try:
-                done.set_result(do(slave))
-            except Exception as error:
-                done.set_exception(error)
-
-        self._act(node.node_id, partial(node.act, act))
+        self._act(node.node_id, partial(node.act, lambda slave: _answer(done, partial(do, slave))))
         self._wake()
         return done.result(_PATIENCE_S)
 
@@ -318,17 +319,10 @@ class ServedBus(EmulatedBus):
             self._writer.flush()
 
     def _act(self, node_id: int, act: Callable[[], T]) -> T:
-        future: Future[T] = Future()
-
-        def request() -> None:
-            try:
-                future.set_result(act())
-            except Exception as error:
-                future.set_exception(error)
-
         if node_id not in self._requests_of:  # no such node: a fault that says so
             return act()
-        self._requests_of[node_id].put(request)
+        future: Future[T] = Future()
+        self._requests_of[node_id].put(partial(_answer, future, act))
         try:
             return future.result(_PATIENCE_S)
         except TimeoutError:

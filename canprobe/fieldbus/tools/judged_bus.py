@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from canprobe.fieldbus.tools.emulated_bus import EmulatedBus
 from canprobe.fieldbus.tools.faults.fault import FOREVER_NS
-from canprobe.fieldbus.tools.judge import Judge, judge_frames, read_record
+from canprobe.fieldbus.tools.judge import Judge, read_record
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
 
@@ -28,9 +28,7 @@ class JudgedBus:
         """What is to be said of the master until now; faults that were thrown excuse what follows them."""
         self._bus.flush()
         frames = read_record(self._bus.log, self._bus.channel)
-        judge: Judge = judge_frames(
-            frames, self._bus.descriptions, bitrate=self._bitrate, charges_ns=self._charges_ns()
-        )
+        judge = Judge(self._bus.descriptions, bitrate=self._bitrate, charges_ns=self._charges_ns()).hear(frames)
         return judge.report("the master", {"bit rate": f"{self._bitrate} bit/s"}, log=str(self._bus.log))
 
     def findings(self) -> list[ReportRow]:

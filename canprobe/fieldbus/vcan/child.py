@@ -42,15 +42,12 @@ class Job(Protocol):
 
     def poll(self) -> int | None:
         """Pass the output on; return the exit status once the command has ended."""
-        ...
 
     def send_signal(self, number: int) -> None:
         """Send a signal to the command and what it started in its group."""
-        ...
 
     def kill(self) -> None:
         """End the command at once, whatever it does."""
-        ...
 
 
 def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[int, bool]:

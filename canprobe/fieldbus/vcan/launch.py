@@ -20,7 +20,7 @@ from pathlib import Path
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.real.link import missing_ip, sudo
 from canprobe.fieldbus.bus.real.socketcan import check_interface, has_socketcan
-from canprobe.fieldbus.vcan.child import LocalJob, caught_signals, supervise
+from canprobe.fieldbus.vcan.child import Job, LocalJob, caught_signals, supervise
 from canprobe.fieldbus.vcan.guest import GuestError, GuestJob, missing_packages
 
 CHANNEL, SECOND_CHANNEL = "vcan0", "vcan1"
@@ -60,9 +60,7 @@ def run_with_vcan(
             with _local_way() as way:
                 if way is not None:
                     job = LocalJob([*way[1], *command], {**os.environ, WAY_VARIABLE: way[0]}, shell)
-                    status, timed_out = supervise(job, signals, timeout_s)
-                    _report_time_out(timed_out, timeout_s)
-                    return status
+                    return _supervise(job, signals, timeout_s)
         if (status := _check_guest(install)) != 0:
             return status
         boot = functools.partial(GuestJob, command, {**os.environ, WAY_VARIABLE: "guest"}, realtime, shell)
@@ -103,8 +101,7 @@ def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None)
     interrupted, _ = supervise(_Boot(job), signals, None)
     if interrupted:
         return interrupted
-    status, timed_out = supervise(job, signals, timeout_s)
-    _report_time_out(timed_out, timeout_s)
+    status = _supervise(job, signals, timeout_s)
     if status == 128 + signal.SIGKILL:
         _report_killed()
     job.halt()
@@ -141,10 +138,7 @@ def _local_way() -> Iterator[tuple[str, list[str]] | None]:
     elif shutil.which("unshare") and _succeeds([*namespace, "true"]):
         yield "namespace", namespace
     elif os.geteuid() == 0 and _succeeds(["sh", "-c", _LINK_COMMAND]):
-        made = [
-            CHANNEL,
-            *([SECOND_CHANNEL] if _succeeds(["sh", "-c", _SECOND_LINK_COMMAND]) else []),
-        ]  # unless it is there already
+        made = [CHANNEL, SECOND_CHANNEL] if _succeeds(["sh", "-c", _SECOND_LINK_COMMAND]) else [CHANNEL]
         try:
             yield "link", []
         finally:
@@ -155,11 +149,10 @@ def _local_way() -> Iterator[tuple[str, list[str]] | None]:
 
 
 def _has_vcan() -> bool:
-    try:
+    with contextlib.suppress(InterfaceError):
         check_interface(CHANNEL)
-    except InterfaceError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _succeeds(command: Sequence[str]) -> bool:
@@ -183,9 +176,12 @@ def _install(line: str) -> bool:
     return False
 
 
-def _report_time_out(timed_out: bool, timeout_s: float | None) -> None:
+def _supervise(job: Job, signals: list[int], timeout_s: float | None) -> int:
+    """The exit status of a command that runs; that the time was up is said."""
+    status, timed_out = supervise(job, signals, timeout_s)
     if timed_out:
         _say(f"the command was stopped after {timeout_s:g} s")
+    return status
 
 
 def _report_killed() -> None:

@@ -15,7 +15,7 @@ from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.results.summary import summarise
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cli.common_arguments import PATIENT_SYNCS
+from canprobe.cli.parser import PATIENT_SYNCS
 
 STALL_NS = 8_000_000
 EVERY = 40

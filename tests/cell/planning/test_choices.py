@@ -120,8 +120,10 @@ def test_priorities_follow_the_deadlines_and_are_never_restricted(cylinder):
     assert len({pdo.cob_id for pdo in ordered.pdos}) == len({pdo.cob_id for pdo in default.pdos})
     shared = [pdo for pdo in ordered.pdos if pdo.direction == "rpdo" and pdo.number == 2]
     assert len({pdo.cob_id for pdo in shared}) == 3  # two drives each
-    assert {pdo.layout.mapping_words() for pdo in shared} == {
-        pdo.layout.mapping_words() for pdo in default.pdos if pdo.direction == "rpdo" and pdo.number == 2
+    assert {tuple(entry.word for entry in pdo.layout.entries) for pdo in shared} == {
+        tuple(entry.word for entry in pdo.layout.entries)
+        for pdo in default.pdos
+        if pdo.direction == "rpdo" and pdo.number == 2
     }
 
 

@@ -12,7 +12,7 @@ from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.logs import SUFFIXES, ForeignLog, open_log
 from canprobe.fieldbus.bus.port import ERR_FLAG
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.fieldbus.tools.judge.record import read_record
+from canprobe.fieldbus.tools.judge.bus_frame import read_record
 
 CLASSIC = [
     can.Message(timestamp=0.0, arbitration_id=0x80, data=[1], is_extended_id=False, channel=1),

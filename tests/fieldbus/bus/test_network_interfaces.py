@@ -15,7 +15,7 @@ from patience import patience_s
 
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.fieldbus.bus.real.configured import configured_bus
+from canprobe.fieldbus.bus.real.adapters import configured_bus
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.python_can import Echoes
 

@@ -9,8 +9,7 @@ from timed_buses import BIT, INTERMISSION, Scripted, Source, make_bus
 from wire_faults import Babbler, ErrorsAt
 
 from canprobe.fieldbus.bus.port import ControllerState
-from canprobe.fieldbus.bus.virtual.bit_errors import BitErrors
-from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
+from canprobe.fieldbus.bus.virtual.controllers import BitErrors, ErrorCounters
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS, exact_bits
 from canprobe.fieldbus.protocol.response_times import Message, worst_case_response
 

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from canprobe.fieldbus.drive.motor import MotorDynamics
-from canprobe.fieldbus.drive.profile import torque_run
+from canprobe.fieldbus.drive.profile import MotorDynamics, torque_run
 
 GAIN, COULOMB, DAMPING = 100.0, 50.0, 4.0  # of the plant of numbers
 

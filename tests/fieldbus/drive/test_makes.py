@@ -9,7 +9,7 @@ from canopen.objectdictionary import ObjectDictionary
 from makes import MAKES, Make, changed, pdo, standard_drive, without, word, write_eds
 
 from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.drive.ideal_axis import IdealAxis
+from canprobe.fieldbus.drive.from_eds import IdealAxis
 from canprobe.fieldbus.eds.packaged import load_eds
 
 CYCLE = 10_000_000

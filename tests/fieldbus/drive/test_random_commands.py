@@ -9,7 +9,7 @@ from makes import MAKES, write_eds
 from random_orders import WORDS, live
 
 from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.drive.ideal_axis import IdealAxis
+from canprobe.fieldbus.drive.from_eds import IdealAxis
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.protocol.cia402 import state_of
 

@@ -88,9 +88,10 @@ def test_pdos_modes_and_features():
     assert device.rpdos == device.tpdos == (1, 2, 3, 4)
     assert device.modes == {1, 6, 8, 9, 10}  # PP, homing, CSP, CSV, CST
     assert 1_000_000 in device.bitrates
+    read = device.od.device_information
     info = configparser.RawConfigParser()
     info.read_string(eds_path("puma260_joint").read_text(encoding="ascii"))
     stated = info["DeviceInfo"]["SimpleBootUpSlave"], info["DeviceInfo"]["SimpleBootUpMaster"]
-    assert (str(int(device.simple_boot_up_slave)), str(int(device.simple_boot_up_master))) == stated
+    assert (str(int(read.simple_boot_up_slave)), str(int(read.simple_boot_up_master))) == stated
     bare = described("bare.eds")
-    assert (bare.modes, bare.rpdos, bare.bitrates, bare.simple_boot_up_slave) == (None, (), (), False)
+    assert (bare.modes, bare.rpdos, bare.bitrates) == (None, (), ())

@@ -116,7 +116,7 @@ def test_automatic_transitions():
 
 
 def test_bits_stand_where_the_standard_has_them():
-    assert (cia402.VOLTAGE_ENABLED_BIT, cia402.WARNING_BIT, cia402.REMOTE_BIT) == (4, 7, 9)
+    assert (cia402.VOLTAGE_ENABLED_BIT, cia402.REMOTE_BIT) == (4, 9)
     assert (cia402.TARGET_REACHED_BIT, cia402.INTERNAL_LIMIT_BIT) == (10, 11)
     assert (cia402.DRIVE_FOLLOWS_BIT, cia402.FOLLOWING_ERROR_BIT, cia402.HALT_BIT) == (12, 13, 8)
     assert [m.value for m in cia402.OperationMode] == [0, 1, 6, 7, 8, 9, 10]

@@ -75,7 +75,7 @@ def test_mappings_that_cannot_be_are_refused_cia_301(bits):
 
 
 def test_mapping_words_cia_301_1a00h():
-    assert TPDO1.mapping_words() == (0x60410010, 0x60640020, 0x60770010)
+    assert tuple(entry.word for entry in TPDO1.entries) == (0x60410010, 0x60640020, 0x60770010)
     for entry in (*TPDO1.entries, DUMMY32):
         assert PdoEntry.from_word(entry.word, entry.signed, entry.name) == entry
 

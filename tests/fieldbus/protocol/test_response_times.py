@@ -9,8 +9,12 @@ from hypothesis import strategies as st
 from simulated_bus import instants, simulate
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.fifo_response_times import worst_case_response_fifo
-from canprobe.fieldbus.protocol.response_times import Message, frame_time_ns, worst_case_response
+from canprobe.fieldbus.protocol.response_times import (
+    Message,
+    frame_time_ns,
+    worst_case_response,
+    worst_case_response_fifo,
+)
 
 MS = 1_000_000
 CYCLE = 2_500_000

@@ -9,7 +9,7 @@ from scripted_masters import Careful, DrivesMuteAxis, Master, MutePassedOver, al
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.tools.judge import RULES, BusFrame, judge_frames
+from canprobe.fieldbus.tools.judge import RULES, BusFrame, Judge
 
 GOOD = [Master, *all_masters(Careful)]
 BAD = [master for master in all_masters() if not issubclass(master, Careful)]
@@ -20,7 +20,7 @@ def descriptions(*node_ids):
 
 
 def judged(master):
-    return judge_frames((BusFrame(*frame) for frame in master.run()), descriptions(*master.nodes))
+    return Judge(descriptions(*master.nodes)).hear(BusFrame(*frame) for frame in master.run())
 
 
 def found(judge):
@@ -63,6 +63,6 @@ def test_any_frames_are_judged_without_an_error(seed):
             known = rng.choice((0, 0x80, 0x81, 0x100, 0x181, 0x201, 0x581, 0x601, 0x701, 0x77F, 0x7E5))
             other = rng.choice((known, rng.randrange(0x800), known | 0x40000000, rng.randrange(1 << 29) | 0x80000000))
             frames.append((t_ns, other, rng.randbytes(rng.choice((0, 1, 2, 6, 7, 8)))))
-    judge = judge_frames((BusFrame(*frame) for frame in frames), descriptions(1, 2))
+    judge = Judge(descriptions(1, 2)).hear(BusFrame(*frame) for frame in frames)
     assert judge.frame_count == len(frames)
     judge.report("", {})

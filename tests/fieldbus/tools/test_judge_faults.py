@@ -13,7 +13,7 @@ from canprobe.fieldbus.drive.from_eds import make_eds_node
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
-from canprobe.fieldbus.tools.judge import BusFrame, first_answers, judge_frames
+from canprobe.fieldbus.tools.judge import BusFrame, Judge, first_answers
 from canprobe.fieldbus.tools.judge.injections import STANDARD_FAULTS, Injections
 
 NODES = (1, 2)
@@ -84,7 +84,7 @@ class SineMaster:
         nodes = {node: Description(load_eds("puma260_joint", node)) for node in NODES}
         thrown = self.injections.thrown
         spans = [(one.begin_ns, one.end_ns) for one in thrown]
-        judge = judge_frames(self.frames, nodes, served=True, charges_ns=spans)
+        judge = Judge(nodes, served=True, charges_ns=spans).hear(self.frames)
         return {rule.number for rule in judge.rules if rule.count}, first_answers(self.frames, thrown, nodes)
 
 

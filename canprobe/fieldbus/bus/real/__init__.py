@@ -5,7 +5,6 @@
     mmsg         many frames in one system call, under `socketcan`
     link         how a SocketCAN interface is set, and the lines that set it
     python_can   the port on every other interface
-    configured   the bus that python-can's own configuration names
     echoes       which received frames are our own
     processor    priority and locked memory for a process in real time
     memory       reserved memory, and no garbage collection inside a cycle

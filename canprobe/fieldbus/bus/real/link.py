@@ -42,7 +42,7 @@ class LinkState:
         state: state of the controller, such as `ERROR-ACTIVE`.
         tx_errors, rx_errors: the controller's error counters.
         modes: modes of the controller, such as `LISTEN-ONLY`, `FD`.
-        bus_errors, bus_offs: numbers of them since the interface was made.
+        bus_offs: number of times that it went bus off since the interface was made.
     """
 
     name: str
@@ -57,7 +57,6 @@ class LinkState:
     tx_errors: int | None = None
     rx_errors: int | None = None
     modes: tuple[str, ...] = ()
-    bus_errors: int | None = None
     bus_offs: int | None = None
 
 
@@ -89,7 +88,6 @@ def parse_link(text: str) -> LinkState:
         tx_errors=_whole(errors, "tx"),
         rx_errors=_whole(errors, "rx"),
         modes=tuple(str(mode) for mode in _list(data, "ctrlmode")),
-        bus_errors=_whole(counted, "bus_error"),
         bus_offs=_whole(counted, "bus_off"),
     )
 

@@ -5,9 +5,7 @@ Time is a `VirtualClock`. It passes only while somebody waits on it, and then ju
 
     lockstep         frames arrive at once, in the order of arbitration, without time on the wire
     timed            frames take their bits at the bit rate, wait for each other, and fail where the wire fails
-    bit_errors       which transmissions the wire corrupts
-    error_counters   the error counters of one controller: error active, error passive, bus off
-    controllers      all controllers of a timed bus: who has to wait, and who is off the bus
+    controllers      bits that the wire corrupts, and the error counters of all nodes: who has to wait, who is bus off
 
 Start reading at `lockstep`; a `TimedBus` is a `LockstepBus` that adds the wire.
 """

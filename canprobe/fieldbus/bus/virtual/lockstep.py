@@ -129,7 +129,10 @@ class LockstepBus:
 
     def detach(self, participant: Participant) -> None:
         """Take `participant` off the bus; frames that it had queued are lost."""
-        self._remove(participant)
+        self._nodes = [node for node in self._nodes if node.owner is not participant]
+        self._heads = [head for head in self._heads if head[2].owner is not participant]
+        heapify(self._heads)
+        self._forget_listeners()
 
     def port(self) -> LockstepPort:
         """Return a new port of a master; several see each other's frames."""
@@ -185,7 +188,7 @@ class LockstepBus:
 
     def remove_port(self, port: LockstepPort) -> None:
         """Take a closed port off the bus."""
-        self._remove(port)
+        self.detach(port)
 
     def _advance_due(self, t_ns: int) -> bool:
         advanced = False
@@ -260,12 +263,6 @@ class LockstepBus:
         self._nodes.append(node)
         self._forget_listeners()
         return node
-
-    def _remove(self, owner: Participant) -> None:
-        self._nodes = [node for node in self._nodes if node.owner is not owner]
-        self._heads = [head for head in self._heads if head[2].owner is not owner]
-        heapify(self._heads)
-        self._forget_listeners()
 
     def _forget_listeners(self) -> None:
         for node in self._nodes:

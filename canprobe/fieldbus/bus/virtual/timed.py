@@ -18,9 +18,7 @@ from typing import Literal
 
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ERR_BUS, ERR_FLAG, ERR_PROTOCOL
-from canprobe.fieldbus.bus.virtual.bit_errors import WireErrors
-from canprobe.fieldbus.bus.virtual.controllers import Controllers
-from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
+from canprobe.fieldbus.bus.virtual.controllers import Controllers, ErrorCounters, WireErrors
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, LockstepPort, Participant, arbitration_key
 from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
@@ -348,11 +346,11 @@ class TimedBus(LockstepBus):
         self._stale = True
         return node
 
-    def _remove(self, owner: Participant) -> None:
-        for node in [node for node in self._nodes if node.owner is owner]:
+    def detach(self, participant: Participant) -> None:
+        for node in [node for node in self._nodes if node.owner is participant]:
             self._silence(node)
             self._controllers.remove(node)
             if self._flying is not None and self._flying[2] is node:
                 self._flying = None  # the node falls silent in the middle of a frame
-        super()._remove(owner)
+        super().detach(participant)
         self._stale = True

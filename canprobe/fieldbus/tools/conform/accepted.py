@@ -53,6 +53,6 @@ def abort_text(code: int) -> str:
     return f"{code:08X}h ({words})"
 
 
-def accepted_text(accepted: AbortSet) -> str:
+def text(accepted: AbortSet) -> str:
     """The accepted codes as text."""
     return "abort " + ", ".join(f"{code:08X}h" for code in accepted)

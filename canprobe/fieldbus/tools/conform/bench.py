@@ -7,7 +7,7 @@ from typing import NoReturn
 
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
-from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NMT_ID, RTR_FLAG, SYNC_ID, NmtCommand, NmtState
+from canprobe.fieldbus.protocol.frames import NMT_GOALS, NMT_ID, RTR_FLAG, SYNC_ID, NmtCommand, NmtState
 from canprobe.fieldbus.protocol.sdo import place_text
 from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
@@ -17,12 +17,8 @@ from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
 
 HEARTBEAT_MS = 50
 """Period of the heartbeat by which points see the NMT state."""
-COMMANDS = {
-    NmtState.PRE_OPERATIONAL: NmtCommand.PRE_OPERATIONAL,
-    NmtState.OPERATIONAL: NmtCommand.START,
-    NmtState.STOPPED: NmtCommand.STOP,
-}
-_QUEUED_NS = 5_000_000
+COMMANDS: dict[NmtState, NmtCommand] = {NMT_GOALS[command]: command for command in tuple(NmtCommand)[:3]}
+QUEUED_NS = 5_000_000
 """Time in which frames may still come that were queued before a change of the state."""
 
 
@@ -34,10 +30,10 @@ class Bench(SdoClient):
         device: the device.
         permits: gate for what is sent.
         times: how long is waited.
-        bitrate: bit rate of the bus, bit/s.
-        fd: whether the bus carries CAN FD frames.
 
     Attributes:
+        bitrate: bit rate of the bus, bit/s.
+        fd: whether the bus carries CAN FD frames.
         distributions: measured times by name, ms.
         first_answer: answer to the first read of 1000h, by which is seen that the device serves.
         by_hand: function that asks a person to do something, and returns whether it was done.
@@ -46,18 +42,9 @@ class Bench(SdoClient):
         kept_out: why the device cannot be brought to operational; empty: it can.
     """
 
-    def __init__(
-        self,
-        port: Port,
-        device: ExaminedDevice,
-        permits: Permits,
-        times: BenchTimes,
-        *,
-        bitrate: int = 1_000_000,
-        fd: bool = False,
-    ) -> None:
+    def __init__(self, port: Port, device: ExaminedDevice, permits: Permits, times: BenchTimes) -> None:
         super().__init__(port, device.node_id, permits, times)
-        self.device, self.bitrate, self.fd = device, bitrate, fd
+        self.device, self.bitrate, self.fd = device, 1_000_000, False
         self.notes = []
         self.asked: set[int] = set()
         self.standing: set[int] = set()
@@ -113,12 +100,21 @@ class Bench(SdoClient):
         """Fail the point."""
         raise Deviation(text)
 
+    def does_not_apply(self, why: str) -> NoReturn:
+        """End the point, which cannot be examined on this device."""
+        raise PointNotApplicable(why)
+
     def nmt(self, command: int) -> int:
         """Send an NMT command to the device; return when. Raises PointNotApplicable where it cannot be followed."""
         if command == NmtCommand.START and self.kept_out:
             raise PointNotApplicable(f"it needs operational: {self.kept_out}")
         self._changed_ns = self.send(NMT_ID, bytes((command, self.node_id)))
         return self._changed_ns
+
+    def start(self) -> None:
+        """Start the device, and let it get ready."""
+        self.nmt(NmtCommand.START)
+        self.pass_time(0.01)
 
     def watch_state(self) -> None:
         """Let the device report its state: by heartbeat, or where it has none by guarding.
@@ -128,31 +124,28 @@ class Bench(SdoClient):
         """
         if self.device.writable(0x1017):
             self.put(0x1017, 0, HEARTBEAT_MS)
-        elif not self.device.number(0x1017) and self._guarded() is None:
+        elif not self.device.number(0x1017) and self.guarded() is None:
             raise PointNotApplicable("the device reports its state neither by heartbeat nor by guarding")
 
     def state(self) -> int:
         """NMT state as the device reports it now; call `watch_state` before."""
         period_ms = HEARTBEAT_MS if self.device.writable(0x1017) else self.device.number(0x1017)
         if not period_ms:
-            state = self._guarded()
-            return self.deviates("no answer to guarding") if state is None else state
-        can_id, until_ns = (
-            HEARTBEAT_BASE + self.node_id,
-            self.now_ns + round((3e-3 * period_ms + self.times.slack_s) * 1e9),
-        )
-        self.taken(can_id)
-        while (frame := self.next(can_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
-            if len(frame.data) == 1 and frame.data[0] and frame.t_ns > self._changed_ns + _QUEUED_NS:
+            state = self.guarded()
+            return self.deviates("no answer to guarding") if state is None else state & 0x7F
+        until_ns = self.now_ns + round((3e-3 * period_ms + self.times.slack_s) * 1e9)
+        self.taken(self.beat_id)
+        while (frame := self.next(self.beat_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+            if len(frame.data) == 1 and frame.data[0] and frame.t_ns > self._changed_ns + QUEUED_NS:
                 return frame.data[0]
         self.deviates(f"no heartbeat within three periods of {period_ms} ms")
 
-    def _guarded(self) -> int | None:
-        can_id = HEARTBEAT_BASE + self.node_id
-        self.taken(can_id)
-        self.send(can_id | RTR_FLAG)
-        frame = self.next(can_id, self.times.silence_s + self.times.slack_s)
-        return frame.data[0] & 0x7F if frame is not None and len(frame.data) == 1 else None
+    def guarded(self) -> int | None:
+        """Answer to guarding: state and toggle bit; None where none comes."""
+        self.taken(self.beat_id)
+        self.send(self.beat_id | RTR_FLAG)
+        frame = self.next(self.beat_id, self.times.silence_s + self.times.slack_s)
+        return frame.data[0] if frame is not None and len(frame.data) == 1 else None
 
     def go(self, state: NmtState) -> None:
         """Command a state, and check that the device reports it; call `watch_state` before."""
@@ -163,15 +156,14 @@ class Bench(SdoClient):
     def settle(self, state: NmtState) -> int:
         """Command a state without looking at it; what was queued before has come when this returns the time of it."""
         t_ns = self.nmt(COMMANDS[state])
-        self.pass_time(2 * _QUEUED_NS * 1e-9)
+        self.pass_time(2 * QUEUED_NS * 1e-9)
         return t_ns
 
     def reset(self, command: NmtCommand = NmtCommand.RESET_COMMUNICATION) -> int:
         """Reset the device, and wait for its boot-up message; return when it came. Raises Deviation."""
-        can_id = HEARTBEAT_BASE + self.node_id
-        self.taken(can_id)
+        self.taken(self.beat_id)
         until_ns = self.nmt(command) + round(self.times.boot_s * 1e9)
-        while (frame := self.next(can_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+        while (frame := self.next(self.beat_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
             if frame.data == b"\0":
                 return frame.t_ns
         self.deviates(f"no boot-up message within {self.times.boot_s:g} s of {command.name.lower().replace('_', ' ')}")
@@ -210,3 +202,9 @@ class Bench(SdoClient):
     def sync(self, counter: int | None = None) -> int:
         """Send a SYNC, with a counter or without one; return when."""
         return self.send(SYNC_ID, b"" if counter is None else bytes((counter,)))
+
+    def sync_and_wait(self) -> int:
+        """Send a SYNC, and let what it brings come; return when it was sent."""
+        t_ns = self.sync()
+        self.pass_time(self.times.slack_s)
+        return t_ns

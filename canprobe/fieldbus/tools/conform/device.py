@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from canprobe.fieldbus.bus.sdo import decode_text
 from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.reading import is_drive
+from canprobe.fieldbus.protocol.cia402 import STATUSWORD
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.conform.outcome import Deviation
@@ -16,10 +17,8 @@ from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
 
 RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
 DRIVE_PROFILE = 402
-CONTROLWORD, STATUSWORD = 0x6040, 0x6041
 _AXIS_STEP = 0x800
-_VARIABLES = (0x1000, 0x1001, 0x1002, 0x1005, 0x1006, 0x1007, 0x1008, 0x1009, 0x100A, 0x100C, 0x100D, 0x1012, 0x1014)
-_MORE_VARIABLES = (0x1015, 0x1017, 0x1019)
+_VARIABLES = (*range(0x1000, 0x1003), *range(0x1005, 0x100B), 0x100C, 0x100D, 0x1012, 0x1014, 0x1015, 0x1017, 0x1019)
 _RECORDS = (0x1003, 0x1016, 0x1018, 0x1020, 0x1028, 0x1029, 0x1200, 0x1201)
 _MAX_ENTRIES = 64
 _UNDESCRIBED_PDOS = 32
@@ -55,14 +54,13 @@ class ExaminedDevice:
 
     def read_all(self, bench: SdoClient, written: WriteList) -> None:
         """Read the communication objects that the standard or the EDS names, and what the user lets be written."""
-        for index in (*_VARIABLES, *_MORE_VARIABLES):
+        for index in _VARIABLES:
             self._read(bench, (index, 0))
         for index in (*_RECORDS, *self._pdo_indices()):
             self._read_record(bench, index)
         for entry in self.entries():
-            place = entry.index, entry.subindex
-            if entry.readable and place not in self.values and (entry.index < 0x2000 or written.permits(place)):
-                self._read(bench, place)
+            if entry.readable and not self.has(*entry.place) and (entry.index < 0x2000 or written.permits(entry.place)):
+                self._read(bench, entry.place)
         if self.profile == DRIVE_PROFILE or (self.description is not None and is_drive(self.description.od)):
             for axis in range(8):
                 index = STATUSWORD + axis * _AXIS_STEP
@@ -141,6 +139,10 @@ class ExaminedDevice:
     def pdos(self, area: range) -> list[int]:
         """Indices of the communication parameters of the PDOs in an area."""
         return sorted(index for index, subindex in self.values if subindex == 1 and index in area)
+
+    def valid_pdos(self, area: range) -> dict[int, int]:
+        """Indices of the communication parameters of the valid PDOs in an area, by identifier."""
+        return {cob_id: pdo for pdo in self.pdos(area) if (cob_id := self.cob_id(pdo)) is not None}
 
     def mapping(self, pdo: int) -> list[int]:
         """Mapped entries of a PDO, each index << 16 | subindex << 8 | bits."""

@@ -19,11 +19,11 @@ from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.port import ControllerState, Port, nothing
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, describe_state, known_state
+from canprobe.fieldbus.protocol.cia402 import CONTROLWORD, POWERED_STATES, describe_state, known_state
 from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import CONTROLWORD, RPDOS, ExaminedDevice
+from canprobe.fieldbus.tools.conform.device import RPDOS, ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.hints import HINTS
@@ -150,33 +150,25 @@ class Examination:
         written = settings.written.with_motion() if settings.motion else settings.written
         permits = Permits(self._node_id, surroundings, written)
         device = ExaminedDevice(self._node_id, self._description)
-        self.bench = bench = Bench(
-            self._port, device, permits, settings.times, bitrate=settings.bitrate, fd=settings.fd
-        )
-        bench.by_hand = self._by_hand
+        self.bench = bench = Bench(self._port, device, permits, settings.times)
+        bench.bitrate, bench.fd, bench.by_hand = settings.bitrate, settings.fd, self._by_hand
         try:
             bench.first_answer = bench.request(0x40, 0x1000)
         except CanprobeError as error:
             raise NodeError(self._node_id, f"it cannot be examined: {error}") from error
         device.read_all(bench, written)
-        self.journal = Journal(
-            restorable(
-                device.values, [p for p in device.values if written.permits(p) and not is_object(p[0], CONTROLWORD)]
-            ),
-            settings.snapshot,
-            device.identity,
-            temporary=not settings.keep_snapshot,
-        )
+        permitted = [p for p in device.values if written.permits(p) and not is_object(p[0], CONTROLWORD)]
+        values, temporary = restorable(device.values, permitted), not settings.keep_snapshot
+        self.journal = Journal(values, settings.snapshot, device.identity, temporary=temporary)
         permits.values, bench.noted = device.values, self.journal.note
-        permits.rpdo_ids = {c for pdo in device.pdos(RPDOS) if (c := device.cob_id(pdo)) is not None}
+        permits.rpdo_ids = set(device.valid_pdos(RPDOS))
         if (emcy_id := device.number(0x1014)) and not emcy_id >> 31:
             bench.emcy_id = emcy_id & 0x7FF
         self._boots = bench.boots
-        self.report.title = (
-            f"{device.facts().get('device name', 'device')}, node {self._node_id} on {self._port.channel}"
-        )
+        facts = device.facts()
+        self.report.title = f"{facts.get('device name', 'device')}, node {self._node_id} on {self._port.channel}"
         history = [f"{device.number(0x1003, n):08X}h" for n in range(1, device.number(0x1003) + 1)]
-        self.report.facts.update(device.facts())
+        self.report.facts.update(facts)
         self.report.facts["error history (1003h) before"] = ", ".join(history) or "empty"
         self.report.facts["bus"] = f"{self._port.channel}, beside the device: {surroundings.text()}"
         if surroundings.lacks("nmt") and device.has(0x1017):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from canprobe.fieldbus.bus.port import ControllerState, Port, TimedFrame
 from canprobe.fieldbus.protocol.emcy import Emcy
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Frame
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE, Frame
 from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.conform.outcome import BenchFailure
 from canprobe.fieldbus.tools.conform.permits import Permits
@@ -68,6 +68,7 @@ class FrameLink:
 
     Attributes:
         emcy_id: identifier of the device's EMCY.
+        request_id, answer_id, beat_id: identifiers of the SDO requests to the device, of its answers, of its heartbeat.
         emergencies: EMCY messages that nobody has taken yet, with their times.
         boots: number of boot-ups so far.
         odd_ids: identifiers, with their flags, of remote requests and frames with 29 bits that came.
@@ -78,7 +79,8 @@ class FrameLink:
 
     def __init__(self, port: Port, node_id: int, permits: Permits, times: BenchTimes) -> None:
         self.port, self.node_id, self.permits, self.times = port, node_id, permits, times
-        self.emcy_id = EMCY_BASE + node_id
+        self.emcy_id, self.beat_id = EMCY_BASE + node_id, HEARTBEAT_BASE + node_id
+        self.request_id, self.answer_id = SDO_RX_BASE + node_id, SDO_TX_BASE + node_id
         self.emergencies: deque[tuple[Emcy, int]] = deque()
         self.boots = 0
         self.odd_ids: set[int] = set()
@@ -178,7 +180,7 @@ class FrameLink:
         can_id, data, t_ns = frame
         if can_id == self.emcy_id and len(data) == _EMCY_BYTES:
             self.emergencies.append((Emcy.unpack(data), t_ns))
-        elif can_id == HEARTBEAT_BASE + self.node_id and data == b"\0":
+        elif can_id == self.beat_id and data == b"\0":
             self.boots += 1
         if can_id > MAX_BASE_ID:
             self.odd_ids.add(can_id)

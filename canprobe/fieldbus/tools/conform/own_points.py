@@ -33,33 +33,14 @@ from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.protocol.sdo import Place, place_text
 from canprobe.fieldbus.tools.conform.accepted import abort_text
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
 FIRST_NUMBER = 201
 """Number of the first point of a file."""
-STEPS: Mapping[str, tuple[str, ...]] = {
-    "read": ("equals", "mask", "low", "high", "abort"),
-    "write": ("value", "abort"),
-    "nmt": (),
-    "send": ("emcy", "within_ms"),
-    "expect": ("data", "within_ms"),
-    "silent": ("for_ms",),
-    "emcy": ("within_ms",),
-    "wait_ms": (),
-    "ask": (),
-}
-"""Words of a step, and what each may have."""
 _KEYS = ("name", "clause", "expected", "hint", "needs", "steps")
 _NEEDS = ("eds", "nmt", "sync", "alone", "drive", "motion")
-_NMT = {
-    "start": NmtCommand.START,
-    "stop": NmtCommand.STOP,
-    "pre-operational": NmtCommand.PRE_OPERATIONAL,
-    "reset-node": NmtCommand.RESET_NODE,
-    "reset-communication": NmtCommand.RESET_COMMUNICATION,
-}
+_NMT = {command.name.lower().replace("_", "-"): command for command in NmtCommand}
 _MAX_BYTES = 1 << 20
 _DEFAULT_MS = 100.0
 _PLACE = re.compile(r"([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2})h?)?")
@@ -114,10 +95,11 @@ def _parse_step(where: str, step: object) -> Step:
     if not isinstance(step, dict) or not words:
         raise UsageError(f"{where}: expected a table with one of {', '.join(STEPS)}, got {step!r}")
     word = words[0]
-    _check_keys(where, step, (word, *STEPS[word]))
+    parse, keys = STEPS[word]
+    _check_keys(where, step, (word, *keys))
     value = step[word]
     try:
-        return _STEP_PARSERS[word](value, step)
+        return parse(value, step)
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{where}: {word} = {value!r}: {error}") from error
 
@@ -258,21 +240,18 @@ def _wait(value: float, _step: Mapping[str, Any]) -> Step:
 
 
 def _ask(text: str, _step: Mapping[str, Any]) -> Step:
-    def act(bench: Bench) -> None:
-        if not bench.by_hand(str(text)):
-            raise PointNotApplicable(f"it was not done by hand: {text}")
-
-    return act
+    return lambda bench: None if bench.by_hand(str(text)) else bench.does_not_apply(f"it was not done by hand: {text}")
 
 
-_STEP_PARSERS: Mapping[str, Callable[[Any, Mapping[str, Any]], Step]] = {
-    "read": _read,
-    "write": _write,
-    "nmt": _nmt,
-    "send": _send,
-    "expect": _expect,
-    "silent": _silent,
-    "emcy": _emcy,
-    "wait_ms": _wait,
-    "ask": _ask,
+STEPS: Mapping[str, tuple[Callable[[Any, Mapping[str, Any]], Step], tuple[str, ...]]] = {
+    "read": (_read, ("equals", "mask", "low", "high", "abort")),
+    "write": (_write, ("value", "abort")),
+    "nmt": (_nmt, ()),
+    "send": (_send, ("emcy", "within_ms")),
+    "expect": (_expect, ("data", "within_ms")),
+    "silent": (_silent, ("for_ms",)),
+    "emcy": (_emcy, ("within_ms",)),
+    "wait_ms": (_wait, ()),
+    "ask": (_ask, ()),
 }
+"""Words of a step: what parses it, and what else it may have."""

@@ -36,6 +36,13 @@ def switch_off(bench: Bench, pdo: int) -> None:
     bench.put(pdo, 1, bench.device.number(pdo, 1) | INVALID_FLAG, 4)
 
 
+def idle_pdo(bench: Bench, area: range, *, mapping: bool = False) -> int:
+    """A PDO that can be changed, as `changeable_pdo` finds it, out of use."""
+    pdo = changeable_pdo(bench, area, mapping=mapping)
+    switch_off(bench, pdo)
+    return pdo
+
+
 def switch_on(bench: Bench, pdo: int) -> int:
     """Put a PDO to work under its own identifier, or the pre-defined one; return the identifier."""
     word = bench.device.number(pdo, 1) & ~INVALID_FLAG
@@ -54,10 +61,10 @@ def map_entries(bench: Bench, pdo: int, words: list[int]) -> None:
     bench.put(pdo + 0x200, 0, len(words))
 
 
-def set_parameters(
+def put_to_work(
     bench: Bench, pdo: int, kind: int, *, inhibit: int = 0, event_ms: int = 0, start: int | None = None
-) -> None:
-    """Set transmission type and times of a PDO that is out of use.
+) -> int:
+    """Set transmission type and times of a PDO that is out of use, and switch it on; return its identifier.
 
     Raises:
         PointNotApplicable: the device has not all of them, or does not take the transmission type.
@@ -68,16 +75,15 @@ def set_parameters(
         if value is not None and (value or bench.device.number(pdo, subindex)):
             bench.need((pdo, subindex))
             bench.put(pdo, subindex, value)
+    return switch_on(bench, pdo)
 
 
 def synchronous_tpdo(bench: Bench, every: int = 1, start: int | None = None) -> int:
     """A TPDO that is sent at every n-th SYNC; return its identifier. SYNC has no counter, unless a start is given."""
-    pdo = changeable_pdo(bench, TPDOS)
+    pdo = idle_pdo(bench, TPDOS)
     if start is None:
         plain_sync(bench)
-    switch_off(bench, pdo)
-    set_parameters(bench, pdo, every, start=start)
-    return switch_on(bench, pdo)
+    return put_to_work(bench, pdo, every, start=start)
 
 
 def plain_sync(bench: Bench) -> None:
@@ -95,11 +101,10 @@ def permitted_entry(bench: Bench, *, transmits: bool) -> DescribedEntry:
         PointNotApplicable: there is none.
     """
     for entry in bench.device.entries():
-        place = entry.index, entry.subindex
         mappable = entry.in_tpdo and entry.writable if transmits else entry.in_rpdo and entry.readable
         if is_object(entry.index, *MOTION_OBJECTS) or entry.index < 0x2000 or not entry.is_integer:
             continue
-        if mappable and bench.permits.written.permits(place):
+        if mappable and bench.permits.written.permits(entry.place):
             return entry
     way = "a TPDO" if transmits else "an RPDO"
     raise PointNotApplicable(f"--write names no entry that {way} may map, and whose value can be read and written")
@@ -110,31 +115,28 @@ def word_of(entry: DescribedEntry) -> int:
     return entry.index << 16 | entry.subindex << 8 | entry.bits
 
 
-def rpdo_of_dummies(bench: Bench, kind: int = EVENT_TYPE, *, event_ms: int = 0) -> tuple[int, int, int]:
+def rpdo_of_dummies(bench: Bench) -> tuple[int, int, int]:
     """An RPDO that carries nothing; return its index, identifier and length.
 
     Raises:
         PointNotApplicable: no mapping can be changed, or none takes a dummy.
     """
-    pdo = changeable_pdo(bench, RPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, RPDOS, mapping=True)
     bench.put(pdo + 0x200, 0, 0)
     word = next((word for word in _DUMMY_WORDS if bench.takes(pdo + 0x200, 1, word)), 0)
     if not word or not bench.takes(pdo + 0x200, 0, 1):
         raise PointNotApplicable("no RPDO takes a dummy entry, so none can be sent without changing something")
-    return pdo, _started(bench, pdo, kind, event_ms), (word & 0xFF) // 8
+    return pdo, _harmless(bench, pdo, EVENT_TYPE), (word & 0xFF) // 8
 
 
-def rpdo_of(bench: Bench, entry: DescribedEntry, kind: int) -> tuple[int, int]:
-    """An RPDO that carries one entry that the user lets be written; return its index and identifier."""
-    pdo = changeable_pdo(bench, RPDOS, mapping=True)
-    switch_off(bench, pdo)
+def rpdo_of(bench: Bench, entry: DescribedEntry, kind: int) -> int:
+    """An RPDO that carries one entry that the user lets be written; return its identifier."""
+    pdo = idle_pdo(bench, RPDOS, mapping=True)
     map_entries(bench, pdo, [word_of(entry)])
-    return pdo, _started(bench, pdo, kind, 0)
+    return _harmless(bench, pdo, kind)
 
 
-def _started(bench: Bench, pdo: int, kind: int, event_ms: int) -> int:
-    set_parameters(bench, pdo, kind, event_ms=event_ms)
-    cob_id = switch_on(bench, pdo)
+def _harmless(bench: Bench, pdo: int, kind: int) -> int:
+    cob_id = put_to_work(bench, pdo, kind)
     bench.permits.harmless.add(cob_id)
     return cob_id

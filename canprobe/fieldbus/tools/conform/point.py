@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 
 
@@ -50,11 +51,12 @@ class PointGroup:
     name: str
 
     def __call__(
-        self, number: int, name: str, clause: str, expected: str, *, needs: str = ""
+        self, number: int, name: str, clause: str, expected: str | accepted.AbortSet, *, needs: str = ""
     ) -> Callable[[Callable[[Bench], None]], Point]:
-        """Make a `Point` of the function below; `needs` are words with blanks between them."""
+        """Make a `Point` of the function below; `expected` are words or codes, `needs` are words with blanks."""
+        text = expected if isinstance(expected, str) else accepted.text(expected)
 
         def make(run: Callable[[Bench], None]) -> Point:
-            return Point(number, self.name, name, clause, expected, run, frozenset(needs.split()))
+            return Point(number, self.name, name, clause, text, run, frozenset(needs.split()))
 
         return make

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.protocol import sdo
-from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 from canprobe.fieldbus.tools.conform.accepted import AbortSet, abort_text
 from canprobe.fieldbus.tools.conform.frame_link import FrameLink
 from canprobe.fieldbus.tools.conform.frame_text import sdo_text
@@ -42,11 +41,11 @@ class SdoClient(FrameLink):
         Raises:
             Deviation: no answer came, or one of another length.
         """
-        answer_id, answer = SDO_TX_BASE + self.node_id, None
-        self.taken(answer_id)
-        until_ns = self.send(SDO_RX_BASE + self.node_id, request) + round(self.times.sdo_s * 1e9)
+        answer = None
+        self.taken(self.answer_id)
+        until_ns = self.send(self.request_id, request) + round(self.times.sdo_s * 1e9)
         named = request[0] >> 5 in (1, 2) or request[0] & 0xE1 == 0xC0 or request[0] & 0xE3 == 0xA0
-        while (frame := self.next(answer_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+        while (frame := self.next(self.answer_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
             answer = frame.data
             if len(answer) != 8 or not named or sdo.place_of(answer) == sdo.place_of(request):
                 break
@@ -124,4 +123,14 @@ class SdoClient(FrameLink):
     def is_silent(self) -> bool:
         """Whether no SDO answer has come, and none comes for the time of a silence."""
         self.pass_time(self.times.silence_s)
-        return not self.taken(SDO_TX_BASE + self.node_id)
+        return not self.taken(self.answer_id)
+
+    def abort(self, index: int) -> None:
+        """End a transfer of an entry from the client's side."""
+        self.send(self.request_id, sdo.pack_abort(index, 0, 0x08000000))
+
+    def ignores(self, can_id: int, data: bytes = b"") -> bool:
+        """Send a frame; whether no SDO answer comes."""
+        self.taken(self.answer_id)
+        self.send(can_id, data)
+        return self.is_silent()

@@ -12,14 +12,7 @@ from dataclasses import dataclass, replace
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.presence import answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.protocol.frames import (
-    EMCY_BASE,
-    HEARTBEAT_BASE,
-    NMT_ID,
-    SDO_RX_BASE,
-    SDO_TX_BASE,
-    SYNC_ID,
-)
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.lss import LSS_ANSWER_ID, LSS_REQUEST_ID
 
 MAX_BASE_ID = 0x7FF

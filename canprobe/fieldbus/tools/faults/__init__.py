@@ -17,8 +17,7 @@ cycle; when it ends, what it changed in the node is undone; a node without fault
     service_faults  heartbeat, NMT, SDO, EMCY, mapping
     drive_faults    CiA 402: fault, torque off, encoder, brake, zero
     registry        the table of all kinds
-    text, injection faults as text, and thrown at running nodes
-    planned         faults of a test, which wait for their nodes
+    text, injection faults as text, and thrown at nodes; those of a test wait for their nodes
     control         the local channel by which `canprobe inject` reaches served nodes
 
 Faults of the array are in `canprobe.cell.emulated.array_faults`. Start reading at `registry`, then `faulty_node`.

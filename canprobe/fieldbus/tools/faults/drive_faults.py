@@ -43,14 +43,12 @@ class DriveFault(DriveEffect):
     )
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
-        self.node.core.now_ns = t_ns
-        self.drive.inject_fault(int(self.fault.value("code")))
-        return self.node.advance(t_ns)
+        return self.act(t_ns, lambda: self.drive.inject_fault(int(self.fault.value("code"))))
 
     def watch(self, t_ns: int) -> Sequence[Frame]:
         if self.fault.value("resettable") or self.drive.state in _FAULT_STATES:
             return ()
+        self.host.hits += 1
         return self.begin(t_ns)
 
 
@@ -62,15 +60,12 @@ class Sto(DriveEffect):
     trips, fails = "drive_fault", "49 50 51 54 55"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         return self.watch(t_ns)
 
     def watch(self, t_ns: int) -> Sequence[Frame]:
         if self.drive.state in _RESTING_STATES:
             return ()
-        self.node.core.now_ns = t_ns
-        self.drive.lose_power(t_ns)
-        return self.node.advance(t_ns)
+        return self.act(t_ns, lambda: self.drive.lose_power(t_ns))
 
 
 class ModeRefused(ObjectAborted):
@@ -93,26 +88,22 @@ class BrakeStuck(DriveEffect):
     trips = "following"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         self.drive.parts.motion.block(t_ns)
         return ()
 
-    def end(self, t_ns: int) -> Sequence[Frame]:
+    def end(self, t_ns: int) -> None:
         self.drive.parts.motion.blocked = False
-        return ()
 
 
 class EncoderFault(DriveEffect):
     """Base class of faults of the encoder."""
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         self.drive.parts.feedback.distortions.append(self.measured)
         return ()
 
-    def end(self, t_ns: int) -> Sequence[Frame]:
+    def end(self, t_ns: int) -> None:
         self.drive.parts.feedback.distortions.remove(self.measured)
-        return ()
 
     def measured(self, counts: float) -> float:
         """Counts that are measured in the place of the true ones."""
@@ -151,7 +142,6 @@ class HomingLost(DriveEffect):
     clause, reaction = "CiA 402-2, homing, bit 12", "moves nothing before it is homed"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         self.drive.forget_homing()
         return ()
 
@@ -165,7 +155,6 @@ class ZeroShift(DriveEffect):
     parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "way of the zero, units of position"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         units = self.drive.parts.parameters.units
         units.origin += self.fault.value("counts") * units.scale
         return ()
@@ -179,14 +168,12 @@ class TorqueLimit(DriveEffect):
     parameters = numbers(permille=Parameter(10, 0, 10_000, "limit, 1/1000 of the rated torque"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         self._before = self.node.dictionary.number(_MAX_TORQUE_INDEX)
         self._limit(int(self.fault.value("permille")))
         return ()
 
-    def end(self, t_ns: int) -> Sequence[Frame]:
+    def end(self, t_ns: int) -> None:
         self._limit(self._before)
-        return ()
 
     def _limit(self, permille: int) -> None:
         dictionary = self.node.dictionary

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from random import Random
 from types import MappingProxyType
@@ -199,17 +199,17 @@ class Effect:
         self.end_ns = fault.end_ns
         self.left = fault.hits
 
-    def begin(self, t_ns: int) -> Sequence[Frame]:
-        """Begin; return frames that the node sends because of it."""
-        return ()
+    def begin(self, t_ns: int) -> Sequence[Frame] | None:
+        """Begin; return frames that the node sends because of it. None: nothing has happened so far."""
+        return None
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
         """Do what is due, and set `due_ns` anew."""
         return ()
 
-    def end(self, t_ns: int) -> Sequence[Frame]:
-        """End; leave the node as it would be without the fault."""
-        return ()
+    def end(self, t_ns: int) -> Sequence[Frame] | None:
+        """End; leave the node as it would be without the fault. Frames that it sends because of it, if any."""
+        return None
 
     def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
         """Change the frames that the node sends at one time."""
@@ -221,6 +221,17 @@ class Effect:
 
     def watch(self, t_ns: int) -> Sequence[Frame]:
         """Look at the node after it received or did something; return frames that it sends because of it."""
+        return ()
+
+    def act(self, t_ns: int, act: Callable[[], object]) -> Sequence[Frame]:
+        """Let the device do something by itself now; return the frames that it sends."""
+        self.node.core.now_ns = t_ns
+        act()
+        return self.node.advance(t_ns)
+
+    def delayed(self, frame: Frame, t_ns: int, ms: float) -> Sequence[Frame]:
+        """Let a frame in the direction of the fault go on later; what goes on now."""
+        self.host.later(frame, t_ns + max(1, round(ms * 1e6)), incoming=self.fault.hears)
         return ()
 
 

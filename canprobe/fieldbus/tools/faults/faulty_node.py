@@ -160,7 +160,7 @@ class FaultyNode(WrappedNode):
         for effect in [one for one in self._effects if one.end_ns <= t_ns or one.left <= 0]:
             self._effects.remove(effect)
             self.history.append((t_ns, "ends", effect.fault))
-            out += effect.end(t_ns)
+            out += effect.end(t_ns) or ()
         return [] if self._is_dark() else out
 
     def _begin(self, fault: Fault, t_ns: int) -> Sequence[Frame]:
@@ -168,7 +168,9 @@ class FaultyNode(WrappedNode):
         effect = fault.kind(fault, self)
         effect.end_ns = t_ns + fault.duration_ns
         self._effects.append(effect)
-        return effect.begin(t_ns)
+        frames = effect.begin(t_ns)
+        self.hits += frames is not None
+        return frames or ()
 
     def _finished(
         self, frames: Sequence[Frame], made: Sequence[Frame], t_ns: int, *, synchronised: bool = False

@@ -56,9 +56,7 @@ class Delay(Effect):
     parameters, incoming = numbers(ms=in_ms(1, "delay, ms")), None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        delay_ns = max(1, round(self.fault.value("ms") * 1e6))
-        self.host.later(frame, t_ns + delay_ns, incoming=self.fault.hears)
-        return ()
+        return self.delayed(frame, t_ns, self.fault.value("ms"))
 
 
 class Duplicate(Effect):
@@ -121,7 +119,6 @@ class Reboot(Effect):
     dark = True
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         self.node.start(t_ns)
         return ()
 
@@ -147,9 +144,8 @@ class Babble(Effect):
     trips, fails = "pdo_missed", "6 30 31 37 40"
     parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
 
-    def begin(self, t_ns: int) -> Sequence[Frame]:
+    def begin(self, t_ns: int) -> None:
         self.due_ns = t_ns
-        return ()
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
         out = []
@@ -280,8 +276,7 @@ class SyncJitter(Effect):
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         if frame[0] != SYNC_ID:
             return None
-        self.host.later(frame, t_ns + max(1, round(1e3 * self.rng.uniform(0.0, self.fault.value("us")))), incoming=True)
-        return ()
+        return self.delayed(frame, t_ns, 1e-3 * self.rng.uniform(0.0, self.fault.value("us")))
 
 
 class SyncLost(Effect):

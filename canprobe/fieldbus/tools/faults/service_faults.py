@@ -71,7 +71,6 @@ class Nmt(Effect):
     parameters = numbers(command=Parameter(2, 1, 130, "command: 2 stop, 128 pre-operational, 129 reset"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
         return self.node.receive(NMT_ID, bytes((int(self.fault.value("command")), self.node.node_id)), t_ns)
 
 
@@ -127,8 +126,7 @@ class SdoSlow(Effect):
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         if frame[0] != SDO_TX_BASE + self.node.node_id:
             return None
-        self.host.later(frame, t_ns + max(1, round(self.fault.value("ms") * 1e6)), incoming=False)
-        return ()
+        return self.delayed(frame, t_ns, self.fault.value("ms"))
 
 
 class SdoAnswer(Effect):
@@ -192,15 +190,10 @@ class EmcyOnce(Effect):
     parameters = numbers(code=error_code(0x5000, "emergency error code"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.host.hits += 1
-        self.node.core.now_ns = t_ns
-        self.node.emcy.report(int(self.fault.value("code")), source=self)
-        return self.node.advance(t_ns)
+        return self.act(t_ns, lambda: self.node.emcy.report(int(self.fault.value("code")), source=self))
 
     def end(self, t_ns: int) -> Sequence[Frame]:
-        self.node.core.now_ns = t_ns
-        self.node.emcy.clear(int(self.fault.value("code")), source=self)
-        return self.node.advance(t_ns)
+        return self.act(t_ns, lambda: self.node.emcy.clear(int(self.fault.value("code")), source=self))
 
 
 class EmcyStorm(Babble):
@@ -231,23 +224,21 @@ class Remapped(Effect):
     trips = "pdo_missed drive_fault"
     _exchanged: tuple[int, int, int] | None = None
 
-    def begin(self, t_ns: int) -> Sequence[Frame]:
+    def begin(self, t_ns: int) -> Sequence[Frame] | None:
         dictionary = self.node.dictionary
         for index in dictionary.indices_in(range(0x1A00, 0x1C00)):
             if dictionary.number(index) >= 2:
-                self.host.hits += 1
                 first, second = dictionary.number(index, 1), dictionary.number(index, 2)
                 self._exchanged = index, first, second
                 self._put(second, first, t_ns)
-                break
-        return ()
+                return ()
+        return None
 
-    def end(self, t_ns: int) -> Sequence[Frame]:
+    def end(self, t_ns: int) -> None:
         if self._exchanged is not None:
             index, first, second = self._exchanged
             if [self.node.dictionary.number(index, sub) for sub in (1, 2)] == [second, first]:
                 self._put(first, second, t_ns)
-        return ()
 
     def _put(self, first: int, second: int, t_ns: int) -> None:
         assert self._exchanged is not None

@@ -2,16 +2,15 @@
 
 Frames come in, of a log or of nodes that are served here; findings go out, each with the frames that show it.
 
-    bus_frame   a frame, with its time
+    bus_frame   a frame, with its time; those of a candump log
     events      what a frame means, such as `ControlSeen`, a controlword
     seen_node   what is known of one node, from frames and its EDS
     sdo_channel which SDO transfer is open, and what it carried
     bus_state   frames → events; nothing that was not on the bus
     rule        what a rule is: its facts, and a generator that gets events; one module a family: enable, targets,
-                pdo_rules, nmt_rules, sync_rules, sdo_rules, homing_rules, reactions, supervision
+                pdo_rules, sdo_rules, network_rules (NMT, SYNC, watchdogs), homing_rules, reactions
     rules       the table of all rules
     judging     `Judge`: events to rules, findings to a report
-    record      a candump log as frames
     bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile
 
 Guards against false alarms: a node is judged after its state was seen; three SYNCs after an NMT start and frames that
@@ -24,9 +23,8 @@ Start reading at `bus_state`, then `rule`, then `enable`.
 """
 
 from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, start_position, write_log
-from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.judging import Judge, judge_frames
-from canprobe.fieldbus.tools.judge.record import nodes_of, read_record
+from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, nodes_of, read_record
+from canprobe.fieldbus.tools.judge.judging import Judge
 from canprobe.fieldbus.tools.judge.rules import RULES
 
 __all__ = [
@@ -35,7 +33,6 @@ __all__ = [
     "Judge",
     "MasterBench",
     "first_answers",
-    "judge_frames",
     "nodes_of",
     "read_record",
     "start_position",

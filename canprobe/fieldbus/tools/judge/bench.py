@@ -134,10 +134,7 @@ class MasterBench:
         """The frames, judged."""
         spans = [(one.begin_ns, one.end_ns) for one in self.thrown()]
         judge = Judge(nodes, served=True, bitrate=bitrate, charges_ns=spans, without=without)
-        for frame in self.record():
-            judge.take(frame)
-        judge.finish(self._last_ns - self._begin_ns)
-        return judge
+        return judge.hear(self.record(), self._last_ns - self._begin_ns)
 
 
 def start_position(description: Description) -> int:

@@ -8,6 +8,7 @@ from itertools import pairwise
 from statistics import median
 
 from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.frames import (
     EMCY_BASE,
     HEARTBEAT_BASE,
@@ -21,34 +22,11 @@ from canprobe.fieldbus.protocol.frames import (
     NmtState,
 )
 from canprobe.fieldbus.protocol.sdo import Place
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.events import (
-    AnswerSeen,
-    BusEvent,
-    ControlSeen,
-    EmcySeen,
-    ForgedSeen,
-    HeartbeatSeen,
-    ModeSeen,
-    NmtSeen,
-    OtherHeartbeatSeen,
-    RemoteSeen,
-    RequestSeen,
-    RpdoSeen,
-    StatusSeen,
-    SyncSeen,
-    TargetSeen,
-)
+from canprobe.fieldbus.tools.judge.events import BusEvent
 from canprobe.fieldbus.tools.judge.sdo_channel import SdoChannel
-from canprobe.fieldbus.tools.judge.seen_node import (
-    CONTROLWORD,
-    INTERPOLATION_DATA,
-    MODE,
-    STATUSWORD,
-    TARGETS,
-    PdoView,
-    SeenNode,
-)
+from canprobe.fieldbus.tools.judge.seen_node import TARGETS, PdoView, SeenNode
 
 _STORE = 0x1010
 _ARBITRATION_BITS = 135
@@ -100,7 +78,7 @@ class BusState:
         self.now_ns = frame.t_ns
         can_id, data = frame.can_id, frame.data
         if can_id & RTR_FLAG and can_id & 0x3FFFFFFF <= 0x7FF:
-            yield RemoteSeen(frame)
+            yield events.RemoteSeen(frame)
         elif can_id <= 0x7FF:
             yield from self._events(frame, can_id, data)
 
@@ -114,7 +92,7 @@ class BusState:
             self.sync_count += 1
             for one in self.nodes.values():
                 one.syncs += one.started_ns is not None
-            yield SyncSeen(frame, data[0] if data else None)
+            yield events.SyncSeen(frame, data[0] if data else None)
         elif base == HEARTBEAT_BASE and can_id > base:
             yield from self._heartbeat(frame, can_id - base)
         elif node is not None and base in (EMCY_BASE, SDO_TX_BASE, SDO_RX_BASE):
@@ -133,7 +111,7 @@ class BusState:
             for event in self._channels[node.node_id].from_server(frame):
                 yield from self._transferred(event)
         elif len(frame.data) == 8:
-            yield EmcySeen(frame, node, int.from_bytes(frame.data[:2], "little"))
+            yield events.EmcySeen(frame, node, int.from_bytes(frame.data[:2], "little"))
 
     def _pdos(self, frame: BusFrame) -> Iterator[BusEvent]:
         for node in self.nodes.values():
@@ -143,20 +121,20 @@ class BusState:
             if sent is not None and frame.from_node is not False:
                 yield from self._tpdo(frame, node, sent)
             elif sent is not None and sent.certain and received is None:
-                yield ForgedSeen(frame, node)
+                yield events.ForgedSeen(frame, node)
 
     def _sent_by(self, node: SeenNode, frame: BusFrame) -> Iterator[BusEvent]:
         node.hear(frame.t_ns)
         node.answers = node.answers or frame.can_id != HEARTBEAT_BASE + node.node_id or frame.data != b"\0"
         if frame.from_node is False:
-            yield ForgedSeen(frame, node)
+            yield events.ForgedSeen(frame, node)
 
     def _nmt(self, frame: BusFrame) -> Iterator[BusEvent]:
         if len(frame.data) != 2 or frame.data[0] not in NmtCommand.__members__.values():
             return
         command, node_id = NmtCommand(frame.data[0]), frame.data[1]
         nodes = tuple(node for node in self.nodes.values() if node_id in (0, node.node_id))
-        yield NmtSeen(frame, command, nodes, node_id == 0)  # the nodes are as they were before it
+        yield events.NmtSeen(frame, command, nodes, node_id == 0)  # the nodes are as they were before it
         for node in nodes:
             node.addressed = True
             node.nmt, node.nmt_ns = NMT_GOALS[command], frame.t_ns
@@ -166,7 +144,7 @@ class BusState:
     def _heartbeat(self, frame: BusFrame, node_id: int) -> Iterator[BusEvent]:
         node = self.nodes.get(node_id)
         if node is None:
-            yield OtherHeartbeatSeen(frame, node_id)
+            yield events.OtherHeartbeatSeen(frame, node_id)
             self.others_ns[node_id] = frame.t_ns
             return
         yield from self._sent_by(node, frame)
@@ -180,7 +158,7 @@ class BusState:
                 node.started_ns = None
         if node.nmt is NmtState.INITIALISING:
             self._channels[node_id].reset()
-        yield HeartbeatSeen(frame, node, node.nmt, before)  # the values are those before a boot-up
+        yield events.HeartbeatSeen(frame, node, node.nmt, before)  # the values are those before a boot-up
         if node.nmt is NmtState.INITIALISING:
             node.boot()
             node.heartbeats_ns.clear()
@@ -190,7 +168,7 @@ class BusState:
                 node.started_ns, node.syncs = frame.t_ns, 0
 
     def _requested(self, event: BusEvent) -> BusEvent:
-        if isinstance(event, RequestSeen):
+        if isinstance(event, events.RequestSeen):
             event.node.asked = True
             event.node.touch(event.place[0])
         return event
@@ -198,7 +176,7 @@ class BusState:
     def _transferred(self, event: BusEvent) -> Iterator[BusEvent]:
         """The end of a transfer, and what its value means."""
         yield event
-        if not isinstance(event, AnswerSeen) or event.late:
+        if not isinstance(event, events.AnswerSeen) or event.late:
             return
         node = event.node
         if event.writes and event.place[0] == _STORE:
@@ -215,7 +193,7 @@ class BusState:
         node.rpdo_counts[pdo.number] = node.rpdo_counts.get(pdo.number, 0) + 1
         values = _unpacked(pdo, frame)
         before = {place: node.sure_value(*place) for place in values}
-        yield RpdoSeen(frame, node, pdo, values, before)
+        yield events.RpdoSeen(frame, node, pdo, values, before)
         yield from self._valued(node, values, frame, pdo, written=True)
 
     def _tpdo(self, frame: BusFrame, node: SeenNode, pdo: PdoView) -> Iterator[BusEvent]:
@@ -230,20 +208,20 @@ class BusState:
         before = {place: node.known(*place) for place in values}
         for place, value in values.items():
             node.take(place, value, frame)
-        for place in sorted(values, key=lambda place: (place[0] == CONTROLWORD, place[0] == MODE, place)):
+        for place in sorted(values, key=lambda place: (place[0] == cia402.CONTROLWORD, place[0] == cia402.MODE, place)):
             index, subindex = place
             known = before[place]
             value, old = values[place], known.value if known is not None else None
-            if index == STATUSWORD and not written:
-                yield StatusSeen(frame, node, value, old)
+            if index == cia402.STATUSWORD and not written:
+                yield events.StatusSeen(frame, node, value, old)
             elif not written:
                 continue
-            elif index == CONTROLWORD:
-                yield ControlSeen(frame, node, value, old, pdo)
-            elif index == MODE:
-                yield ModeSeen(frame, node, value, old)
-            elif index in TARGETS and subindex == (1 if index == INTERPOLATION_DATA else 0):
-                yield TargetSeen(frame, node, index, value, old, known.t_ns if known is not None else 0, pdo)
+            elif index == cia402.CONTROLWORD:
+                yield events.ControlSeen(frame, node, value, old, pdo)
+            elif index == cia402.MODE:
+                yield events.ModeSeen(frame, node, value, old)
+            elif index in TARGETS and subindex == (1 if index == cia402.INTERPOLATION_DATA else 0):
+                yield events.TargetSeen(frame, node, index, value, old, known.t_ns if known is not None else 0, pdo)
 
 
 def _unpacked(pdo: PdoView, frame: BusFrame) -> dict[Place, int]:

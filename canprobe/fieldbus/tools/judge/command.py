@@ -49,10 +49,9 @@ class MasterCommand:
         """Exit status, negative after a signal; None while it runs."""
         return self._process.poll()
 
-    def last_lines(self, count: int = 20) -> list[str]:
+    def last_lines(self) -> list[str]:
         """Last lines of its output."""
-        text = self.output.read_text(encoding="utf-8", errors="replace")
-        return text.splitlines()[-count:]
+        return self.output.read_text(encoding="utf-8", errors="replace").splitlines()[-20:]
 
     def press_on(self) -> bool:
         """End it: send the signals whose time has come since the first call. Whether it has ended."""
@@ -71,8 +70,5 @@ class MasterCommand:
             while not self.press_on():
                 time.sleep(0.02)
         finally:  # a second Ctrl-C leaves nothing behind, too
-            self._kill()
+            system.end_session(self._process, system.KILL)
             self._file.close()
-
-    def _kill(self) -> None:
-        system.end_session(self._process, system.KILL)

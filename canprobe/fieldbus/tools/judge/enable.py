@@ -4,50 +4,27 @@ from __future__ import annotations
 
 from collections import deque
 
-from canprobe.fieldbus.protocol.cia402 import (
-    FAULT_RESET_BIT,
-    HALT_BIT,
-    DriveCommand,
-    DriveState,
-    OperationMode,
-    command_of,
-)
+from canprobe.fieldbus.protocol import cia402
+from canprobe.fieldbus.protocol.cia402 import TRANSITIONS, DriveCommand, DriveState, OperationMode, command_of
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import ControlSeen, ModeSeen, StatusSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity, Watch
-from canprobe.fieldbus.tools.judge.seen_node import (
-    CONTROLWORD,
-    MODE,
-    MODE_DISPLAY,
-    POSITION,
-    STATUSWORD,
-    TARGET_OF_MODE,
-    TARGET_TORQUE,
-    TARGET_VELOCITY,
-    SeenNode,
-)
+from canprobe.fieldbus.tools.judge.seen_node import TARGET_OF_MODE, SeenNode
 
 _AT_ONCE = (OperationMode.CYCLIC_SYNC_POSITION, OperationMode.INTERPOLATED_POSITION)
 """Modes in which a drive follows its target position as soon as it is enabled."""
+_AMOUNTS = (cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE)
+"""Targets of which any but 0 moves the axis."""
 _STEPS_UP = (
     (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON),
     (DriveCommand.SHUTDOWN, DriveCommand.ENABLE_OPERATION),
     (DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION),
 )
 _STATES_FOR = {
-    DriveCommand.SWITCH_ON: frozenset(
-        {DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED}
-    ),
-    DriveCommand.ENABLE_OPERATION: frozenset(
-        {
-            DriveState.READY_TO_SWITCH_ON,  # the drive passes through switched on by itself
-            DriveState.SWITCHED_ON,
-            DriveState.OPERATION_ENABLED,
-            DriveState.QUICK_STOP_ACTIVE,
-        }
-    ),
+    step: {state for (source, command), goal in TRANSITIONS.items() if command is step for state in (source, goal)}
+    for step in (DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION)
 }
-"""States in which a step up may be commanded."""
+"""States in which a step up may be commanded: it leads on from them, or they are its goal."""
 
 
 def enables(event: ControlSeen) -> bool:
@@ -77,7 +54,7 @@ class TargetAtEnable(Rule):
                     armed = None
             if armed is None or node.mode not in _AT_ONCE:
                 continue
-            target, position = node.target(node.mode), node.known(POSITION)
+            target, position = node.target(node.mode), node.known(cia402.POSITION)
             if target is None or position is None:
                 continue
             self.looked += 1
@@ -98,7 +75,7 @@ class SpeedAtEnable(Rule):
     def watch(self, node: SeenNode) -> Watch[ControlSeen]:
         while event := (yield):
             mode = node.mode
-            if mode is None or TARGET_OF_MODE.get(mode) not in (TARGET_VELOCITY, TARGET_TORQUE) or not enables(event):
+            if mode is None or TARGET_OF_MODE.get(mode) not in _AMOUNTS or not enables(event):
                 continue
             self.looked += 1
             target = node.target(mode)
@@ -147,7 +124,7 @@ class ModeNotConfirmed(Rule):
 
     def watch(self, node: SeenNode) -> Watch[ControlSeen | TargetSeen]:
         while event := (yield):
-            asked = node.known(MODE)
+            asked = node.known(cia402.MODE)
             if asked is None:
                 continue
             if isinstance(event, ControlSeen):
@@ -159,7 +136,7 @@ class ModeNotConfirmed(Rule):
                 continue
             self.looked += 1
             if not node.mode_confirmed:
-                shown = node.known(MODE_DISPLAY)
+                shown = node.known(cia402.MODE_DISPLAY)
                 display = f"6061h was {shown.value}" if shown is not None else "6061h was not read"
                 self.blame(node, f"{does} in mode {asked.value}; {display}", asked, shown, event)
 
@@ -178,7 +155,7 @@ class SteppedBlind(Rule):
             if command is None or (before, command) not in _STEPS_UP:
                 continue
             self.looked += 1
-            status, wanted = node.known(STATUSWORD), _STATES_FOR[command]
+            status, wanted = node.known(cia402.STATUSWORD), _STATES_FOR[command]
             if before is DriveCommand.SWITCH_ON:
                 wanted = wanted - {DriveState.READY_TO_SWITCH_ON}
             if status is None or node.state not in wanted:
@@ -200,7 +177,7 @@ class ResetHeld(Rule):
     def watch(self, node: SeenNode) -> Watch[ControlSeen]:
         first: BusFrame | None = None
         while event := (yield):
-            if not event.word >> FAULT_RESET_BIT & 1:
+            if not event.word >> cia402.FAULT_RESET_BIT & 1:
                 first = None
                 continue
             first = first or event.frame
@@ -248,7 +225,7 @@ class LeavesQuickStop(Rule):
         first: BusFrame | None = None  # that shows a quick stop which the master has not commanded
         while event := (yield):
             if isinstance(event, StatusSeen):
-                word = node.number(CONTROLWORD)
+                word = node.number(cia402.CONTROLWORD)
                 by_itself = word is not None and command_of(word) is DriveCommand.ENABLE_OPERATION
                 if node.state is not DriveState.QUICK_STOP_ACTIVE:
                     first = None
@@ -274,8 +251,8 @@ class HaltKept(Rule):
     def watch(self, node: SeenNode) -> Watch[TargetSeen | ModeSeen]:
         first: BusFrame | None = None
         while event := (yield):
-            word = node.known(CONTROLWORD)
-            if word is None or not word.value >> HALT_BIT & 1 or not node.enabled:
+            word = node.known(cia402.CONTROLWORD)
+            if word is None or not word.value >> cia402.HALT_BIT & 1 or not node.enabled:
                 first = None
                 continue
             self.looked += 1

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED_BIT, HOMING_ERROR_BIT, HOMING_START_BIT, OperationMode
+from canprobe.fieldbus.protocol import cia402
+from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import ControlSeen, HeartbeatSeen, StatusSeen
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity, Watch
-from canprobe.fieldbus.tools.judge.seen_node import MODE, MODE_DISPLAY, SeenNode
+from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
 
 class HomesAgain(Rule):
@@ -23,12 +24,12 @@ class HomesAgain(Rule):
         while event := (yield):
             if isinstance(event, HeartbeatSeen):
                 referenced = None if event.state is NmtState.INITIALISING else referenced
-            elif node.number(MODE_DISPLAY) != OperationMode.HOMING:
+            elif node.number(cia402.MODE_DISPLAY) != OperationMode.HOMING:
                 continue
             elif isinstance(event, StatusSeen):
-                attained = event.word >> HOMING_ATTAINED_BIT & 1 and not event.word >> HOMING_ERROR_BIT & 1
-                referenced = (referenced or event.frame) if attained else None
-            elif event.word & ~(event.before or 0) & 1 << HOMING_START_BIT and node.enabled:
+                done, failed = event.word >> cia402.HOMING_ATTAINED_BIT & 1, event.word >> cia402.HOMING_ERROR_BIT & 1
+                referenced = (referenced or event.frame) if done and not failed else None
+            elif event.word & ~(event.before or 0) & 1 << cia402.HOMING_START_BIT and node.enabled:
                 self.looked += 1
                 if referenced is not None:
                     self.blame(node, "homing is started on an axis that has its reference", referenced, event)
@@ -46,16 +47,16 @@ class HomingStart(Rule):
     def watch(self, node: SeenNode) -> Watch[ControlSeen]:
         first: BusFrame | None = None  # with bit 4
         while event := (yield):
-            if not event.word >> HOMING_START_BIT & 1:
+            if not event.word >> cia402.HOMING_START_BIT & 1:
                 first = None
                 continue
-            first, asked = first or event.frame, node.known(MODE)
+            first, asked = first or event.frame, node.known(cia402.MODE)
             if asked is None or asked.value != OperationMode.HOMING:
                 continue
             if first is event.frame:
                 self.looked += 1
                 if not node.mode_confirmed:
-                    shown = node.known(MODE_DISPLAY)
+                    shown = node.known(cia402.MODE_DISPLAY)
                     display = shown.value if shown is not None else "not read"
                     self.blame(node, f"bit 4 rises while 6061h is {display}", asked, shown, event)
             elif self.in_a_row(

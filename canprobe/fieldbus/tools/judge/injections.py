@@ -28,12 +28,10 @@ class Thrown:
 
     Attributes:
         text: node, kind and values of the fault.
-        node_id: its node.
         begin_ns, end_ns: when it held.
     """
 
     text: str
-    node_id: int
     begin_ns: int
     end_ns: int
 
@@ -72,8 +70,7 @@ class Injections:
             if fault not in self._holding:
                 given = "".join(f" {name}={value:g}" for name, value in fault.values.items())
                 text = f"node {fault.node_id}: {fault.kind.name}{given}"
-                one = Thrown(text, fault.node_id, self._last_ns, now_ns)
-                self._holding[fault] = one
+                self._holding[fault] = one = Thrown(text, self._last_ns, now_ns)
                 self.thrown.append(one)
         for fault in [fault for fault in self._holding if fault not in holding]:
             self._holding.pop(fault).end_ns = now_ns

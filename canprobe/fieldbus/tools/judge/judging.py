@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
+from canprobe.fieldbus.tools.judge.network_rules import IrregularSync
 from canprobe.fieldbus.tools.judge.rule import Rule, Watch
 from canprobe.fieldbus.tools.judge.rules import NO_RULES, RULES
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
-from canprobe.fieldbus.tools.judge.sync_rules import IrregularSync
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
 _Key = tuple[type[BusEvent], SeenNode | None]
@@ -42,12 +42,11 @@ class Judge:
         *,
         served: bool = False,
         bitrate: int = 1_000_000,
-        charges_ns: Iterable[tuple[int, int]] = (),
+        charges_ns: Sequence[tuple[int, int]] = (),
         without: Collection[int] = (),
     ) -> None:
         self.bus = BusState(nodes, served=served, bitrate=bitrate)
-        charges = list(charges_ns)
-        self.rules: list[Rule] = [rule(self.bus, charges) for rule in RULES if rule.number not in without]
+        self.rules: list[Rule] = [rule(self.bus, charges_ns) for rule in RULES if rule.number not in without]
         self._left_out = [(f"{r.number:02} {r.name}", "left out on request") for r in RULES if r.number in without]
         self.frame_count = 0
         self._watches: list[Watch[Any]] = []
@@ -59,28 +58,27 @@ class Judge:
                 for kind in rule.hears():
                     self._ears.setdefault((kind, node), []).append(watch)
 
-    def take(self, frame: BusFrame) -> None:
-        """Take the next frame."""
-        self.frame_count += 1
-        for event in self.bus.take(frame):
-            for node in (None, *event.among(self.bus.nodes.values())):
-                for watch in self._ears.get((type(event), node), ()):
-                    watch.send(event)
-
-    def finish(self, end_ns: int = 0) -> list[Rule]:
-        """End the bus; return the rules that found something.
+    def hear(self, frames: Iterable[BusFrame], end_ns: int = 0) -> Judge:
+        """Take the frames of the bus, from the first to the last; return the judge.
 
         Args:
+            frames: the frames, in the order of their times.
             end_ns: time up to which the bus was heard, where that is later than its last frame.
         """
+        for frame in frames:
+            self.frame_count += 1
+            for event in self.bus.take(frame):
+                for node in (None, *event.among(self.bus.nodes.values())):
+                    for watch in self._ears.get((type(event), node), ()):
+                        watch.send(event)
         self.bus.now_ns = max(self.bus.now_ns, end_ns)
         for watch in self._watches:
             with contextlib.suppress(StopIteration):
                 watch.send(None)
-        return [rule for rule in self.rules if rule.count]
+        return self
 
     def report(self, title: str, facts: Mapping[str, str], log: str | None = None) -> Report:
-        """The report, after `finish`.
+        """The report on what was heard.
 
         Args:
             title: what was judged.
@@ -117,20 +115,3 @@ def _row(rule: Rule) -> ReportRow:
         hint=rule.hint,
         severity=rule.severity.value,
     )
-
-
-def judge_frames(
-    frames: Iterable[BusFrame],
-    nodes: Mapping[int, Description],
-    *,
-    served: bool = False,
-    bitrate: int = 1_000_000,
-    charges_ns: Iterable[tuple[int, int]] = (),
-    without: Collection[int] = (),
-) -> Judge:
-    """Judge frames that were recorded; the arguments are those of `Judge`."""
-    judge = Judge(nodes, served=served, bitrate=bitrate, charges_ns=charges_ns, without=without)
-    for frame in frames:
-        judge.take(frame)
-    judge.finish()
-    return judge

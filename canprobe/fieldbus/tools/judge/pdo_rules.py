@@ -5,26 +5,17 @@ from __future__ import annotations
 from collections import deque
 from itertools import pairwise
 
+from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.sdo import place_text
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import BusEvent, RequestSeen, RpdoSeen, StatusSeen, SyncSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity, Watch
-from canprobe.fieldbus.tools.judge.seen_node import (
-    CONTROLWORD,
-    MODE,
-    MODE_DISPLAY,
-    POSITION,
-    TARGET_POSITION,
-    TARGET_TORQUE,
-    TARGET_VELOCITY,
-    TARGETS,
-    SeenNode,
-)
+from canprobe.fieldbus.tools.judge.seen_node import TARGETS, SeenNode
 
 _SECOND_NS = 1_000_000_000
-_HARMLESS = frozenset({CONTROLWORD, TARGET_VELOCITY, TARGET_TORQUE, 0x60B0, 0x60B1, 0x60B2, 0x60FE})
+_HARMLESS = {cia402.CONTROLWORD, cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE, 0x60B0, 0x60B1, 0x60B2, 0x60FE}
 """Objects of which 0 is a quiet value."""
 _PROFILE = range(0x6040, 0x6100)
 
@@ -41,7 +32,7 @@ class ZeroFilled(Rule):
         unjudged: BusFrame | None = None  # a target of 0, which is compared with the position once that is seen
         while event := (yield):
             if isinstance(event, StatusSeen):
-                if unjudged is not None and node.known(POSITION) is not None:
+                if unjudged is not None and node.known(cia402.POSITION) is not None:
                     self._judge_target(node, unjudged)
                     unjudged = None
                 continue
@@ -52,19 +43,19 @@ class ZeroFilled(Rule):
                 index = place[0]
                 if value or index not in _PROFILE or index in _HARMLESS:
                     continue
-                if index == TARGET_POSITION:
-                    if node.known(POSITION) is None:
+                if index == cia402.TARGET_POSITION:
+                    if node.known(cia402.POSITION) is None:
                         unjudged = event.frame
                     else:
                         self._judge_target(node, event.frame)
                     continue
-                shown = node.known(MODE_DISPLAY) if index == MODE else None
+                shown = node.known(cia402.MODE_DISPLAY) if index == cia402.MODE else None
                 if was := (shown.value if shown is not None else event.before[place]):
                     what = f"{place_text(*place)} is 0 in the first RPDO {event.pdo.number}; it was {was}"
                     self.blame(node, what, shown, event)
 
     def _judge_target(self, node: SeenNode, first: BusFrame) -> None:
-        position = node.known(POSITION)
+        position = node.known(cia402.POSITION)
         if position is not None and abs(position.value) > node.tolerance(self.bus.period_ns):
             what = f"607Ah is 0 in the first RPDO, and the axis is at {position.value}"
             self.blame(node, what, position, first)
@@ -83,10 +74,10 @@ class NeverSent(Rule):
         started_ns = node.started_ns
         if not node.operational or started_ns is None or self.bus.now_ns - started_ns < _SECOND_NS:
             return
-        control = node.known(CONTROLWORD)
+        control = node.known(cia402.CONTROLWORD)
         by_sdo = control is not None and control.t_ns > started_ns and not any(node.rpdo_counts.values())
         for pdo in node.rpdos.values():
-            if not pdo.used or not pdo.maps(CONTROLWORD, *TARGETS):
+            if not pdo.used or not pdo.maps(cia402.CONTROLWORD, *TARGETS):
                 continue
             self.looked += 1
             if not node.rpdo_counts.get(pdo.number) and not (by_sdo and not pdo.maps(*TARGETS)):
@@ -221,7 +212,7 @@ class CyclicWithoutSync(Rule):
         while event := (yield):
             pdo = event.pdo
             cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and node.enabled
-            if pdo is None or not cyclic or event.index != TARGET_POSITION or not pdo.certain:
+            if pdo is None or not cyclic or event.index != cia402.TARGET_POSITION or not pdo.certain:
                 continue
             kind = pdo.layout.transmission_type
             since_ns = event.frame.t_ns - max(self.bus.syncs_ns[-1] if self.bus.syncs_ns else 0, node.started_ns or 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, command_of
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
@@ -19,7 +20,7 @@ from canprobe.fieldbus.tools.judge.events import (
     TargetSeen,
 )
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, BusRule, Rule, Severity, Watch
-from canprobe.fieldbus.tools.judge.seen_node import STATUSWORD, SeenNode
+from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.judge.targets import Onward
 
 _COMMUNICATION = (0x81, 0x82)
@@ -195,7 +196,7 @@ class LossIgnored(BusRule):
     def _beats(self, node: SeenNode) -> bool:
         """Whether heartbeats show that a node lives; else its synchronous statuswords do, which come with each SYNC."""
         return len(node.heartbeats_ns) >= 3 or not any(
-            pdo.layout.transmission_type == 1 and pdo.maps(STATUSWORD) for pdo in node.tpdos.values()
+            pdo.layout.transmission_type == 1 and pdo.maps(cia402.STATUSWORD) for pdo in node.tpdos.values()
         )
 
     def _limit_ns(self, node: SeenNode) -> int:

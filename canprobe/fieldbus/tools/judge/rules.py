@@ -2,20 +2,10 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.tools.judge import (
-    enable,
-    homing_rules,
-    nmt_rules,
-    pdo_rules,
-    reactions,
-    sdo_rules,
-    supervision,
-    sync_rules,
-    targets,
-)
+from canprobe.fieldbus.tools.judge import enable, homing_rules, network_rules, pdo_rules, reactions, sdo_rules, targets
 from canprobe.fieldbus.tools.judge.rule import BusRule, Rule
 
-_MODULES = (enable, targets, pdo_rules, nmt_rules, sync_rules, sdo_rules, homing_rules, reactions, supervision)
+_MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, homing_rules, reactions)
 _FOUND = {
     one
     for module in _MODULES

@@ -37,7 +37,7 @@ class SdoChannel:
     def __init__(self, node: SeenNode) -> None:
         self._node = node
         self._open: _Transfer | None = None
-        self._aborted: tuple[_Transfer, BusFrame] | None = None
+        self._aborted: _Transfer | None = None
 
     def reset(self) -> None:
         """Forget the open transfer: the node has booted."""
@@ -51,18 +51,9 @@ class SdoChannel:
         command = data[0] >> 5
         place = sdo.place_of(data)
         if data[0] == sdo.ABORT:
-            transfer = one
-            self._open, self._aborted = None, (one, frame) if one is not None else self._aborted
-            yield AbortSeen(
-                frame,
-                self._node,
-                transfer.writes if transfer else False,
-                transfer.place if transfer else None,
-                place,
-                sdo.abort_code(data),
-                True,
-                transfer.request if transfer else None,
-            )
+            self._open, self._aborted = None, one or self._aborted
+            writes, of, request = (one.writes, one.place, one.request) if one is not None else (False, None, None)
+            yield AbortSeen(frame, self._node, writes, of, place, sdo.abort_code(data), True, request)
         elif one is not None and one.block and one.answered:
             if not one.writes and data[0] == _BLOCK_END:
                 yield from self._end(frame)
@@ -103,8 +94,8 @@ class SdoChannel:
 
     def _late(self, frame: BusFrame, command: int) -> Iterator[BusEvent]:
         """An answer to a transfer that the client has given up."""
-        if self._aborted is not None and command in (2, 3) and sdo.place_of(frame.data) == self._aborted[0].place:
-            one, _ = self._aborted
+        one = self._aborted
+        if one is not None and command in (2, 3) and sdo.place_of(frame.data) == one.place:
             self._aborted = None
             yield AnswerSeen(frame, self._node, one.writes, one.place, None, one.request, late=True)
 

@@ -9,26 +9,24 @@ from itertools import pairwise
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode, known_state
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, NmtState
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 
-CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY = 0x6040, 0x6041, 0x6060, 0x6061
-POSITION, VELOCITY, TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE = 0x6064, 0x606C, 0x607A, 0x60FF, 0x6071
-INTERPOLATION_DATA = 0x60C1
-TARGETS = frozenset({TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE, INTERPOLATION_DATA})
+TARGETS = frozenset({cia402.TARGET_POSITION, cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE, cia402.INTERPOLATION_DATA})
 TARGET_OF_MODE = {
-    OperationMode.PROFILE_POSITION: TARGET_POSITION,
-    3: TARGET_VELOCITY,
-    4: TARGET_TORQUE,
-    OperationMode.INTERPOLATED_POSITION: INTERPOLATION_DATA,
-    OperationMode.CYCLIC_SYNC_POSITION: TARGET_POSITION,
-    OperationMode.CYCLIC_SYNC_VELOCITY: TARGET_VELOCITY,
-    OperationMode.CYCLIC_SYNC_TORQUE: TARGET_TORQUE,
+    OperationMode.PROFILE_POSITION: cia402.TARGET_POSITION,
+    3: cia402.TARGET_VELOCITY,
+    4: cia402.TARGET_TORQUE,
+    OperationMode.INTERPOLATED_POSITION: cia402.INTERPOLATION_DATA,
+    OperationMode.CYCLIC_SYNC_POSITION: cia402.TARGET_POSITION,
+    OperationMode.CYCLIC_SYNC_VELOCITY: cia402.TARGET_VELOCITY,
+    OperationMode.CYCLIC_SYNC_TORQUE: cia402.TARGET_TORQUE,
 }
-_SIGNED = frozenset({MODE, MODE_DISPLAY, POSITION, VELOCITY, 0x6077, 0x60C2}) | TARGETS
+_SIGNED = frozenset({cia402.MODE, cia402.MODE_DISPLAY, cia402.POSITION, cia402.VELOCITY, 0x6077, 0x60C2}) | TARGETS
 """Objects that are signed where no EDS says it. 60C2h:02 is, too."""
 _HEARTBEAT_TIME = 0x1017
 _SPEED_LIMIT, _SPEED_UNIT, _SOFT_LIMITS, _RANGE = 0x607F, 0x60A9, 0x607D, 0x607B
@@ -140,7 +138,7 @@ class SeenNode:
     def hear(self, t_ns: int) -> None:
         """Note a frame of the node; behind a silence its last statusword says nothing any more."""
         if self.silent(t_ns):
-            self._known.pop((STATUSWORD, 0), None)
+            self._known.pop((cia402.STATUSWORD, 0), None)
         self.seen, self.heard_ns = True, t_ns
 
     def silent(self, t_ns: int) -> bool:
@@ -175,11 +173,11 @@ class SeenNode:
 
     def take(self, place: Place, value: int, frame: BusFrame) -> None:
         """Take the value of an object, written or read. A mode that is asked for again keeps its first time."""
-        if place[0] != MODE or self.number(MODE) != value:
+        if place[0] != cia402.MODE or self.number(cia402.MODE) != value:
             self._known[place] = Known(value, frame)
         if 0x1400 <= place[0] < 0x1C00:
             self.read_pdos()
-        if place[0] == POSITION:
+        if place[0] == cia402.POSITION:
             self.positions.append((frame.t_ns, value))
 
     def touch(self, index: int) -> None:
@@ -229,7 +227,7 @@ class SeenNode:
     @property
     def is_drive(self) -> bool:
         """Whether it is a CiA 402 drive."""
-        return self._description.entry(CONTROLWORD) is not None
+        return self._description.entry(cia402.CONTROLWORD) is not None
 
     @property
     def operational(self) -> bool:
@@ -244,7 +242,7 @@ class SeenNode:
     @property
     def state(self) -> DriveState | None:
         """State by the last statusword."""
-        word = self.number(STATUSWORD)
+        word = self.number(cia402.STATUSWORD)
         return known_state(word) if word is not None else None
 
     @property
@@ -255,13 +253,13 @@ class SeenNode:
     @property
     def mode(self) -> int | None:
         """Mode of operation: as the drive displays it, or else as it was asked for."""
-        shown = self.number(MODE_DISPLAY)
-        return shown if shown is not None else self.number(MODE)
+        shown = self.number(cia402.MODE_DISPLAY)
+        return shown if shown is not None else self.number(cia402.MODE)
 
     @property
     def mode_confirmed(self) -> bool:
         """Whether 6061h showed the mode since 6060h was written, or 6060h never was."""
-        asked, shown = self.known(MODE), self.known(MODE_DISPLAY)
+        asked, shown = self.known(cia402.MODE), self.known(cia402.MODE_DISPLAY)
         if asked is None or asked.value == 0:
             return True
         return shown is not None and shown.value == asked.value and shown.t_ns >= asked.t_ns
@@ -271,7 +269,7 @@ class SeenNode:
         index = TARGET_OF_MODE.get(mode) if mode is not None else None
         if index is None:
             return None
-        if index == INTERPOLATION_DATA:
+        if index == cia402.INTERPOLATION_DATA:
             return self.known(index, 1)
         return self.known(index)
 
@@ -306,7 +304,7 @@ class SeenNode:
     def moves(self, t_ns: int) -> bool:
         """Whether the axis moves: by 606Ch, or by the last positions."""
         least = self.least_speed
-        shown = self.known(VELOCITY)
+        shown = self.known(cia402.VELOCITY)
         if shown is not None and t_ns - shown.t_ns < _FRESH_NS:
             return abs(shown.value) > least
         fresh = [(t, at) for t, at in self.positions if t_ns - t < _FRESH_NS]

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.protocol.cia402 import FOLLOWING_ERROR_BIT, HALT_BIT, DriveCommand, OperationMode, command_of
+from canprobe.fieldbus.protocol import cia402
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, OperationMode, command_of
 from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import ControlSeen, ModeSeen, NmtSeen, RpdoSeen, StatusSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity, Watch
-from canprobe.fieldbus.tools.judge.seen_node import (
-    CONTROLWORD,
-    INTERPOLATION_DATA,
-    POSITION,
-    STATUSWORD,
-    TARGET_POSITION,
-    TARGETS,
-    Known,
-    SeenNode,
-)
+from canprobe.fieldbus.tools.judge.seen_node import TARGET_OF_MODE, TARGETS, Known, SeenNode
 
-_POSITION_MODES = (
-    OperationMode.PROFILE_POSITION,
-    OperationMode.INTERPOLATED_POSITION,
-    OperationMode.CYCLIC_SYNC_POSITION,
-)
+_PLACES = (cia402.TARGET_POSITION, cia402.INTERPOLATION_DATA)
+_POSITION_MODES = [mode for mode, target in TARGET_OF_MODE.items() if target in _PLACES]
 _CREEP_SHARE = 0.2
 """Share of the speed of a moving axis below which targets stand, as those that follow a noisy position."""
 _LOST_SHARE = 3.0
@@ -53,7 +42,7 @@ class Onward:
 
     def goes_on(self, event: TargetSeen) -> bool:
         """Take a target; whether a window that is over has at least 90 % of the way of the one before."""
-        found, cyclic = False, event.index in (TARGET_POSITION, INTERPOLATION_DATA)
+        found, cyclic = False, event.index in _PLACES
         while event.frame.t_ns >= self._begin_ns + self._window_ns:
             least = self._least if cyclic else 0.0
             before = self._before
@@ -94,7 +83,7 @@ class StepTooLarge(Rule):
         last: int | None = None
         while event := (yield):
             period_ns = self.bus.period_ns
-            cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == TARGET_POSITION
+            cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == cia402.TARGET_POSITION
             if not (cyclic and node.enabled and node.settled and period_ns and event.before is not None):
                 last = None
                 continue
@@ -127,7 +116,8 @@ class OutsideLimits(Rule):
     def watch(self, node: SeenNode) -> Watch[TargetSeen]:
         while event := (yield):
             limits = node.soft_limits()
-            if event.index != TARGET_POSITION or not node.enabled or node.mode not in _POSITION_MODES or not limits:
+            to_position = event.index == cia402.TARGET_POSITION and node.mode in _POSITION_MODES
+            if not to_position or not node.enabled or not limits:
                 continue
             low, high = limits
             if self.in_a_row(node, not low <= event.value <= high):
@@ -147,14 +137,15 @@ class FollowingErrorIgnored(Rule):
         onward: Onward | None = None
         while event := (yield):
             if isinstance(event, StatusSeen):
-                lags = bool(event.word >> FOLLOWING_ERROR_BIT & 1) and node.enabled and node.mode in _POSITION_MODES
+                late = bool(event.word >> cia402.FOLLOWING_ERROR_BIT & 1)
+                lags = late and node.enabled and node.mode in _POSITION_MODES
                 if self.in_a_row(node, lags, 4):
                     onward = Onward(node, event.frame.t_ns, self.bus.period_ns, event.frame)
                 elif not lags:
                     onward = None
             elif onward is not None and onward.goes_on(event):
                 what = "bit 13 of 6041h is set, and the targets go on"
-                self.blame(node, what, onward.cause, node.known(POSITION), event)
+                self.blame(node, what, onward.cause, node.known(cia402.POSITION), event)
                 onward = None
 
 
@@ -191,8 +182,8 @@ class EndsMoving(Rule):
                     last = None
 
     def _unstopped(self, node: SeenNode) -> bool:
-        word = node.number(CONTROLWORD)
-        halted = word is not None and word >> HALT_BIT & 1
+        word = node.number(cia402.CONTROLWORD)
+        halted = word is not None and word >> cia402.HALT_BIT & 1
         return node.moves(self.bus.now_ns) and not halted
 
 
@@ -219,4 +210,4 @@ class PowerOffMoving(Rule):
 
 def motion_of(node: SeenNode) -> tuple[Known | None, ...]:
     """What showed the last motion of a node."""
-    return node.known(STATUSWORD), node.known(POSITION)
+    return node.known(cia402.STATUSWORD), node.known(cia402.POSITION)

@@ -14,8 +14,7 @@ brings: the work of the task's controller, noise of powered motors on the cable,
 
     figures   what was measured
     meter     the port that measures
-    verdict   figures → verdict
-    overruns  figures → overruns at another rate
+    verdict   figures → verdict, and overruns at another rate
     machine   facts of the machine
 
 The room uses the standard library only, and sends nothing itself. Start reading at `verdict`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -58,37 +59,37 @@ def read_json(path: Path) -> Report:
 def _parse_report(document: dict[str, Any]) -> Report:
     distributions = _typed(document["distributions"], dict)
     return Report(
-        tool=_typed(document["tool"], str),
-        title=_typed(document["title"], str),
-        facts={name: _typed(value, str) for name, value in _typed(document["facts"], dict).items()},
+        tool=_text(document["tool"]),
+        title=_text(document["title"]),
+        facts={name: _text(value) for name, value in _typed(document["facts"], dict).items()},
         rows=[_parse_row(_typed(row, dict)) for row in _typed(document["rows"], list)],
-        left_out=[(_typed(what, str), _typed(why, str)) for what, why in _typed(document["left_out"], list)],
+        left_out=[(_text(what), _text(why)) for what, why in _typed(document["left_out"], list)],
         manual=list(_texts(document["manual"])),
         distributions={name: tuple(map(float, _typed(times, list))) for name, times in distributions.items()},
-        log=None if document["log"] is None else _typed(document["log"], str),
+        log=None if document["log"] is None else _text(document["log"]),
     )
 
 
 def _parse_row(row: dict[str, Any]) -> ReportRow:
-    values: dict[str, Any] = {}
-    for one in fields(ReportRow):
-        value = row[one.name]
-        match one.name:
-            case "sent" | "came" | "written":
-                values[one.name] = _texts(value)
-            case "verdict":
-                values[one.name] = Verdict(value)
-            case "seconds":
-                values[one.name] = float(value)
-            case _:
-                values[one.name] = _typed(value, str)
+    values = {one.name: _PARSERS.get(one.name, _text)(row[one.name]) for one in fields(ReportRow)}
     if values["severity"] not in SEVERITIES:
         raise ValueError(f"severity: expected one of {', '.join(SEVERITIES[1:])}, got {values['severity']!r}")
     return ReportRow(**values)
 
 
+def _text(value: object) -> str:
+    return _typed(value, str)
+
+
 def _texts(value: object) -> tuple[str, ...]:
-    return tuple(_typed(one, str) for one in _typed(value, list))
+    return tuple(map(_text, _typed(value, list)))
+
+
+_PARSERS: dict[str, Callable[[Any], Any]] = {
+    **{"verdict": Verdict, "seconds": float},
+    **dict.fromkeys(("sent", "came", "written"), _texts),
+}
+"""What reads the attributes of `ReportRow` that are no text."""
 
 
 def _typed(value: object, kind: type[Kind]) -> Kind:

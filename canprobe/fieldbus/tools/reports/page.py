@@ -61,18 +61,15 @@ def write_html(report: Report, path: Path, change: ReportChange | None = None) -
     )
     facts = [(name, _text(value)) for name, value in report.facts.items()]
     facts += [("log", _text(report.log))] if report.log is not None else []
-    changes = [] if change is None else ["<h2>Since the baseline</h2>", _list(change.lines())]
     body = [
         f'<h1>{title}</h1><p class="counts">{counts}</p>',
         *_worst(report),
-        *(["<h2>Device and bench</h2>", _facts(facts)] if facts else []),
-        *changes,
+        *_section("Device and bench", _facts(facts)),
+        *_section("Since the baseline", _list([] if change is None else change.lines())),
         *(line for group, rows in report.groups().items() for line in _group(group, rows)),
-        *_section("Measured times", [_times(report.distributions)] if report.distributions else []),
-        *_section(
-            "Left out", [_facts([(what, _text(why)) for what, why in report.left_out])] if report.left_out else []
-        ),
-        *_section("Steps by hand", [_list(report.manual)] if report.manual else []),
+        *_section("Measured times", _times(report.distributions) if report.distributions else ""),
+        *_section("Left out", _facts((what, _text(why)) for what, why in report.left_out)),
+        *_section("Steps by hand", _list(report.manual)),
         f"<footer>{_text(NO_CERTIFICATE)}</footer>",
     ]
     head = (
@@ -113,8 +110,9 @@ def _group(group: str, rows: Sequence[ReportRow]) -> Iterable[str]:
         yield f"<details{opened}>{summary}{table}</details>"
 
 
-def _section(name: str, content: Sequence[str]) -> list[str]:
-    return [f"<h2>{name}</h2>", *content] if content else []
+def _section(name: str, content: str) -> list[str]:
+    """A heading and what stands below it, if there is anything."""
+    return [f"<h2>{name}</h2>", content] if content else []
 
 
 def _times(distributions: dict[str, tuple[float, ...]]) -> str:
@@ -152,11 +150,12 @@ def _histogram(times: Sequence[float]) -> str:
 def _facts(entries: Iterable[tuple[str, str]]) -> str:
     """A table of two columns; the values are HTML."""
     rows = "".join(f"<tr><th>{_text(name)}</th><td>{value}</td></tr>" for name, value in entries)
-    return f'<table class="facts">{rows}</table>'
+    return f'<table class="facts">{rows}</table>' if rows else ""
 
 
 def _list(lines: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>"
+    items = "".join(f"<li>{_text(line)}</li>" for line in lines)
+    return f"<ul>{items}</ul>" if items else ""
 
 
 def _pre(lines: Sequence[str]) -> str:

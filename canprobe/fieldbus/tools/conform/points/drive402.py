@@ -9,42 +9,28 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import (
-    HOMING_ATTAINED_BIT,
-    HOMING_ERROR_BIT,
-    SETPOINT_ACKNOWLEDGE_BIT,
     TRANSITIONS,
     DriveCommand,
     DriveState,
+    OperationMode,
     describe_state,
     known_state,
 )
 from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import CONTROLWORD, STATUSWORD
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
 point = PointGroup("drive402")
 AUTOMATON = "CiA 402-2, finite state automaton"
-_WORDS = {
-    DriveCommand.SHUTDOWN: 0x06,
-    DriveCommand.SWITCH_ON: 0x07,
-    DriveCommand.ENABLE_OPERATION: 0x0F,
-    DriveCommand.DISABLE_VOLTAGE: 0x00,
-    DriveCommand.QUICK_STOP: 0x02,
-}
-_WAYS = {
-    DriveState.SWITCH_ON_DISABLED: (),
-    DriveState.READY_TO_SWITCH_ON: (DriveCommand.SHUTDOWN,),
-    DriveState.SWITCHED_ON: (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON),
-    DriveState.OPERATION_ENABLED: (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION),
-}
+_WORDS = {command: pattern for _, pattern, command in cia402.CONTROLWORD_PATTERNS}
+_WAY_UP = (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION)
+_STATES = tuple(DriveState)[1:5]
+"""States on the way up, from SWITCH_ON_DISABLED to OPERATION_ENABLED."""
 _REACH_S = 2.0
-_MODE, _MODE_DISPLAY, _MODES, _TARGET, _ACTUAL, _METHOD = 0x6060, 0x6061, 0x6502, 0x607A, 0x6064, 0x6098
-_PROFILE_POSITION, _HOMING = 1, 6
 _PRESENT_POSITION = (37, 35)
 """Homing methods that take the present position as home."""
 
@@ -52,26 +38,26 @@ _PRESENT_POSITION = (37, 35)
 def _reach(bench: Bench, state: DriveState, what: str) -> None:
     """Wait for a state of the drive. Raises Deviation."""
     until_ns = bench.now_ns + round(_REACH_S * 1e9)
-    while known_state(word := bench.number(STATUSWORD)) is not state:
+    while known_state(word := bench.number(cia402.STATUSWORD)) is not state:
         if bench.now_ns >= until_ns:
             bench.deviates(f"{what}: the drive is {describe_state(word)}, expected {state.name}")
         bench.pass_time(0.01)
 
 
 def _command(bench: Bench, command: DriveCommand) -> None:
-    bench.put(CONTROLWORD, 0, _WORDS[command], 2)
+    bench.put(cia402.CONTROLWORD, 0, _WORDS[command], 2)
 
 
 @contextmanager
 def _at_rest(bench: Bench, mode: int = 0) -> Iterator[None]:
     """The drive switched off in a mode, with its target where it is; switched off afterwards, whatever happens."""
     modes = _supported(bench)
-    mode = mode or next((m for m in (_PROFILE_POSITION, 8, 9, 10, 3, 7) if modes >> m - 1 & 1), 0)
+    mode = mode or next((m for m in (OperationMode.PROFILE_POSITION, 8, 9, 10, 3, 7) if modes >> m - 1 & 1), 0)
     if not mode or (modes and not modes >> mode - 1 & 1):
-        raise PointNotApplicable(f"6502h does not list mode {mode}")
+        bench.does_not_apply(f"6502h does not list mode {mode}")
     _off(bench)
-    bench.put(_MODE, 0, mode, 1)
-    bench.put(_TARGET, 0, bench.number(_ACTUAL), 4)
+    bench.put(cia402.MODE, 0, mode, 1)
+    bench.put(cia402.TARGET_POSITION, 0, bench.number(cia402.POSITION), 4)
     try:
         yield
     finally:
@@ -81,22 +67,22 @@ def _at_rest(bench: Bench, mode: int = 0) -> Iterator[None]:
 def _supported(bench: Bench) -> int:
     """6502h; 0 where the drive has none."""
     try:
-        return int.from_bytes(bench.upload(_MODES), "little")
+        return int.from_bytes(bench.upload(cia402.SUPPORTED_MODES), "little")
     except SdoRefused:
         return 0
 
 
 def _off(bench: Bench) -> None:
     """Disable the voltage, and reset a fault that is there."""
-    bench.put(CONTROLWORD, 0, 0, 2)
-    if known_state(bench.number(STATUSWORD)) is DriveState.FAULT:
-        raise PointNotApplicable("the drive is in FAULT; reset it first")
+    bench.put(cia402.CONTROLWORD, 0, 0, 2)
+    if known_state(bench.number(cia402.STATUSWORD)) is DriveState.FAULT:
+        bench.does_not_apply("the drive is in FAULT; reset it first")
     _reach(bench, DriveState.SWITCH_ON_DISABLED, "disable voltage")
 
 
 def _go(bench: Bench, state: DriveState) -> None:
     _off(bench)
-    for command in _WAYS[state]:
+    for command in _WAY_UP[: _STATES.index(state)]:
         _command(bench, command)
     _reach(bench, state, "on the way up")
 
@@ -104,7 +90,7 @@ def _go(bench: Bench, state: DriveState) -> None:
 @point(48, "statusword", "CiA 402-2, 6041h", "the bits of a state, the power stage off", needs="drive")
 def statusword(bench: Bench) -> None:
     """The bits of 6041h are those of a state."""
-    word = bench.number(STATUSWORD)
+    word = bench.number(cia402.STATUSWORD)
     if known_state(word) is None:
         bench.deviates(f"6041h is {word:04X}h, which is no state")
 
@@ -118,13 +104,13 @@ def statusword(bench: Bench) -> None:
 )
 def supported_modes(bench: Bench) -> None:
     """6502h beside the EDS, and the mode that 6061h shows."""
-    entry = bench.device.described(_MODES)
+    entry = bench.device.described(cia402.SUPPORTED_MODES)
     if bench.device.description is not None and entry is None:
-        raise PointNotApplicable("the EDS describes no 6502h")
-    modes = bench.number(_MODES)
+        bench.does_not_apply("the EDS describes no 6502h")
+    modes = bench.number(cia402.SUPPORTED_MODES)
     if entry is not None and isinstance(entry.default, int) and entry.default and entry.default != modes:
         bench.notes.append(f"6502h is {modes:08X}h, the EDS says {entry.default:08X}h")
-    mode = bench.number(_MODE_DISPLAY)
+    mode = bench.number(cia402.MODE_DISPLAY)
     if 0 < mode < 33 and not modes >> mode - 1 & 1:
         bench.deviates(f"6061h shows mode {mode}, which 6502h does not list")
 
@@ -137,15 +123,15 @@ def mode_display(bench: Bench) -> None:
     modes = _supported(bench)
     _off(bench)
     for mode in range(1, 11):
-        request = pack_write(_MODE, 0, bytes((mode,)))
+        request = pack_write(cia402.MODE, 0, bytes((mode,)))
         if not modes >> mode - 1 & 1:
             bench.must_refuse(
                 request, (*accepted.VALUE, 0x06040043, 0x06010000), f"mode {mode}, which 6502h does not list"
             )
             continue
-        bench.put(_MODE, 0, mode, 1)
+        bench.put(cia402.MODE, 0, mode, 1)
         bench.pass_time(0.05)
-        if (shown := bench.number(_MODE_DISPLAY)) != mode:
+        if (shown := bench.number(cia402.MODE_DISPLAY)) != mode:
             bench.deviates(f"6061h is {shown} after mode {mode}")
 
 
@@ -154,7 +140,7 @@ def transitions(bench: Bench) -> None:
     """Every command that does something, in every state up to operation enabled; quick stop is point 51."""
     with _at_rest(bench):
         for (source, command), goal in TRANSITIONS.items():
-            if source not in _WAYS or command not in _WORDS or goal is DriveState.QUICK_STOP_ACTIVE:
+            if source not in _STATES or command not in _WORDS or goal is DriveState.QUICK_STOP_ACTIVE:
                 continue
             _go(bench, source)
             _command(bench, command)
@@ -200,27 +186,27 @@ def quick_stop(bench: Bench) -> None:
 )
 def handshake(bench: Bench) -> None:
     """A set-point where the axis is: it is acknowledged, and the acknowledgement goes with bit 4."""
-    with _at_rest(bench, _PROFILE_POSITION):
+    with _at_rest(bench, OperationMode.PROFILE_POSITION):
         _go(bench, DriveState.OPERATION_ENABLED)
         for word, acknowledged in ((0x1F, 1), (0x0F, 0)):
-            bench.put(CONTROLWORD, 0, word, 2)
+            bench.put(cia402.CONTROLWORD, 0, word, 2)
             bench.pass_time(0.05)
-            if (found := bench.number(STATUSWORD) >> SETPOINT_ACKNOWLEDGE_BIT & 1) != acknowledged:
+            if (found := bench.number(cia402.STATUSWORD) >> cia402.SETPOINT_ACKNOWLEDGE_BIT & 1) != acknowledged:
                 bench.deviates(f"bit 12 of 6041h is {found} after controlword {word:04X}h")
 
 
 @point(55, "homing", "CiA 402-2, homing", "bit 12 comes, bit 13 does not", needs="drive motion")
 def homing(bench: Bench) -> None:
     """Method 37 or 35, which takes the present position as home."""
-    with _at_rest(bench, _HOMING):
-        if not any(bench.takes(_METHOD, 0, method) for method in _PRESENT_POSITION):
-            raise PointNotApplicable("the drive has no homing method that takes the present position")
+    with _at_rest(bench, OperationMode.HOMING):
+        if not any(bench.takes(cia402.HOMING_METHOD, 0, method) for method in _PRESENT_POSITION):
+            bench.does_not_apply("the drive has no homing method that takes the present position")
         _go(bench, DriveState.OPERATION_ENABLED)
-        bench.put(CONTROLWORD, 0, 0x1F, 2)
+        bench.put(cia402.CONTROLWORD, 0, 0x1F, 2)
         until_ns = bench.now_ns + round(_REACH_S * 1e9)
-        while not (word := bench.number(STATUSWORD)) >> HOMING_ATTAINED_BIT & 1:
-            if word >> HOMING_ERROR_BIT & 1 or bench.now_ns >= until_ns:
+        while not (word := bench.number(cia402.STATUSWORD)) >> cia402.HOMING_ATTAINED_BIT & 1:
+            if word >> cia402.HOMING_ERROR_BIT & 1 or bench.now_ns >= until_ns:
                 bench.deviates(f"homing is not attained: 6041h is {word:04X}h")
             bench.pass_time(0.01)
-        if word >> HOMING_ERROR_BIT & 1:
+        if word >> cia402.HOMING_ERROR_BIT & 1:
             bench.deviates(f"homing is attained with an error: 6041h is {word:04X}h")

@@ -6,10 +6,9 @@ The error that is provoked is a SYNC of the wrong length (8240h), which a right 
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, is_no_error
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, NmtCommand
+from canprobe.fieldbus.protocol.frames import EMCY_BASE
 from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync
@@ -23,20 +22,13 @@ _GENERIC, _COMMUNICATION = 0x01, 0x10
 def _provoke(bench: Bench) -> int:
     """Provoke 8240h; return when it came."""
     plain_sync(bench)
-    bench.nmt(NmtCommand.START)
-    bench.pass_time(0.01)
-    bench.sync()
-    bench.pass_time(bench.times.slack_s)
+    bench.start()
+    bench.sync_and_wait()
     bench.sync(1)
     try:
         return bench.emcy(SYNC_LENGTH_CODE, 1.5e-3 * _INHIBIT_MS)[1]
     except Deviation as error:
         raise PointNotApplicable("no EMCY could be provoked: a SYNC of the wrong length brings none") from error
-
-
-def _end(bench: Bench) -> None:
-    bench.sync()
-    bench.pass_time(bench.times.slack_s)
 
 
 @point(42, "history", "CiA 301, 1003h", "the newest error first: its code in the low 16 bits", needs="nmt sync")
@@ -46,21 +38,21 @@ def history(bench: Bench) -> None:
     before = bench.number(0x1003)
     _provoke(bench)
     count, newest = bench.number(0x1003), bench.number(0x1003, 1)
-    _end(bench)
+    bench.sync_and_wait()
     if count not in (before, before + 1) or not count:
         bench.deviates(f"1003h:00 is {count} after an error, it was {before}")
     if newest & 0xFFFF != SYNC_LENGTH_CODE:
         bench.deviates(f"1003h:01 is {newest:08X}h after EMCY 8240h")
 
 
-@point(42, "write to the history", "CiA 301, 1003h", accepted_text(accepted.VALUE))
+@point(42, "write to the history", "CiA 301, 1003h", accepted.VALUE)
 def write_to_history(bench: Bench) -> None:
     """1003h:00 takes nothing but 0."""
     bench.need((0x1003, 0))
     bench.must_refuse(pack_write(0x1003, 0, b"\1"), (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
 
 
-@point(42, "empty entry", "CiA 301, 1003h", accepted_text(accepted.NO_DATA) + ", or 06090011h")
+@point(42, "empty entry", "CiA 301, 1003h", accepted.text(accepted.NO_DATA) + ", or 06090011h")
 def empty_entry(bench: Bench) -> None:
     """The entry behind the last error."""
     bench.need((0x1003, 0), written=False)
@@ -86,7 +78,7 @@ def identifier(bench: Bench) -> None:
     if value & 0x7FF != 0x80 + bench.node_id:
         bench.notes.append(f"1014h is {value:08X}h, the default is {0x80 + bench.node_id:08X}h")
     if value >> 31:
-        raise PointNotApplicable("bit 31 of 1014h says that there is no EMCY")
+        bench.does_not_apply("bit 31 of 1014h says that there is no EMCY")
     others = [can_id for can_id in range(EMCY_BASE + 1, EMCY_BASE + 128) if can_id != bench.emcy_id]
     for can_id in others:
         bench.taken(can_id)
@@ -97,7 +89,7 @@ def identifier(bench: Bench) -> None:
         if any(frame.data[:2] == code for can_id in others for frame in bench.taken(can_id)):
             bench.deviates(f"EMCY comes under another identifier than 1014h, {bench.emcy_id:03X}h")
         raise
-    _end(bench)
+    bench.sync_and_wait()
 
 
 @point(43, "inhibit time", "CiA 301, 1015h", "no two messages within the inhibit time", needs="nmt sync")
@@ -131,7 +123,7 @@ def error_register(bench: Bench) -> None:
     if not during & _GENERIC:
         bench.notes.append(f"1001h is {during:02X}h during an error: bit 0 is for any error")
     bench.emergencies.clear()
-    _end(bench)
+    bench.sync_and_wait()
     ended = any(is_no_error(emcy.code) for emcy, _ in bench.emergencies)
     if ended and (after := bench.number(0x1001)) != before:
         bench.deviates(f"1001h is {after:02X}h after the end of the error, it was {before:02X}h")

@@ -6,7 +6,6 @@ from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
 from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -37,10 +36,9 @@ def _beat(bench: Bench, producer: int) -> int:
 def producer(bench: Bench) -> None:
     """Heartbeats every 50 ms, then none."""
     bench.need((0x1017, 0))
-    can_id = HEARTBEAT_BASE + bench.node_id
     bench.put(0x1017, 0, _PERIOD_MS)
     period_s = _PERIOD_MS * 1e-3
-    frames = bench.during((_PRODUCED + 1) * period_s + bench.times.slack_s, [can_id])
+    frames = bench.during((_PRODUCED + 1) * period_s + bench.times.slack_s, [bench.beat_id])
     if len(frames) < _PRODUCED:
         bench.deviates(f"{len(frames)} heartbeats in {_PRODUCED + 1} periods of {_PERIOD_MS} ms")
     mean_s = (frames[-1].t_ns - frames[0].t_ns) * 1e-9 / (len(frames) - 1)
@@ -48,16 +46,8 @@ def producer(bench: Bench) -> None:
         bench.deviates(f"the heartbeat comes every {mean_s * 1e3:.1f} ms, expected {_PERIOD_MS} ms")
     bench.put(0x1017, 0, 0)
     bench.pass_time(bench.times.slack_s)
-    if frames := bench.during(3 * period_s, [can_id]):
+    if bench.during(3 * period_s, [bench.beat_id]):
         bench.deviates("heartbeats come although 1017h is 0")
-
-
-def _guarded(bench: Bench) -> int | None:
-    can_id = HEARTBEAT_BASE + bench.node_id
-    bench.taken(can_id)
-    bench.send(can_id | RTR_FLAG)
-    frame = bench.next(can_id, bench.times.silence_s)
-    return frame.data[0] if frame is not None and len(frame.data) == 1 else None
 
 
 def _need_guarding(bench: Bench) -> None:
@@ -66,7 +56,7 @@ def _need_guarding(bench: Bench) -> None:
     if bench.device.writable(0x1017):
         bench.put(0x1017, 0, 0)
     elif bench.device.number(0x1017):
-        raise PointNotApplicable("the heartbeat cannot be switched off, and excludes guarding")
+        bench.does_not_apply("the heartbeat cannot be switched off, and excludes guarding")
 
 
 @point(9, "guarding", "CiA 301, node guarding", "the state, with a bit that toggles, from 0 on", needs="nmt")
@@ -80,7 +70,7 @@ def guarding(bench: Bench) -> None:
     answers = []
     for state in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED, NmtState.PRE_OPERATIONAL):
         bench.settle(state)
-        answers.append(_guarded(bench))
+        answers.append(bench.guarded())
     if answers != (wanted := [0x7F, 0x85, 0x04, 0xFF]):
         got = ", ".join("none" if one is None else f"{one:02X}h" for one in answers)
         bench.deviates(f"guarding answers {got}; expected {', '.join(f'{one:02X}h' for one in wanted)}")
@@ -90,13 +80,13 @@ def guarding(bench: Bench) -> None:
 def life_guarding(bench: Bench) -> None:
     """Two requests, then none for the life time."""
     _need_guarding(bench)
-    if _guarded(bench) is None:
-        raise PointNotApplicable("the device does not answer guarding")
+    if bench.guarded() is None:
+        bench.does_not_apply("the device does not answer guarding")
     bench.put(0x100C, 0, _GUARD_MS)
     bench.put(0x100D, 0, _LIFE_FACTOR)
     bench.nmt(0x01)
     for _ in range(2):
-        if _guarded(bench) is None:
+        if bench.guarded() is None:
             bench.deviates("guarding is not answered while life guarding runs")
     bench.emcy(HEARTBEAT_LOST_CODE, _GUARD_MS * _LIFE_FACTOR * 1e-3)
     bench.put(0x100D, 0, 0)
@@ -109,11 +99,10 @@ def heartbeat_wins(bench: Bench) -> None:
     bench.put(0x1017, 0, _PERIOD_MS)
     bench.put(0x100C, 0, _GUARD_MS)
     bench.put(0x100D, 0, 1)
-    can_id = HEARTBEAT_BASE + bench.node_id
-    bench.taken(can_id)
-    bench.send(can_id | RTR_FLAG)
+    bench.taken(bench.beat_id)
+    bench.send(bench.beat_id | RTR_FLAG)
     bench.pass_time(3 * _GUARD_MS * 1e-3)
-    frames = bench.taken(can_id)
+    frames = bench.taken(bench.beat_id)
     if len(frames) < 3:
         bench.deviates("no heartbeat comes while guarding is configured, too")
     if any(len(frame.data) != 1 or frame.data[0] & 0x80 for frame in frames):
@@ -148,7 +137,7 @@ def consumer(bench: Bench) -> None:
     bench.put(0x1016, 1, 0)
 
 
-@point(44, "duplicate consumer", "CiA 301, 1016h", accepted_text(accepted.DUPLICATE))
+@point(44, "duplicate consumer", "CiA 301, 1016h", accepted.DUPLICATE)
 def duplicate_consumer(bench: Bench) -> None:
     """Two entries for one producer."""
     bench.need((0x1016, 2))

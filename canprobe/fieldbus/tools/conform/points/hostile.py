@@ -12,14 +12,13 @@ from canprobe.fieldbus.protocol.frames import (
     NMT_ID,
     RTR_FLAG,
     SDO_RX_BASE,
-    SDO_TX_BASE,
     NmtCommand,
     NmtState,
 )
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
-from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request
+from canprobe.fieldbus.protocol.sdo import pack_read, pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
+from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("hostile")
@@ -31,13 +30,7 @@ _PACE_S = 0.02
 @point(93, "SDO of every length", "CiA 301, SDO: eight bytes", "0 to 7 bytes are not answered")
 def sdo_lengths(bench: Bench) -> None:
     """A request cut to 0 to 7 bytes. Some devices answer shorter requests on purpose, which is noted."""
-    answer_id = SDO_TX_BASE + bench.node_id
-    answered = []
-    for length in range(8):
-        bench.taken(answer_id)
-        bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE[:length])
-        if not bench.is_silent():
-            answered.append(length)
+    answered = [length for length in range(8) if not bench.ignores(bench.request_id, _READ_TYPE[:length])]
     if any(length < 4 for length in answered):
         bench.deviates(f"requests of {answered} bytes are answered")
     if answered:
@@ -48,25 +41,19 @@ def sdo_lengths(bench: Bench) -> None:
 @point(94, "remote requests", "CiA 301, CAN data frames", "remote requests for SDO and EMCY are ignored")
 def remote_requests(bench: Bench) -> None:
     """Remote requests under every identifier of the device but guarding and TPDOs."""
-    answer_id = SDO_TX_BASE + bench.node_id
-    for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE):
-        bench.taken(answer_id)
-        bench.send((base + bench.node_id) | RTR_FLAG)
-        if not bench.is_silent():
-            bench.deviates(f"a remote request for {base + bench.node_id:03X}h is answered")
+    for can_id in (bench.request_id, bench.answer_id, EMCY_BASE + bench.node_id):
+        if not bench.ignores(can_id | RTR_FLAG):
+            bench.deviates(f"a remote request for {can_id:03X}h is answered")
     bench.serves("remote requests")
 
 
 @point(95, "29-bit frames", "CiA 301, CAN base frames", "frames with 29 bits are another device's", needs="alone nmt")
 def extended_frames(bench: Bench) -> None:
     """The identifiers of SDO and NMT in 29 bits, as they are and above the 11 bits."""
-    answer_id = SDO_TX_BASE + bench.node_id
     bench.watch_state()
     for shift in (0, 18):
-        can_id = (SDO_RX_BASE + bench.node_id) << shift | EFF_FLAG
-        bench.taken(answer_id)
-        bench.send(can_id, _READ_TYPE)
-        if not bench.is_silent():
+        can_id = bench.request_id << shift | EFF_FLAG
+        if not bench.ignores(can_id, _READ_TYPE):
             bench.deviates(f"an SDO request with identifier {can_id & ~EFF_FLAG:08X}h is answered")
         bench.send(NMT_ID << shift | EFF_FLAG, bytes((NmtCommand.STOP, bench.node_id)))
         if (state := bench.state()) != NmtState.PRE_OPERATIONAL:
@@ -77,17 +64,16 @@ def extended_frames(bench: Bench) -> None:
 @point(96, "every SDO command", "CiA 301, SDO command specifiers", "an answer of eight bytes or none; then it serves")
 def every_command(bench: Bench) -> None:
     """All 256 command bytes with 1000h, which cannot be written; what may begin a transfer is aborted."""
-    answer_id = SDO_TX_BASE + bench.node_id
     value = bench.device.values.get((0x1000, 0), bytes(4))
     for command in range(256):
-        bench.taken(answer_id)
+        bench.taken(bench.answer_id)
         if command >> 5 == 1 and command & 2 and (4 - (command >> 2 & 3) if command & 1 else 4) != len(value):
             continue  # a value that is shorter than that of 1000h
-        bench.send(SDO_RX_BASE + bench.node_id, pack_request(command, 0x1000, 0, value))
-        frame = bench.next(answer_id, _PACE_S)
+        bench.send(bench.request_id, pack_request(command, 0x1000, 0, value))
+        frame = bench.next(bench.answer_id, _PACE_S)
         if frame is not None and len(frame.data) != 8:
             bench.deviates(f"command {command:02X}h is answered with {len(frame.data)} bytes")
-    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(0x1000, 0, 0x08000000))
+    bench.abort(0x1000)
     while not bench.is_silent():
         pass  # answers that come late
     bench.serves("all command bytes")
@@ -97,10 +83,8 @@ def every_command(bench: Bench) -> None:
 def fd_frames(bench: Bench) -> None:
     """A request in a frame of twelve bytes, where the bus carries such frames."""
     if not bench.fd:
-        raise PointNotApplicable("the bus carries no CAN FD frames")
-    bench.taken(SDO_TX_BASE + bench.node_id)
-    bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE.ljust(_FD_BYTES, b"\0"))
-    if not bench.is_silent():
+        bench.does_not_apply("the bus carries no CAN FD frames")
+    if not bench.ignores(bench.request_id, _READ_TYPE.ljust(_FD_BYTES, b"\0")):
         bench.deviates("an SDO request of twelve bytes is answered")
     bench.serves("CAN FD frames")
 
@@ -123,11 +107,7 @@ def own_frames(bench: Bench) -> None:
 def other_identifiers(bench: Bench) -> None:
     """Every 16th identifier that is no service of the device, with 0 to 8 bytes."""
     bench.watch_state()
-    own = {
-        bench.device.cob_id(pdo)
-        for area in (range(0x1400, 0x1600), range(0x1800, 0x1A00))
-        for pdo in bench.device.pdos(area)
-    }
+    own = {*bench.device.valid_pdos(RPDOS), *bench.device.valid_pdos(TPDOS)}
     lengths = 0
     for can_id in range(0x103, 0x7E0, 16):
         services = can_id & 0x7F == bench.node_id or HEARTBEAT_BASE <= can_id < HEARTBEAT_BASE + 128 or can_id in own

@@ -20,7 +20,6 @@ from canprobe.fieldbus.protocol.lss import (
     pack_number,
 )
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("lss")
@@ -67,7 +66,7 @@ def _configuration(bench: Bench) -> Iterator[None]:
     answer = _select(bench, _address(bench))
     try:
         if answer is None:
-            raise PointNotApplicable("the device does not answer switch state selective, which is point 66")
+            bench.does_not_apply("the device does not answer switch state selective, which is point 66")
         yield
     finally:
         _release(bench)
@@ -84,7 +83,7 @@ def switch_selective(bench: Bench) -> None:
         description = bench.device.description
         if description is not None and description.od.device_information.LSS_supported:
             bench.deviates("no answer to its own numbers; the EDS says LSS_Supported=1")
-        raise PointNotApplicable("the device does not speak LSS")
+        bench.does_not_apply("the device does not speak LSS")
     answer = _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID))
     _release(bench)
     if answer is None:

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from canprobe.fieldbus.node.core import NO_RTR_FLAG
-from canprobe.fieldbus.protocol.frames import (
-    HEARTBEAT_BASE,
-    NMT_ID,
-    RTR_FLAG,
-    SDO_RX_BASE,
-    SDO_TX_BASE,
-    NmtCommand,
-    NmtState,
-)
+from canprobe.fieldbus.protocol.frames import NMT_ID, RTR_FLAG, NmtCommand, NmtState
 from canprobe.fieldbus.protocol.sdo import pack_read
-from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.bench import QUEUED_NS, Bench
 from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
-from canprobe.fieldbus.tools.conform.outcome import NotPermitted, PointNotApplicable
+from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("nmt")
 _STATES = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
 _READ_TYPE = pack_read(0x1000)
-_QUEUED_NS = 5_000_000
 _PACE_S = 0.02
 
 
@@ -46,7 +37,7 @@ def power_on(bench: Bench) -> None:
     """The device announces itself when it gets its power, which a person switches."""
     before = bench.boots
     if not bench.by_hand(f"switch node {bench.node_id} off and on, then confirm"):
-        raise PointNotApplicable("it needs somebody who switches the device off and on")
+        bench.does_not_apply("it needs somebody who switches the device off and on")
     bench.pass_time(bench.times.boot_s)
     if bench.boots == before:
         bench.deviates("no boot-up message after the power came back")
@@ -98,7 +89,7 @@ def wrong_commands(bench: Bench) -> None:
         bench.go(state)
         for data in (*wrong, *short):
             bench.send(NMT_ID, data)
-        bench.pass_time(2 * _QUEUED_NS * 1e-9)
+        bench.pass_time(2 * QUEUED_NS * 1e-9)
         if (found := bench.state()) != state:
             bench.deviates(f"state {found:02X}h after wrong commands in state {state:02X}h")
 
@@ -106,21 +97,21 @@ def wrong_commands(bench: Bench) -> None:
 @point(4, "initialisation", "CiA 301, NMT initialisation", "nothing is served before the boot-up", needs="nmt")
 def initialisation(bench: Bench) -> None:
     """SDO requests from the reset on: none is answered before the boot-up message."""
-    beat_id, answer_id = HEARTBEAT_BASE + bench.node_id, SDO_TX_BASE + bench.node_id
+    beat_id, answer_id = bench.beat_id, bench.answer_id
     bench.taken(beat_id)
     bench.taken(answer_id)
     started_ns = bench.nmt(NmtCommand.RESET_COMMUNICATION)
     frames: list[CameFrame] = []
     until_ns = started_ns + round(bench.times.boot_s * 1e9)
     while not any(frame.can_id == beat_id for frame in frames) and bench.now_ns < until_ns:
-        bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE)
+        bench.send(bench.request_id, _READ_TYPE)
         bench.pass_time(_PACE_S)
         frames += [*bench.taken(answer_id), *(frame for frame in bench.taken(beat_id) if frame.data == b"\0")]
     booted_ns = next((frame.t_ns for frame in frames if frame.can_id == beat_id), None)
     if booted_ns is None:
         bench.deviates(f"no boot-up message within {bench.times.boot_s:g} s")
     # an answer right behind the command may have been under way, one right before the boot-up have won the arbitration
-    between = range(started_ns + _QUEUED_NS, booted_ns - _QUEUED_NS)
+    between = range(started_ns + QUEUED_NS, booted_ns - QUEUED_NS)
     if early := [frame.t_ns for frame in frames if frame.can_id == answer_id and frame.t_ns in between]:
         after_ms, before_ms = (early[0] - started_ns) * 1e-6, (booted_ns - early[0]) * 1e-6
         bench.deviates(
@@ -134,9 +125,7 @@ def stopped(bench: Bench) -> None:
     """SDO is silent in stopped, and served again in pre-operational."""
     bench.watch_state()
     bench.go(NmtState.STOPPED)
-    bench.taken(SDO_TX_BASE + bench.node_id)
-    bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE)
-    if not bench.is_silent():
+    if not bench.ignores(bench.request_id, _READ_TYPE):
         bench.deviates("an SDO request is answered in stopped")
     bench.go(NmtState.PRE_OPERATIONAL)
     bench.serves("the return to pre-operational")
@@ -151,9 +140,9 @@ def stopped(bench: Bench) -> None:
 )
 def pdos_in_operational(bench: Bench) -> None:
     """SYNC and remote requests in pre-operational and stopped; frames that were queued before may still come."""
-    ids = [cob_id for pdo in bench.device.pdos(TPDOS) if (cob_id := bench.device.cob_id(pdo)) is not None]
-    if not ids:
-        raise PointNotApplicable("the device has no valid TPDO")
+    tpdos = bench.device.valid_pdos(TPDOS)
+    if not tpdos:
+        bench.does_not_apply("the device has no valid TPDO")
     for state in (NmtState.PRE_OPERATIONAL, NmtState.STOPPED):
         bench.nmt(NmtCommand.START)
         changed_ns = bench.settle(state)
@@ -161,12 +150,11 @@ def pdos_in_operational(bench: Bench) -> None:
         for _ in range(2):
             if with_sync:
                 bench.sync()
-            for pdo in bench.device.pdos(TPDOS):
-                cob_id = bench.device.cob_id(pdo)
-                if cob_id is not None and not bench.device.number(pdo, 1) & NO_RTR_FLAG:
+            for cob_id, pdo in tpdos.items():
+                if not bench.device.number(pdo, 1) & NO_RTR_FLAG:
                     request_pdo(bench, cob_id)
         bench.pass_time(bench.times.silence_s)
-        frames = [frame for can_id in ids for frame in bench.taken(can_id) if frame.t_ns > changed_ns + _QUEUED_NS]
+        frames = [frame for can_id in tpdos for frame in bench.taken(can_id) if frame.t_ns > changed_ns + QUEUED_NS]
         if frames:
             bench.deviates(f"TPDO {frames[0].can_id:03X}h comes in {state.name.lower().replace('_', '-')}")
     bench.nmt(NmtCommand.PRE_OPERATIONAL)

@@ -7,10 +7,8 @@ from collections.abc import Iterator
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.protocol.sdo import ABORT, pack_read, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
@@ -34,12 +32,12 @@ def read_all(bench: Bench) -> None:
     """Every readable entry of the EDS: it is there, and as long as its type."""
     wrong = []
     for entry in bench.device.entries():
-        mandatory = (entry.index, entry.subindex) in _MANDATORY  # which point 92 reads
+        mandatory = entry.place in _MANDATORY  # which point 92 reads
         if not entry.readable or mandatory or rule_of(entry.index) is WriteRule.HISTORY:
             continue
-        place, size = place_text(entry.index, entry.subindex), -(-entry.bits // 8) if entry.is_integer else 0
+        place, size = place_text(*entry.place), -(-entry.bits // 8) if entry.is_integer else 0
         try:
-            value = bench.upload(entry.index, entry.subindex)
+            value = bench.upload(*entry.place)
         except SdoRefused as refused:
             if refused.code not in _MAY_HAVE_NOTHING:
                 wrong.append(str(refused))
@@ -50,24 +48,24 @@ def read_all(bench: Bench) -> None:
         bench.deviates(_named(wrong))
 
 
-@point(78, "write every ro", "CiA 306-1, AccessType", accepted_text(accepted.READ_ONLY), needs="eds")
+@point(78, "write every ro", "CiA 306-1, AccessType", accepted.READ_ONLY, needs="eds")
 def write_every_read_only(bench: Bench) -> None:
     """Every ro and const entry of the EDS gets its own value: 1000h is point 10, the application area needs --write."""
     tried = 0
     for entry in bench.device.entries():
-        place = entry.index, entry.subindex
-        value = bench.device.values.get(place, b"")
+        value = bench.device.values.get(entry.place, b"")
         allowed = rule_of(entry.index) in (WriteRule.REFUSED, WriteRule.CHANGED, WriteRule.SAME)
         if entry.writable or entry.index == 0x1000 or not 0 < len(value) <= 4:
             continue
-        if allowed or bench.permits.written.permits(place):
+        if allowed or bench.permits.written.permits(entry.place):
             tried += 1
-            bench.must_refuse(pack_write(*place, value), accepted.READ_ONLY, f"write to {place_text(*place)}")
+            what = f"write to {place_text(*entry.place)}"
+            bench.must_refuse(pack_write(*entry.place, value), accepted.READ_ONLY, what)
     if not tried:
-        raise PointNotApplicable("the EDS describes no further entry as ro in the communication area")
+        bench.does_not_apply("the EDS describes no further entry as ro in the communication area")
 
 
-@point(79, "sub-index FFh", "CiA 301, structure of an object", "four bytes, or " + accepted_text(accepted.NO_ENTRY))
+@point(79, "sub-index FFh", "CiA 301, structure of an object", "four bytes, or " + accepted.text(accepted.NO_ENTRY))
 def structure(bench: Bench) -> None:
     """Sub-index FFh of the identity."""
     answer = bench.ask(pack_read(0x1018, 0xFF))
@@ -80,16 +78,15 @@ def structure(bench: Bench) -> None:
 def _compared(bench: Bench) -> Iterator[tuple[DescribedEntry, int]]:
     """Entries of the communication area with a default of the EDS, and the value that the device has."""
     for entry in bench.device.entries():
-        place = entry.index, entry.subindex
-        if isinstance(entry.default, int) and place in bench.device.values and entry.bits:
-            yield entry, bench.device.number(*place)
+        if isinstance(entry.default, int) and bench.device.has(*entry.place) and entry.bits:
+            yield entry, bench.device.number(*entry.place)
 
 
 @point(81, "defaults", "CiA 306-1, DefaultValue", "for information: what differs is noted", needs="eds")
 def defaults(bench: Bench) -> None:
     """Values that differ from the EDS: a device that was configured has others."""
     differing = [
-        f"{place_text(entry.index, entry.subindex)} is {value:#x}, EDS {entry.default:#x}"
+        f"{place_text(*entry.place)} is {value:#x}, EDS {entry.default:#x}"
         for entry, value in _compared(bench)
         if isinstance(entry.default, int)
         and value != entry.default & (1 << entry.bits) - 1
@@ -125,7 +122,7 @@ def sync_identifier(bench: Bench) -> None:
         bench.notes.append(f"SYNC has identifier {value & 0x7FF:03X}h")
 
 
-@point(87, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE))
+@point(87, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE)
 def restricted_identifiers(bench: Bench) -> None:
     """1005h, 1012h and 1014h with restricted identifiers; one that is accepted is put back."""
     found = False
@@ -137,7 +134,7 @@ def restricted_identifiers(bench: Bench) -> None:
             request = pack_write(index, 0, cob_id.to_bytes(4, "little"))
             bench.must_refuse(request, accepted.VALUE, f"{cob_id:03X}h for {index:04X}h")
     if not found:
-        raise PointNotApplicable("none of 1005h, 1012h and 1014h can be written")
+        bench.does_not_apply("none of 1005h, 1012h and 1014h can be written")
 
 
 @point(90, "identity", "CiA 306-1, DeviceInfo; CiA 301, 1018h", "the numbers of the EDS", needs="eds")

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
-from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import TPDOS
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import (
     EVENT_TYPE,
     changeable_pdo,
+    idle_pdo,
     map_entries,
     permitted_entry,
     plain_sync,
+    put_to_work,
     rpdo_of,
     rpdo_of_dummies,
-    set_parameters,
     switch_off,
-    switch_on,
     synchronous_tpdo,
     word_of,
 )
@@ -46,9 +45,14 @@ def syncs(bench: Bench, cob_id: int, counters: list[int | None]) -> list[int]:
     return found
 
 
-def _start(bench: Bench) -> None:
-    bench.nmt(NmtCommand.START)
-    bench.pass_time(0.01)
+def _event_tpdo(bench: Bench, kind: int) -> tuple[DescribedEntry, int]:
+    """A started TPDO of an entry that the user lets be written; return the entry and the identifier."""
+    entry, pdo = permitted_entry(bench, transmits=True), idle_pdo(bench, TPDOS, mapping=True)
+    plain_sync(bench)
+    map_entries(bench, pdo, [word_of(entry)])
+    cob_id = put_to_work(bench, pdo, kind)
+    bench.start()
+    return entry, cob_id
 
 
 @point(30, "type 1", TRANSMISSION, "one TPDO a SYNC, as long as its mapping", needs="nmt sync")
@@ -56,7 +60,7 @@ def type_1(bench: Bench) -> None:
     """Five SYNCs bring five TPDOs."""
     cob_id = synchronous_tpdo(bench)
     pdo = changeable_pdo(bench, TPDOS)
-    _start(bench)
+    bench.start()
     if (found := syncs(bench, cob_id, [None] * 5)) != [1] * 5:
         bench.deviates(f"five SYNCs bring {found} TPDOs, expected one each")
     bench.sync()
@@ -70,7 +74,7 @@ def type_1(bench: Bench) -> None:
 def type_n(bench: Bench) -> None:
     """Type 3, nine SYNCs."""
     cob_id = synchronous_tpdo(bench, every=3)
-    _start(bench)
+    bench.start()
     found = syncs(bench, cob_id, [None] * 9)
     if sum(found) != 3 or found[:3] != found[3:6] or found[:3] != found[6:]:
         bench.deviates(f"with type 3 nine SYNCs bring {found} TPDOs")
@@ -79,18 +83,12 @@ def type_n(bench: Bench) -> None:
 @point(30, "type 0", TRANSMISSION, "after an event one TPDO, at the next SYNC", needs="nmt sync eds")
 def type_0(bench: Bench) -> None:
     """An entry that the user lets be written changes between SYNCs."""
-    entry, pdo = permitted_entry(bench, transmits=True), changeable_pdo(bench, TPDOS, mapping=True)
-    plain_sync(bench)
-    switch_off(bench, pdo)
-    map_entries(bench, pdo, [word_of(entry)])
-    set_parameters(bench, pdo, 0)
-    cob_id = switch_on(bench, pdo)
-    _start(bench)
+    entry, cob_id = _event_tpdo(bench, 0)
     syncs(bench, cob_id, [None])
     quiet = syncs(bench, cob_id, [None, None])
-    bench.put(entry.index, entry.subindex, bench.number(entry.index, entry.subindex) ^ 1)
+    bench.put(*entry.place, bench.number(*entry.place) ^ 1)
     if (found := quiet + syncs(bench, cob_id, [None, None])) == [0, 0, 0, 0]:
-        raise PointNotApplicable(_NO_EVENT)
+        bench.does_not_apply(_NO_EVENT)
     if found != [0, 0, 1, 0]:
         bench.deviates(f"two SYNCs, an event and two SYNCs bring {found} TPDOs, expected [0, 0, 1, 0]")
 
@@ -98,20 +96,14 @@ def type_0(bench: Bench) -> None:
 @point(30, "type 255", TRANSMISSION, "an event brings a TPDO at once, SYNC brings none", needs="nmt sync eds")
 def type_255(bench: Bench) -> None:
     """An entry that the user lets be written changes; then a SYNC."""
-    entry, pdo = permitted_entry(bench, transmits=True), changeable_pdo(bench, TPDOS, mapping=True)
-    plain_sync(bench)
-    switch_off(bench, pdo)
-    map_entries(bench, pdo, [word_of(entry)])
-    set_parameters(bench, pdo, EVENT_TYPE)
-    cob_id = switch_on(bench, pdo)
-    _start(bench)
+    entry, cob_id = _event_tpdo(bench, EVENT_TYPE)
     bench.taken(cob_id)
-    bench.put(entry.index, entry.subindex, bench.number(entry.index, entry.subindex) ^ 1)
+    bench.put(*entry.place, bench.number(*entry.place) ^ 1)
     at_once = bench.next(cob_id, bench.times.slack_s)
     if syncs(bench, cob_id, [None]) != [0]:
         bench.deviates("SYNC brings a TPDO of type 255")
     if at_once is None:
-        raise PointNotApplicable(_NO_EVENT)
+        bench.does_not_apply(_NO_EVENT)
 
 
 @point(30, "remote request", TRANSMISSION, "type 253 answers a remote request, and no SYNC", needs="nmt")
@@ -119,11 +111,10 @@ def remote_request(bench: Bench) -> None:
     """A remote request for a TPDO whose bit 30 permits it."""
     pdo = changeable_pdo(bench, TPDOS)
     if bench.device.number(pdo, 1) & NO_RTR_FLAG:
-        raise PointNotApplicable("bit 30 of the COB-ID permits no remote request")
+        bench.does_not_apply("bit 30 of the COB-ID permits no remote request")
     switch_off(bench, pdo)
-    set_parameters(bench, pdo, 253)
-    cob_id = switch_on(bench, pdo)
-    _start(bench)
+    cob_id = put_to_work(bench, pdo, 253)
+    bench.start()
     bench.taken(cob_id)
     request_pdo(bench, cob_id)
     if bench.next(cob_id, bench.times.slack_s) is None:
@@ -132,11 +123,8 @@ def remote_request(bench: Bench) -> None:
 
 def _event_driven(bench: Bench, event_ms: int, inhibit: int = 0) -> list[int]:
     """A TPDO of type 255 with its times; return when it came in half a second."""
-    pdo = changeable_pdo(bench, TPDOS)
-    switch_off(bench, pdo)
-    set_parameters(bench, pdo, EVENT_TYPE, inhibit=inhibit, event_ms=event_ms)
-    cob_id = switch_on(bench, pdo)
-    _start(bench)
+    cob_id = put_to_work(bench, idle_pdo(bench, TPDOS), EVENT_TYPE, inhibit=inhibit, event_ms=event_ms)
+    bench.start()
     return [frame.t_ns for frame in bench.during(0.5, [cob_id])]
 
 
@@ -168,15 +156,14 @@ def synchronous_rpdo(bench: Bench) -> None:
     """An entry that the user lets be written, by an RPDO of type 1."""
     entry = permitted_entry(bench, transmits=False)
     plain_sync(bench)
-    _, cob_id = rpdo_of(bench, entry, 1)
-    _start(bench)
-    before = bench.number(entry.index, entry.subindex)
+    cob_id = rpdo_of(bench, entry, 1)
+    bench.start()
+    before = bench.number(*entry.place)
     _send_value(bench, cob_id, before ^ 1, entry.bits)
-    if bench.number(entry.index, entry.subindex) != before:
+    if bench.number(*entry.place) != before:
         bench.deviates("a synchronous RPDO is applied before SYNC")
-    bench.sync()
-    bench.pass_time(bench.times.slack_s)
-    if bench.number(entry.index, entry.subindex) != before ^ 1:
+    bench.sync_and_wait()
+    if bench.number(*entry.place) != before ^ 1:
         bench.deviates("a synchronous RPDO is not applied at SYNC")
 
 
@@ -190,7 +177,7 @@ def _send_value(bench: Bench, cob_id: int, value: int, bits: int) -> None:
 def short_rpdo(bench: Bench) -> None:
     """A dummy RPDO without a byte; a whole one ends the error."""
     _, cob_id, length = rpdo_of_dummies(bench)
-    _start(bench)
+    bench.start()
     bench.send(cob_id, bytes(length))
     bench.pass_time(bench.times.slack_s)
     if bench.errors():
@@ -206,14 +193,14 @@ def short_rpdo_applied(bench: Bench) -> None:
     """An entry that the user lets be written keeps its value."""
     entry = permitted_entry(bench, transmits=False)
     if entry.bits < 16:
-        raise PointNotApplicable("the entry has one byte only")
-    _, cob_id = rpdo_of(bench, entry, EVENT_TYPE)
-    _start(bench)
-    before = bench.number(entry.index, entry.subindex)
+        bench.does_not_apply("the entry has one byte only")
+    cob_id = rpdo_of(bench, entry, EVENT_TYPE)
+    bench.start()
+    before = bench.number(*entry.place)
     bench.asked.add(PDO_TOO_SHORT_CODE)
     bench.send(cob_id, bytes((before & 0xFF ^ 1,)))
     bench.pass_time(bench.times.slack_s)
-    if bench.number(entry.index, entry.subindex) != before:
+    if bench.number(*entry.place) != before:
         bench.deviates("a short RPDO is applied")
     _send_value(bench, cob_id, before, entry.bits)
 
@@ -222,14 +209,14 @@ def short_rpdo_applied(bench: Bench) -> None:
 def long_rpdo(bench: Bench) -> None:
     """An entry that the user lets be written, by an RPDO with a byte too many."""
     entry = permitted_entry(bench, transmits=False)
-    _, cob_id = rpdo_of(bench, entry, EVENT_TYPE)
-    _start(bench)
+    cob_id = rpdo_of(bench, entry, EVENT_TYPE)
+    bench.start()
     if entry.bits >= 64:
-        raise PointNotApplicable("the entry fills a whole frame")
+        bench.does_not_apply("the entry fills a whole frame")
     bench.asked.add(PDO_TOO_LONG_CODE)
-    before = bench.number(entry.index, entry.subindex)
+    before = bench.number(*entry.place)
     _send_value(bench, cob_id, before ^ 1, entry.bits + 8)
-    if bench.number(entry.index, entry.subindex) != before ^ 1:
+    if bench.number(*entry.place) != before ^ 1:
         bench.deviates("the first bytes of a long RPDO are not used")
     _send_value(bench, cob_id, before, entry.bits)
 
@@ -240,9 +227,8 @@ def rpdo_event_timer(bench: Bench) -> None:
     pdo, cob_id, length = rpdo_of_dummies(bench)
     bench.need((pdo, 5))
     switch_off(bench, pdo)
-    set_parameters(bench, pdo, EVENT_TYPE, event_ms=_WATCHED_MS)
-    switch_on(bench, pdo)
-    _start(bench)
+    put_to_work(bench, pdo, EVENT_TYPE, event_ms=_WATCHED_MS)
+    bench.start()
     bench.pass_time(1.5e-3 * _WATCHED_MS)
     for _ in range(2):
         last_ns = bench.send(cob_id, bytes(length))
@@ -268,17 +254,16 @@ def synchronous_window(bench: Bench) -> None:
     entry = permitted_entry(bench, transmits=False)
     bench.need((0x1007, 0))
     plain_sync(bench)
-    _, cob_id = rpdo_of(bench, entry, 1)
+    cob_id = rpdo_of(bench, entry, 1)
     bench.put(0x1007, 0, _WINDOW_US)
-    _start(bench)
-    before, seen = bench.number(entry.index, entry.subindex), []
+    bench.start()
+    before, seen = bench.number(*entry.place), []
     for wait_s in (0.0, 1.5e-6 * _WINDOW_US):
         bench.sync()
         bench.pass_time(wait_s)
         _send_value(bench, cob_id, before ^ (2 if wait_s else 1), entry.bits)
-        bench.sync()
-        bench.pass_time(bench.times.slack_s)
-        seen.append(bench.number(entry.index, entry.subindex) ^ before)
+        bench.sync_and_wait()
+        seen.append(bench.number(*entry.place) ^ before)
     if seen[0] != 1:
         bench.deviates("an RPDO within the window is not applied at the next SYNC")
     if seen[1] != 1:
@@ -294,7 +279,7 @@ def sync_start_value(bench: Bench) -> None:
         bench.put(0x1006, 0, 0)
     bench.put(0x1019, 0, 10)
     cob_id = synchronous_tpdo(bench, every=2, start=3)
-    _start(bench)
+    bench.start()
     found = syncs(bench, cob_id, list(range(1, 9)))
     if found != [0, 0, 1, 0, 1, 0, 1, 0]:
         bench.deviates(f"SYNCs 1 to 8 bring {found} TPDOs; type 2 from 3 on is [0, 0, 1, 0, 1, 0, 1, 0]")

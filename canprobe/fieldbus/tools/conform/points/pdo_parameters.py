@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from canprobe.fieldbus.node.core import NO_RTR_FLAG
-from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.protocol.sdo import ABORT, pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import (
     changeable_pdo,
+    idle_pdo,
     map_entries,
     rpdo_of_dummies,
     switch_off,
     switch_on,
+    word_of,
 )
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
@@ -47,14 +47,20 @@ def _valid(bench: Bench, area: range, *, mapping: bool = False) -> int:
     return pdo
 
 
-@point(25, "mapping while valid", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
-def mapping_while_valid(bench: Bench) -> None:
-    """An entry of a PDO in use gets another value, and its count 0."""
-    pdo = _valid(bench, TPDOS, mapping=True)
+def _refused_entry(bench: Bench, pdo: int, what: str) -> int:
+    """Write another word to the first mapped entry, which must be refused; the word that is there."""
     first = bench.number(pdo + 0x200, 1)
     other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
     request = pack_write(pdo + 0x200, 1, other.to_bytes(4, "little"))
-    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), "an entry of a PDO in use")
+    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), what)
+    return first
+
+
+@point(25, "mapping while valid", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
+def mapping_while_valid(bench: Bench) -> None:
+    """An entry of a PDO in use gets another value, and its count 0."""
+    pdo = _valid(bench, TPDOS, mapping=True)
+    first = _refused_entry(bench, pdo, "an entry of a PDO in use")
     if bench.number(pdo + 0x200, 1) != first:
         bench.deviates("a mapping entry has changed although the write was refused")
 
@@ -63,7 +69,7 @@ def mapping_while_valid(bench: Bench) -> None:
     25,
     "count while valid",
     MAPPING,
-    "the count stays, or is refused with " + accepted_text(accepted.MAPPING_LOCKED),
+    "the count stays, or is refused with " + accepted.text(accepted.MAPPING_LOCKED),
     needs="nmt",
 )
 def count_while_valid(bench: Bench) -> None:
@@ -72,16 +78,10 @@ def count_while_valid(bench: Bench) -> None:
     bench.must_refuse(pack_write(pdo + 0x200, 0, b"\0"), accepted.MAPPING_LOCKED, "the count of a PDO in use")
 
 
-@point(25, "mapping while counted", MAPPING, accepted_text(accepted.MAPPING_LOCKED), needs="nmt")
+@point(25, "mapping while counted", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
 def mapping_while_counted(bench: Bench) -> None:
     """An entry of a PDO out of use, whose count is not 0."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
-    first = bench.number(pdo + 0x200, 1)
-    request = pack_write(
-        pdo + 0x200, 1, (_IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD).to_bytes(4, "little")
-    )
-    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), "an entry while the count is not 0")
+    _refused_entry(bench, idle_pdo(bench, TPDOS, mapping=True), "an entry while the count is not 0")
 
 
 def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.AbortSet, what: str) -> None:
@@ -96,11 +96,10 @@ def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.A
     bench.deviates(f"{what}: all writes are accepted")
 
 
-@point(26, "mapping too long", MAPPING, accepted_text(accepted.MAPPING_LENGTH), needs="nmt")
+@point(26, "mapping too long", MAPPING, accepted.MAPPING_LENGTH, needs="nmt")
 def mapping_too_long(bench: Bench) -> None:
     """More than eight bytes: the first entry of a TPDO again and again."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     word = bench.device.mapping(pdo)[0]
     places = sum(bench.device.has(pdo + 0x200, n) for n in range(1, 65))
     count = min(64 // max(word & 0xFF, 1) + 1, _LONG_ENTRIES)
@@ -112,15 +111,14 @@ def mapping_too_long(bench: Bench) -> None:
         _refused_at_last(bench, pdo, [word] * count, accepted.MAPPING_LENGTH, f"{count} entries of {word & 0xFF} bits")
 
 
-@point(27, "absent object", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+@point(27, "absent object", MAPPING, accepted.NOT_MAPPABLE, needs="nmt")
 def map_absent(bench: Bench) -> None:
     """An object that the device does not have."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     _refused_at_last(bench, pdo, [_ABSENT_WORD], accepted.NOT_MAPPABLE, "mapping of an absent object")
 
 
-@point(27, "not mappable", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt eds")
+@point(27, "not mappable", MAPPING, accepted.NOT_MAPPABLE, needs="nmt eds")
 def map_unmappable(bench: Bench) -> None:
     """An entry that the EDS does not let be mapped, in a TPDO; one that is ro, in an RPDO."""
     tried = 0
@@ -142,13 +140,12 @@ def map_unmappable(bench: Bench) -> None:
             continue
         tried += 1
         switch_off(bench, pdo)
-        word = entry.index << 16 | entry.subindex << 8 | entry.bits
-        _refused_at_last(bench, pdo, [word], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
+        _refused_at_last(bench, pdo, [word_of(entry)], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
     if not tried:
-        raise PointNotApplicable("no mapping can be changed, or the EDS lets everything be mapped")
+        bench.does_not_apply("no mapping can be changed, or the EDS lets everything be mapped")
 
 
-@point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted_text(accepted.PDO_LOCKED), needs="nmt")
+@point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
 def identifier_while_valid(bench: Bench) -> None:
     """Another identifier for a PDO in use."""
     for area in (RPDOS, TPDOS):
@@ -159,7 +156,7 @@ def identifier_while_valid(bench: Bench) -> None:
         bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
 
 
-@point(28, "times while valid", "CiA 301, 18xxh:03, :06", accepted_text(accepted.PDO_LOCKED), needs="nmt")
+@point(28, "times while valid", "CiA 301, 18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
 def times_while_valid(bench: Bench) -> None:
     """Inhibit time and SYNC start value of a TPDO in use."""
     pdo, tried = _valid(bench, TPDOS), 0
@@ -169,31 +166,29 @@ def times_while_valid(bench: Bench) -> None:
             value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
             bench.must_refuse(pack_write(pdo, subindex, value), accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
     if not tried:
-        raise PointNotApplicable("the TPDOs have neither inhibit time nor start value")
+        bench.does_not_apply("the TPDOs have neither inhibit time nor start value")
 
 
-@point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted_text(accepted.VALUE), needs="nmt")
+@point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE, needs="nmt")
 def restricted_identifiers_of_pdos(bench: Bench) -> None:
     """Restricted identifiers for a PDO out of use."""
     for area in (RPDOS, TPDOS):
         if not bench.device.pdos(area):
             continue
-        pdo = changeable_pdo(bench, area)
-        switch_off(bench, pdo)
+        pdo = idle_pdo(bench, area)
         for cob_id in _RESTRICTED:
             request = pack_write(pdo, 1, cob_id.to_bytes(4, "little"))
             bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
 
 
-@point(29, "reserved types", "CiA 301, transmission type", accepted_text(accepted.VALUE), needs="nmt")
+@point(29, "reserved types", "CiA 301, transmission type", accepted.VALUE, needs="nmt")
 def reserved_types(bench: Bench) -> None:
     """Reserved transmission types for a PDO out of use."""
     for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):
         if not bench.device.pdos(area):
             continue
-        pdo = changeable_pdo(bench, area)
+        pdo = idle_pdo(bench, area)
         bench.need((pdo, 2))
-        switch_off(bench, pdo)
         for kind in _RESERVED_TYPES[what]:
             bench.must_refuse(pack_write(pdo, 2, bytes((kind,))), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
 
@@ -205,19 +200,17 @@ def dummies(bench: Bench) -> None:
     assert description is not None
     allowed = sorted(description.dummies & {0x0005, 0x0006, 0x0007})
     if not allowed:
-        raise PointNotApplicable("the EDS allows no dummy")
-    pdo = changeable_pdo(bench, RPDOS, mapping=True)
-    switch_off(bench, pdo)
+        bench.does_not_apply("the EDS allows no dummy")
+    pdo = idle_pdo(bench, RPDOS, mapping=True)
     for data_type in allowed:
         map_entries(bench, pdo, [data_type << 16 | 8 << data_type - 5])
     rpdo_of_dummies(bench)
 
 
-@point(38, "dummies in a TPDO", MAPPING, accepted_text(accepted.NOT_MAPPABLE), needs="nmt")
+@point(38, "dummies in a TPDO", MAPPING, accepted.NOT_MAPPABLE, needs="nmt")
 def dummies_in_tpdo(bench: Bench) -> None:
     """A dummy entry in a TPDO."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
-    switch_off(bench, pdo)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     _refused_at_last(bench, pdo, [_DUMMY_WORD], accepted.NOT_MAPPABLE, "a dummy in a TPDO")
 
 
@@ -242,14 +235,13 @@ def mapped_entries(bench: Bench) -> None:
 @point(83, "heard lengths", MAPPING, "every TPDO that comes is as long as its mapping")
 def heard_lengths(bench: Bench) -> None:
     """Every TPDO that was heard before, and that comes in operational by SYNC, request, event timer or by itself."""
-    pdos = {cob_id: pdo for pdo in bench.device.pdos(TPDOS) if (cob_id := bench.device.cob_id(pdo)) is not None}
+    pdos = bench.device.valid_pdos(TPDOS)
     surroundings = bench.permits.surroundings
     heard = {cob_id: surroundings.lengths_of(cob_id) for cob_id in pdos}
     for cob_id in pdos:
         bench.taken(cob_id)
     if not surroundings.lacks("nmt"):
-        bench.nmt(NmtCommand.START)
-        bench.pass_time(0.01)
+        bench.start()
         _ask_for_tpdos(bench, pdos)
     longest_ms = min(max([bench.device.number(pdo, 5) for pdo in pdos.values()], default=0), _LONGEST_EVENT_MS)
     bench.pass_time(1.5e-3 * longest_ms + bench.times.silence_s)
@@ -263,7 +255,7 @@ def heard_lengths(bench: Bench) -> None:
     if wrong:
         bench.deviates("; ".join(wrong))
     if not any(heard.values()):
-        raise PointNotApplicable("no TPDO is heard")
+        bench.does_not_apply("no TPDO is heard")
     if silent := [f"{cob_id:03X}h" for cob_id, lengths in heard.items() if not lengths]:
         bench.notes.append(f"not heard: TPDO {', '.join(silent)}")
 
@@ -285,9 +277,8 @@ def _ask_for_tpdos(bench: Bench, pdos: Mapping[int, int]) -> None:
 @point(84, "mapped anew", MAPPING, "out of use, 0, entries, count, in use: all writes are accepted", needs="nmt")
 def mapped_anew(bench: Bench) -> None:
     """The own mapping of a TPDO, in the order that the standard demands."""
-    pdo = changeable_pdo(bench, TPDOS, mapping=True)
+    pdo = idle_pdo(bench, TPDOS, mapping=True)
     words = bench.device.mapping(pdo)
-    switch_off(bench, pdo)
     map_entries(bench, pdo, words)
     switch_on(bench, pdo)
     if (found := [bench.number(pdo + 0x200, n) for n in range(1, len(words) + 1)]) != words:
@@ -307,4 +298,4 @@ def mappable(bench: Bench) -> None:
             continue
         switch_off(bench, pdo)
         for entry in entries.values():
-            map_entries(bench, pdo, [entry.index << 16 | entry.subindex << 8 | entry.bits])
+            map_entries(bench, pdo, [word_of(entry)])

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
-from canprobe.fieldbus.protocol.frames import SDO_RX_BASE
-from canprobe.fieldbus.protocol.sdo import pack_abort, pack_read, pack_request, pack_write, place_text
+from canprobe.fieldbus.protocol.sdo import pack_read, pack_request, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
@@ -20,7 +17,7 @@ _ABSENT = (0x1FF0, 0x5FFE, 0x9FFE)
 """Indices that hardly any device has, in three areas; they are read only."""
 
 
-@point(10, "write ro", CODES, accepted_text(accepted.READ_ONLY))
+@point(10, "write ro", CODES, accepted.READ_ONLY)
 def write_read_only(bench: Bench) -> None:
     """1000h gets its own value."""
     bench.need((0x1000, 0), written=False)
@@ -28,18 +25,17 @@ def write_read_only(bench: Bench) -> None:
     bench.must_refuse(request, accepted.READ_ONLY, "write to 1000h")
 
 
-@point(11, "read wo", CODES, accepted_text(accepted.WRITE_ONLY), needs="eds")
+@point(11, "read wo", CODES, accepted.WRITE_ONLY, needs="eds")
 def read_write_only(bench: Bench) -> None:
     """Every entry that the EDS describes as wo."""
     entries = [entry for entry in bench.device.entries() if not entry.readable]
     if not entries:
-        raise PointNotApplicable("the EDS describes no entry as wo")
+        bench.does_not_apply("the EDS describes no entry as wo")
     for entry in entries:
-        request = pack_read(entry.index, entry.subindex)
-        bench.must_refuse(request, accepted.WRITE_ONLY, f"read of {place_text(entry.index, entry.subindex)}")
+        bench.must_refuse(pack_read(*entry.place), accepted.WRITE_ONLY, f"read of {place_text(*entry.place)}")
 
 
-@point(12, "absent object", CODES, accepted_text(accepted.NO_OBJECT))
+@point(12, "absent object", CODES, accepted.NO_OBJECT)
 def absent_object(bench: Bench) -> None:
     """Reads of indices that the device does not have."""
     for index in _ABSENT:
@@ -47,7 +43,7 @@ def absent_object(bench: Bench) -> None:
             bench.must_refuse(pack_read(index), accepted.NO_OBJECT, f"read of {index:04X}h")
 
 
-@point(13, "absent sub-index", CODES, accepted_text(accepted.NO_SUBINDEX))
+@point(13, "absent sub-index", CODES, accepted.NO_SUBINDEX)
 def absent_subindex(bench: Bench) -> None:
     """1018h beyond its highest sub-index: a read, and a write of zeros."""
     bench.need((0x1018, 0), written=False)
@@ -56,13 +52,13 @@ def absent_subindex(bench: Bench) -> None:
     bench.must_refuse(pack_write(0x1018, beyond, bytes(4)), accepted.NO_SUBINDEX, f"write to 1018h:{beyond:02X}")
 
 
-@point(14, "unknown command", CODES, accepted_text(accepted.UNKNOWN_COMMAND))
+@point(14, "unknown command", CODES, accepted.UNKNOWN_COMMAND)
 def unknown_command(bench: Bench) -> None:
     """Command byte E0h."""
     bench.must_refuse(pack_request(0xE0, 0x1000, 0), accepted.UNKNOWN_COMMAND, "command E0h")
 
 
-@point(15, "too long", CODES, accepted_text(accepted.TOO_LONG))
+@point(15, "too long", CODES, accepted.TOO_LONG)
 def too_long(bench: Bench) -> None:
     """1017h in four bytes."""
     bench.need((0x1017, 0))
@@ -70,7 +66,7 @@ def too_long(bench: Bench) -> None:
     bench.must_refuse(pack_write(0x1017, 0, value), accepted.TOO_LONG, "4 bytes for 1017h")
 
 
-@point(16, "too short", CODES, accepted_text(accepted.TOO_SHORT))
+@point(16, "too short", CODES, accepted.TOO_SHORT)
 def too_short(bench: Bench) -> None:
     """1017h in one byte."""
     bench.need((0x1017, 0))
@@ -81,10 +77,9 @@ def too_short(bench: Bench) -> None:
 def _limited(bench: Bench) -> Iterator[tuple[DescribedEntry, int, bool]]:
     """Entries that may be written, with a value beyond a limit of the EDS and whether it is above."""
     for entry in bench.device.entries():
-        place = entry.index, entry.subindex
-        permitted = rule_of(entry.index) is WriteRule.CHANGED or bench.permits.written.permits(place)
+        permitted = rule_of(entry.index) is WriteRule.CHANGED or bench.permits.written.permits(entry.place)
         permitted = permitted and not is_object(entry.index, *MOTION_OBJECTS)
-        if not (permitted and entry.writable and entry.is_integer and place in bench.device.values):
+        if not (permitted and entry.writable and entry.is_integer and bench.device.has(*entry.place)):
             continue
         least = -(1 << entry.bits - 1) if entry.signed else 0
         for limit, beyond, above in ((entry.high, 1, True), (entry.low, -1, False)):
@@ -98,11 +93,11 @@ def limits(bench: Bench) -> None:
     found = False
     for entry, value, above in _limited(bench):
         found = True
-        request = pack_write(entry.index, entry.subindex, bench.packed(entry.index, entry.subindex, value))
-        what = f"{value} for {place_text(entry.index, entry.subindex)}"
+        request = pack_write(*entry.place, bench.packed(*entry.place, value))
+        what = f"{value} for {place_text(*entry.place)}"
         bench.must_refuse(request, accepted.ABOVE if above else accepted.BELOW, what)
     if not found:
-        raise PointNotApplicable("no entry that may be written has a limit; --write names more")
+        bench.does_not_apply("no entry that may be written has a limit; --write names more")
 
 
 @point(75, "default channel", "CiA 301, 1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
@@ -114,7 +109,7 @@ def default_channel(bench: Bench) -> None:
             bench.deviates(f"1200h:{subindex:02X} is {found:08X}h, expected {base + bench.node_id:08X}h")
 
 
-@point(76, "further channels", "CiA 301, 1201h to 127Fh", accepted_text(accepted.NO_OBJECT), needs="eds")
+@point(76, "further channels", "CiA 301, 1201h to 127Fh", accepted.NO_OBJECT, needs="eds")
 def further_channels(bench: Bench) -> None:
     """Channels that the EDS does not describe are not there."""
     for index in (0x1201, 0x1202, 0x1240, 0x127F):
@@ -128,7 +123,7 @@ def two_channels(bench: Bench) -> None:
     bench.need((0x1201, 1), (0x1201, 2), written=False)
     request_id, answer_id = bench.number(0x1201, 1), bench.number(0x1201, 2)
     if (request_id | answer_id) >> 11:
-        raise PointNotApplicable("channel 1201h is not in use")
+        bench.does_not_apply("channel 1201h is not in use")
     name = bench.device.values.get((0x1008, 0), b"")
     answer = bench.request(0x40, 0x1008)
     bench.send(request_id, pack_read(0x1000))
@@ -138,4 +133,4 @@ def two_channels(bench: Bench) -> None:
     segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]
     if segment and segment != name[:7].ljust(7, b"\0"):
         bench.deviates("a segment of 1008h is wrong after a transfer on the other channel")
-    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(0x1008, 0, 0x08000000))
+    bench.abort(0x1008)

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 
-from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
-from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_abort, pack_request
+from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_request
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import AbortSet, accepted_text
+from canprobe.fieldbus.tools.conform.accepted import AbortSet
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("sdo")
@@ -38,23 +36,18 @@ def _segmented_upload(bench: Bench) -> None:
             if bench.request(0x40, index)[0] & 0xE2 != 0x40:
                 bench.deviates(f"{index:04X}h is longer than four bytes, and comes expedited")
             return
-    raise PointNotApplicable("the device has no text of more than four bytes")
+    bench.does_not_apply("the device has no text of more than four bytes")
 
 
 def _segment(value: bytes, toggle: int = 0, *, last: bool = True) -> bytes:
     return bytes((toggle | (7 - len(value)) << 1 | last,)) + value.ljust(7, b"\0")
 
 
-def _abort(bench: Bench) -> None:
-    """End the transfer from the client's side."""
-    bench.send(SDO_RX_BASE + bench.node_id, pack_abort(_HEARTBEAT, 0, 0x08000000))
-
-
 def _own_value(bench: Bench) -> bytes:
     return bench.device.values[_HEARTBEAT, 0]
 
 
-@point(18, "toggle of a download", SEGMENTS, accepted_text(accepted.TOGGLE))
+@point(18, "toggle of a download", SEGMENTS, accepted.TOGGLE)
 def toggle_down(bench: Bench) -> None:
     """The first segment has toggle bit 1."""
     _segmented_download(bench)
@@ -62,7 +55,7 @@ def toggle_down(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(18, "toggle of an upload", SEGMENTS, accepted_text(accepted.TOGGLE))
+@point(18, "toggle of an upload", SEGMENTS, accepted.TOGGLE)
 def toggle_up(bench: Bench) -> None:
     """The first request for a segment has toggle bit 1."""
     _segmented_upload(bench)
@@ -74,8 +67,7 @@ def toggle_up(bench: Bench) -> None:
 def server_timeout(bench: Bench) -> None:
     """A download that is not continued: an abort, if one comes, is the time-out, and the server is free afterwards."""
     _segmented_download(bench)
-    answer_id = SDO_TX_BASE + bench.node_id
-    frame = bench.next(answer_id, _SERVER_TIMEOUT_S)
+    frame = bench.next(bench.answer_id, _SERVER_TIMEOUT_S)
     if frame is not None:
         bench.check_abort(frame.data, accepted.TIMED_OUT, "a download that is not continued")
     else:
@@ -83,7 +75,7 @@ def server_timeout(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(20, "no transfer", SEGMENTS, accepted_text(accepted.UNKNOWN_COMMAND))
+@point(20, "no transfer", SEGMENTS, accepted.UNKNOWN_COMMAND)
 def no_transfer(bench: Bench) -> None:
     """Segments while no transfer is open."""
     for command, what in ((0x60, "a request for a segment"), (0x00, "a segment")):
@@ -94,15 +86,15 @@ def no_transfer(bench: Bench) -> None:
 def client_abort(bench: Bench) -> None:
     """The client aborts a download."""
     _segmented_download(bench)
-    bench.taken(SDO_TX_BASE + bench.node_id)
-    _abort(bench)
+    bench.taken(bench.answer_id)
+    bench.abort(_HEARTBEAT)
     if not bench.is_silent():
         bench.deviates("the abort of the client is answered")
     bench.must_refuse(_segment(_own_value(bench)), accepted.UNKNOWN_COMMAND, "a segment after the abort")
     bench.serves("the transfer")
 
 
-@point(22, "fewer than announced", SEGMENTS, accepted_text(accepted.TOO_SHORT))
+@point(22, "fewer than announced", SEGMENTS, accepted.TOO_SHORT)
 def fewer_than_announced(bench: Bench) -> None:
     """Two bytes are announced, one is sent."""
     _segmented_download(bench)
@@ -110,7 +102,7 @@ def fewer_than_announced(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(22, "more than announced", SEGMENTS, accepted_text(accepted.TOO_LONG))
+@point(22, "more than announced", SEGMENTS, accepted.TOO_LONG)
 def more_than_announced(bench: Bench) -> None:
     """Two bytes are announced, three are sent."""
     _segmented_download(bench)
@@ -135,7 +127,7 @@ def expedited(bench: Bench) -> None:
 def segmented_upload(bench: Bench) -> None:
     """A text in segments, twice the same."""
     _segmented_upload(bench)
-    _abort(bench)
+    bench.abort(_HEARTBEAT)
     for index in (0x1008, 0x1009, 0x100A):
         value = bench.device.values.get((index, 0), b"")
         if len(value) > 4 and bench.upload(index) != value:
@@ -158,7 +150,7 @@ def _block_answer(bench: Bench, request: bytes) -> bytes:
     """Begin a block transfer; where the device has none, the point does not apply."""
     answer = bench.ask(request)
     if answer[0] == ABORT and abort_code(answer) == _COMMAND_UNSUPPORTED:
-        raise PointNotApplicable("the device has no block transfer (05040001h)")
+        bench.does_not_apply("the device has no block transfer (05040001h)")
     return answer
 
 
@@ -174,11 +166,11 @@ def _block_segments(bench: Bench, index: int) -> tuple[bytes, int, int]:
     answer = _block_answer(bench, pack_request(0xA4, index, 0, bytes((127, 0))))
     if answer[0] >> 5 != 6:
         bench.deviates(f"a block upload is answered with {answer.hex(' ')}")
-    bench.taken(SDO_TX_BASE + bench.node_id)
-    bench.send(SDO_RX_BASE + bench.node_id, b"\xa3" + bytes(7))
+    bench.taken(bench.answer_id)
+    bench.send(bench.request_id, b"\xa3" + bytes(7))
     value, number, last = b"", 0, False
     while not last and number < 127:
-        frame = bench.next(SDO_TX_BASE + bench.node_id, bench.times.sdo_s)
+        frame = bench.next(bench.answer_id, bench.times.sdo_s)
         number += 1
         if frame is None or len(frame.data) != 8 or frame.data[0] & 0x7F != number:
             bench.deviates(f"segment {number} of a block does not come, or has another number")
@@ -196,7 +188,7 @@ def block_upload(bench: Bench) -> None:
     if end[0] & 0xE3 != 0xC1:
         bench.deviates(f"the end of a block upload is {end.hex(' ')}")
     value = value[: len(value) - (end[0] >> 2 & 7)]
-    bench.send(SDO_RX_BASE + bench.node_id, b"\xa1" + bytes(7))
+    bench.send(bench.request_id, b"\xa1" + bytes(7))
     if value != wanted:
         bench.deviates(f"a block upload of {index:04X}h gives {value.hex()}, segments gave {wanted.hex()}")
     if with_crc and int.from_bytes(end[1:3], "little") != crc_hqx(value, 0):
@@ -204,7 +196,7 @@ def block_upload(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(23, "acknowledgement of 128", BLOCKS, accepted_text(accepted.SEQUENCE))
+@point(23, "acknowledgement of 128", BLOCKS, accepted.SEQUENCE)
 def acknowledgement_of_128(bench: Bench) -> None:
     """A block upload, of which more segments are acknowledged than a block can have."""
     index = _text_index(bench)
@@ -219,9 +211,8 @@ def _block_download(bench: Bench, value: bytes, *, number: int = 1, crc: int | N
     answer = _block_answer(bench, pack_request(0xC6, _HEARTBEAT, 0, len(value).to_bytes(4, "little")))
     if answer[0] >> 5 != 5 or not 1 <= answer[4] <= 127:
         bench.deviates(f"a block download is answered with {answer.hex(' ')}")
-    request_id, answer_id = SDO_RX_BASE + bench.node_id, SDO_TX_BASE + bench.node_id
-    bench.send(request_id, bytes((0x80 | number,)) + value.ljust(7, b"\0"), segment=True)
-    frame = bench.next(answer_id, bench.times.sdo_s)
+    bench.send(bench.request_id, bytes((0x80 | number,)) + value.ljust(7, b"\0"), segment=True)
+    frame = bench.next(bench.answer_id, bench.times.sdo_s)
     if frame is None:
         bench.deviates("a block is not acknowledged")
     if frame.data[0] == ABORT or frame.data[1] != 1:
@@ -241,13 +232,13 @@ def block_download(bench: Bench) -> None:
         bench.deviates("1017h does not have the value of the block")
 
 
-@point(23, "CRC of a block", BLOCKS, accepted_text(accepted.CRC))
+@point(23, "CRC of a block", BLOCKS, accepted.CRC)
 def block_crc(bench: Bench) -> None:
     """A wrong CRC, where the device announces that it checks it."""
     answer = _block_answer(bench, pack_request(0xC6, _HEARTBEAT, 0, bytes((2, 0, 0, 0))))
-    _abort(bench)
+    bench.abort(_HEARTBEAT)
     if not answer[0] & 4:
-        raise PointNotApplicable("the device does not check a CRC")
+        bench.does_not_apply("the device does not check a CRC")
     value = b"\x10\x27"
     last = _block_download(bench, value, crc=crc_hqx(value, 0) ^ 0xFFFF)
     bench.check_abort(last, accepted.CRC, "a block with a wrong CRC")
@@ -263,7 +254,7 @@ def block_sequence(bench: Bench) -> None:
     elif answer[0] & 0xE3 != 0xA2 or answer[1] != 0:
         bench.deviates(f"a block that begins with segment 2 is answered with {answer.hex(' ')}")
     else:
-        _abort(bench)
+        bench.abort(_HEARTBEAT)
     bench.serves("the transfer")
 
 
@@ -275,13 +266,13 @@ def _refuses_block_size(bench: Bench, size: int, codes: AbortSet) -> None:
     bench.serves("the transfer")
 
 
-@point(23, "block of 0", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
+@point(23, "block of 0", BLOCKS, accepted.BLOCK_SIZE)
 def block_of_0(bench: Bench) -> None:
     """An upload in blocks of no segment."""
     _refuses_block_size(bench, 0, accepted.BLOCK_SIZE)
 
 
-@point(23, "block of 128", BLOCKS, accepted_text(accepted.BLOCK_SIZE))
+@point(23, "block of 128", BLOCKS, accepted.BLOCK_SIZE)
 def block_of_128(bench: Bench) -> None:
     """An upload in blocks of more than 127 segments."""
     _refuses_block_size(bench, 128, accepted.BLOCK_SIZE)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
-from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync, synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -17,7 +15,7 @@ _PERIOD_US = 100_000
 _RESERVED = (1, 241, 248, 255)
 
 
-@point(39, "reserved overflow", "CiA 301, 1019h", accepted_text(accepted.VALUE))
+@point(39, "reserved overflow", "CiA 301, 1019h", accepted.VALUE)
 def reserved_overflow(bench: Bench) -> None:
     """1019h with 1 and with 241 to 255."""
     bench.need((0x1019, 0))
@@ -27,7 +25,7 @@ def reserved_overflow(bench: Bench) -> None:
         bench.must_refuse(pack_write(0x1019, 0, bytes((value,))), accepted.VALUE, f"{value} for 1019h")
 
 
-@point(39, "overflow while a period is set", "CiA 301, 1019h", accepted_text(accepted.SYNC_LOCKED), needs="sync")
+@point(39, "overflow while a period is set", "CiA 301, 1019h", accepted.SYNC_LOCKED, needs="sync")
 def overflow_while_period(bench: Bench) -> None:
     """1019h while 1006h is not 0, and again while it is."""
     bench.need((0x1019, 0), (0x1006, 0))
@@ -42,8 +40,7 @@ def overflow_while_period(bench: Bench) -> None:
 def wrong_length(bench: Bench) -> None:
     """A SYNC with a byte while 1019h is 0; a right one ends the error."""
     cob_id = synchronous_tpdo(bench)
-    bench.nmt(NmtCommand.START)
-    bench.pass_time(0.01)
+    bench.start()
     syncs(bench, cob_id, [None])
     if syncs(bench, cob_id, [1]) != [0]:
         bench.deviates("a SYNC with a byte too many brings a TPDO")
@@ -57,11 +54,9 @@ def lost_sync(bench: Bench) -> None:
     bench.need((0x1006, 0))
     plain_sync(bench)
     bench.put(0x1006, 0, _PERIOD_US)
-    bench.nmt(NmtCommand.START)
-    bench.pass_time(0.01)
+    bench.start()
     for _ in range(2):
-        last_ns = bench.sync()
-        bench.pass_time(bench.times.slack_s)
+        bench.sync_and_wait()
     bench.asked.add(SYNC_LOST_CODE)
     bench.emergencies.clear()
     for _ in range(5):
@@ -72,5 +67,4 @@ def lost_sync(bench: Bench) -> None:
     t_ns = bench.optional_emcy(SYNC_LOST_CODE, 3e-6 * _PERIOD_US)
     if (t_ns - last_ns) * 1e-3 < 1.1 * _PERIOD_US:
         bench.deviates(f"EMCY 8100h {(t_ns - last_ns) * 1e-6:.0f} ms after a SYNC, the period is 100 ms")
-    bench.sync()
-    bench.pass_time(bench.times.slack_s)
+    bench.sync_and_wait()

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE, NmtCommand
 from canprobe.fieldbus.protocol.response_times import NS_PER_S
 from canprobe.fieldbus.protocol.sdo import pack_read
-from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS, Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
@@ -16,8 +15,6 @@ SDO_TIME, SYNC_TIME, HEARTBEAT_TIME = "SDO answer", "SYNC to TPDO", "heartbeat p
 """Names of the distributions."""
 _SDO_COUNT, _SYNC_COUNT, _BEAT_COUNT = 100, 50, 20
 _SYNC_PERIOD_S = 0.01
-HEARTBEAT_MS = 50
-"""Period that 1017h gets."""
 _BEAT_SHARE = 0.2
 _LOAD_IDS = (0x06A, 0x06B)
 """Identifiers above the device's in the arbitration that belong to no service."""
@@ -30,9 +27,9 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     """Times of reads of 1000h, ms. Raises Deviation where one is not answered or wrong."""
     times: list[float] = []
     for _ in range(count):
-        bench.taken(SDO_TX_BASE + bench.node_id)
-        t_ns = bench.send(SDO_RX_BASE + bench.node_id, pack_read(0x1000))
-        frame = bench.next(SDO_TX_BASE + bench.node_id, bench.times.sdo_s)
+        bench.taken(bench.answer_id)
+        t_ns = bench.send(bench.request_id, pack_read(0x1000))
+        frame = bench.next(bench.answer_id, bench.times.sdo_s)
         if frame is None or frame.data != bench.first_answer:
             bench.deviates(f"read {len(times) + 1} of {count} of 1000h is not answered within {bench.times.sdo_s:g} s")
         times.append((frame.t_ns - t_ns) * 1e-6)
@@ -51,8 +48,7 @@ def sdo_time(bench: Bench) -> None:
 def sync_time(bench: Bench) -> None:
     """Times from SYNC to a TPDO of type 1, at 100 Hz."""
     cob_id = synchronous_tpdo(bench)
-    bench.nmt(NmtCommand.START)
-    bench.pass_time(_SYNC_PERIOD_S)
+    bench.start()
     times = []
     for _ in range(_SYNC_COUNT):
         bench.taken(cob_id)
@@ -69,7 +65,7 @@ def heartbeat_time(bench: Bench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
     bench.put(0x1017, 0, HEARTBEAT_MS)
-    frames = bench.during((_BEAT_COUNT + 2) * 1e-3 * HEARTBEAT_MS, [HEARTBEAT_BASE + bench.node_id])
+    frames = bench.during((_BEAT_COUNT + 2) * 1e-3 * HEARTBEAT_MS, [bench.beat_id])
     gaps = tuple((b.t_ns - a.t_ns) * 1e-6 for a, b in pairwise(frames[1:]))
     bench.distributions[HEARTBEAT_TIME] = gaps
     allowed_ms = _BEAT_SHARE * HEARTBEAT_MS + bench.times.slack_s * 1e3
@@ -92,7 +88,7 @@ def under_load(bench: Bench) -> None:
     bench.put(0x1017, 0, HEARTBEAT_MS)
     bench.load = [(can_id, bytes(range(8))) for can_id in _LOAD_IDS], _LOAD_GAP_BITS * NS_PER_S // bench.bitrate
     began_ns = bench.now_ns
-    beats = bench.during(4e-3 * HEARTBEAT_MS, [HEARTBEAT_BASE + bench.node_id])
+    beats = bench.during(4e-3 * HEARTBEAT_MS, [bench.beat_id])
     bench.distributions[f"{SDO_TIME} under load"] = _sdo_times(bench, _LOADED_COUNT)
     if len(beats) < 3:
         bench.deviates(f"{len(beats)} heartbeats in {(bench.now_ns - began_ns) * 1e-6:.0f} ms under load")
