@@ -2,9 +2,7 @@
 
 import json
 import re
-import shutil
 import tomllib
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -132,31 +130,3 @@ def test_a_scene_or_cell_with_keys_of_a_newer_version_names_it(tmp_path):
     (tmp_path / "cell.toml").write_text(f'written_by = "canprobe 9.0.0"\n{cell}')
     with pytest.raises(SceneError, match=r"written by canprobe 9.0.0, this is canprobe .*: probe.warp: unknown key"):
         load_cell(tmp_path / "cell.toml")
-
-
-@pytest.fixture
-def renamed(monkeypatch):
-    """Two keys that have got other names."""
-    names = {("task", "time_s"): "duration_s", ("joints", "least_deg"): "min_deg"}
-    monkeypatch.setattr("canprobe.cell.scene.toml_files.RENAMED_KEYS", names)
-
-
-def test_a_renamed_key_is_read_with_a_warning(tmp_path, renamed):
-    scene = tmp_path / "scene.toml"
-    shutil.copy(scenes_folder() / "listen.toml", scene)
-    scene.write_text(scene.read_text().replace("duration_s = 5", "time_s = 4"))
-    with pytest.warns(
-        FutureWarning, match=r"scene.toml: task.time_s is now duration_s; the next minor version refuses"
-    ):
-        assert load_scene(scene).task.duration_s == 4
-    cell = tmp_path / "cell.toml"
-    cell.write_text(packaged_files("cells")["puma560"].read_text().replace("min_deg", "least_deg"))
-    with pytest.warns(FutureWarning, match="least_deg is now min_deg"):
-        assert load_scene("free", {"cell": str(cell)}).joints == load_scene("free", {"cell": "puma560"}).joints
-    with pytest.warns(FutureWarning, match="time_s"):
-        assert load_scene("listen", {"task.duration_s": None, "task.time_s": 3}).task.duration_s == 3
-    with pytest.raises(SceneError, match=r"task.time_s: it is now duration_s, which stands there too; remove time_s"):
-        load_scene("listen", {"task.time_s": 3})
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        load_scene("listen")

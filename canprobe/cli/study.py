@@ -39,17 +39,6 @@ STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
 """Studies, as they are typed, that have an option, by the option's name."""
 FORM_OPTIONS = ("recover", "link", "soak", "vcan")
 """Options that name another form of a study, in the order in which they are typed."""
-RENAMED: Mapping[str, str] = {
-    "arrays": "calibration",
-    "bound": "estimators",
-    "calibrations": "calibration",
-    "explore": "surfaces",
-    "link": "realtime --link",
-    "recover": "faults --recover",
-    "shapes": "surfaces",
-    "soak": "realtime --soak",
-}
-"""Former study → what is typed now."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -139,8 +128,6 @@ def _chosen(args: argparse.Namespace) -> dict[str, Any]:
 
 def _refuse_wrong(args: argparse.Namespace, typed: str, studies: Mapping[str, str], forms: Collection[str]) -> None:
     """Complain about an unknown study, and about options that it does not have."""
-    if args.name in RENAMED:
-        args.complain(f"study {args.name} is now a part of another one: canprobe study {RENAMED[args.name]}")
     if args.name not in studies:
         known = ", ".join(studies)
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, studies)}" if args.name else "expected NAME"

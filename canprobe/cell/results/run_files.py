@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.emulated.truth_columns import with_present_names
 from canprobe.cell.npz import read_npz
 from canprobe.cell.rows import ROWS_FOLDER, read_left_rows
 from canprobe.cell.scene.load import SAVED_AS, load_scene
@@ -160,22 +159,8 @@ def read_tactile(file: Path, setup: Setup | None = None) -> Columns:
 
 
 def read_truth(file: Path, setup: Setup | None = None) -> Columns:
-    """The columns of ``truth.npz``; see `read_log`. Former names are understood, with one warning."""
-    prismatic = _prismatic(file.parent / LOG) if setup is None or setup.arm is None else setup.arm.model.chain.prismatic
-    columns = with_present_names(_columns(file, "the true values of a run"), prismatic, file)
-    return _checked(columns, file, _OF_TRUTH, setup)
-
-
-def _prismatic(log: Path) -> tuple[bool, ...] | None:
-    """Which joints are prismatic, by the log beside a truth that does not say so; None: nor does the log."""
-    try:
-        columns = read_npz(log)
-    except UsageError:
-        return None
-    turning, sliding = columns.get("q_rad"), columns.get("q_m")
-    if sliding is None:
-        return None if turning is None else (False,) * turning.shape[-1]
-    return (True,) * sliding.shape[-1] if turning is None else tuple(np.isnan(turning).all(axis=0).tolist())
+    """The columns of ``truth.npz``; see `read_log`."""
+    return _checked(_columns(file, "the true values of a run"), file, _OF_TRUTH, setup)
 
 
 def needed(columns: Columns, names: Iterable[str], file: Path) -> None:

@@ -52,10 +52,6 @@ ObjectKind = Literal[
 Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
-RENAMED_KEYS: dict[tuple[str, str], str] = {}
-"""Present name of a key by its section and former name. A file with the former one is read with a warning for one minor
-version of canprobe."""
-
 Vec2 = tuple[float, float]
 Row4 = tuple[float, float, float, float]
 Posture = tuple[float, ...]

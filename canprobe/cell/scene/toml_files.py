@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import re
 import tomllib
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from canprobe import __version__
-from canprobe.cell.scene.model import RENAMED_KEYS
 from canprobe.errors import SceneError, regular_file
 
 WRITTEN_BY_KEY = "written_by"
@@ -29,34 +27,16 @@ def written_by_line() -> str:
 
 
 def with_writer(document: Mapping[str, Any], file: str) -> tuple[dict[str, Any], str]:
-    """A document with present keys without `WRITTEN_BY_KEY`, and the name of its file in messages, with its writer.
+    """A document without `WRITTEN_BY_KEY`, and the name of its file in messages, with its writer.
 
     Raises:
-        SceneError: the writer is no text, or a key stands under its former name and its present one.
+        SceneError: the writer is no text.
     """
     writer = document.get(WRITTEN_BY_KEY, f"canprobe {__version__}")
     if not isinstance(writer, str):
         raise SceneError([f"{file}: {WRITTEN_BY_KEY}: expected text, got {toml_value(writer)}; remove the line"])
     rest = {name: value for name, value in document.items() if name != WRITTEN_BY_KEY}
-    for (section, former), present in RENAMED_KEYS.items():
-        table, where = rest.get(section), f"{file}: {section}"
-        if section == "joints" and isinstance(table, dict):
-            rest[section] = {name: _renamed(one, former, present, f"{where}.{name}") for name, one in table.items()}
-        elif section in rest:
-            rest[section] = _renamed(table, former, present, where)
     return rest, f"{file}{written_by_other(writer)}"
-
-
-def _renamed(table: object, former: str, present: str, where: str) -> object:
-    """A table with a key under its present name, with a warning."""
-    if not isinstance(table, dict) or former not in table:
-        return table
-    if present in table:
-        raise SceneError([f"{where}.{former}: it is now {present}, which stands there too; remove {former}"])
-    warnings.warn(
-        f"{where}.{former} is now {present}; the next minor version refuses {former}", FutureWarning, stacklevel=2
-    )
-    return {present if key == former else key: value for key, value in table.items()}
 
 
 def written_by_other(writer: object) -> str:

@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
-from canprobe.cell.emulated.truth_columns import TruthColumns
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.options import RunOptions, quiet
 from canprobe.cell.planning.model import Plan
@@ -99,7 +98,7 @@ class SessionBuses(ABC):
 
     def _keep_truth(self) -> None:
         if self.world.recorder is not None:
-            self.truth = TruthColumns(self._files.keep("truth.npz", self.world.recorder))
+            self.truth = dict(self._files.keep("truth.npz", self.world.recorder))
 
     def _joined(self, ports: dict[str, Port]) -> Port:
         if len(ports) == 1:

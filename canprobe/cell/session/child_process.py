@@ -15,7 +15,6 @@ from typing import IO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.emulated.truth_columns import TruthColumns
 from canprobe.cell.npz import read_npz
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import SAVED_AS
@@ -219,7 +218,7 @@ class EmulatorChild(ChildProcess):
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
                     self._process.wait(patience_s)
                     break
-        truth = TruthColumns()
+        truth: dict[str, NDArray[np.float64]] = {}
         with contextlib.suppress(UsageError):  # none was written, or it was cut off by a full disk
             truth.update(read_npz(self._truth))
         words = self.last_words()

@@ -29,9 +29,7 @@ except ImportError as error:
 from canprobe.lab.gym.env import TouchScan
 from canprobe.lab.gym.randomise import OBJECTS, OneOf, Uniform
 
-__all__ = ["OBJECTS", "Choice", "OneOf", "TouchScan", "Uniform"]
+__all__ = ["OBJECTS", "OneOf", "TouchScan", "Uniform"]
 
-Choice = OneOf
-"""The earlier name of `OneOf`."""
 
 gymnasium.register(id="canprobe/TouchScan-v0", entry_point="canprobe.lab.gym.env:TouchScan")

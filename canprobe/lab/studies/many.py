@@ -18,7 +18,6 @@ import numpy as np
 
 import canprobe
 from canprobe.api import run_plan
-from canprobe.cell.emulated.truth_columns import present_name
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
@@ -159,7 +158,6 @@ def run_many(
     changes = [dict(zip(keys, values, strict=True)) for values in combinations]
     scenes = [load_scene(base, change) for change in changes]  # all are checked before anything is written
     folder = Path(out) if out is not None else Path("runs") / f"many-{base.name}"
-    series = [f"{TRUTH}{present_name(s.removeprefix(TRUTH))}" if s.startswith(TRUTH) else s for s in series]
     cases, rows = [], []
     for change, changed in zip(changes, scenes, strict=True):
         text, digest = _with_own_files(changed, folder)

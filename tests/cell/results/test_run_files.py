@@ -15,9 +15,8 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.emulated.truth_columns import NAMES, with_present_names, with_units
+from canprobe.cell.emulated.truth_columns import with_units
 from canprobe.cell.npz import read_npz
-from canprobe.cell.results.run_files import read_truth
 from canprobe.cli import main
 from canprobe.errors import UsageError
 
@@ -165,47 +164,11 @@ def test_a_truth_of_another_shape_is_named(folder: Path, capsys: pytest.CaptureF
     )
 
 
-def with_former_names(columns: dict[str, np.ndarray]) -> None:
-    """As earlier versions wrote the truth: the columns without their units."""
-    for old, new in {"q": "q_rad", **NAMES}.items():
-        columns[old] = columns.pop(new)
-
-
-def test_a_truth_under_its_former_names_is_read_with_one_warning(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["replay", str(folder), "--json"]) == 0
-    replayed = capsys.readouterr().out
-    present = read_truth(folder / "truth.npz")
-    with_columns("truth.npz", with_former_names)(folder)
-    with pytest.warns(FutureWarning, match="columns without units, of an earlier canprobe: .*force") as told:
-        former = read_truth(folder / "truth.npz")
-    assert len(told) == 1 and former.keys() == present.keys()
-    assert all(np.array_equal(former[name], present[name]) for name in present)
-    with pytest.warns(FutureWarning) as told:
-        assert main(["replay", str(folder), "--json"]) == 0
-    assert len(told) == 1 and capsys.readouterr().out == replayed
-
-
-def test_joints_of_a_former_file_are_renamed_where_it_is_known_which_slide(tmp_path: Path) -> None:
-    columns = {"q": np.array([[1.0, 0.2]])}
-    with pytest.warns(FutureWarning, match="columns without units, of an earlier canprobe: q;"):
-        assert with_present_names(columns, (False, True), tmp_path).keys() == {"q_rad", "q_m"}
-    assert with_present_names(columns, None, tmp_path) == columns
-
-
-def test_a_former_name_of_the_truth_gives_its_column_with_one_warning() -> None:
+def test_joints_that_slide_have_their_own_column_of_the_truth() -> None:
     q = np.array([[1.0, 0.2], [1.1, 0.3]])
     truth = with_units({"t_s": np.arange(2.0), "q": q, "force": np.array([0.0, 2.0])}, (False, True))
     assert list(truth) == ["t_s", "q_rad", "q_m", "force_n"]
     assert np.isnan(truth["q_rad"][:, 1]).all() and np.isnan(truth["q_m"][:, 0]).all()
-    with pytest.warns(FutureWarning, match="truth: force is now force_n") as told:
-        assert truth["force"] is truth["force_n"]
-    with pytest.warns(FutureWarning):
-        assert np.array_equal(truth["q"], q)
-    assert len(told) == 1 and "force" in truth and "kappa" not in truth and truth.get("kappa") is None
-    with pytest.raises(KeyError, match="kappa"):
-        truth["kappa"]
 
 
 def test_a_column_of_an_own_controller_has_any_shape(folder: Path) -> None:

@@ -103,13 +103,8 @@ def test_list(capsys):
     [
         (["study", "region"], "did you mean regions?"),
         (["study"], "expected NAME"),
-        (["study", "soak"], "canprobe study realtime --soak"),
-        (["study", "shapes"], "canprobe study surfaces"),
-        (["study", "bound"], "canprobe study estimators"),
         (["study", "regions", "--soak"], "expected one of faults --vcan"),
         (["study", "faults", "--link"], "realtime --link"),
-        (["study", "recover"], "canprobe study faults --recover"),
-        (["study", "link"], "canprobe study realtime --link"),
     ],
 )
 def test_a_wrong_name_is_told(argv, said, capsys):
