@@ -293,15 +293,22 @@ def test_vcan_belongs_to_faults_and_knows_no_seed(capsys):
 
 
 @pytest.mark.parametrize(
-    ("number", "kind", "most_n"),
-    [(2611, "wrong-data", 3.0), (644, "remapped", 3.0), (673, "wrong-data", 3.0), (1720, "encoder-jump", 6.5)],
+    ("number", "kind"),
+    [
+        (2611, "wrong-data"),
+        (644, "remapped"),
+        (1713, "emcy"),
+        pytest.param(673, "wrong-data", marks=pytest.mark.slow(reason="a fourth and a fifth stop in a motion")),
+        pytest.param(1720, "encoder-jump", marks=pytest.mark.slow(reason="a fourth and a fifth stop in a motion")),
+    ],
 )
-def test_a_stop_in_a_motion_presses_no_harder_than_the_motion(number, kind, most_n):
+def test_a_stop_in_a_motion_presses_no_harder_than_the_motion(number, kind):
     """45.8 N: one step back had set the speed from which each drive then braked by itself. 13.1 N: a statusword that
     stands beside an impossible position was believed, and the arm was stopped at once. 15.9 N: a hold went back to a
-    guess of where a joint was. 35.8 N: one wrong report said that a joint stands, which had its quick stop then.
+    guess of where a joint was. 35.8 N: one wrong report said that a joint stands, which had its quick stop then. 7.0 N:
+    a lift-off began behind the targets, with a jump against the motion.
     """
     case = FaultCase.of(number)
     assert case.kind.name == kind, "the registry has changed: the numbers mean other runs"
     run = run_case(case)
-    assert run["failures"] == [] and run["force_max_n"] < most_n
+    assert run["failures"] == [] and run["force_max_n"] < 3.0
