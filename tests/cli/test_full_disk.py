@@ -93,7 +93,7 @@ def test_a_study_s_cells_that_were_kept_before_are_whole(tmp_path):
         finally:
             store.close()
     again = CellStore(tmp_path)
-    assert (again.get("a"), again.get("b")) == ("1", None)
+    assert again.answers == {"a": "1"}
     again.close()
 
 

@@ -40,14 +40,14 @@ FD = """[{},{"ifname":"can1","flags":["NOARP","UP","ECHO"],"mtu":72,"txqlen":10,
 FIXED = """[{"ifname":"can2","flags":["UP"],"txqlen":10,"linkinfo":{"info_kind":"can","info_data":
 {"state":"ERROR-ACTIVE","restart_ms":0,"bittiming_bitrate":500000,"bitrate_const":[125000,500000]}}}]"""
 
-GOOD = LinkState("can0", "can", True, 1000, 1_000_000, None, 0.8, 100, "ERROR-ACTIVE", 0, 0, (), 0, 0)
+GOOD = LinkState("can0", "can", True, 1000, 1_000_000, None, 0.8, 100, "ERROR-ACTIVE", 0, 0, (), 0)
 EXPECTED = ExpectedLink(1_000_000, None, 16)
 
 
 def test_what_ip_prints_is_read():
     assert parse_link(VCAN) == LinkState("vcan0", "vcan", tx_queue=1000)
     assert parse_link(PASSIVE) == LinkState(
-        "can0", "can", True, 100, 250_000, None, 0.875, 100, "ERROR-PASSIVE", 0, 135, (), 2, 0
+        "can0", "can", True, 100, 250_000, None, 0.875, 100, "ERROR-PASSIVE", 0, 135, (), 2
     )
     assert parse_link(FD) == LinkState(
         "can1", "can", True, 10, 1_000_000, 8_000_000, 0.75, 0, "ERROR-ACTIVE", 0, 0, ("FD", "LISTEN-ONLY")
