@@ -47,7 +47,7 @@ EXPECTED = ExpectedLink(1_000_000, None, 16)
 def test_what_ip_prints_is_read():
     assert parse_link(VCAN) == LinkState("vcan0", "vcan", tx_queue=1000)
     assert parse_link(PASSIVE) == LinkState(
-        "can0", "can", True, 100, 250_000, None, 0.875, 100, "ERROR-PASSIVE", 0, 135, (), 2
+        "can0", "can", True, 100, 250_000, None, 0.875, 100, "ERROR-PASSIVE", 0, 135, (), 0
     )
     assert parse_link(FD) == LinkState(
         "can1", "can", True, 10, 1_000_000, 8_000_000, 0.75, 0, "ERROR-ACTIVE", 0, 0, ("FD", "LISTEN-ONLY")
