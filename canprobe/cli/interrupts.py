@@ -6,7 +6,8 @@ import contextlib
 import signal
 from collections.abc import Callable, Iterator, Mapping
 
-from canprobe.fieldbus.bus.real.interrupts import TERMINATION_SIGNALS, Terminated, raise_terminated
+from canprobe.fieldbus.bus.real.interrupts import Terminated, raise_terminated
+from canprobe.fieldbus.bus.system import system
 
 
 @contextlib.contextmanager
@@ -28,7 +29,7 @@ def _handlers(handlers: Mapping[int, Callable[..., None]]) -> Iterator[None]:
 
 def termination_interrupts() -> contextlib.AbstractContextManager[None]:
     """Within the block SIGTERM and SIGHUP raise `Terminated`, but for one that is ignored, as under nohup."""
-    heeded = [number for number in TERMINATION_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    heeded = [number for number in system.TERMINATION_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
     return _handlers(dict.fromkeys(heeded, raise_terminated))
 
 

@@ -32,11 +32,11 @@ LEAP_RAD = 10e-3
 
 
 class WayBack:
-    """The way of the tool's point off the object, cycle by cycle, from the last targets of the motors on.
+    """The way of the tool's point off the object, cycle by cycle, from given targets of the motors on.
 
-    In a motion those lie ahead of the arm. A way from where the arm is would begin with a jump against the motion,
-    behind which each joint overshoots in its own way (7 N at 25 mm/s, instead of 2). A motor that is further from its
-    target than it lags in a motion begins where it is.
+    In a motion the last targets lie ahead of the arm. A way from where the arm is would begin with a jump against the
+    motion, behind which each joint overshoots in its own way (7 N at 25 mm/s, instead of 2). A motor that is further
+    from its target than it lags in a motion begins where it is.
 
     Args:
         model: the arm's geometry.
@@ -57,7 +57,7 @@ class WayBack:
 
         Args:
             measured: joint positions (n,), rad or m.
-            targets: last targets (n,) of the motors, counts, where the way begins.
+            targets: targets (n,) of the motors, counts, at which the way begins.
         """
         T, J = forward_jacobian(self._model.chain, measured, self._flange_probe)
         if self._away is None or self._targets is None:
@@ -91,14 +91,18 @@ class LiftOff:
     ) -> None:
         assert plan.setup.arm is not None
         model, self._period_s = plan.setup.arm.model, plan.sync.period_ns * 1e-9
+        self._model = model
         self._drives = drives
-        heard = zip(drives.axes, drives.ages(), drives.enabled_ones(), strict=True)
+        ages = drives.ages()
+        heard = zip(drives.axes, ages, drives.enabled_ones(), strict=True)
         self._free = np.array([age == 0 and on and _obeys(watch, axis.node_id, error) for axis, age, on in heard])
         self._way = WayBack(model, plan.setup.probe.T_flange_probe, self._period_s, self._free)
         self._trail = trail if self._free.all() else None  # with a drive at rest the others do not go where they were
         self._step_max: Floats = model.qd_max * plan.setup.limits.speed_share * self._period_s
         self._retrace: Retrace | None = None
         self._begun = False
+        booted = any(watch.states.get(axis.node_id) is NmtState.INITIALISING for axis in drives.axes)
+        self._all_there = not booted and not any(ages)
 
     @property
     def possible(self) -> bool:
@@ -124,7 +128,9 @@ class LiftOff:
             supervisor.begin_way_back()
             self._retrace = self._trail.back(measurement.q, self._step_max) if self._trail is not None else None
         retrace = self._retrace
-        q = self._way.step(measurement.q, self._drives.aimed) if retrace is None else retrace.step(self._period_s)
+        # a drive that is silent or has booted stands where it lost its power: the others do not go on without it
+        targets = self._drives.aimed if self._all_there else joints_to_units(self._model, measurement.q)
+        q = self._way.step(measurement.q, targets) if retrace is None else retrace.step(self._period_s)
         if q is None:
             return None
         command, finding = supervisor.guard_target(Command(q))

@@ -23,9 +23,8 @@ def test_a_cell_comes_back_from_what_a_seed_takes(seed):
 
 @pytest.mark.parametrize("seed", [182, pytest.param(272, marks=MORE)])
 def test_a_joint_that_stops_in_a_scan_does_not_press_the_others_into_the_object(seed):
-    """5.65 and 5.46 N, and the probe was left there; the others go on to their last targets by what they lag."""
     outcome = run_case(draw_case(seed))
-    assert outcome["lost"] >= 1 and outcome["force_max_n"] <= 1.2 * outcome["force_limit_n"]
+    assert outcome["lost"] >= 1 and outcome["force_max_n"] <= outcome["force_limit_n"]
 
 
 def test_the_same_seed_is_the_same_run():

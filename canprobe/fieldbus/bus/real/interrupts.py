@@ -13,7 +13,6 @@ from typing import Any
 
 from canprobe.fieldbus.bus.system import system
 
-TERMINATION_SIGNALS = system.TERMINATION_SIGNALS
 REPEAT_PERIOD_S = 0.1
 """Time between two repetitions of an interrupt."""
 
@@ -36,7 +35,7 @@ def interrupts_held() -> Iterator[None]:
     came: list[int] = []
     before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
-        for number in (signal.SIGINT, *TERMINATION_SIGNALS):
+        for number in (signal.SIGINT, *system.TERMINATION_SIGNALS):
             if signal.getsignal(number) is not signal.SIG_IGN:
                 before[number] = signal.signal(number, lambda n, _: came.append(n))
     try:
@@ -60,7 +59,7 @@ def interrupts_repeated() -> Iterator[None]:
         return
     came: list[signal.Signals] = []
     left = threading.Event()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *TERMINATION_SIGNALS)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *system.TERMINATION_SIGNALS)}
     handlers = {number: handler for number, handler in before.items() if callable(handler)}
     hook = sys.unraisablehook
 
@@ -114,9 +113,9 @@ class Interrupts:
         self._waiting: int | None = None
 
     def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, *TERMINATION_SIGNALS):
+        for number in (signal.SIGINT, *system.TERMINATION_SIGNALS):
             before = signal.getsignal(number)
-            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATION_SIGNALS else before
+            handler = raise_terminated if before is signal.SIG_DFL and number in system.TERMINATION_SIGNALS else before
             if not callable(handler):
                 continue
             try:

@@ -1,4 +1,4 @@
-"""A frame that was seen on a bus, and the frames of a candump log, which is judged after the fact."""
+"""A frame that was seen on a bus, and the frames of a log, which is judged after the fact."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class BusFrame:
 
 
 def read_record(path: Path, channel: str | None = None) -> Iterator[BusFrame]:
-    """Read the frames of one channel of a candump log in the order of their times; error frames are left out.
+    """Read the frames of one channel of a log in the order of their times; error frames are left out.
 
     A log that was written by a master has the frames that it sent before those that it read later.
 
