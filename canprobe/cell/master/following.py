@@ -99,9 +99,17 @@ class Following:
             ends = [cycles[max(last + 1 - delay, 0)][1][motor] for delay in self._delays]
             starts = [cycles[max(last + 1 - delay - span, 0)][1][motor] for delay in self._delays]
             asks = [end - start for end, start in zip(ends, starts, strict=True)]
-            late_ns = max(jitter_ns, *[cycles[-k][3] for k in range(1, span + 1)])
-            uneven = (abs(t_ns - begin_ns - span * self._period_ns) + late_ns) / self._period_ns
+            late_ns = abs(t_ns - begin_ns - span * self._period_ns) + self._late_ns(span, t_ns, jitter_ns)
             allowed = margin + OVERSHOOT_SHARE * (max(asks) - min(asks))
-            allowed += uneven * max([abs(b - a) for a, b in pairwise((*starts, *ends))])
+            allowed += late_ns / self._period_ns * max([abs(b - a) for a, b in pairwise((*starts, *ends))])
             most = max(most, moved - max(asks) - allowed, min(asks) - allowed - moved)
         return most
+
+    def _late_ns(self, span: int, t_ns: int, jitter_ns: int) -> int:
+        """Time by which a drive may have begun a ramp late that it went on in these cycles, or broken it off early."""
+        late_ns, after_ns = jitter_ns, t_ns
+        for k in range(1, min(span + self._usual, len(self._cycles)) + 1):
+            seen_ns, _, _, jitter_ns = self._cycles[-k]
+            late_ns = max(late_ns, jitter_ns, abs(after_ns - seen_ns - self._period_ns))
+            after_ns = seen_ns
+        return late_ns

@@ -41,6 +41,25 @@ class Motor:
         return round(self.x)
 
 
+class TimedMotor:
+    """Reaches each target a period after the SYNC that it saw, from where it was by then, behind a first-order lag."""
+
+    def __init__(self, lag_s):
+        self.x, self.lag_s, self.t = 0.0, lag_s, 0.0
+        self.begin, self.end, self.latched = 0.0, 0.0, 0.0
+
+    def reference(self, t):
+        return self.begin + (self.end - self.begin) * min((t - self.latched) / (PERIOD_NS * 1e-9), 1.0)
+
+    def sync(self, t, target):
+        """Latch a target at a time; returns the position there."""
+        for t_k in np.linspace(self.t, t, 50)[1:]:
+            share = 1.0 - math.exp(-(t - self.t) / 49 / self.lag_s) if self.lag_s else 1.0
+            self.x += share * (self.reference(t_k) - self.x)
+        self.begin, self.end, self.latched, self.t = self.reference(t), target, t, t
+        return round(self.x)
+
+
 def found(motor, targets, *, at=10**9, what=lambda motor: None, late=None, period_ns=PERIOD_NS):
     """Cycles from `at` to the first cycle in which the motor does not follow; None where it always does."""
     following, t_ns = Following(MODEL, LAG_S, period_ns), 0
@@ -132,6 +151,19 @@ def test_after_a_stall_of_the_master_the_drives_begin_from_rest(stall_ns):
         # the targets go on by their step, from where they were
         following.aim([round(target)] * 6, [counts] * 6, t_ns)
         counts = motor.step(round(target))
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 2e-3, LAG_S, 1.5 * LAG_S])
+@pytest.mark.parametrize("what", motions())
+def test_drives_follow_a_master_whose_every_sync_is_up_to_nearly_half_a_period_late(what, lag_s):
+    rng = np.random.default_rng(11)
+    following, motor, sent = Following(MODEL, LAG_S, PERIOD_NS), TimedMotor(lag_s), 0
+    for k, target in enumerate(motions()[what]):
+        t_ns = (k + 1) * PERIOD_NS + round(rng.uniform(0.0, 0.45) * rng.integers(0, 2) * PERIOD_NS)
+        counts = motor.sync(t_ns * 1e-9, sent)
+        assert following.beyond(0, counts, t_ns) == 0.0, k
+        sent = round(target)
+        following.aim([sent] * 6, [counts] * 6, t_ns)
 
 
 def test_what_is_not_known_is_not_compared():
