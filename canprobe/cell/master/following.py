@@ -99,10 +99,11 @@ class Following:
             ends = [cycles[max(last + 1 - delay, 0)][1][motor] for delay in self._delays]
             starts = [cycles[max(last + 1 - delay - span, 0)][1][motor] for delay in self._delays]
             asks = [end - start for end, start in zip(ends, starts, strict=True)]
-            late_ns = abs(t_ns - begin_ns - span * self._period_ns) + self._late_ns(span, t_ns, jitter_ns)
-            allowed = margin + OVERSHOOT_SHARE * (max(asks) - min(asks))
-            allowed += late_ns / self._period_ns * max([abs(b - a) for a, b in pairwise((*starts, *ends))])
-            most = max(most, moved - max(asks) - allowed, min(asks) - allowed - moved)
+            outside = max(moved - max(asks), min(asks) - moved) - margin - OVERSHOOT_SHARE * (max(asks) - min(asks))
+            if outside > most:
+                late_ns = abs(t_ns - begin_ns - span * self._period_ns) + self._late_ns(span, t_ns, jitter_ns)
+                step = max([abs(b - a) for a, b in pairwise((*starts, *ends))])
+                most = max(most, outside - late_ns / self._period_ns * step)
         return most
 
     def _late_ns(self, span: int, t_ns: int, jitter_ns: int) -> int:
