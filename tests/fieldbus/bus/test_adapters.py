@@ -82,6 +82,12 @@ def test_an_unknown_interface_is_named_as_what_was_meant(name, own, meant):
     check_interface_name(meant, own)
 
 
+@pytest.mark.parametrize("name", ["can0", "vcan0", "slcan1"])
+def test_a_channel_in_the_place_of_an_interface_is_told_with_the_line_to_type(name):
+    with pytest.raises(UsageError, match=f"name both: --bus socketcan --channel {name}$"):
+        check_interface_name(name)
+
+
 def test_interfaces_of_the_kernel_are_found_with_their_state_and_line(tmp_path, monkeypatch):
     for name, number in (("can0", 280), ("can1", 280), ("vcan0", 280), ("eth0", 1)):
         (tmp_path / name).mkdir()

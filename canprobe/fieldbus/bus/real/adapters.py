@@ -18,6 +18,7 @@ import importlib
 import importlib.util
 import json
 import logging
+import re
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -192,6 +193,8 @@ def check_interface_name(name: str, own: Iterable[str] = ()) -> None:
         return
     if name in (known := interface_names()):
         return
+    if re.fullmatch(r"(v|sl)?can\d+", name):
+        raise UsageError(f"no interface {name!r}: a channel of socketcan; name both: --bus socketcan --channel {name}")
     mine = f"canprobe has {' and '.join(own)} (for `run`), and " if own else ""
     raise UsageError(
         f"no interface {name!r}{did_you_mean(name, [*own, *known], 0.6)}; {mine}python-can has: {', '.join(known)};"
