@@ -1,18 +1,17 @@
-"""Draw docs/img/scenes/SCENE.png: the best panel of each packaged scene's report. `python docs/gallery.py [SCENE …]`
+"""Draw docs/img/scenes/SCENE.png: the best panel of each packaged scene's report.
 
-Each scene runs once without a bus (`--bus direct`, seed 0). `python docs/generate.py` puts the pictures into the page.
+`python docs/measure.py pictures` draws them. Each scene runs once without a bus (`--bus direct`, seed 0). Then
+`python docs/generate.py` puts them into the page.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from matplotlib.transforms import Bbox
 from PIL import Image, ImageOps
 
 import canprobe
-from canprobe.cell.scene.load import packaged
 
 FOLDER = Path(__file__).parent / "img" / "scenes"
 DPI = 100
@@ -22,7 +21,7 @@ PANELS = {"listen": (0, 1), "calibrate": (1, 0)}
 BORDER = 6
 
 
-def draw(name: str) -> Path:
+def draw_panel(name: str) -> Path:
     """Run a scene and save one panel of its figure, without the white space round it."""
     figure = canprobe.run(name, bus="direct", seed=0, files=False).plot()
     figure.suptitle("")
@@ -39,10 +38,3 @@ def draw(name: str) -> Path:
     image = image.crop((left - BORDER, top - BORDER, right + BORDER, bottom + BORDER))
     image.quantize(COLOURS).save(path, optimize=True)
     return path
-
-
-if __name__ == "__main__":
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    for scene, _ in packaged("scene"):
-        if not sys.argv[1:] or scene in sys.argv[1:]:
-            print(draw(scene), flush=True)

@@ -36,8 +36,8 @@ GALLERY = """\
 
 One picture for each packaged scene, with the figures to expect of it. In scans orange is the measured path of the
 contact, blue the recovered surface, grey the true one. The pictures are panels of `report.png`, drawn by
-`python docs/gallery.py` from one run each with `--bus direct`, seed 0. `canprobe run NAME` makes the whole report,
-`canprobe view NAME` shows the scene in three dimensions.
+`python docs/measure.py pictures` from one run each with `--bus direct`, seed 0. `canprobe run NAME` makes the whole
+report, `canprobe view NAME` shows the scene in three dimensions.
 
 What the figures mean, and why three scenes have large errors: [packaged scenes](packaged-scenes.md)."""
 
@@ -145,7 +145,7 @@ def with_pace(page: str, measured: Mapping[str, Any]) -> str:
 
 
 def gallery(measured: Mapping[str, Any]) -> str:
-    """The page of pictures; `python docs/gallery.py` draws them."""
+    """The page of pictures; `docs/gallery.py` draws them."""
     scenes = measured["scenes"]
     rows = [GALLERY, _source_of_scenes(scenes)]
     for name, title in packaged("scene"):

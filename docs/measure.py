@@ -1,11 +1,11 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
-A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
-`growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `pictures`, one of `FORMS`, or one of
-`PRINTED`, what a page shows of a command that the tests repeat. Without names everything is measured but what takes
-more than half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every
-entry has its own command, date, commit and machine, so that one can be measured anew without the others; an entry whose
-study is gone stays with its commit. Then `python docs/generate.py` writes the pages.
+A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `whole_cell`, `vcan0`, `pace`,
+`side_by_side`, `growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `pictures`, one of
+`FORMS`, or one of `PRINTED`, what a page shows of a command that the tests repeat. Without names everything is measured
+but what takes more than half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the
+figures. Every entry has its own command, date, commit and machine, so that one can be measured anew without the others;
+an entry whose study is gone stays with its commit. Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from gallery import draw_panel
 from moving_picture import draw_moving
 from PIL import Image
 
@@ -40,6 +41,7 @@ from canprobe.lab.studies.result import processor
 from canprobe.lab.studies.sweep import STUDIES
 
 DOCS = Path(__file__).resolve().parent
+IMAGES = DOCS / "img"
 FILE = DOCS / "measured.json"
 RUNS = DOCS.parent / "runs" / "measured"
 """Where studies and runs on vcan0 leave their files; finished cells of a study are used again."""
@@ -188,6 +190,35 @@ def one_scan() -> Entry:
     return {"command": "canprobe run cylinder --seed 0 … --seed 9", "table": _scan_table(runs)}
 
 
+def whole_cell() -> Entry:
+    """Errors of the whole cell against its computing time, over plant, rate and estimator: medians of three seeds."""
+    keys = {
+        "plant.fidelity": ["ideal", "dynamic"],
+        "cycle.rate_hz": [200, 400],
+        "shape.method": ["chord", "recursive", "ml"],
+    }
+    many = canprobe.run_many(
+        "cylinder", keys, seeds=3, bus="direct", duration_s=5.0, workers=1, out=RUNS / "whole_cell"
+    )
+    runs = many.table()
+    runs["pace"] = 1e3 * runs["wall_time_s"] / runs["sim_time_s"]
+    runs["force"] = 100.0 * runs["contact.force_true_rms_error_n"] / runs["contact.force_target_n"]
+    errors = ["shape.kappa_rms_error_percent", "shape.normal_rms_deg", "force"]
+    medians = runs.groupby(list(keys), sort=False)[["pace", *errors]].median().reset_index()
+    head = [
+        "plant",
+        "rate",
+        "estimator",
+        "a second of the scan",
+        "curvature, RMS",
+        "normal, RMS",
+        "measured force, RMS",
+    ]
+    form = "{} | {} Hz | `{}` | {:.0f} ms | {:.1f} % | {:.3f}° | {:.1f} %"
+    table = [form.format(*row).split(" | ") for row in medians.itertuples(index=False)]
+    return {"command": "python docs/measure.py whole_cell", "table": [head, *table]}
+
+
 def vcan0() -> Entry:
     """The same on a real vcan0."""
     folders = [RUNS / "vcan0" / str(seed) for seed in SEEDS_OF_ONE_SCAN]
@@ -240,10 +271,11 @@ def study(name: str) -> Entry:
     out = RUNS / FORMS.get(name, name).replace(" --", "-")
     printed(f"{command} --out {out}")
     entry = {"command": command} | _found(name, json.loads((out / f"{name}.json").read_text(encoding="utf-8")))
-    for picture in out.glob("*.png"):
-        if (shown := DOCS / "img" / picture.name).exists():
-            Image.open(picture).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(shown, optimize=True)
-    return entry
+    shown = [picture.name for picture in out.glob("*.png") if (IMAGES / picture.name).exists()]
+    for picture in shown:
+        whole = Image.open(out / picture).convert("RGB")
+        whole.quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(IMAGES / picture, optimize=True)
+    return entry | ({"pictures": {picture: picture_digest(picture) for picture in shown}} if shown else {})
 
 
 def _found(name: str, result: Row) -> Entry:
@@ -361,15 +393,25 @@ PRINTED: Mapping[str, Sequence[Sequence[str]]] = {
 
 
 def pictures() -> Entry:
-    """The pictures of the default scan, drawn anew; their figures are those of `first_day`."""
+    """The pictures of the default scan, with the figures of `first_day`, and those of the gallery, drawn anew."""
     result = canprobe.run("cylinder", {"scene.figures": False})
-    draw_run(result, DOCS / "img" / "cylinder.png")
-    draw_surface(result, DOCS / "img" / "surface.png")
-    draw_moving(canprobe.run("cylinder", {"scene.figures": False}, duration_s=5.0), DOCS / "img" / "scan.webp")
+    draw_run(result, IMAGES / "cylinder.png")
+    draw_surface(result, IMAGES / "surface.png")
+    draw_moving(canprobe.run("cylinder", {"scene.figures": False}, duration_s=5.0), IMAGES / "scan.webp")
     for name in ("cylinder", "surface"):
-        path = DOCS / "img" / f"{name}.png"
+        path = IMAGES / f"{name}.png"
         Image.open(path).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(path, optimize=True)
-    return {"command": "python docs/measure.py pictures", "drawn_by": {name: drawing_code(name) for name in DRAWN_BY}}
+    panels = [draw_panel(name).relative_to(IMAGES).as_posix() for name, _ in packaged("scene")]
+    return {
+        "command": "python docs/measure.py pictures",
+        "drawn_by": {name: drawing_code(name) for name in DRAWN_BY},
+        "pictures": {name: picture_digest(name) for name in sorted({*DRAWN_BY, *panels})},
+    }
+
+
+def picture_digest(name: str) -> str:
+    """Digest of a picture of the pages: the entry that it was drawn with has it."""
+    return hashlib.sha256((IMAGES / name).read_bytes()).hexdigest()[:16]
 
 
 RESULTS = DOCS.parent / "canprobe" / "cell" / "results"
@@ -377,8 +419,9 @@ DRAWN_BY: Mapping[str, Sequence[Path]] = {
     "cylinder.png": [RESULTS / f"{name}.py" for name in ("figures", "picture", "surface_figure")],
     "surface.png": [RESULTS / f"{name}.py" for name in ("surface_figure", "picture")],
     "scan.webp": [DOCS / "moving_picture.py"],
+    "scenes/cylinder.png": [DOCS / "gallery.py", *(RESULTS / f"{name}.py" for name in ("figures", "picture"))],
 }
-"""Code that draws a picture: where it changes, the picture is drawn anew."""
+"""Code that draws a picture: where it changes, the picture is drawn anew, and with the one of a scene all of them."""
 
 
 def drawing_code(name: str) -> str:
@@ -393,6 +436,7 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "local_node": local_node,
     "canopen_node": canopen_node,
     "one_scan": one_scan,
+    "whole_cell": whole_cell,
     "vcan0": vcan0,
     "pace": partial(bench_table, "pace"),
     "side_by_side": partial(bench_table, "side_by_side"),

@@ -42,6 +42,13 @@ def test_a_picture_is_drawn_by_the_present_code(name):
     assert MEASURED["pictures"]["drawn_by"][name] == measure.drawing_code(name), "type: python docs/measure.py pictures"
 
 
+def test_a_picture_is_the_one_that_was_drawn_with_the_figures_beside_it():
+    entries = [entry.get("pictures", {}) for entry in MEASURED.values()]
+    noted = {name: digest for entry in entries for name, digest in entry.items()}
+    shown = {path.relative_to(measure.IMAGES).as_posix() for path in measure.IMAGES.rglob("*.[pw]*")} - {"view.png"}
+    assert noted == {name: measure.picture_digest(name) for name in shown}, "type: python docs/measure.py STUDY"
+
+
 def test_prose_beside_a_table_of_measurements_repeats_its_figure():
     table = dict((row[0], row[1]) for row in MEASURED["side_by_side"]["table"][1:])
     lockstep, direct = (float(table[name].split()[0]) for name in ("lockstep", "direct"))
