@@ -93,7 +93,8 @@ def run(args: argparse.Namespace) -> int:
     if args.list:
         return _list(args)
     if args.node is None:
-        raise UsageError("conform: --node N names the device; `canprobe scan` lists the nodes on a bus")
+        how = "any, such as --node 1" if args.bus == "lockstep" else "`canprobe scan` lists the nodes on a bus"
+        raise UsageError(f"conform: --node N names the device; {how}")
     from canprobe.fieldbus.tools.conform import ExaminationSettings, WriteList, restore_snapshot
     from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 

@@ -83,6 +83,7 @@ def test_the_list_and_chosen_points(capsys):
     ("arguments", "text"),
     [
         (["conform"], "--node N names the device"),
+        (["conform", "--bus", "lockstep"], "any, such as --node 1"),
         (["conform", "--node", "5", "--bus", "lockstep"], "name it with --eds"),
         (["conform", "--node", "5", "--bus", "direct"], "no bus in --bus direct"),
         ([*ARGS, "--points", "smo"], "did you mean"),
