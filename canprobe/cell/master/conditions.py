@@ -328,7 +328,8 @@ def _off_pad(contact: TouchState) -> SafetyStop | None:
         return None
     return SafetyStop(
         f"the contact runs off the edge of the array: the true force is above the {contact.force:.1f} N measured; let"
-        " the pad follow the surface (a smaller task.rolling_share or task.speed_mm_s), or take a smaller probe"
+        " the pad follow the surface (a smaller task.rolling_share or task.speed_mm_s), or take a smaller probe, or an"
+        " array that the whole contact fits on"
     )
 
 

@@ -10,6 +10,9 @@ import math
 OFF_PAD_EDGE_SHARE = 0.95
 """Pressure at the pad's edge over the highest pressure from which on a contact counts as off the pad: a paraboloid has
 lost a sixth of its force by then."""
+OFF_PAD_ACROSS_SHARE = 0.5
+"""The same at two opposite edges: a contact that lies across the whole pad goes on beyond both, as a cylinder's on a
+flat array, whatever the gains of single taxels."""
 OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
 """The same limit where only moments are known: distance of the centroid from the edge, in standard deviations of the
 pressure (the width of a taxel included), and in taxels. A paraboloid has lost a fourth of its force by the first; one

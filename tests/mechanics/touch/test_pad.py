@@ -75,3 +75,14 @@ def test_a_contact_at_the_rim_of_a_list_leaves_it(mount_m: float | None, leaves:
     assert not compute_patch(image, calibration).off_pad
     image[3:5, 6:8] = 200
     assert compute_patch(image, calibration).off_pad is leaves
+
+
+@pytest.mark.parametrize(("rows", "leaves"), [(slice(0, 8), True), (slice(0, 6), False), (slice(1, 7), False)])
+def test_a_contact_across_the_whole_pad_goes_on_beyond_it_though_no_edge_has_its_highest_pressure(
+    rows: slice, leaves: bool
+) -> None:
+    image = np.zeros((8, 8), np.uint8)
+    image[rows, 3:5] = 100
+    image[4, 4] = 180
+    assert compute_patch(image, PatchCalibration(Pad(8, 8, 2e-3))).off_pad is leaves
+    assert compute_patch(image.T.copy(), PatchCalibration(Pad(8, 8, 2e-3))).off_pad is leaves

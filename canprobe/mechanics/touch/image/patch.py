@@ -24,7 +24,7 @@ from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors, F
 from canprobe.mechanics.touch.image.silent_taxels import may_be_dead, mended
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
-from canprobe.mechanics.touch.stops import OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
+from canprobe.mechanics.touch.stops import OFF_PAD_ACROSS_SHARE, OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 from canprobe.mechanics.types import Floats
 
 _MIN_TAXELS = 4
@@ -64,8 +64,8 @@ class Patch(NamedTuple):
         too_few: whether fewer than four taxels are active, too few for moments.
         dead: number of taxels inside the patch that do not measure, bridged by their neighbours (`mended`,
             `silent_taxels`).
-        off_pad: whether the pressure is highest at the pad's edge: a fifth of the contact or more lies beyond it, and
-            the force is only a lower bound.
+        off_pad: whether the pressure is highest at the pad's edge, or half of it at two opposite edges: a sixth of the
+            contact or more lies beyond, and the force is only a lower bound.
         bridged: share of the force that taxels would measure which do not, interpolated.
         sigma: standard deviation of the force by its causes; of a single image, whose age in the touch is not known, 0.
     """
@@ -202,10 +202,10 @@ def compute_patch(
     if pad.is_grid:
         edges = _edges(counts, pad.shape, window)
     else:  # a flat list has no contact that may leave it
-        edges = (0 if pad.is_flat else int(taxels.reshape(-1)[pad.rim].max()), 0)
+        edges = (0 if pad.is_flat else int(taxels.reshape(-1)[pad.rim].max()), 0, 0)
     n_active, peak = len(active), max(active)
     pascals = calibration.pascals
-    peak_pa, at_pad, at_window = [pascals.item(count) for count in (peak, *edges)]
+    peak_pa, at_pad, across, at_window = [pascals.item(count) for count in (peak, *edges)]
     pressure = pascals.take(taxels)
     shows_shape = peak > MIN_PEAK_RATIO * calibration.threshold_counts
     if window is not None and at_window > MAX_EDGE_SHARE * peak_pa and shows_shape:
@@ -222,7 +222,7 @@ def compute_patch(
         cut_by_pad=at_pad > 0.0,
         too_few=n_active < _MIN_TAXELS,
         dead=dead,
-        off_pad=at_pad >= OFF_PAD_EDGE_SHARE * peak_pa,
+        off_pad=at_pad >= OFF_PAD_EDGE_SHARE * peak_pa or across >= OFF_PAD_ACROSS_SHARE * peak_pa,
     )
 
 
@@ -236,13 +236,14 @@ def _force_and_centroid(total: float, u: float, v: float, calibration: PatchCali
     return force, u * calibration.pitch_m, v * calibration.pitch_m
 
 
-def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) -> tuple[int, int]:
-    """Highest count at the pad's edge, and at an edge of the window inside the pad."""
+def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) -> tuple[int, int, int]:
+    """Highest count at the pad's edge, what two opposite edges both have, and that at edges of a window in the pad."""
     height, width = shape
-    edges = counts[:width] + counts[-width:] + counts[::width] + counts[width - 1 :: width]
-    at_pad = max(edges.strip(b"\0"), default=0)  # usually nothing is left: the strip is faster than the maximum
+    top, bottom, left, right = counts[:width], counts[-width:], counts[::width], counts[width - 1 :: width]
+    sides = [max(side.strip(b"\0"), default=0) for side in (top, bottom, left, right)]  # the strip is the faster one
+    at_pad, across = max(sides), max(min(sides[:2]), min(sides[2:]))
     if window is None:
-        return at_pad, 0
+        return at_pad, across, 0
     r0, c0, n_rows, n_cols = window
     inside = b""
     for row in (r0, r0 + n_rows - 1):
@@ -251,7 +252,7 @@ def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) 
     for column in (c0, c0 + n_cols - 1):
         if 0 < column < width - 1:
             inside += counts[column::width]
-    return at_pad, max(inside, default=0)
+    return at_pad, across, max(inside, default=0)
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:
