@@ -249,7 +249,7 @@ class ProbingTask(Task):
             return words
         return (
             f"{words}, and no image of the array has changed since bring-up: the array may be blind; press it with a"
-            " finger (`canprobe run listen` shows what it measures), then try again"
+            " finger (`canprobe run listen` shows what it measures), then try again; task.search_mm widens the search"
         )
 
     def _settle(self) -> ProbePose:

@@ -31,7 +31,9 @@ it is not.
 MAX_BRIDGED_SHARE = 0.5
 """Share of the force, interpolated over taxels that do not measure, up to which it is known. Over 200 random presses
 its error was below 5 % with one dead row and below 7 % with two that were found; beyond half of the force 6 to 20 %."""
-MIN_REST_SAMPLES = 10
+MIN_REACHED_SHARE = 0.5
+"""Least share of the wanted force at rest: where one count of the drives is deeper, the force stays where it is."""
+MIN_REST_SAMPLES = 5
 """Least number of samples that are judged."""
 
 
@@ -77,9 +79,11 @@ class AtRest:
                 "or lower task.force_n"
             )
         sigma = math.sqrt(self._spread / (self._n - 1))
-        if sigma > MAX_FORCE_SPREAD * target:
+        reached = self._mean >= MIN_REACHED_SHARE * target or self._saturated
+        if sigma > MAX_FORCE_SPREAD * target or not reached:
+            what = "does not settle" if reached else "is not reached"
             return (
-                f"the force does not settle: {self._mean:.1f} ± {sigma:.1f} N where {target:.1f} N are wanted; the "
-                "contact is too stiff for the arm's encoder counts, or servo.surface_height_hz too high"
+                f"the force {what}: {self._mean:.1f} ± {sigma:.1f} N where {target:.1f} N are wanted; the contact is "
+                "too stiff for the arm's encoder counts, or servo.surface_height_hz too high"
             )
         return None

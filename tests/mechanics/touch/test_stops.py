@@ -32,5 +32,14 @@ def test_a_saturated_array_shows_a_lower_bound_only():
 
 
 def test_a_few_samples_tell_nothing():
-    assert doubt_of([0.0, 4.0] * (MIN_REST_SAMPLES // 2 - 1)) is None
-    assert doubt_of([0.0, 4.0] * (MIN_REST_SAMPLES // 2)) is not None
+    assert doubt_of(([0.0, 4.0] * MIN_REST_SAMPLES)[: MIN_REST_SAMPLES - 1]) is None
+    assert doubt_of([0.0, 4.0] * MIN_REST_SAMPLES) is not None
+
+
+def test_a_force_that_stays_far_below_the_wanted_one_is_doubted_but_for_a_saturated_array():
+    assert doubt_of([1.1] * 10) is None
+    assert doubt_of([0.4] * 10) == (
+        "the force is not reached: 0.4 ± 0.0 N where 2.0 N are wanted; the contact is too stiff for the arm's encoder"
+        " counts, or servo.surface_height_hz too high"
+    )
+    assert doubt_of([0.4] * 10, saturated=0.5) is None
