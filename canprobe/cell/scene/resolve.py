@@ -210,6 +210,8 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
             positions=positions * MM,
             normals=normals / np.linalg.norm(normals, axis=1, keepdims=True) if normals is not None else None,
         )
+    if pad.is_flat:  # the scatter of its centroid is not known: a calibration is of an array on a sphere
+        calibration = replace(calibration, noise=replace(calibration.noise, assumed=True))
     return Array(
         node_id=settings.node_id,
         channel=settings.channel or scene.bus.channel,
