@@ -22,9 +22,11 @@ def test_the_registry_has_every_kind_once_and_names_conditions_that_there_are():
 @pytest.mark.parametrize("name", CELL_FAULTS)
 def test_a_kind_trips_the_conditions_that_it_declares(name):
     kind = CELL_FAULTS[name]
-    scene, node_id, at = ("press", 16, HOLD_CYCLE) if kind.needs == "array" else ("free", 3, FREE_CYCLE)
+    scene, node_id, at, until = ("free", 3, FREE_CYCLE, 110)
+    if kind.needs == "array":
+        scene, node_id, at, until = ("press", 16, HOLD_CYCLE, 55)
     text = f"node {node_id}: {name} seed=1" + (" for 20 ms" if name in PASSING else "")
-    run = Injected(scene, at, lambda run: run.inject(text), until=110)
+    run = Injected(scene, at, lambda run: run.inject(text), until=until)
     assert set(run.session.cell.supervisor.first) == kind.conditions
     begin_ns = run.injected_ns - run.session.record.origin_ns
     assert rules_raised(run.session.plan, run.frames, charges_ns=[(begin_ns, run.frames[-1][2])]) == {}

@@ -139,7 +139,7 @@ def failing(_):
 
 
 class Twice(Injected):
-    """Ctrl-C in contact, and something else 20 cycles into the lift-off, which takes 128."""
+    """Ctrl-C in contact, and something else 10 cycles into the lift-off, which takes 64."""
 
     def __init__(self, second):
         self.second, self.lifting = second, 0
@@ -153,7 +153,7 @@ class Twice(Injected):
             def add(row):
                 inner(row)
                 self.lifting += "q_target_rad" in row
-                if self.lifting == 20 and "q_target_rad" in row:
+                if self.lifting == 10 and "q_target_rad" in row:
                     self.second(self)
 
             self.session.cell.log.add = add
@@ -188,7 +188,7 @@ def moving(run):
 def test_a_lift_off_does_not_go_on_when_something_else_comes(second, cycles):
     run = Twice(second)
     assert type(run.error) is KeyboardInterrupt
-    assert 20 <= run.lifting <= 20 + cycles
+    assert 10 <= run.lifting <= 10 + cycles
     assert 0.2 * WAY_BACK < lifted(run)[0] < 0.5 * WAY_BACK, "as far as it was, and what is left of the motion"
     if second is master_heard:
         assert "another master is on the bus: SYNC from another master" in run.session.cell.notes.lines()
@@ -337,7 +337,7 @@ def test_a_second_interrupt_stops_at_once():
     class Hurried(Injected):
         def record(self, row):
             self.rows += 1
-            if self.rows == 20:
+            if self.rows == 10:
                 signal.raise_signal(signal.SIGINT)
 
         def _say(self, text):
@@ -350,7 +350,7 @@ def test_a_second_interrupt_stops_at_once():
     assert isinstance(run.error, KeyboardInterrupt)
     run.assert_drives_off()
     back, _ = lifted(run)
-    assert 0.2 * WAY_BACK < back < 0.5 * WAY_BACK, "20 of 128 cycles, the fast ones"
+    assert 0.2 * WAY_BACK < back < 0.5 * WAY_BACK, "10 of 64 cycles, the fast ones"
 
 
 def test_a_way_back_on_which_the_force_grows_ends():
