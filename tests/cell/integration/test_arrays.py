@@ -44,6 +44,7 @@ position_mm = [-120, -122.5, 374]
 rotation_deg = [0, 0, 20]
 [task]
 kind = "{kind}"
+clearance_mm = 0.3
 duration_s = 1
 """
 FREE = """rows = 10

@@ -8,7 +8,13 @@ from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.supervision import Reaction
 from canprobe.errors import PlanError, SafetyStop
 
-SCAN = {"task.duration_s": 2.0, "bus.interface": "direct"}
+SCAN = {
+    "task.duration_s": 1.0,
+    "task.clearance_mm": 0.3,
+    "bus.interface": "direct",
+    "shape.also": [],
+    "scene.figures": False,
+}
 
 
 COLUMNS = pytest.mark.slow(reason="a row is like a column")

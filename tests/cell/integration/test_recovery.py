@@ -163,7 +163,7 @@ class Nod(Controller):
     went_on = ()
 
     def step(self, measurement):
-        return Command(done=measurement.cycle > LOSS_CYCLE + 200)
+        return Command(done=measurement.cycle > LOSS_CYCLE + 80)
 
 
 def test_a_controller_that_cannot_go_on_ends_and_the_next_one_finds_the_cell_up():

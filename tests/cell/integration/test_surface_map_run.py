@@ -85,7 +85,12 @@ def test_answers_are_joined_with_earlier_passes_only_where_a_scene_asks(scan):
 
 def test_without_a_shape_there_is_no_map(tmp_path):
     (tmp_path / "surface.npz").write_text("of an earlier run")
-    result = undrawn_run(canprobe.load_scene("press"), duration_s=0.2, out=tmp_path, force=True)
+    result = undrawn_run(
+        canprobe.load_scene("press", {"task.clearance_mm": 0.3, "bus.timed": False}),
+        duration_s=0.1,
+        out=tmp_path,
+        force=True,
+    )
     assert result.surface_map is None
     assert not (tmp_path / "surface.npz").exists()
     assert "surface.npz" not in result.plan.outputs

@@ -21,7 +21,7 @@ from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import NMT_ID, SYNC_ID
 
-SHORT = {"task.duration_s": 0.2, "task.clearance_mm": 0.5}
+SHORT = {"task.duration_s": 0.1, "task.clearance_mm": 0.1, "cycle.rate_hz": 200.0}
 HOUR_NS = 3_600_000_000_000
 WALL_NS = 1_700_000_000_000_000_000
 
