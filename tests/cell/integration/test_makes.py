@@ -282,7 +282,7 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
     ],
 )
 def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
-    scene = change(canprobe.load_scene("cylinder", {"cell": cell}), emulate=quirk, scene={"figures": False})
+    scene = change(canprobe.load_scene("press", {"cell": cell}), emulate=quirk, scene={"figures": False})
     with pytest.raises(NodeError, match=told), Session(scene, RunOptions(tmp_path)) as session:
         session.run(lambda _: Command(done=True))
 

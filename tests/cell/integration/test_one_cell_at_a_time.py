@@ -46,11 +46,11 @@ def nod(measurement):
 
 
 def test_a_controller_of_ones_own_leaves_what_a_run_leaves(free, tmp_path):
-    with canprobe.open_cell(free, out=tmp_path / "own") as cell:
+    with canprobe.open_cell(undrawn(free), out=tmp_path / "own") as cell:
         result = cell.run(nod)
         with pytest.raises(UsageError, match=r"result\.summary: complete when the block of open_cell is left"):
             _ = result.summary["completed"]
-    task = canprobe.run(free, out=tmp_path / "task", duration_s=0.1)
+    task = undrawn_run(free, out=tmp_path / "task", duration_s=0.1)
     names = {path.name for path in task.out.iterdir()}
     assert names >= FILES and {path.name for path in result.out.iterdir()} == names
     assert result.summary["completed"] and result.summary.keys() == task.summary.keys()
@@ -100,14 +100,14 @@ def test_a_cell_that_is_not_opened_says_how(free):
 
 
 def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys):
-    scene, run = undrawn(free), ["run", "free", "--duration", "0.1", "--out", str(tmp_path)]
+    scene, run = undrawn(free), ["run", "free", "--no-figures", "--duration", "0.1", "--out", str(tmp_path)]
     undrawn_run(free, out=tmp_path, duration_s=0.1)
     (tmp_path / "surface.npz").write_text("of an earlier run")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for call in (canprobe.run, canprobe.open_cell):
         with pytest.raises(UsageError, match="not empty: name another folder for the results"):
             call(scene, out=tmp_path)
-    for words in (run, [*run, "--bus", "socketcan", "--channel", "nobus0"], ["view", *run[1:], "--html", "x.html"]):
+    for words in (run, [*run, "--bus", "socketcan", "--channel", "nobus0"], ["view", "free", *run[3:], "--html", "x.html"]):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"canprobe: {tmp_path}: not empty") and "--force" in line

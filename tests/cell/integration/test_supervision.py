@@ -396,6 +396,7 @@ def test_force_above_the_limit_makes_the_probe_retreat():
     retreat = np.flatnonzero(run.session.cell.log.arrays()["phase"] == Phase.RETREAT)[0]
     assert 0 < (retreat - above) * run.limits.period_ns <= BY_KEY["force"].within(run.limits)
     run.assert_drives_off()
+    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def vanish(run):
