@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from contextlib import nullcontext
 
 import pytest
 from judged import rules_raised
@@ -160,6 +161,8 @@ def real_bus(monkeypatch):
     monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", open_port)
     monkeypatch.setattr("canprobe.cell.session.buses.MonotonicClock", lambda: bus.clock)
     monkeypatch.setattr("canprobe.cell.session.buses.check_links", lambda *_: None)
+    monkeypatch.setattr("canprobe.cell.session.session.garbage_collection_paused", lambda **_: nullcontext())
+    monkeypatch.setattr("canprobe.cell.session.session.rehearse", lambda _: None)
     return scene, reports
 
 

@@ -107,7 +107,11 @@ def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys
     for call in (canprobe.run, canprobe.open_cell):
         with pytest.raises(UsageError, match="not empty: name another folder for the results"):
             call(scene, out=tmp_path)
-    for words in (run, [*run, "--bus", "socketcan", "--channel", "nobus0"], ["view", "free", *run[3:], "--html", "x.html"]):
+    for words in (
+        run,
+        [*run, "--bus", "socketcan", "--channel", "nobus0"],
+        ["view", "free", *run[3:], "--html", "x.html"],
+    ):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"canprobe: {tmp_path}: not empty") and "--force" in line

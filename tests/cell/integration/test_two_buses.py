@@ -229,7 +229,9 @@ def spread_scene(scene, first):
 @pytest.fixture(scope="module")
 def seven(tmp_path_factory):
     out = tmp_path_factory.mktemp("seven")
-    scene = spread_scene(canprobe.load_scene("cylinder", {"cell": "seven-axis", "task.clearance_mm": 0.3, "shape.also": []}), 4)
+    scene = spread_scene(
+        canprobe.load_scene("cylinder", {"cell": "seven-axis", "task.clearance_mm": 0.3, "shape.also": []}), 4
+    )
     return undrawn_run(scene, out=out, duration_s=0.1), list(read_candump(out / "bus.log"))
 
 

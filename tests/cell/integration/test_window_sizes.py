@@ -34,7 +34,11 @@ def tactile(plan):
 
 @pytest.fixture(scope="module")
 def press():
-    return change(canprobe.load_scene("press", {"task.clearance_mm": 0.3}), arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"})
+    return change(
+        canprobe.load_scene("press", {"task.clearance_mm": 0.3}),
+        arm={"grouped_rpdo": True},
+        bus={"cob_ids": "by_deadline"},
+    )
 
 
 @pytest.mark.parametrize("side", [10])
@@ -132,7 +136,8 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
     )
     path = tmp_path / "older.eds"
     path.write_text(older)
-    scene = change(canprobe.load_scene("press"), sensor={"eds": str(path), "window": "auto"})
+    scene = canprobe.load_scene("press", {"task.clearance_mm": 0.3})
+    scene = change(scene, sensor={"eds": str(path), "window": "auto"})
     plan = canprobe.plan(scene)
     assert plan.scene.sensor.window == 8
     assert ("another window", f"{path} has no window size (2008h), so the window keeps 8×8 taxels") in (

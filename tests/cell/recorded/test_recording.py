@@ -73,7 +73,7 @@ OTHER_STEPS = pytest.mark.slow(reason="other steps of the same clock")
         (-5_000,),
         pytest.param((-20_000,), marks=OTHER_STEPS),
         pytest.param((-3_600_000_000,), marks=OTHER_STEPS),
-        (86_400_000_000,),
+        pytest.param((86_400_000_000,), marks=OTHER_STEPS),
         (-2_000_000, -7_000_000),
     ],
     ids=lambda steps: "_".join(map(str, steps)),
@@ -137,11 +137,10 @@ def test_lines_in_another_order_are_no_step_of_the_clock(lockstep_run, tmp_path)
     ("change", "message"),
     [
         (lambda us, n, before: us - 5_000_000 * (5000 <= n < 5020), r"log:50\d\d: the SYNC of can0 is .* to and fro"),
-        (lambda us, n, before: us + 5_000_000 * (5000 <= n < 5020), r"log:50\d\d: the SYNC of can0 is .* to and fro"),
         (lambda us, n, before: us - before, "differences from line to line .*candump -td"),
         (lambda us, n, before: 0, "all the same, as candump -H"),
     ],
-    ids=["back and forth", "forth and back", "delta", "none"],
+    ids=["back and forth", "delta", "none"],
 )
 def test_stamps_that_cannot_be_mended_are_refused(lockstep_run, tmp_path, change, message):
     log = tmp_path / "odd.log"
