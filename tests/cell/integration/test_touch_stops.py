@@ -10,7 +10,6 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import SafetyStop
 
-
 QUICK = {"task.duration_s": 3.0, "task.clearance_mm": 0.05, "cycle.rate_hz": 200.0}
 
 

@@ -19,7 +19,7 @@ READY = [80.0, 70.0, 10.0, 5.0, 90.0, 20.0]
 
 
 def cell(scene="puma260", out=None, **changes):
-    keys = {"postures.ready": READY} if scene == "puma260" else {}
+    keys = {"bus.timed": False, "scene.figures": False} | ({"postures.ready": READY} if scene == "puma260" else {})
     return canprobe.open_cell(
         scene, {**keys, **{key.replace("__", "."): value for key, value in changes.items()}}, bus="lockstep", out=out
     )
