@@ -67,7 +67,14 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
 
 
 def scene_of(folder: Path) -> Scene:
-    short = {"task.duration_s": SECONDS, "task.clearance_mm": 0.2, "shape.memory_mm": 3, "shape.also": ["ml"]}
+    short = {
+        "task.duration_s": SECONDS,
+        "task.clearance_mm": 0.2,
+        "task.length_mm": 8.0,
+        "task.width_mm": 2.0,
+        "shape.memory_mm": 3,
+        "shape.also": ["ml"],
+    }
     return undrawn(canprobe.load_scene(folder / "scene.toml", short))
 
 

@@ -139,7 +139,7 @@ def test_public_name_is_the_function():
     assert canprobe.plan(canprobe.load_scene("free")).scene.name == "free"
 
 
-@pytest.mark.parametrize("argv", [["--help"], ["plan", "cylinder"], ["scenes"], ["run", "--help"]])
+@pytest.mark.parametrize("argv", [["--help"], ["plan", "press"], ["scenes"], ["run", "--help"]])
 def test_light_commands_import_neither_scipy_nor_matplotlib(argv):
     code = (
         "import sys; from canprobe.cli import main; status = main(sys.argv[1:]); "

@@ -370,8 +370,7 @@ def pressed(made, force_n, fidelity, friction):
     return plant
 
 
-@pytest.mark.parametrize("force_n", [3.0, 30.0])
-@pytest.mark.parametrize("made", [puma, seven, gantry])
+@pytest.mark.parametrize(("made", "force_n"), [(puma, 3.0), (seven, 30.0), (gantry, 30.0)])
 def test_both_arms_report_the_torque_against_a_push(made, force_n):
     """At rest the dynamic arm's torque is weight less push, but for what friction carries; the ideal one has no weight.
 

@@ -285,7 +285,7 @@ def test_what_is_said_about_a_mesh_that_cannot_be_taken(tmp_path, monkeypatch):
 
 
 def test_a_saved_scene_takes_its_heights_along(tmp_path):
-    scene = load_scene("relief")
+    scene = load_scene("relief", {"task.length_mm": 4.0, "task.width_mm": 2.0})
     write_scene(canprobe.plan(scene), tmp_path)
     assert (tmp_path / "relief.npz").is_file()
     there = load_scene(tmp_path / "scene.toml")
