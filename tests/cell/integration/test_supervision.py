@@ -217,9 +217,8 @@ def test_a_silent_drive():
     assert "node 5: lost: no usable TPDO for 6 cycles" in str(run.error)
 
 
-@pytest.mark.parametrize("fault", ["torn", "corrupt", "header-crc"])
-def test_tactile_frames_that_are_torn_or_corrupt_are_dropped(fault):
-    run = Injected("press", HOLD_CYCLE, lambda r: r.inject(f"node 16: {fault} for 15 ms"), until=40)
+def test_tactile_frames_that_are_corrupt_are_dropped():
+    run = Injected("press", HOLD_CYCLE, lambda r: r.inject("node 16: corrupt for 15 ms"), until=40)
     run.assert_counted("torn_frame")
 
 

@@ -20,14 +20,8 @@ def steps_deg(run, joint):
     return math.degrees(np.abs(np.diff(run.session.buses.truth["q_rad"][run.at :, joint - 1])).max())
 
 
-def stands(node_id):
-    """The power stage is off, and the drive reports on that it is enabled."""
-    return lambda run: run.nodes[node_id].node.application.parts.motion.block(run.now())
-
-
 FAULTS = {
     "a brake that is stuck for a second": lambda run: run.inject("node 3: brake-stuck for 1 s"),
-    "a power stage that is off": stands(3),
     "an encoder that is frozen": lambda run: run.inject("node 3: encoder-frozen"),
 }
 
