@@ -44,14 +44,14 @@ def mixed_plan(makes, folder):
     return make_plan(setup.changed("arm", drives=tuple(drives)))
 
 
-def moved(plan, folder, *, at_cycles=200):
+def moved(plan, folder, *, at_cycles=80):
     """Bring a cell up and move its joints: what was said, how far each joint came (rad), the frames on the bus."""
     said, q = [], []
 
     def controller(measurement):
         q.append(measurement.q)
         k = len(q)
-        return Command(q[0] + SWING * min(1.0, k / 100), done=k > at_cycles)
+        return Command(q[0] + SWING * min(1.0, k / 50), done=k > at_cycles)
 
     with Session(plan, RunOptions(folder, said.append)) as session:
         session.run(controller)

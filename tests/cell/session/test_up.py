@@ -233,7 +233,7 @@ def test_swapped_drives_are_seen(cell, seed):
 OTHER_EYES = pytest.mark.slow(reason="other eyes on the same arm")
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=OTHER_EYES) for seed in range(2, 5))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=OTHER_EYES) for seed in range(1, 5))])
 def test_a_right_arm_is_found_so_by_every_eye(cell, seed):
     cell.operator, cell.world, said = Watcher(seed), true_world(scene(seed=seed)), []
     findings = canprobe.api.check_joints(scene(seed=seed), operator=cell.operator, say=said.append)
@@ -243,9 +243,9 @@ def test_a_right_arm_is_found_so_by_every_eye(cell, seed):
     assert_disabled(cell.session)
 
 
-@pytest.mark.parametrize(("name", "joint"), [("seven-axis", 3), ("gantry", 2), ("puma260", 4)])
+@pytest.mark.parametrize(("name", "joint"), [("seven-axis", 3), ("gantry", 2)])
 def test_each_kind_of_arm_is_checked_in_its_unit(cell, name, joint):
-    """Seven axes, slides in mm, and the wrist whose motors drag each other along."""
+    """Seven axes, and slides in mm."""
     right = scene(name)
     cell.operator, cell.world = Watcher(1, {joint, 0}), true_world(right)
     findings = canprobe.api.check_joints(right, operator=cell.operator)
