@@ -253,7 +253,10 @@ tare_images = 20""",
 }
 
 
-@pytest.mark.parametrize("array", SCANNING)
+TWO = pytest.mark.slow(reason="a grid of two pitches; the default scans two lists of places")
+
+
+@pytest.mark.parametrize("array", [pytest.param(name, marks=[TWO] * (name == "two pitches")) for name in SCANNING])
 def test_an_array_that_is_no_square_grid_scans(array):
     scene = touch(SCANNING[array])
     bus = "lockstep" if "wire" in SCANNING[array] else "direct"

@@ -366,7 +366,7 @@ def pressed(made, force_n, fidelity, friction):
     if made is puma:
         c = replace(c, bodies=BODIES["puma260"])
     plant = Plant(replace(c, fidelity=fidelity, dynamics=Dynamics(friction=0.3 * friction)))
-    plant.advance(1_500_000_000)
+    plant.advance(800_000_000)
     return plant
 
 

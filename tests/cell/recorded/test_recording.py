@@ -55,13 +55,9 @@ def stepped(lines, *steps_us):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(lockstep_run):
+def undisturbed(lockstep_run, replayed_log):
     """The replay and the traffic of the log as it is."""
-    log = lockstep_run.out / "bus.log"
-    return (
-        canprobe.replay(log, scene=lockstep_run.plan.scene),
-        canprobe.measure_traffic(log, lockstep_run.plan, exact=False),
-    )
+    return replayed_log, canprobe.measure_traffic(lockstep_run.out / "bus.log", lockstep_run.plan, exact=False)
 
 
 OTHER_STEPS = pytest.mark.slow(reason="other steps of the same clock")

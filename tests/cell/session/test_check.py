@@ -75,7 +75,7 @@ def test_nodes_are_left_as_they_were_found_and_no_drive_is_enabled():
     cell.assert_left_as_found()
 
 
-@pytest.mark.parametrize("share", [0.2, 0.3, 0.35, 0.4, 0.6, 0.8])
+@pytest.mark.parametrize("share", [0.2, 0.35, 0.6, 0.8])
 def test_a_check_that_is_interrupted_leaves_the_nodes_as_they_were_found(share, monkeypatch):
     """Ctrl-C in a call of the port: while listening, reading, configuring, cycling, putting back."""
     monkeypatch.setattr("canprobe.cell.session.check.IDLE_S", 0.01)

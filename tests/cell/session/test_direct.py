@@ -67,7 +67,7 @@ def the_beginning(plan):
     return step
 
 
-FEW = ("axial", "free", "press", "listen")
+FEW = ("free", "listen")
 OTHERS = pytest.mark.slow(reason="each packaged scene, on two buses")
 
 
