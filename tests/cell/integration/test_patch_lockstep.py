@@ -16,8 +16,8 @@ from canprobe.cell.tasks.shape import replay_samples
 
 @pytest.fixture(scope="module")
 def axial():
-    """The session and its controller after 1.4 s (35 mm) on the axial scene."""
-    session = Session(canprobe.load_scene("axial", {"task.duration_s": 1.4, "task.clearance_mm": 0.3}))
+    """The session and its controller after 2 s (50 mm) on the axial scene."""
+    session = Session(canprobe.load_scene("axial", {"task.duration_s": 2.0, "task.clearance_mm": 0.3}))
     controller = make_task(session.plan)
     with session:
         session.run(controller)
