@@ -187,9 +187,8 @@ def test_arrays_of_other_sizes_scan(sensor, curvature, bus):
 
 
 def test_a_node_of_another_size_computes_features():
-    summary = canprobe.run(
-        touch('rows = 10\ncolumns = 12\npitch_mm = 2\nmode = "features"', "press"), bus="direct"
-    ).summary
+    scene = touch('rows = 10\ncolumns = 12\npitch_mm = 2\nmode = "features"', "press")
+    summary = canprobe.run(scene, bus="direct", files=False).summary
     assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.3
 
 
