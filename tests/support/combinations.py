@@ -334,7 +334,7 @@ def draw(seed: int, folder: Path) -> Combination:
 
 
 def _task_of(rng: Random, kind: str, text: str, folder: Path, radius: float) -> str:
-    duration = {"free": 2, "listen": 1, "press": 1}.get(kind, 3)
+    duration = {"free": 2, "scan": 2}.get(kind, 1)
     if kind in ("free", "listen"):
         return f'\n[task]\nkind = "{kind}"\nduration_s = {duration}\n'
     # the object lies under the probe as it stands in the start posture

@@ -22,17 +22,19 @@ from canprobe.fieldbus.tools.faults.fault import Effect
 
 FREE_CYCLE = 80
 """A cycle in which the arm of `free` moves."""
-HOLD_CYCLE = 480
-"""A cycle in which `press` holds its force."""
+HOLD_CYCLE = 200
+"""A cycle in which `press`, with 200 cycles a second, holds its force."""
+SCAN_CYCLE = 440
+"""A cycle in which `cylinder` and `plane` scan."""
+_SCAN = {"task.clearance_mm": 0.3}
+_QUICK = {"press": {"cycle.rate_hz": 200.0, "task.clearance_mm": 0.05}, "cylinder": _SCAN, "plane": _SCAN}
 
 
 class Injected:
     """A run in which something happens at one cycle; what came of it, and when."""
 
     def __init__(self, name, at, action, *, until=400, own=False, **changes):
-        scene = canprobe.load_scene(name, {"task.duration_s": 3.0})
-        if scene.task.kind in ("press", "scan"):
-            scene = replace(scene, task=replace(scene.task, clearance_mm=0.8))
+        scene = canprobe.load_scene(name, {"task.duration_s": 3.0} | _QUICK.get(name, {}))
         scene = replace(scene, **{k: replace(getattr(scene, k), **v) for k, v in changes.items()})
         self.frames = []
         self.session = Session(scene, RunOptions(say=self._say, observers=(self._hear,)))

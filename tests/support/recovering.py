@@ -9,9 +9,9 @@ from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 
-LOSS_CYCLE = 300
+LOSS_CYCLE = 120
 """Cycle of the loss: the arm moves."""
-HELD_CYCLES = 100
+HELD_CYCLES = 40
 """Cycles of the hold before motion is asked for."""
 
 
@@ -20,7 +20,7 @@ class Way(Controller):
 
     resumable = True
 
-    def __init__(self, cycles=150):
+    def __init__(self, cycles=120):
         self.left, self.q, self.went_on = cycles, None, []
 
     def step(self, measurement):

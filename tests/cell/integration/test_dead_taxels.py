@@ -8,7 +8,13 @@ from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.supervision import Reaction
 from canprobe.errors import PlanError, SafetyStop
 
-SCAN = {"task.duration_s": 2.0, "bus.interface": "direct"}
+SCAN = {
+    "task.duration_s": 1.0,
+    "task.clearance_mm": 0.3,
+    "bus.interface": "direct",
+    "shape.also": [],
+    "scene.figures": False,
+}
 
 
 COLUMNS = pytest.mark.slow(reason="a row is like a column")
@@ -17,7 +23,7 @@ COLUMNS = pytest.mark.slow(reason="a row is like a column")
 @pytest.mark.parametrize("key", ["dead_rows", pytest.param("dead_columns", marks=COLUMNS)])
 def test_a_dead_row_is_named_once_and_the_force_is_right(key):
     """A servo that believed the rest pressed with 2.5 N for 2 N."""
-    result = canprobe.run(canprobe.load_scene("cylinder", SCAN | {f"plant.{key}": [7]}))
+    result = canprobe.run(canprobe.load_scene("cylinder", SCAN | {f"plant.{key}": [7]}), files=False)
     named = [fault for fault in result.summary["faults"] if "of the array reads nothing" in fault]
     assert len(named) == 1
     assert named[0].startswith(
@@ -32,7 +38,7 @@ def test_a_dead_row_is_named_once_and_the_force_is_right(key):
 
 def test_three_dead_rows_under_the_patch_end_the_touch():
     with pytest.raises(SafetyStop, match=r"% of the force lies on taxels that do not measure") as stopped:
-        canprobe.run(canprobe.load_scene("cylinder", SCAN | {"plant.dead_rows": [6, 7, 8]}))
+        canprobe.run(canprobe.load_scene("cylinder", SCAN | {"plant.dead_rows": [6, 7, 8]}), files=False)
     assert BY_KEY["taxels_hidden"].reaction is Reaction.RETREAT
     faults = " ".join(stopped.value.summary["faults"])
     assert all(f"row {number} of the array reads nothing" in faults for number in (6, 7, 8))

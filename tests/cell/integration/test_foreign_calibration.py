@@ -16,7 +16,13 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_shape_tracker, make_task
 from canprobe.mechanics.touch.pad import Pad
 
-SCAN = {"task.duration_s": 5.0, "shape.also": [], "scene.figures": False, "bus.interface": "direct"}
+SCAN = {
+    "task.duration_s": 4.0,
+    "task.clearance_mm": 0.3,
+    "shape.also": [],
+    "scene.figures": False,
+    "bus.interface": "direct",
+}
 SAID = "the array is not as its calibration says"
 
 

@@ -44,14 +44,14 @@ def mixed_plan(makes, folder):
     return make_plan(setup.changed("arm", drives=tuple(drives)))
 
 
-def moved(plan, folder, *, at_cycles=200):
+def moved(plan, folder, *, at_cycles=80):
     """Bring a cell up and move its joints: what was said, how far each joint came (rad), the frames on the bus."""
     said, q = [], []
 
     def controller(measurement):
         q.append(measurement.q)
         k = len(q)
-        return Command(q[0] + SWING * min(1.0, k / 100), done=k > at_cycles)
+        return Command(q[0] + SWING * min(1.0, k / 50), done=k > at_cycles)
 
     with Session(plan, RunOptions(folder, said.append)) as session:
         session.run(controller)
@@ -282,7 +282,7 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
     ],
 )
 def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
-    scene = change(canprobe.load_scene("cylinder", {"cell": cell}), emulate=quirk, scene={"figures": False})
+    scene = change(canprobe.load_scene("press", {"cell": cell}), emulate=quirk, scene={"figures": False})
     with pytest.raises(NodeError, match=told), Session(scene, RunOptions(tmp_path)) as session:
         session.run(lambda _: Command(done=True))
 

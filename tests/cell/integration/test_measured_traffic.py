@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from contextlib import nullcontext
 
 import pytest
 from judged import rules_raised
@@ -30,8 +31,8 @@ def timed(scene, **fields):
 @pytest.fixture(scope="module")
 def press(tmp_path_factory):
     folder = tmp_path_factory.mktemp("press")
-    scene = canprobe.load_scene("press")
-    return undrawn_run(scene, out=folder, duration_s=1.0), folder
+    scene = canprobe.load_scene("press", {"task.clearance_mm": 0.3})
+    return undrawn_run(scene, out=folder, duration_s=0.1), folder
 
 
 def test_a_touch_is_as_planned_to_the_frame(press):
@@ -148,7 +149,7 @@ def real_bus(monkeypatch):
     scene = canprobe.load_scene("free")
     arm = dataclasses.replace(scene.arm, emulated=False)
     scene = dataclasses.replace(scene, arm=arm, bus=dataclasses.replace(scene.bus, interface="socketcan"))
-    scene = canprobe.load_scene(scene, {"task.duration_s": 0.3})
+    scene = canprobe.load_scene(scene, {"task.duration_s": 0.1, "scene.figures": False})
     bus, reports = LockstepBus(VirtualClock()), []
     for node in make_world(canprobe.plan(scene), scene.drives).nodes:
         bus.attach(node)
@@ -160,6 +161,8 @@ def real_bus(monkeypatch):
     monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", open_port)
     monkeypatch.setattr("canprobe.cell.session.buses.MonotonicClock", lambda: bus.clock)
     monkeypatch.setattr("canprobe.cell.session.buses.check_links", lambda *_: None)
+    monkeypatch.setattr("canprobe.cell.session.session.garbage_collection_paused", lambda **_: nullcontext())
+    monkeypatch.setattr("canprobe.cell.session.session.rehearse", lambda _: None)
     return scene, reports
 
 

@@ -16,6 +16,7 @@ from canprobe.cell.master.controller import Command
 from canprobe.cell.npz import read_npz
 from canprobe.cell.results import summary as results
 from canprobe.cell.session import folder as recording
+from canprobe.cell.session.session import with_bridges
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
@@ -46,11 +47,11 @@ def nod(measurement):
 
 
 def test_a_controller_of_ones_own_leaves_what_a_run_leaves(free, tmp_path):
-    with canprobe.open_cell(free, out=tmp_path / "own") as cell:
+    with canprobe.open_cell(undrawn(free), out=tmp_path / "own") as cell:
         result = cell.run(nod)
         with pytest.raises(UsageError, match=r"result\.summary: complete when the block of open_cell is left"):
             _ = result.summary["completed"]
-    task = canprobe.run(free, out=tmp_path / "task", duration_s=0.1)
+    task = undrawn_run(free, out=tmp_path / "task", duration_s=0.1)
     names = {path.name for path in task.out.iterdir()}
     assert names >= FILES and {path.name for path in result.out.iterdir()} == names
     assert result.summary["completed"] and result.summary.keys() == task.summary.keys()
@@ -100,14 +101,18 @@ def test_a_cell_that_is_not_opened_says_how(free):
 
 
 def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys):
-    scene, run = undrawn(free), ["run", "free", "--duration", "0.1", "--out", str(tmp_path)]
+    scene, run = undrawn(free), ["run", "free", "--no-figures", "--duration", "0.1", "--out", str(tmp_path)]
     undrawn_run(free, out=tmp_path, duration_s=0.1)
     (tmp_path / "surface.npz").write_text("of an earlier run")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for call in (canprobe.run, canprobe.open_cell):
         with pytest.raises(UsageError, match="not empty: name another folder for the results"):
             call(scene, out=tmp_path)
-    for words in (run, [*run, "--bus", "socketcan", "--channel", "nobus0"], ["view", *run[1:], "--html", "x.html"]):
+    for words in (
+        run,
+        [*run, "--bus", "socketcan", "--channel", "nobus0"],
+        ["view", "free", *run[3:], "--html", "x.html"],
+    ):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"canprobe: {tmp_path}: not empty") and "--force" in line
@@ -236,9 +241,9 @@ def test_the_scene_is_there_as_soon_as_the_log(free, tmp_path):
         assert canprobe.load_scene(tmp_path / "scene.toml").name == "free"
 
 
-def test_one_bridge_may_be_named_as_it_is(free, tmp_path):
-    undrawn_run(free, out=tmp_path, duration_s=0.1, bridge="mcap")
-    assert (tmp_path / "run.mcap").stat().st_size > 0
+def test_one_bridge_may_be_named_as_it_is(free):
+    assert with_bridges(free, "mcap").bridge.use == with_bridges(free, ["mcap"]).bridge.use == ("mcap",)
+    assert canprobe.open_cell(free, bridge="mcap").plan.scene.bridge.use == ("mcap",)
 
 
 @pytest.mark.parametrize("name", ["log.npz", "summary.json"])

@@ -39,7 +39,7 @@ class Stalls(Wrapped):
 
 @pytest.fixture(scope="module")
 def stalled() -> tuple[Session, Stalls]:
-    scene = canprobe.load_scene("cylinder", {"task.duration_s": 2.0})
+    scene = canprobe.load_scene("cylinder", {"task.duration_s": 1.5, "task.clearance_mm": 0.3})
     session = Session(scene)
     controller = Stalls(session, EVERY)
     with session:
@@ -85,9 +85,9 @@ def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Sta
 
 # Stalls up to the limit of `--patient`, each with TPDOs lost behind it: the force of the touch stays below its limit.
 
-FIRST, SPACING = 850, 36
+FIRST, SPACING = 450, 36
 STALLS_MS = (15, 45, int((PATIENT_SYNCS - 1) * 2.5))
-LOST, JOINTS = (0, 1, 3), ((1,), (3,), (4, 5, 6), (1, 2, 3, 4, 5, 6))
+LOST, JOINTS = (0, 1, 3), ((3,), (4, 5, 6), (1, 2, 3, 4, 5, 6))
 EPISODES = [
     (stall_ms, lost, joints)
     for stall_ms, lost, joints in product(STALLS_MS, LOST, JOINTS)

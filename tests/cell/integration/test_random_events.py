@@ -190,4 +190,4 @@ class CellUnderFaults(RuleBasedStateMachine):
 
 
 TestCellUnderFaults = CellUnderFaults.TestCase
-TestCellUnderFaults.settings = hypothesis.settings(max_examples=12, stateful_step_count=15)
+TestCellUnderFaults.settings = hypothesis.settings(max_examples=6, stateful_step_count=15)

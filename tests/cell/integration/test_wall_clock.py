@@ -21,7 +21,7 @@ from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import NMT_ID, SYNC_ID
 
-SHORT = {"task.duration_s": 0.2, "task.clearance_mm": 0.5}
+SHORT = {"task.duration_s": 0.1, "task.clearance_mm": 0.1, "cycle.rate_hz": 200.0}
 HOUR_NS = 3_600_000_000_000
 WALL_NS = 1_700_000_000_000_000_000
 
@@ -92,16 +92,13 @@ def test_a_wall_clock_that_is_set_in_each_phase_changes_nothing(run_with):
             times[phase.name] = round(1e9 * log["t_s"][during[len(during) // 2]]) + 300_000
     times["stop"] = (next(t_ns for t_ns, can_id in sent if t_ns > syncs[-1] and can_id == NMT_ID) + syncs[-1]) // 2
     assert {"listen", "bring-up", "APPROACH", "stop"} < times.keys() and len(times) >= 7, times
-    for sign in (1, -1):
-        steps = [
-            (t_ns, sign * (-1) ** number * HOUR_NS) for number, t_ns in enumerate(sorted(times.values()))
-        ]  # alternately
-        stepped, found, _ = run_with(f"set{sign}", steps)
-        assert found["completed"] and found["cycle"]["clock_steps"] == len(times)
-        assert found["cycle"]["missed_pdos"] == 0
-        assert stepped.keys() == log.keys()
-        for column, values in log.items():
-            np.testing.assert_array_equal(stepped[column], values, err_msg=column)
+    steps = [(t_ns, (-1) ** number * HOUR_NS) for number, t_ns in enumerate(sorted(times.values()))]  # alternately
+    stepped, found, _ = run_with("set", steps)
+    assert found["completed"] and found["cycle"]["clock_steps"] == len(times)
+    assert found["cycle"]["missed_pdos"] == 0
+    assert stepped.keys() == log.keys()
+    for column, values in log.items():
+        np.testing.assert_array_equal(stepped[column], values, err_msg=column)
     to_and_fro = []
     for number, t_ns in enumerate(sorted(times.values())):  # frames of one look, between two others
         step = (-1) ** number * HOUR_NS

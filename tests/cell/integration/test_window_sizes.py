@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from undrawn import undrawn_run
 
 import canprobe
 import canprobe.fieldbus.eds.packaged
@@ -33,13 +34,17 @@ def tactile(plan):
 
 @pytest.fixture(scope="module")
 def press():
-    return change(canprobe.load_scene("press"), arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"})
+    return change(
+        canprobe.load_scene("press", {"task.clearance_mm": 0.3}),
+        arm={"grouped_rpdo": True},
+        bus={"cob_ids": "by_deadline"},
+    )
 
 
 @pytest.mark.parametrize("side", [10])
 def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
     scene = change(press, sensor={"window": side})
-    result = canprobe.run(scene, out=tmp_path, duration_s=0.4)
+    result = undrawn_run(scene, out=tmp_path, duration_s=0.1)
     assert len(tactile(result.plan)) == PDOS[side]
     measured = canprobe.measure_traffic(tmp_path, result.plan)
     assert measured.as_planned and measured.unlisted == {} and measured.missing == ()
@@ -86,31 +91,31 @@ def test_the_smallest_that_holds_the_patch_comes_first_then_smaller_then_larger_
 
 
 def test_auto_takes_what_fits_and_says_why():
-    cylinder = change(canprobe.load_scene("cylinder"), sensor={"window": "auto"})
-    full = canprobe.plan(cylinder)
+    press = change(canprobe.load_scene("press"), sensor={"window": "auto"})
+    full = canprobe.plan(press)
     assert full.scene.sensor.window == 10
     assert "motor torque (6077h)" in dict(full.left_out), "it goes before the window is cut"
-    tight = canprobe.plan(change(cylinder, cycle={"rate_hz": 1e6 / 2400}, sensor={"rate_hz": 1e6 / 4800}))
+    tight = canprobe.plan(change(press, cycle={"rate_hz": 1e6 / 2400}, sensor={"rate_hz": 1e6 / 4800}))
     assert tight.scene.sensor.window == 8
     assert "the largest that fits, cutting its rim" in tight.choices[0].why
     assert "motor torque (6077h)" not in dict(tight.left_out)
-    grouped = canprobe.plan(change(cylinder, arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"}))
+    grouped = canprobe.plan(change(press, arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"}))
     assert grouped.scene.sensor.window == 10 and len(tactile(grouped)) == 14
     assert "the smallest that holds it" in grouped.choices[0].why
     listening = canprobe.plan(change(canprobe.load_scene("listen"), sensor={"mode": "window", "window": "auto"}))
     assert listening.scene.sensor.window == 12
-    features = canprobe.plan(change(cylinder, sensor={"mode": "features"}))
+    features = canprobe.plan(change(press, sensor={"mode": "features"}))
     assert features.choices == (), "there is no window to choose"
 
 
 def test_what_does_not_fit_names_the_windows_that_do():
     with pytest.raises(PlanError, match=r"5695 µs of the 5000 µs in 2 cycles") as refused:
-        canprobe.plan(change(canprobe.load_scene("cylinder"), sensor={"window": 12}))
+        canprobe.plan(change(canprobe.load_scene("press"), sensor={"window": 12}))
     assert any(way.startswith("sensor.window = 8: load 8") for way in refused.value.ways_out)
 
 
 def test_on_can_fd_every_word_of_every_window_has_its_place():
-    scene = change(canprobe.load_scene("cylinder"), sensor={"eds": "tactile_array_fd.eds"}, bus={"fd": True})
+    scene = change(canprobe.load_scene("press"), sensor={"eds": "tactile_array_fd.eds"}, bus={"fd": True})
     lengths = {4: [8, 16], 6: [8, 32, 8], 8: [8, 64], 10: [8, 64, 32, 8], 12: [8, 64, 64, 16]}
     for side, expected in lengths.items():
         plan = canprobe.plan(change(scene, sensor={"window": side}))
@@ -131,7 +136,8 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
     )
     path = tmp_path / "older.eds"
     path.write_text(older)
-    scene = change(canprobe.load_scene("press"), sensor={"eds": str(path), "window": "auto"})
+    scene = canprobe.load_scene("press", {"task.clearance_mm": 0.3})
+    scene = change(scene, sensor={"eds": str(path), "window": "auto"})
     plan = canprobe.plan(scene)
     assert plan.scene.sensor.window == 8
     assert ("another window", f"{path} has no window size (2008h), so the window keeps 8×8 taxels") in (

@@ -657,7 +657,7 @@ def test_drives_whose_file_has_oddities_that_nobody_uses_are_planned_and_run(tmp
 @pytest.mark.parametrize("fixed", [True, False])
 def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
     scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=fixed)
-    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.1)
     assert result.summary["completed"] and result.summary["faults"] == []
     assert {"q_rad", "statusword"} <= set(result.log) and "torque_permille" not in result.log
     assert any(line.startswith("motor torque (torque_permille of log.npz): ") for line in result.summary["left_out"])
@@ -737,8 +737,8 @@ def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):
     plan = canprobe.plan(scene)
     (write,) = [one for one in make_configurations(plan)[0].writes if one.index == 0x1006 and one.value]
     assert (write.value, write.absence, plan.nodes[0].interpolation) == (2500, None, ())
-    told = undrawn_run(canprobe.load_scene("free"), out=tmp_path / "told", duration_s=0.5)
-    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    told = undrawn_run(canprobe.load_scene("free"), out=tmp_path / "told", duration_s=0.3)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.3)
     assert result.summary["completed"] and result.summary["faults"] == []
     assert np.ptp(result.truth["q_rad"][:, 5]) > 0.01
     assert np.array_equal(result.truth["q_rad"], told.truth["q_rad"]), "as the drive that is given 60C2h"

@@ -399,7 +399,7 @@ def test_without_profile_position_the_joint_is_left_at_its_switch(tmp_path):
     make = MAKES["late_target"]()
     changed(make.objects, 0x6502, 0, default=1 << 7 | 1 << 5)
     eds = {"eds": str(write_eds(make, tmp_path)), "emulated": False}
-    bench = Bench(change(scene_of([18], homing_speed_deg_s=20.0), arm=eds, cycle={"rate_hz": 333.333}), tmp_path)
+    bench = Bench(change(scene_of([18], homing_speed_deg_s=60.0), arm=eds, cycle={"rate_hz": 333.333}), tmp_path)
     (told,) = bench.home()
     assert told.endswith("it stands there, outside its range: move it inside by hand before a run")
 

@@ -31,8 +31,8 @@ from canprobe.fieldbus.protocol.response_times import Message, worst_case_respon
 
 
 @pytest.fixture(scope="module")
-def cylinder():
-    return load_scene("cylinder")
+def press():
+    return load_scene("press")
 
 
 def opened_plan(scene):
@@ -43,23 +43,23 @@ def chosen(plan):
     return {choice.key: choice.written for choice in plan.choices}
 
 
-def test_what_fits_is_left_as_the_contract_has_it(cylinder):
-    plan = opened_plan(cylinder)
-    assert plan.pdos == canprobe.plan(cylinder).pdos
+def test_what_fits_is_left_as_the_contract_has_it(press):
+    plan = opened_plan(press)
+    assert plan.pdos == canprobe.plan(press).pdos
     assert chosen(plan) == {
         "sensor.channel": '"can0"', "bus.fd": "false", "arm.grouped_rpdo": "false", "bus.cob_ids": '"default"',
     }  # fmt: skip
-    assert not canprobe.plan(cylinder).choices
+    assert not canprobe.plan(press).choices
 
 
-def test_the_packaged_scenes_leave_nothing_open(cylinder):
-    assert '"auto"' not in dump_scene(cylinder)
-    assert canprobe.plan(cylinder).scene == cylinder
+def test_the_packaged_scenes_leave_nothing_open(press):
+    assert '"auto"' not in dump_scene(press)
+    assert canprobe.plan(press).scene == press
 
 
-def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
+def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(press):
     """Neither alone is enough: the planner finds the pair, which costs no hardware."""
-    scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
+    scene = change(press, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
     for half in ({"arm": {"grouped_rpdo": True}}, {"bus": {"cob_ids": "by_deadline"}}):
         with pytest.raises(PlanError):
             canprobe.plan(change(scene, **half))
@@ -69,8 +69,8 @@ def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
     assert len(plan.buses) == 1
 
 
-def test_ways_out_name_changes_that_fit_only_together(cylinder):
-    scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
+def test_ways_out_name_changes_that_fit_only_together(press):
+    scene = change(press, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
     with pytest.raises(PlanError) as refused:
         canprobe.plan(scene)
     ways = refused.value.ways_out
@@ -78,8 +78,8 @@ def test_ways_out_name_changes_that_fit_only_together(cylinder):
     assert not any(way.startswith("arm.grouped_rpdo = true: ") for way in ways)  # alone it does not
 
 
-def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(cylinder):
-    image = change(cylinder, sensor={"mode": "image"})
+def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(press):
+    image = change(press, sensor={"mode": "image"})
     split = opened_plan(image)
     assert [(bus.channel, bus.node_ids) for bus in split.buses] == [("can0", (1, 2, 3, 4, 5, 6)), ("can1", (16,))]
     assert {pdo.channel for pdo in split.pdos if pdo.kind == "tactile"} == {"can1"}
@@ -88,31 +88,31 @@ def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(cylinder):
     assert len(fd.buses) == 1 and fd.scene.bus.fd is True and chosen(fd)["bus.fd"] == "true"
 
 
-def test_what_is_written_is_kept(cylinder):
-    scene = change(cylinder, sensor={"mode": "image", "channel": "auto"}, bus={"fd": "auto"})
+def test_what_is_written_is_kept(press):
+    scene = change(press, sensor={"mode": "image", "channel": "auto"}, bus={"fd": "auto"})
     assert canprobe.plan(scene).scene.arm.grouped_rpdo is False
     with pytest.raises(PlanError, match="none of 2 ways"):
         canprobe.plan(change(scene, sensor={"channel": "can0"}, arm={"grouped_rpdo": "auto"}, bus={"fd": False}))
 
 
-def test_the_sensor_gives_less_last_of_all(cylinder):
-    assert canprobe.plan(change(cylinder, sensor={"mode": "auto"})).scene.sensor.mode == "window"
-    fast = change(cylinder, cycle={"rate_hz": 1e6 / 2100}, sensor={"rate_hz": 1e6 / 4200, "mode": "auto"})
+def test_the_sensor_gives_less_last_of_all(press):
+    assert canprobe.plan(change(press, sensor={"mode": "auto"})).scene.sensor.mode == "window"
+    fast = change(press, cycle={"rate_hz": 1e6 / 2100}, sensor={"rate_hz": 1e6 / 4200, "mode": "auto"})
     assert canprobe.plan(fast).scene.sensor.mode == "features"
     assert opened_plan(fast).scene.sensor.mode == "window"
     assert canprobe.plan(change(load_scene("listen"), sensor={"mode": "auto"})).scene.sensor.mode == "image"
 
 
-def test_nothing_fits_says_how_many_were_tried_and_what_would(cylinder):
+def test_nothing_fits_says_how_many_were_tried_and_what_would(press):
     with pytest.raises(PlanError) as refused:
-        opened_plan(change(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"}))
+        opened_plan(change(press, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"}))
     first, *_, last = refused.value.problems
     assert first.startswith("none of 32 ways to fill what is left open fits; the nearest: sensor.mode = ")
     assert "1280 µs of the 1000 µs" in last and refused.value.ways_out[0].startswith("cycle.rate_hz = ")
 
 
-def test_priorities_follow_the_deadlines_and_are_never_restricted(cylinder):
-    grouped = change(cylinder, arm={"grouped_rpdo": True})
+def test_priorities_follow_the_deadlines_and_are_never_restricted(press):
+    grouped = change(press, arm={"grouped_rpdo": True})
     default, ordered = canprobe.plan(grouped), canprobe.plan(change(grouped, bus={"cob_ids": "by_deadline"}))
     by_id = sorted(ordered.pdos, key=lambda pdo: pdo.cob_id)
     assert [pdo.deadline_ns for pdo in by_id] == sorted(pdo.deadline_ns for pdo in ordered.pdos)
@@ -142,8 +142,8 @@ def test_deadline_order_fits_where_the_default_order_does_not():
     assert late([*patient, urgent]) == ["urgent"] and not late([urgent, *patient])
 
 
-def test_order_by_deadline_twice_changes_nothing(cylinder):
-    once = order_by_deadline(canprobe.plan(cylinder).pdos)
+def test_order_by_deadline_twice_changes_nothing(press):
+    once = order_by_deadline(canprobe.plan(press).pdos)
     assert order_by_deadline(once) == once
 
 
@@ -172,10 +172,10 @@ def test_open_keys_in_the_file(line, complaint):
 
 
 def test_the_command_opens_what_stands_at_its_default(capsys):
-    assert main(["plan", "cylinder", "--auto", "--json"]) == 0
+    assert main(["plan", "press", "--auto", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert {"key": "bus.fd", "value": "false", "why": "classical frames do"} in document["choices"]
-    assert main(["plan", "cylinder", "--auto", "--full"]) == 0
+    assert main(["plan", "press", "--auto", "--full"]) == 0
     assert "chosen by the plan:" in capsys.readouterr().out
 
 

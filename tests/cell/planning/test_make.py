@@ -70,8 +70,7 @@ def test_the_patch_is_left_out_where_it_is_switched_off_or_no_taxels_are_sent():
 
 
 def test_switches_of_the_plant_are_listed():
-    cylinder = load_scene("cylinder")
-    quiet = change(cylinder, plant={"noise": False, "creep": False})
+    quiet = change(load_scene("press"), plant={"noise": False, "creep": False})
     left = dict(canprobe.plan(quiet).left_out)
     assert left["taxel noise"] == "plant.noise = false"
     assert "taxel creep" in left
@@ -139,7 +138,7 @@ def test_public_name_is_the_function():
     assert canprobe.plan(canprobe.load_scene("free")).scene.name == "free"
 
 
-@pytest.mark.parametrize("argv", [["--help"], ["plan", "cylinder"], ["scenes"], ["run", "--help"]])
+@pytest.mark.parametrize("argv", [["--help"], ["plan", "press"], ["scenes"], ["run", "--help"]])
 def test_light_commands_import_neither_scipy_nor_matplotlib(argv):
     code = (
         "import sys; from canprobe.cli import main; status = main(sys.argv[1:]); "
@@ -169,7 +168,7 @@ def test_help_imports_not_even_numpy():
     ids=["no bodies", "no extra"],
 )
 def test_a_dynamic_arm_that_cannot_be_emulated_is_refused(monkeypatch, changes, match):
-    setup = resolve(load_scene("cylinder"))
+    setup = resolve(load_scene("press"))
     setup = replace(setup, truth=replace(setup.truth, fidelity="dynamic", **changes))
     monkeypatch.setattr("canprobe.mechanics.robot.dynamics.importlib.util.find_spec", lambda name: None)
     with pytest.raises(canprobe.PlanError, match=match):

@@ -87,18 +87,18 @@ def test_rows_for_a_terminal(plan):
 
 
 def test_the_command_draws_and_prints_it(tmp_path, capsys):
-    assert main(["plan", "cylinder", "--figure", str(tmp_path / "plan.png")]) == 0
+    assert main(["plan", "press", "--figure", str(tmp_path / "plan.png")]) == 0
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["plan", "cylinder", "--figure", str(tmp_path / "bare")]) == 0
+    assert main(["plan", "press", "--figure", str(tmp_path / "bare")]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "bare.png") and (tmp_path / "bare.png").is_file()
-    assert main(["plan", "cylinder", "--figure", str(tmp_path / "plan.xyz")]) == 2
+    assert main(["plan", "press", "--figure", str(tmp_path / "plan.xyz")]) == 2
     capsys.readouterr()
-    assert main(["plan", "cylinder", "--json"]) == 0
+    assert main(["plan", "press", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["timeline"][0] == {
         "part": "SYNC", "channel": "can0", "cob_id": 0x80, "cycle": 0, "start_us": 0.0, "end_us": 65.0,
     }  # fmt: skip
     pdo = document["pdos"][0]
     assert pdo["slack_us"] == pdo["deadline_us"] - pdo["response_us"]
-    assert main(["plan", "cylinder", "--full"]) == 0
+    assert main(["plan", "press", "--full"]) == 0
     assert "cycle 2  can0        SSS" in capsys.readouterr().out

@@ -41,14 +41,14 @@ def test_what_shares_a_queue_shares_its_worst_case():
 
 
 def test_the_default_cell_does_not_fit_and_says_what_would():
-    error = refused(fifo("cylinder"))
+    error = refused(fifo("press"))
     assert "every node's oldest frame first: worst-case response time of SYNC is without bound" in error.problems[0]
     assert error.ways_out[0].startswith("controllers that send their most urgent frame first")
 
 
 @pytest.mark.parametrize("name, cycle", [("free", {"rate_hz": 125.0}), ("listen", {})])
 def test_no_frame_of_a_run_is_later_than_planned(name, cycle, tmp_path):
-    result = undrawn_run(fifo(name, **({"cycle": cycle} if cycle else {})), out=tmp_path, duration_s=1.0)
+    result = undrawn_run(fifo(name, **({"cycle": cycle} if cycle else {})), out=tmp_path, duration_s=0.3)
     measured = canprobe.measure_traffic(tmp_path, result.plan)
     assert measured.as_planned
     behind_sync = [one for one in measured.classes if one.slowest is not None]

@@ -366,12 +366,11 @@ def pressed(made, force_n, fidelity, friction):
     if made is puma:
         c = replace(c, bodies=BODIES["puma260"])
     plant = Plant(replace(c, fidelity=fidelity, dynamics=Dynamics(friction=0.3 * friction)))
-    plant.advance(1_500_000_000)
+    plant.advance(800_000_000)
     return plant
 
 
-@pytest.mark.parametrize("force_n", [3.0, 30.0])
-@pytest.mark.parametrize("made", [puma, seven, gantry])
+@pytest.mark.parametrize(("made", "force_n"), [(puma, 3.0), (seven, 30.0), (gantry, 30.0)])
 def test_both_arms_report_the_torque_against_a_push(made, force_n):
     """At rest the dynamic arm's torque is weight less push, but for what friction carries; the ideal one has no weight.
 

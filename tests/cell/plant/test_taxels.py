@@ -70,8 +70,9 @@ def test_pressure_sum_is_the_force(kappa, force, uv):
     assert total == pytest.approx(force, rel=0.015)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.5, 1.2, 2.5])
-@pytest.mark.parametrize("uv", [(0.0, 0.0), (3e-3, 1e-3), (-2e-3, 4e-3)])
+@pytest.mark.parametrize(
+    ("uv", "angle"), [((0.0, 0.0), 0.0), ((0.0, 0.0), 0.5), ((3e-3, 1e-3), 1.2), ((-2e-3, 4e-3), 2.5)]
+)
 def test_pressure_is_the_overlap_of_the_exact_bodies(uv, angle):
     """Probe sphere against a round cylinder in the pad frame, taxel by taxel, without blur."""
     radius, depth = 0.036, 0.4e-3

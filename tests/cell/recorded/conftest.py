@@ -99,6 +99,12 @@ def lockstep_run(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def replayed_log(lockstep_run):
+    """The replay of its log alone."""
+    return canprobe.replay(lockstep_run.out / "bus.log", scene=lockstep_run.plan.scene)
+
+
+@pytest.fixture(scope="session")
 def motion_run(tmp_path_factory):
     """The same without the contact patch, whose share in an answer is taken or left: a small change may decide it."""
     return undrawn_run(short_scan(patch=False), out=tmp_path_factory.mktemp("recorded") / "motion")

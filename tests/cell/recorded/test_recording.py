@@ -55,13 +55,9 @@ def stepped(lines, *steps_us):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(lockstep_run):
+def undisturbed(lockstep_run, replayed_log):
     """The replay and the traffic of the log as it is."""
-    log = lockstep_run.out / "bus.log"
-    return (
-        canprobe.replay(log, scene=lockstep_run.plan.scene),
-        canprobe.measure_traffic(log, lockstep_run.plan, exact=False),
-    )
+    return replayed_log, canprobe.measure_traffic(lockstep_run.out / "bus.log", lockstep_run.plan, exact=False)
 
 
 OTHER_STEPS = pytest.mark.slow(reason="other steps of the same clock")
@@ -73,7 +69,7 @@ OTHER_STEPS = pytest.mark.slow(reason="other steps of the same clock")
         (-5_000,),
         pytest.param((-20_000,), marks=OTHER_STEPS),
         pytest.param((-3_600_000_000,), marks=OTHER_STEPS),
-        (86_400_000_000,),
+        pytest.param((86_400_000_000,), marks=OTHER_STEPS),
         (-2_000_000, -7_000_000),
     ],
     ids=lambda steps: "_".join(map(str, steps)),
@@ -137,11 +133,10 @@ def test_lines_in_another_order_are_no_step_of_the_clock(lockstep_run, tmp_path)
     ("change", "message"),
     [
         (lambda us, n, before: us - 5_000_000 * (5000 <= n < 5020), r"log:50\d\d: the SYNC of can0 is .* to and fro"),
-        (lambda us, n, before: us + 5_000_000 * (5000 <= n < 5020), r"log:50\d\d: the SYNC of can0 is .* to and fro"),
         (lambda us, n, before: us - before, "differences from line to line .*candump -td"),
         (lambda us, n, before: 0, "all the same, as candump -H"),
     ],
-    ids=["back and forth", "forth and back", "delta", "none"],
+    ids=["back and forth", "delta", "none"],
 )
 def test_stamps_that_cannot_be_mended_are_refused(lockstep_run, tmp_path, change, message):
     log = tmp_path / "odd.log"

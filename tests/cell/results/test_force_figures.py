@@ -10,7 +10,7 @@ from canprobe.cell.results.text import force_lines, summary_text
 
 @pytest.fixture(scope="module")
 def result():
-    return canprobe.run(canprobe.load_scene("press", {"task.duration_s": 1.0}), bus="direct")
+    return canprobe.run("press", {"task.clearance_mm": 0.3}, bus="direct", duration_s=1.0, files=False)
 
 
 def test_the_error_of_the_force_is_measured_less_true(result):

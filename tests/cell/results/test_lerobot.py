@@ -22,7 +22,7 @@ ROW = "data/chunk-000/file-000.parquet"
 def folders(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     for seed in (0, 1):
-        scene = canprobe.load_scene("cylinder", {**SHORT, "bus.interface": "lockstep"})
+        scene = canprobe.load_scene("cylinder", {**SHORT, "bus.interface": "lockstep", "shape.also": []})
         canprobe.run(scene, seed=seed, out=folder / f"scan{seed}")
     canprobe.run(canprobe.load_scene("free", SHORT), out=folder / "free", bus="direct")
     return folder

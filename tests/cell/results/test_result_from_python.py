@@ -15,8 +15,8 @@ from canprobe.mechanics.touch.contact import Doubt
 
 @pytest.fixture(scope="module")
 def result():
-    quick = {"task.clearance_mm": 0.5, "shape.also": ["ml"]}
-    return canprobe.run("cylinder", quick, bus="direct", duration_s=2.0, files=False)
+    quick = {"task.clearance_mm": 0.2, "shape.also": ["ml"]}
+    return canprobe.run("cylinder", quick, bus="direct", duration_s=1.7, files=False)
 
 
 class LastSphere:

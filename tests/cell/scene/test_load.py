@@ -233,7 +233,7 @@ def test_default_scene_is_the_papers_experiment():
     assert scene.task.duration_s >= 20
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(title=st.text(), seed=st.integers(0, 2**63 - 1), force=st.floats(0.001, 4.9), x=st.floats(-1e3, 1e3))
 def test_any_values_survive_the_way_back(title, seed, force, x):
     scene = parse_scene(SCAN)

@@ -17,6 +17,7 @@ from canprobe.errors import SceneError, UsageError
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "own-package.md").read_text(encoding="utf-8")
 EXAMPLE = dict(re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```$', PAGE, re.S | re.M))
+QUICK = {"task.clearance_mm": 0.2, "shape.also": []}
 FREE = '[scene]\nname = "lab-free"\ntitle = "As free"\n[task]\nkind = "free"\n[arm]\n'
 
 
@@ -139,7 +140,7 @@ def test_a_name_of_canprobe_stays_its_own(install, capsys):
     assert main(["cells"]) == 0
     assert re.search(r"lab:puma260 +Another one +of the package lab", capsys.readouterr().out)
     overrides = {"shape.method": "ml", "shape.also": []}
-    assert canprobe.run("sphere", overrides, bus="direct", duration_s=0.3, files=False).summary["completed"]
+    assert canprobe.run("sphere", overrides | QUICK, bus="direct", duration_s=0.1, files=False).summary["completed"]
 
 
 MINE = """class Mine:
@@ -162,7 +163,7 @@ MINE = """class Mine:
 def test_a_broken_estimator_is_named(install, code, why):
     install("lab", [("estimators", "lab-fit", "lab_fits:Mine")], {"lab_fits.py": code})
     with pytest.raises(UsageError, match="estimator lab-fit of the package lab: ") as error:
-        canprobe.run("sphere", {"shape.method": "lab-fit"}, bus="direct", duration_s=1.0, files=False)
+        canprobe.run("sphere", {"shape.method": "lab-fit"} | QUICK, bus="direct", duration_s=0.5, files=False)
     assert why in str(error.value)
 
 

@@ -171,7 +171,7 @@ BINARY = pytest.mark.slow(reason="the binary form of the same kind")
         *(pytest.param(name, marks=BINARY) for name in ("b.stl", "b.ply")),
     ],
 )
-def test_of_thirty_damaged_files_each_is_read_or_named(name, tmp_path):
+def test_of_fifteen_damaged_files_each_is_read_or_named(name, tmp_path):
     if name.startswith("b") or not name.endswith(("npy", "npz", "csv", "txt")):
         trimesh = pytest.importorskip("trimesh")
         whole = trimesh.load_mesh(cap(tmp_path, name).file, process=False)
@@ -183,7 +183,7 @@ def test_of_thirty_damaged_files_each_is_read_or_named(name, tmp_path):
         content = Path(write(tmp_path, name, BUMP_MM, spacing=1.0)).read_bytes()
         settings = ObjectSettings("heights", spacing_mm=1.0)
     rng, named = np.random.default_rng(0), 0
-    for number in range(30):
+    for number in range(15):
         path = tmp_path / f"odd{number}.{name[2:]}"
         path.write_bytes(damaged(content, rng))
         try:
@@ -191,7 +191,7 @@ def test_of_thirty_damaged_files_each_is_read_or_named(name, tmp_path):
         except ValueError as error:
             assert str(error).startswith(f"file: {path.name}"), error
             named += 1
-    assert named > 10
+    assert named > 5
 
 
 def test_a_decimal_comma_between_semicolons(tmp_path):
@@ -285,7 +285,7 @@ def test_what_is_said_about_a_mesh_that_cannot_be_taken(tmp_path, monkeypatch):
 
 
 def test_a_saved_scene_takes_its_heights_along(tmp_path):
-    scene = load_scene("relief")
+    scene = load_scene("relief", {"task.length_mm": 4.0, "task.width_mm": 2.0})
     write_scene(canprobe.plan(scene), tmp_path)
     assert (tmp_path / "relief.npz").is_file()
     there = load_scene(tmp_path / "scene.toml")
@@ -344,6 +344,7 @@ def test_a_probe_that_leaves_a_mesh_is_stopped_and_touches_nothing_beyond(tmp_pa
     (tmp_path / "longer.toml").write_text(longer)
     changes = {"object.origin_mm": "[0, 18.4]", "plant.true_cell": '"longer.toml"', "scene.figures": "false"}
     changes |= {"task.heading_deg": 90, "task.length_mm": 10, "object.rotation_deg": "[0, 0, 0]"}
+    changes["shape.also"] = "[]"
     words = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
     scene, out = Path(dome(tmp_path, True)), tmp_path / "run"
     scene.write_text(scene.read_text().replace("width_mm = 2", 'strategy = "straight"'))

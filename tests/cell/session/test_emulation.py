@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 
 import pytest
 
@@ -23,9 +24,8 @@ def served(monkeypatch):
         bus = LockstepBus(VirtualClock())
         monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
         monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
-        monkeypatch.setattr(
-            "canprobe.cell.session.emulation.ask_for_processor", lambda: False
-        )  # not for the tests' own process
+        for name, stand_in in (("ask_for_processor", lambda: False), ("garbage_collection_paused", nullcontext)):
+            monkeypatch.setattr(f"canprobe.cell.session.emulation.{name}", stand_in)  # not for the tests' own process
 
         def serve(buses, stop, **_):
             emulate.look = stop
@@ -108,9 +108,14 @@ def test_stored_values_are_there_again_each_with_its_node(served, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("channel", "wide"), [("239.74.163.2", True), ("ff15::1", True), (LOCAL_GROUP, False), ("ff01::2", False)]
+    ("channel", "wide", "what"),
+    [
+        ("239.74.163.2", True, ("free", "--nodes", "1")),
+        ("ff15::1", True, ("--eds", "puma260_joint", "--node-id", "1")),
+        (LOCAL_GROUP, False, ("free", "--nodes", "1")),
+        ("ff01::2", False, ("--eds", "puma260_joint", "--node-id", "1")),
+    ],
 )
-@pytest.mark.parametrize("what", [("free", "--nodes", "1"), ("--eds", "puma260_joint", "--node-id", "1")])
 def test_nodes_that_other_machines_reach_are_served_with_the_warning_of_a_run(served, capsys, what, channel, wide):
     assert served(lambda _: None, "--bus", "udp_multicast", "--channel", channel, what=what) == 0
     warned = (

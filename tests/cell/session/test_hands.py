@@ -19,7 +19,7 @@ READY = [80.0, 70.0, 10.0, 5.0, 90.0, 20.0]
 
 
 def cell(scene="puma260", out=None, **changes):
-    keys = {"postures.ready": READY} if scene == "puma260" else {}
+    keys = {"bus.timed": False, "scene.figures": False} | ({"postures.ready": READY} if scene == "puma260" else {})
     return canprobe.open_cell(
         scene, {**keys, **{key.replace("__", "."): value for key, value in changes.items()}}, bus="lockstep", out=out
     )
@@ -93,14 +93,14 @@ def test_a_way_through_a_limit_or_a_keep_out_is_refused_with_joint_place_and_tim
 def test_a_jog_of_a_joint_and_of_the_probe_goes_its_way():
     with cell() as opened:
         q0 = opened.read().q
-        opened.jog(3, velocity=np.radians(-5.0), for_s=1.0)
+        opened.jog(3, velocity=np.radians(-20.0), for_s=0.25)
         q1 = opened.read().q
         np.testing.assert_allclose(np.degrees(q1 - q0), [0, 0, -5, 0, 0, 0], atol=0.02)
         T0 = opened.probe(q1)[0]
-        opened.jog(along=(0, 0, 1), velocity=0.01, for_s=1.0)
+        opened.jog(along=(0, 0, 1), velocity=0.04, for_s=0.25)
         T1 = opened.probe(opened.read().q)[0]
         np.testing.assert_allclose(T1[:3, 3] - T0[:3, 3], [0, 0, 0.01], atol=5e-5)
-        opened.jog(about=(0, 0, 1), velocity=0.2, for_s=0.5, in_probe_frame=True)
+        opened.jog(about=(0, 0, 1), velocity=0.4, for_s=0.25, in_probe_frame=True)
         T2 = opened.probe(opened.read().q)[0]
         np.testing.assert_allclose(T1[:3, :3].T @ T2[:3, :3], turn_z(0.1), atol=1e-3)
         for wrong in ({}, {"joint": 9}, {"joint": 1, "along": (0, 0, 1)}, {"along": (0, 0, 0)}):
@@ -113,12 +113,11 @@ def turn_z(angle):
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
-@pytest.mark.parametrize("fidelity", ["ideal", "dynamic"])
 @pytest.mark.parametrize(
-    "way",
+    ("way", "fidelity"),
     [
-        {"along": (0, 0, 1), "in_probe_frame": True, "velocity": 0.1, "for_s": 1.0},
-        {"joint": 3, "velocity": 0.5, "for_s": 1},
+        ({"along": (0, 0, 1), "in_probe_frame": True, "velocity": 0.1, "for_s": 1.0}, "ideal"),
+        ({"joint": 3, "velocity": 0.5, "for_s": 1}, "dynamic"),
     ],
     ids=["probe", "joint 3"],
 )
@@ -162,13 +161,13 @@ def test_an_arm_that_stands_beyond_a_limit_is_jogged_back_and_no_further_out():
     with cell(joints__joint_3__start_deg=50.0) as opened:
         opened.plan.setup.arm.model.q_max.setflags(write=True)
         opened.plan.setup.arm.model.q_max[2] = np.radians(49.0)  # a stop that was set while the arm stood beyond it
-        assert opened.jog(3, velocity=np.radians(2.0), for_s=0.5) is None
+        assert opened.jog(3, velocity=np.radians(5.0), for_s=0.2) is None
         assert np.degrees(opened.read().q[2]) == pytest.approx(50.0, abs=0.02), "not further out"
-        assert opened.jog(3, velocity=np.radians(-4.0), for_s=1.0) is None
+        assert opened.jog(3, velocity=np.radians(-16.0), for_s=0.25) is None
         assert np.degrees(opened.read().q[2]) == pytest.approx(46.0, abs=0.02)
 
 
-@pytest.mark.parametrize("kind", ["brake-stuck", "freeze", "encoder-frozen", "mute", "sto", "drive-fault", "emcy"])
+@pytest.mark.parametrize("kind", ["brake-stuck", "encoder-frozen", "mute", "drive-fault", "emcy"])
 def test_a_fault_of_a_drive_ends_a_motion(kind):
     """The joint does not follow, or its drive is lost: the cell stops, and stays so until a person's word."""
     opened = cell()

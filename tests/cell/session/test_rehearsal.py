@@ -18,7 +18,7 @@ from canprobe.fieldbus.eds.packaged import eds_path
 MOST_CYCLES = 1200
 
 
-@pytest.mark.parametrize("name", ["cylinder", "press", "calibrate", "free", "listen"])
+@pytest.mark.parametrize("name", ["press", "calibrate", "free", "listen"])
 def test_a_scene_is_done_in_few_cycles(name):
     with Session(shortened(load_scene(name))) as session:
         session.run(make_task(session.plan))
@@ -36,7 +36,7 @@ def test_a_scan_is_felt_estimated_and_left():
             return command
 
         session.run(step)
-    assert sum(answers) >= 3
+    assert sum(answers) >= 3 and len(session.cell.log) < MOST_CYCLES
     phases = set(session.cell.log.arrays()["phase"].tolist())
     assert {Phase.APPROACH, Phase.SETTLE, Phase.SCAN, Phase.RETREAT} <= phases
 
@@ -48,7 +48,7 @@ def test_a_shorter_scene_stays_as_short():
 
 
 def test_what_goes_wrong_in_it_is_of_no_interest():
-    scene = load_scene("cylinder")
+    scene = load_scene("press")
     rehearse(canprobe.plan(replace(scene, limits=replace(scene.limits, force_max_n=2.1))))
 
 

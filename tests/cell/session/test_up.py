@@ -29,6 +29,7 @@ from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, SYNC_ID
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units
 
+SLOW = {"cycle.rate_hz": 100.0, "sensor.rate_hz": 100.0}
 REPORTED = "by its encoders the arm stands at"
 
 
@@ -206,7 +207,7 @@ def test_an_interrupt_between_two_joints_disables_and_reports_what_was_done(cell
     ],
     ids=["gear half", "gear twice", "counts twice", "sign", "does not move"],
 )
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_no_encoder_shows_is_found_by_who_watches(cell, factor, gear_only, fault, seed):
     """Of a joint by chance. A joint with another gear drags those of the wrist along, as its drive counts for them."""
     joint = int(np.random.default_rng((seed, round(100 * abs(factor)))).integers(6))
@@ -221,7 +222,7 @@ def test_what_no_encoder_shows_is_found_by_who_watches(cell, factor, gear_only, 
     assert_disabled(cell.session)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_swapped_drives_are_seen(cell, seed):
     pair = sorted(int(joint) for joint in np.random.default_rng(seed).choice(6, 2, replace=False))
     cell.operator, cell.world = Watcher(seed, pair), true_world(scene(seed=seed), swapped=pair)
@@ -232,7 +233,7 @@ def test_swapped_drives_are_seen(cell, seed):
 OTHER_EYES = pytest.mark.slow(reason="other eyes on the same arm")
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=OTHER_EYES) for seed in range(2, 5))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=OTHER_EYES) for seed in range(1, 5))])
 def test_a_right_arm_is_found_so_by_every_eye(cell, seed):
     cell.operator, cell.world, said = Watcher(seed), true_world(scene(seed=seed)), []
     findings = canprobe.api.check_joints(scene(seed=seed), operator=cell.operator, say=said.append)
@@ -242,9 +243,9 @@ def test_a_right_arm_is_found_so_by_every_eye(cell, seed):
     assert_disabled(cell.session)
 
 
-@pytest.mark.parametrize(("name", "joint"), [("seven-axis", 3), ("gantry", 2), ("puma260", 4)])
+@pytest.mark.parametrize(("name", "joint"), [("seven-axis", 3), ("gantry", 2)])
 def test_each_kind_of_arm_is_checked_in_its_unit(cell, name, joint):
-    """Seven axes, slides in mm, and the wrist whose motors drag each other along."""
+    """Seven axes, and slides in mm."""
     right = scene(name)
     cell.operator, cell.world = Watcher(1, {joint, 0}), true_world(right)
     findings = canprobe.api.check_joints(right, operator=cell.operator)
@@ -404,7 +405,7 @@ def test_a_record_that_cannot_be_written_is_a_warning(cell, state):
 
 def test_what_presses_on_the_array_stops_the_joint_and_is_named(cell):
     """Joint 2 lowers the probe onto the cylinder 6 mm below it."""
-    touching = change(canprobe.load_scene("cylinder"), bus={"timed": False})
+    touching = canprobe.load_scene("press", {"cycle.rate_hz": 200.0, "bus.timed": False})
     forces, said = [], []
 
     class Noting(Obeying):
@@ -426,7 +427,7 @@ def test_what_presses_on_the_array_stops_the_joint_and_is_named(cell):
 
 @pytest.mark.parametrize(("noise", "seen"), [(True, True), (False, False)])
 def test_an_array_of_which_no_image_changes_is_no_witness(cell, noise, seen):
-    quiet = canprobe.load_scene("cylinder", {"bus.timed": False, "plant.noise": noise})
+    quiet = canprobe.load_scene("press", {**SLOW, "bus.timed": False, "plant.noise": noise})
     cell.operator = Watcher(0, {5})
     (finding,) = [one for one in canprobe.api.check_joints(quiet, operator=cell.operator) if one.skipped is None]
     assert finding.seen is not None and (finding.force is not None) == seen

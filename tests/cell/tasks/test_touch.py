@@ -2,7 +2,6 @@
 
 import math
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,7 +63,7 @@ def test_what_is_no_command_cannot_be_requested(kind, value):
 
 @pytest.fixture
 def press():
-    return Session(canprobe.load_scene("press", {"task.duration_s": 3.0}))
+    return Session(canprobe.load_scene("press", {"task.duration_s": 3.0, "task.clearance_mm": 0.3, "bus.timed": False}))
 
 
 def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
@@ -100,8 +99,9 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
 
 def test_a_stop_lets_a_calibration_go_of_its_ball():
     """Stopped in its second touch, it does not leave the probe pressing."""
-    scene = canprobe.load_scene("calibrate")
-    session = Session(replace(scene, bus=replace(scene.bus, timed=False)))
+    session = Session(
+        canprobe.load_scene("calibrate", {"bus.timed": False, "task.touches": 3, "task.clearance_mm": 1.0})
+    )
     queue, task = deque(), make_task(session.plan)
     controller = RequestedTask(task, None, (queue,), 2.5e-3)
 
