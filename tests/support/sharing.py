@@ -73,11 +73,12 @@ def is_worker(config: pytest.Config) -> bool:
 
 
 def count_workers(config: pytest.Config) -> int:
-    """Return one worker a processor; none where a session of its own is quicker, or is what was asked for."""
+    """Return one worker a processor, and one for the tests that wait for the time of a bus; none where a session of
+    its own is quicker, or is what was asked for."""
     processors = len(os.sched_getaffinity(0))
     files_only = all(argument.partition("::")[0].endswith(".py") for argument in config.args)
     by_itself = files_only or config.getoption("capture") == "no" or config.getoption("benchmark_only", False)
-    return 0 if by_itself or processors == 1 else processors
+    return 0 if by_itself or processors == 1 else processors + 1
 
 
 def tell_worker(config: pytest.Config, workerinput: dict[str, Any]) -> None:
