@@ -30,7 +30,7 @@ def typed(folder: Path, *words: str) -> tuple[int, str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run in `first`."""
     folder = tmp_path_factory.mktemp("there")
-    status, said = typed(folder, "run", "cylinder", "--duration", "0.5", "--no-figures", "--out", "first")
+    status, said = typed(folder, "run", "cylinder", "--duration", "0.3", "--no-figures", "--out", "first")
     assert status == 0, said
     return folder
 
@@ -41,7 +41,7 @@ SHORT = ("--duration", "0.2", "--no-figures", "--out")
 @pytest.mark.parametrize(
     "words",
     [
-        ("plan", "cylinder"),
+        ("plan", "press"),
         ("run", "free", "--bus", "direct", *SHORT, "direct"),
         ("init", "cell", "--eds", "puma260_joint"),
         ("replay", "first"),
