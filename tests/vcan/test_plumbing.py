@@ -13,8 +13,7 @@ import pytest
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 SUPPORT = CONFTEST.parent / "support"
 WORKERS = ("-n", "2", "--dist", "loadfile")
-TWO_WORKERS = pytest.mark.slow(reason="the same with two workers, three more sessions of pytest")
-ONE_SESSION = pytest.mark.slow(reason="the same without workers, another session of pytest")
+TWO_WORKERS = pytest.mark.slow(reason="the same with two workers, which the suite itself has")
 ALLOWED = pytest.mark.slow(reason="another session of pytest, for skips that are allowed")
 
 ADDED = """
@@ -122,7 +121,7 @@ def counts(output: str) -> dict[str, int]:
     return {word.rstrip("s"): int(number) for number, word in re.findall(r"(\d+) ([a-z]+)", last)}
 
 
-@pytest.mark.parametrize("workers", [pytest.param((), marks=ONE_SESSION), WORKERS], ids=["one session", "workers"])
+@pytest.mark.parametrize("workers", [(), pytest.param(WORKERS, marks=TWO_WORKERS)], ids=["one session", "workers"])
 def test_outcomes_and_texts_come_back(project: Path, workers: tuple[str, ...]) -> None:
     """One that hangs fails by the timer where the vcan is, and the next goes on."""
     (project / "test_hangs.py").write_text(HANGS)
