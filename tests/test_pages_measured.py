@@ -19,10 +19,8 @@ PAGES = [DOCS.parent / "README.md", *DOCS.glob("*.md")]
 TEXTS = {path.relative_to(DOCS.parent).as_posix(): path.read_text(encoding="utf-8") for path in PAGES}
 
 
-SCANS = pytest.mark.slow(reason="a whole scan; the default repeats the one of own-arm.md")
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[SCANS] * (name != "own_arm")) for name in measure.PRINTED])
+@pytest.mark.slow(reason="a whole scan for each page")
+@pytest.mark.parametrize("name", measure.PRINTED)
 def test_a_command_prints_what_its_page_shows(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert measure.printed_by(name) == MEASURED[name]["printed"], f"type: python docs/measure.py {name}"

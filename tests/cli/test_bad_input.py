@@ -280,18 +280,17 @@ TERM = pytest.mark.slow(reason="the other signal")
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=TERM)])
 def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, tmp_path):
-    process = start(tmp_path, "run", "cylinder", "--out", "results")
+    process = start(tmp_path, "run", "press", "--duration", "600", "--no-figures", "--out", "results")
     results = tmp_path / "results"
-    wait_for_size(log := results / "bus.log", 1 << 20, process)  # in the scan, by its volume
+    wait_for_size(log := results / "bus.log", 3 << 18, process)  # in contact, by its volume
     process.send_signal(number)
     out, err = process.communicate()
     assert (process.returncode, out) == (status, "")
     assert err == "canprobe: interrupted, the cell is stopped; results until then: results\n"
     summary = json.loads((results / "summary.json").read_text())
     assert (summary["completed"], summary["stop_reason"]) == (False, "interrupted")
-    assert 0 < summary["cycle"]["cycles"] < 8000
-    assert summary["contact"]["contact_fraction"] == 1.0  # of the scan so far
-    assert summary["contact"]["speed_mean_m_s"] == pytest.approx(0.025, rel=0.05)
+    assert 0 < summary["cycle"]["cycles"] < 240_000
+    assert summary["contact"]["contact_fraction"] == 1.0  # of the hold so far
     with np.load(results / "log.npz") as columns:
         assert len(columns["t_s"]) in (summary["cycle"]["cycles"], summary["cycle"]["cycles"] - 1)  # amid a cycle
     last = {can_id: data for _, _, can_id, data in read_candump(log)}

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -16,12 +17,12 @@ IMITATION = Path(__file__).parents[1] / "support" / "other_system"
 FAULT = "this is a fault of canprobe itself"
 
 
-def typed(folder: Path, *words: str) -> tuple[int, str]:
+def typed(folder: Path, *words: str, program: tuple[str, ...] = ("-m", "canprobe")) -> tuple[int, str]:
     """Status and output of a command on the imitated system."""
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(IMITATION), *sys.path]), "PYTHONIOENCODING": "cp1252"}
     env.pop("PYTEST_VERSION", None)
     done = subprocess.run(
-        [sys.executable, "-m", "canprobe", *words], cwd=folder, env=env, capture_output=True, check=False, timeout=120
+        [sys.executable, *program, *words], cwd=folder, env=env, capture_output=True, check=False, timeout=120
     )
     return done.returncode, (done.stdout + done.stderr).decode("cp1252")
 
@@ -30,35 +31,40 @@ def typed(folder: Path, *words: str) -> tuple[int, str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run in `first`."""
     folder = tmp_path_factory.mktemp("there")
-    status, said = typed(folder, "run", "cylinder", "--duration", "0.5", "--no-figures", "--out", "first")
+    status, said = typed(folder, "run", "cylinder", "--duration", "0.3", "--no-figures", "--out", "first")
     assert status == 0, said
     return folder
 
 
 SHORT = ("--duration", "0.2", "--no-figures", "--out")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("plan", "cylinder"),
-        ("run", "free", "--bus", "direct", *SHORT, "direct"),
-        ("init", "cell", "--eds", "puma260_joint"),
-        ("replay", "first"),
-        ("judge", "--record", "first/bus.log", "cylinder"),
-        ("adapters",),
-        ("move", "puma260", "--joint", "1", "--by", "1deg", "--yes"),
-        pytest.param(("check", "free"), marks=pytest.mark.slow(reason="another command in a process")),
-        pytest.param(("tare", "puma260", "--yes"), marks=pytest.mark.slow(reason="another command in a process")),
-        pytest.param(("schema", "scene"), marks=pytest.mark.slow(reason="another command in a process")),
-        pytest.param(("eds", "list"), marks=pytest.mark.slow(reason="another command in a process")),
-        pytest.param(
-            ("study", "estimators", "--quick", "--out", "study"), marks=pytest.mark.slow(reason="a study in processes")
-        ),
-    ],
+COMMANDS = (
+    ("plan", "press"),
+    ("run", "free", "--bus", "direct", *SHORT, "direct"),
+    ("init", "cell", "--eds", "puma260_joint"),
+    ("replay", "first"),
+    ("judge", "--record", "first/bus.log", "cylinder"),
+    ("adapters",),
+    ("move", "puma260", "--joint", "1", "--by", "1deg", "--yes"),
+    ("check", "free"),
+    ("tare", "puma260", "--yes"),
+    ("schema", "scene"),
+    ("eds", "list"),
 )
-def test_what_needs_no_posix_works_without_it(folder, words):
-    status, said = typed(folder, *words)
+ONE_BY_ONE = """
+import json, sys
+from canprobe.cli import main
+sys.exit(next((number for number, words in enumerate(json.loads(sys.argv[1]), 1) if main(words) != 0), 0))
+"""
+
+
+def test_what_needs_no_posix_works_without_it(folder):
+    failed, said = typed(folder, json.dumps(COMMANDS), program=("-c", ONE_BY_ONE))
+    assert failed == 0, f"{COMMANDS[failed - 1]}: {said}"
+
+
+@pytest.mark.slow(reason="a study in processes")
+def test_a_study_needs_no_posix(folder):
+    status, said = typed(folder, "study", "estimators", "--quick", "--out", "study")
     assert status == 0, said
 
 

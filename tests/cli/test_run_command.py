@@ -52,6 +52,8 @@ def test_the_verdict_is_the_beginning_and_the_headline_of_each_figure(tmp_path: 
     )
     assert f"off it by {force['force_rms_error_n']:.3f} N RMS" in lines[head + 3]
     assert len(shape["methods"]) > 1 and not [line for line in lines if "chen1996  " in line or "measured less" in line]
+    assert not [line for line in lines if line.startswith("draw ")]
+    assert not list(tmp_path.glob("*.png")) + list(tmp_path.glob("*.html"))
 
 
 def test_listening_says_how_many_images_came_and_their_force(
@@ -69,9 +71,3 @@ def test_listening_says_how_many_images_came_and_their_force(
         assert images == len(tactile["taxels"]) and rate == pytest.approx(200.0, rel=0.02)
     assert (mean, highest) == pytest.approx((np.nanmean(force), np.nanmax(force)), abs=0.006)
     assert 0.0 < mean < highest
-
-
-def test_no_figures(tmp_path: Path) -> None:
-    lines = run(tmp_path, "--no-figures", "--set", "shape.also=[]")
-    assert not [line for line in lines if line.startswith(("draw ", "estimate again"))]
-    assert (tmp_path / "summary.json").exists() and not list(tmp_path.glob("*.png")) + list(tmp_path.glob("*.html"))

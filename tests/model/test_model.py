@@ -17,7 +17,7 @@ def walk(folder, *defines):
     shutil.copy(MODEL, folder)
     commands = (
         ["spin", *(f"-D{define}" for define in defines), "-a", MODEL.name],
-        ["cc", "-w", "-O1", "-DSAFETY", "-DBFS", "-o", "pan", "pan.c"],
+        ["cc", "-w", "-O0", "-DSAFETY", "-DBFS", "-o", "pan", "pan.c"],
         ["./pan", "-m200000"],
     )
     for command in commands:

@@ -145,7 +145,14 @@ def _on_vcan(node: SlaveNode, stack: ExitStack) -> Bench:
     return Bench(node, master, thread.start, end, True)
 
 
-@pytest.fixture(params=["lockstep", pytest.param("vcan", marks=pytest.mark.vcan)])
+EACH_ON_VCAN = pytest.mark.slow(reason="each point on a real bus; the default has one of each service there")
+ON_BOTH_BUSES = pytest.mark.parametrize(
+    "connect", ["lockstep", pytest.param("vcan", marks=pytest.mark.vcan)], indirect=True
+)
+"""On vcan, too, where not everything is run."""
+
+
+@pytest.fixture(params=["lockstep", pytest.param("vcan", marks=[pytest.mark.vcan, EACH_ON_VCAN])])
 def connect(request: pytest.FixtureRequest) -> Iterator[Callable[[SlaveNode], Bench]]:
     """Put a node on a bus that carries no one else but the bench; it is not powered yet."""
     on_bus = {"lockstep": _in_lockstep, "vcan": _on_vcan}[request.param]

@@ -20,6 +20,7 @@ def link(state: str) -> None:
     type_as_root("ip", "link", "set", "vcan0", state)
 
 
+@pytest.mark.slow(reason="a run on a real bus; the default takes down that of a port: test_socketcan.py")
 def test_the_interface_goes_down_in_mid_run(bench: Any) -> None:
     command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
     bench.bus.until_enabled(6, by=command, cycles=60)
@@ -35,7 +36,7 @@ def test_the_interface_goes_down_in_mid_run(bench: Any) -> None:
     assert any("while stopping" in fault for fault in results.summary["faults"])
 
 
-@pytest.mark.slow(reason="the default takes the interface down and leaves it there")
+@pytest.mark.slow(reason="a second run whose interface goes down")
 def test_the_interface_comes_back_while_the_cell_stops(bench: Any) -> None:
     command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
     bench.bus.until_enabled(6, by=command, cycles=60)

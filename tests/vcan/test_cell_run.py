@@ -23,7 +23,7 @@ PATIENCE_S = 180.0
 
 def test_a_touch_in_two_processes(bench: Any) -> None:
     scene = bench.scene("press")
-    command = bench.start("run", scene, *ON_VCAN0, "--duration", 1, "--out", "results", "--json")
+    command = bench.start("run", scene, *ON_VCAN0, "--duration", 0.3, "--out", "results", "--json")
     bench.bus.until_booted(*NODES, by=command)
     (child,) = command.children
     assert command.end(0) == []

@@ -80,7 +80,7 @@ def test_an_arm_of_six_foreign_drives_in_mode_8(bench: Any, foreign: Any) -> Non
     scene = bench.scene("free", emulated=False)
     positions = start_positions(scene)
     drives = foreign(eds_path("puma260_joint"), 8, positions)
-    command = bench.start("run", scene, *ON_VCAN0, "--duration", 3, "--out", "results", "--json")
+    command = bench.start("run", scene, *ON_VCAN0, "--duration", 1.5, "--out", "results", "--json")
     assert command.end(0) == []
     seen = drives.end()
     assert tuple(seen) == tuple(positions)

@@ -12,8 +12,8 @@ pytestmark = pytest.mark.vcan
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 
 
-def served(bench: Any) -> Any:
-    nodes = ("--nodes", "2-4", "--without-id", "3,4", "--store", "nodes")
+def served(bench: Any, blank: str = "3,4") -> Any:
+    nodes = ("--nodes", "2-4", "--without-id", blank, "--store", "nodes")
     return bench.start("emulate", "free", "--channel", "vcan0", *nodes).until_told("serving nodes")
 
 
@@ -24,11 +24,11 @@ def scan(bench: Any, *words: str) -> Any:
 
 
 def test_a_blank_node_gets_its_id(bench: Any) -> None:
-    nodes = served(bench)
+    nodes = served(bench, "4")
     done = scan(bench, "--assign", "4=44")
     assert [(one["node_id"], one["serial_number"], one["stored"]) for one in done["assigned"]] == [(44, 4, True)]
-    assert [(node["node_id"], node["serial_number"]) for node in done["nodes"]] == [(2, 2), (44, 4)]
-    assert [blank["serial_number"] for blank in done["unconfigured"]] == [3]
+    assert [(node["node_id"], node["serial_number"]) for node in done["nodes"]] == [(2, 2), (3, 3), (44, 4)]
+    assert done["unconfigured"] == []
     nodes.send(signal.SIGINT)
     nodes.wait()
 

@@ -117,9 +117,9 @@ def test_sdo_abort_and_time_out_run_in_virtual_time(cell: Cell) -> None:
     with pytest.raises(SdoAbortedError) as caught:
         held(network, upload(0x5FFF, 0))
     assert caught.value.code == 0x06020000
-    with pytest.raises(SdoTimeoutError, match=r"No SDO response received within 3600 s, 2 times"):
-        held(network, upload(0x2000, 0), 6, timeout_s=3600.0, retries=1)
-    assert bus.clock.now_ns() == 7200 * 10**9
+    with pytest.raises(SdoTimeoutError, match=r"No SDO response received within 60 s, 2 times"):
+        held(network, upload(0x2000, 0), 6, timeout_s=60.0, retries=1)
+    assert bus.clock.now_ns() == 120 * 10**9
 
 
 def test_nodes_are_served_side_by_side_and_requests_sent_again_are_counted(cell: Cell) -> None:

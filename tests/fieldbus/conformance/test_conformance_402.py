@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from conformance_bench import ON_BOTH_BUSES
 
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.eds.packaged import load_eds
@@ -372,6 +373,7 @@ def test_cia402_60_halt_and_on(drive, plant):
 
 
 @pytest.mark.parametrize("lost", ["SYNC", "RPDO"])
+@ON_BOTH_BUSES
 def test_cia402_59_a_silent_master_stops_the_drive(drive, lost):
     drive.set((0x605A, 0, 6, 2))
     master = Master(drive).enable()

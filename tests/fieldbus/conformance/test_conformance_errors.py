@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from conformance_bench import ON_BOTH_BUSES
 
 from canprobe.fieldbus.node.stored_file import keep_in_file
 
@@ -29,6 +30,7 @@ def test_cia301_sync_40_wrong_length(tiny, overflow, good, bad):
     tiny.expect(RESET, TPDO)
 
 
+@ON_BOTH_BUSES
 def test_cia301_emcy_42_history(tiny):
     assert (tiny.read(0x1003), tiny.refusal(0x1003, 1)) == (0, 0x08000024)
     tiny.nmt(0x01)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 import pytest
+from conformance_bench import ON_BOTH_BUSES
 
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
@@ -122,6 +123,7 @@ def fastscan(bench, value, bit, position, following):
     lss(bench, f"51{value.to_bytes(4, 'little').hex()}{bit:02x}{position:02x}{following:02x}")
 
 
+@ON_BOTH_BUSES
 def test_cia305_lss_68_fastscan_finds_every_bit_and_selects(blank):
     """Each question alone: the bits above are those found, so that a wrong answer anywhere shows."""
     fastscan(blank, 0, 0x80, 0, 0)

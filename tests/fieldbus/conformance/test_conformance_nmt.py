@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from conformance_bench import ON_BOTH_BUSES
 
 PRE, OP, STOPPED = 0x7F, 0x05, 0x04
 TO = {PRE: 0x80, OP: 0x01, STOPPED: 0x02}
@@ -28,6 +29,7 @@ def test_cia301_nmt_03_commands_to_all(tiny):
         assert tiny.state() == goal
 
 
+@ON_BOTH_BUSES
 def test_cia301_nmt_05_an_open_transfer_does_not_survive(tiny):
     tiny.ask("2104200014000000")
     tiny.nmt(0x02)

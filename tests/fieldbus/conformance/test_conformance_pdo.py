@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from conformance_bench import ON_BOTH_BUSES
 
 OFF = 0x80000000
 OPEN_TPDO = [(0x1800, 1, OFF | 0x185, 4), (0x1A00, 0, 0, 1)]
@@ -155,6 +156,7 @@ def test_cia301_pdo_34_long_is_reported_and_applied(tiny):
     ("start", "every", "counters", "expected"),
     [(5, 2, range(2, 11), [5, 7, 9]), (4, 3, range(2, 11), [4, 7, 10]), (1, 2, [9, 10, 1, 2, 3, 5, 6], [1, 3, 5])],
 )
+@ON_BOTH_BUSES
 def test_cia301_pdo_37_sync_start_value(tiny, start, every, counters, expected):
     configure(tiny, 0x1800, cob_id=0x185, words=[0x20010020], type=every, start=start)
     tiny.set((0x1019, 0, 10, 1))

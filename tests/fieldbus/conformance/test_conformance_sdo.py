@@ -5,6 +5,7 @@ from __future__ import annotations
 from binascii import crc_hqx
 
 import pytest
+from conformance_bench import ON_BOTH_BUSES
 
 PAD = "00000000"
 NAME = b"a name longer than seven"
@@ -99,6 +100,7 @@ def test_cia301_sdo_23_segmented_up_with_toggle(tiny):
     assert b"".join(answer[1:] for answer in answers)[:24] == NAME
 
 
+@ON_BOTH_BUSES
 def test_cia301_sdo_23_domain_in_blocks_both_ways_with_crc(tiny):
     sent = bytes(i * 7 % 256 for i in range(1000))  # 143 segments: two blocks
     crc = crc_hqx(sent, 0)

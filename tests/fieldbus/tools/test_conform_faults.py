@@ -11,8 +11,10 @@ from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
 from canprobe.fieldbus.tools.faults.fault import MOST, UNANSWERED
 from canprobe.fieldbus.tools.reports import Verdict
 
+LONG = pytest.mark.slow(reason="most transfers end by their time-outs; as long as all other kinds")
 
-@pytest.mark.parametrize("name", BUS_FAULTS)
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[LONG] * (name == "sdo-size")) for name in BUS_FAULTS])
 def test_a_kind_of_fault_fails_the_points_of_its_row(name):
     kind = BUS_FAULTS[name]
     device = eds_device(wrap=lambda node: FaultyNode(node, [Fault(kind, NODE_ID, seed=1)]))

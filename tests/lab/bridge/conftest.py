@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.master.observers import Observation
@@ -36,7 +37,7 @@ def recorded(tmp_path_factory) -> Recorded:
     folder = tmp_path_factory.mktemp("recorded")
     text = dump_scene(canprobe.load_scene("cylinder")).replace('also = ["ml", "chen1996"]', "also = []")
     seen: list[Observation] = []
-    result = canprobe.run(
+    result = undrawn_run(
         parse_scene(text), out=folder, duration_s=0.6, seed=5, bridge=("mcap",), observers=(seen.append,)
     )
     return Recorded(folder, result, seen)
@@ -61,4 +62,4 @@ def listen_run(tmp_path_factory):
 
 def _run(scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp(scene)
-    return folder, canprobe.run(canprobe.load_scene(scene), out=folder, duration_s=0.3)
+    return folder, undrawn_run(canprobe.load_scene(scene), out=folder, duration_s=0.3)

@@ -105,5 +105,5 @@ def test_children_import_our_package_and_the_bridge_is_named_before_the_run(tmp_
     (tmp_path / "canprobe").mkdir()
     (tmp_path / "canprobe" / "__init__.py").write_text("raise ImportError('of the working folder')")
     monkeypatch.chdir(tmp_path)
-    assert main(["run", "press", "--bridge", "mcap", "--duration", "0.5", "--out", "out"]) == 0
+    assert main(["run", "press", "--bridge", "mcap", "--duration", "0.1", "--no-figures", "--out", "out"]) == 0
     assert "bridge mcap: " in capsys.readouterr().err, "also without a terminal"

@@ -84,7 +84,7 @@ def decode(channel, payload):
 
 def test_a_plain_client_negotiates_lists_and_receives(recorded, bridge):
     one, address = bridge
-    with connect(address, subprotocols=[PROTOCOL]) as client:
+    with connect(address, subprotocols=[PROTOCOL], max_queue=None) as client:  # it reads on, and so hears the close
         assert client.subprotocol == PROTOCOL
         info, channels = advertised(client)
         assert (info["op"], info["name"]) == ("serverInfo", "canprobe cylinder")

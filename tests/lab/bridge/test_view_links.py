@@ -72,7 +72,7 @@ def test_meshes_are_drawn_in_their_frames_and_what_cannot_be_read_is_said(lab):
 def test_a_run_shows_the_meshes_as_long_as_they_are_there(lab, tmp_path, capsys):
     out = tmp_path / "run"
     (lab / "free.toml").write_text('cell = "cell.toml"\n[scene]\nname = "free"\n[task]\nkind = "free"\n')
-    assert main(["run", str(lab / "free.toml"), "--duration", "0.2", "--out", str(out)]) == 0
+    assert main(["run", str(lab / "free.toml"), "--duration", "0.2", "--no-figures", "--out", str(out)]) == 0
     assert len(drawn(out / "scene.toml")[0]) == len(drawn(lab / "cell.toml")[0])
     for mesh in (tmp_path / "lab" / "meshes").iterdir():
         mesh.unlink()

@@ -27,7 +27,8 @@ def make():
     made = []
 
     def make(**arguments):
-        made.append(gymnasium.make("canprobe/TouchScan-v0", **arguments).unwrapped)
+        options = {"objects": "train", "task.clearance_mm": 1.0, **arguments.pop("options", {})}
+        made.append(gymnasium.make("canprobe/TouchScan-v0", options=options, **arguments).unwrapped)
         return made[-1]
 
     yield make

@@ -297,9 +297,10 @@ def test_vcan_belongs_to_faults_and_knows_no_seed(capsys):
     [
         (2611, "wrong-data"),
         (644, "remapped"),
-        (1713, "emcy"),
-        pytest.param(673, "wrong-data", marks=pytest.mark.slow(reason="a fourth and a fifth stop in a motion")),
-        pytest.param(1720, "encoder-jump", marks=pytest.mark.slow(reason="a fourth and a fifth stop in a motion")),
+        *(
+            pytest.param(*more, marks=pytest.mark.slow(reason="a stop in an exploration, whose plan and run are long"))
+            for more in ((1713, "emcy"), (673, "wrong-data"), (1720, "encoder-jump"))
+        ),
     ],
 )
 def test_a_stop_in_a_motion_presses_no_harder_than_the_motion(number, kind):

@@ -28,7 +28,7 @@ def test_a_joint_that_stops_in_a_scan_does_not_press_the_others_into_the_object(
 
 
 def test_the_same_seed_is_the_same_run():
-    first, second = run_case(draw_case(3)), run_case(draw_case(3))
+    first, second = run_case(draw_case(2)), run_case(draw_case(2))
     assert first == second and table_rows([first])[-1]["runs"] == 1 and findings([first])
 
 
