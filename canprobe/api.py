@@ -22,11 +22,10 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.bus_tools import commission, monitor, scan
 from canprobe.cell.session.check import check
 from canprobe.cell.session.emulation import emulate, emulate_eds
-from canprobe.cell.session.home import home
 from canprobe.cell.session.session import with_bridges
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.terminal import Progress
-from canprobe.cell.session.up import check_joints, up
+from canprobe.cell.session.up import check_joints, home, up
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import UsageError
 

@@ -27,21 +27,21 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from canprobe.mechanics.robot.chain import Chain, forward
-    from canprobe.mechanics.robot.denavit_hartenberg import from_dh
-    from canprobe.mechanics.robot.model import ArmModel, Joint
-    from canprobe.mechanics.touch import (
-        ContactSample,
-        Prior,
-        SurfaceEstimate,
-        SurfaceMap,
-        SurfaceMatrix,
-        cramer_rao,
-        fit_map,
-        fit_surface,
-        make_object,
-    )
+if TYPE_CHECKING:  # for type checkers, which do not read the table
+    from canprobe.mechanics.robot.chain import Chain as Chain
+    from canprobe.mechanics.robot.chain import forward as forward
+    from canprobe.mechanics.robot.denavit_hartenberg import from_dh as from_dh
+    from canprobe.mechanics.robot.model import ArmModel as ArmModel
+    from canprobe.mechanics.robot.model import Joint as Joint
+    from canprobe.mechanics.touch import ContactSample as ContactSample
+    from canprobe.mechanics.touch import Prior as Prior
+    from canprobe.mechanics.touch import SurfaceEstimate as SurfaceEstimate
+    from canprobe.mechanics.touch import SurfaceMap as SurfaceMap
+    from canprobe.mechanics.touch import SurfaceMatrix as SurfaceMatrix
+    from canprobe.mechanics.touch import cramer_rao as cramer_rao
+    from canprobe.mechanics.touch import fit_map as fit_map
+    from canprobe.mechanics.touch import fit_surface as fit_surface
+    from canprobe.mechanics.touch import make_object as make_object
 
 _MODULES = {
     "ArmModel": "robot.model",
@@ -59,23 +59,7 @@ _MODULES = {
     "from_dh": "robot.denavit_hartenberg",
     "make_object": "touch",
 }
-
-__all__ = [
-    "ArmModel",
-    "Chain",
-    "ContactSample",
-    "Joint",
-    "Prior",
-    "SurfaceEstimate",
-    "SurfaceMap",
-    "SurfaceMatrix",
-    "cramer_rao",
-    "fit_map",
-    "fit_surface",
-    "forward",
-    "from_dh",
-    "make_object",
-]
+__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
 
 
 def __getattr__(name: str) -> Any:

@@ -22,9 +22,9 @@ from canprobe.cell.planning.model import Plan
 from canprobe.errors import NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
+from canprobe.mechanics.robot.inverse_step import lifting_step
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.robot.motors import units_per_motor
-from canprobe.mechanics.robot.remaining_drives import lifting_step
 from canprobe.mechanics.types import Floats
 
 LEAP_RAD = 10e-3

@@ -26,9 +26,9 @@ from canprobe.cell.results.scores import score_shape, summarise_map
 from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_files, write_summary
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
-from canprobe.cell.session.home import home_joints
 from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session
+from canprobe.cell.session.up import home_joints
 from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.hand_motion import HandMotion
 from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_way, joint_way, refuse, share_of_speed

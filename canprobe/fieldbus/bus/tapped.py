@@ -1,4 +1,4 @@
-"""A port in the place of another one, which passes everything on: a record, a judge or a meter hears its frames."""
+"""Ports in the place of another one: a record, a judge or a meter hears its frames, a study disturbs them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCou
 from canprobe.fieldbus.protocol.frames import Frame
 
 
-class TappedPort(PlainPort, ABC):
-    """A `Port` through which another one is used, and whose frames are heard on the way.
+class OuterPort(PlainPort):
+    """Base of ports through which another one is used.
 
     Args:
         port: port to use.
@@ -18,8 +18,7 @@ class TappedPort(PlainPort, ABC):
 
     def __init__(self, port: Port) -> None:
         self._port = port
-        self.clock, self.channel = port.clock, port.channel
-        self.stamps_arrival, self.wait, self.close = port.stamps_arrival, port.wait, port.close
+        self.clock, self.channel, self.close = port.clock, port.channel, port.close
 
     @property
     def counters(self) -> PortCounters:
@@ -30,6 +29,18 @@ class TappedPort(PlainPort, ABC):
     def state(self) -> ControllerState:
         """State of the port's controller."""
         return self._port.state
+
+
+class TappedPort(OuterPort, ABC):
+    """A `Port` through which another one is used, and whose frames are heard on the way.
+
+    Args:
+        port: port to use.
+    """
+
+    def __init__(self, port: Port) -> None:
+        super().__init__(port)
+        self.stamps_arrival, self.wait = port.stamps_arrival, port.wait
 
     @property
     def descriptor(self) -> int | None:

@@ -51,7 +51,7 @@ DRAWS = {"arrays": 1, "scenes": 3}
 """Draws of the published figures."""
 FIRST_ARRAY, ARRAYS, QUICK_ARRAYS = 100, 20, 2
 """Seed of the first array of draw 0, and number of arrays of a draw."""
-OTHER_ARRAY = 10_000
+OTHER_ARRAY_SEED_STEP = 10_000
 """Distance of the seed of the array whose calibration is taken for that of a make."""
 PRESSES, HOLDS = 20, 6
 SCANS, QUICK_SCANS = 24, 3
@@ -154,7 +154,7 @@ def measure(seed: int) -> Row:
 
 def measure_forces(seed: int) -> list[Row]:
     """Hold quadrics on one array, and read their forces with its own calibration and with another one: two rows."""
-    presses, other = (Presses(*random_array(number)) for number in (seed, seed + OTHER_ARRAY))
+    presses, other = (Presses(*random_array(number)) for number in (seed, seed + OTHER_ARRAY_SEED_STEP))
     fits = calibrated(presses, f"emulated, seed {seed}"), calibrated(other, "make", own_gains=False)
     holds = [presses.held() for _ in range(HOLDS)]
     return [

@@ -16,7 +16,8 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.session import Session
 from canprobe.fieldbus.bus.clock import Clock
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCounters, TimedFrame
+from canprobe.fieldbus.bus.port import Port, TimedFrame
+from canprobe.fieldbus.bus.tapped import OuterPort
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 
@@ -171,7 +172,7 @@ class StandingClock(DisturbedClock):
         self.clock.sleep_until_ns(self.end_ns if self.begin_ns <= t_ns else t_ns)
 
 
-class DisturbedPort(PlainPort):
+class DisturbedPort(OuterPort):
     """A port that delays, scatters and loses frames, with a short transmit queue, a late clock or a slow master.
 
     Args:
@@ -183,29 +184,14 @@ class DisturbedPort(PlainPort):
     stamps_arrival = True
 
     def __init__(self, port: Port, setup: SetUp, rng: Random) -> None:
-        self._port, self._setup, self._rng = port, setup, rng
+        super().__init__(port)
+        self._setup, self._rng = setup, rng
         self._period_ns = round(1e9 / setup.rate_hz)
-        self.channel = port.channel
-        self.clock: Clock = port.clock
         clocks = {"machine": DisturbedClock, "still": StandingClock}
         if setup.kind in clocks:
             self.clock = clocks[setup.kind](port.clock, rng, setup.share, setup.size * self._period_ns)
         self._arriving: list[tuple[int, int, Frame]] = []  # a heap: time of arrival, number, frame
         self._number = self._last_ns = self._sent_ns = self._lost_until_ns = 0
-
-    @property
-    def counters(self) -> PortCounters:
-        """Counters of the port."""
-        return self._port.counters
-
-    @property
-    def state(self) -> ControllerState:
-        """State of the port's controller."""
-        return self._port.state
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send frames, as far as they are not lost; a full queue is waited for."""

@@ -9,8 +9,7 @@ Joint positions come in, and poses, Jacobians and torques go out; or poses come 
     model                joints of a chain with stops, speeds, motors, friction, bodies; units of its drives
     motors               motor coordinates, where rotor inertia, friction and drive torque act
     inverse              from poses to joints: rows of a pose that n joints can hold, and joints near a known posture
-    damped_inverse       one step of the Jacobian, damped near singular poses
-    remaining_drives     the same with some drives at rest
+    inverse_step         one step of the inverse Jacobian: damped near singular poses, or with some drives at rest
     probe_poses          poses and postures that put a probe on a surface
     dynamics             mass matrix and bias torques, computed by MuJoCo
     tool_calibration     the probe's centre on the flange, from touches of a ball

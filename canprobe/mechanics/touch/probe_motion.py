@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from canprobe.mechanics.robot.chain import Posture, ending_in, jacobian, pose_of, posture
-from canprobe.mechanics.robot.damped_inverse import damped_step
 from canprobe.mechanics.robot.inverse import in_rows, task_rows
+from canprobe.mechanics.robot.inverse_step import damped_step
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats, Vec

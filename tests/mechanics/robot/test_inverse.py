@@ -10,12 +10,11 @@ from serial_arms import five, gantry, model_of, random_chain, scara, seven
 
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.damped_inverse import damped_step
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, rolls_last, task_rows
+from canprobe.mechanics.robot.inverse_step import damped_step, lifting_step
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
-from canprobe.mechanics.robot.remaining_drives import lifting_step
 
 TOOL = tool_z_offset(80.0)
 POINT = np.array((-0.120, -0.1225, 0.374))

@@ -9,9 +9,8 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
     bus_state   frames → events; nothing that was not on the bus
     rule        what a rule is: its facts, and a generator that gets events; one module a family: enable, targets,
                 pdo_rules, sdo_rules, network_rules (NMT, SYNC, watchdogs), homing_rules, reactions
-    rules       the table of all rules
-    judging     `Judge`: events to rules, findings to a report
-    bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile
+    judging     the table of all rules, and `Judge`: events to rules, findings to a report
+    bench       a master on nodes that are served here, with faults thrown meanwhile; command starts and ends it
 
 Guards against false alarms: a node is judged after its state was seen; three SYNCs after an NMT start and frames that
 may have waited in a queue are passed over; what is wrong counts when it is wrong twice in a row, but for faults that
@@ -24,8 +23,7 @@ Start reading at `bus_state`, then `rule`, then `enable`.
 
 from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, start_position, write_log
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, nodes_of, read_record
-from canprobe.fieldbus.tools.judge.judging import Judge
-from canprobe.fieldbus.tools.judge.rules import RULES
+from canprobe.fieldbus.tools.judge.judging import RULES, Judge
 
 __all__ = [
     "RULES",

@@ -1,4 +1,4 @@
-"""Frames in, a report out: the rules on one bus."""
+"""Frames in, a report out: all rules, on one bus; and what of the list of faults is no rule."""
 
 from __future__ import annotations
 
@@ -7,15 +7,28 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.tools.judge import enable, homing_rules, network_rules, pdo_rules, reactions, sdo_rules, targets
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
 from canprobe.fieldbus.tools.judge.network_rules import IrregularSync
-from canprobe.fieldbus.tools.judge.rule import Rule, Watch
-from canprobe.fieldbus.tools.judge.rules import NO_RULES, RULES
+from canprobe.fieldbus.tools.judge.rule import BusRule, Rule, Watch
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
+_MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, homing_rules, reactions)
+_FOUND = {
+    one
+    for module in _MODULES
+    for one in vars(module).values()
+    if isinstance(one, type) and issubclass(one, Rule) and one not in (Rule, BusRule)
+}
+RULES: tuple[type[Rule], ...] = tuple(sorted(_FOUND, key=lambda rule: rule.number))
+"""All rules, in the order of their numbers."""
+NO_RULES: tuple[tuple[str, str], ...] = (
+    ("12 enabling as part of initialisation", "the bus does not show whether a person asked for it"),
+)
+"""Known faults of masters that are not judged, and why."""
 _Key = tuple[type[BusEvent], SeenNode | None]
 """Kind of an event, and the node that it is about; None for rules on the whole bus."""
 
