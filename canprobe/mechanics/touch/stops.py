@@ -81,9 +81,9 @@ class AtRest:
         sigma = math.sqrt(self._spread / (self._n - 1))
         reached = self._mean >= MIN_REACHED_SHARE * target or self._saturated
         if sigma > MAX_FORCE_SPREAD * target or not reached:
-            what = "does not settle" if reached else "is not reached"
+            what = "the force does not settle" if reached else "the force is not reached"
             return (
-                f"the force {what}: {self._mean:.1f} ± {sigma:.1f} N where {target:.1f} N are wanted; the contact is "
+                f"{what}: {self._mean:.1f} ± {sigma:.1f} N where {target:.1f} N are wanted; the contact is "
                 "too stiff for the arm's encoder counts, or servo.surface_height_hz too high"
             )
         return None
