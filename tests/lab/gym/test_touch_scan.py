@@ -45,7 +45,7 @@ def features_of(env, observation):
 def test_gymnasium_has_nothing_to_say_against_it(make, kind):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(make(observation=kind, estimate=kind == "oracle", options={"task.clearance_mm": 0.3}))
+        check_env(make(observation=kind, estimate=kind == "oracle", options={"task.clearance_mm": 3.0}))
 
 
 def test_the_same_seed_gives_the_same_trace_and_another_one_another(make):
