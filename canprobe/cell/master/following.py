@@ -110,7 +110,7 @@ class Following:
         """Time by which a drive may have begun a ramp late that it went on in these cycles, or broken it off early."""
         late_ns, after_ns = jitter_ns, t_ns
         for k in range(1, min(span + self._usual, len(self._cycles)) + 1):
-            seen_ns, _, _, jitter_ns = self._cycles[-k]
-            late_ns = max(late_ns, jitter_ns, abs(after_ns - seen_ns - self._period_ns))
-            after_ns = seen_ns
+            sync_ns, _, _, seen_later_ns = self._cycles[-k]
+            late_ns = max(late_ns, seen_later_ns, abs(after_ns - sync_ns - self._period_ns))
+            after_ns = sync_ns
         return late_ns

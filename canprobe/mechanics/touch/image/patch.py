@@ -240,7 +240,7 @@ def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) 
     """Highest count at the pad's edge, what two opposite edges both have, and that at edges of a window in the pad."""
     height, width = shape
     top, bottom, left, right = counts[:width], counts[-width:], counts[::width], counts[width - 1 :: width]
-    sides = [max(side.strip(b"\0"), default=0) for side in (top, bottom, left, right)]  # the strip is the faster one
+    sides = [max(side.strip(b"\0"), default=0) for side in (top, bottom, left, right)]  # mostly nothing is left
     at_pad, across = max(sides), max(min(sides[:2]), min(sides[2:]))
     if window is None:
         return at_pad, across, 0
