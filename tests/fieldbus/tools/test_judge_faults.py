@@ -14,7 +14,7 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
 from canprobe.fieldbus.tools.judge import BusFrame, Judge, first_answers
-from canprobe.fieldbus.tools.judge.bench import STANDARD_FAULTS, Injections
+from canprobe.fieldbus.tools.judge.injections import STANDARD_FAULTS, Injections
 
 NODES = (1, 2)
 MS, S = 1_000_000, 1_000_000_000

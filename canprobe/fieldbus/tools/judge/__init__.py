@@ -10,7 +10,7 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
     rule        what a rule is: its facts, and a generator that gets events; one module a family: enable, targets,
                 pdo_rules, sdo_rules, network_rules (NMT, SYNC, watchdogs), homing_rules, reactions
     judging     the table of all rules, and `Judge`: events to rules, findings to a report
-    bench       a master on nodes that are served here, with faults thrown meanwhile; command starts and ends it
+    bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile
 
 Guards against false alarms: a node is judged after its state was seen; three SYNCs after an NMT start and frames that
 may have waited in a queue are passed over; what is wrong counts when it is wrong twice in a row, but for faults that

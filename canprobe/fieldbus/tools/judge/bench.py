@@ -2,120 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 
-from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.tapped import TappedPort
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, command_of, known_state
-from canprobe.fieldbus.protocol.frames import Frame, NmtState
-from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, command_of
+from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.tools.faults import FaultyNodes
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.command import MasterCommand
 from canprobe.fieldbus.tools.judge.events import ControlSeen, NmtSeen, RequestSeen
+from canprobe.fieldbus.tools.judge.injections import Injections, Thrown
 from canprobe.fieldbus.tools.judge.judging import Judge
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
-
-STANDARD_FAULTS = (
-    "sdo-slow ms=200 for 2 s",
-    "heartbeat-off for 2 s",
-    "mute for 2 s",
-    "drive-fault code=0x2310 for 100 ms",
-    "reboot for 200 ms",
-)
-"""The standard sequence, from what a master may bear to what it must bring up anew."""
-_CALM_NS = 2_000_000_000
-"""Time for which the nodes must have been at work before the next fault."""
-
-
-@dataclass(slots=True)
-class Thrown:
-    """A fault that was thrown.
-
-    Attributes:
-        text: node, kind and values of the fault.
-        begin_ns, end_ns: when it held.
-    """
-
-    text: str
-    begin_ns: int
-    end_ns: int
-
-
-class Injections:
-    """Throws faults, and notes when they hold.
-
-    Args:
-        nodes: the served nodes.
-        faults: faults with their nodes, as `parse_fault` reads them; None for the standard sequence.
-        now_ns: present time, from which `at` counts.
-
-    Attributes:
-        thrown: faults that held, in order.
-    """
-
-    def __init__(self, nodes: FaultyNodes, faults: Sequence[str] | None, now_ns: int) -> None:
-        self._nodes = nodes
-        self.thrown: list[Thrown] = []
-        self._holding: dict[Fault, Thrown] = {}
-        self._queue = list(STANDARD_FAULTS) if faults is None else []
-        self._calm_ns: int | None = None
-        self._last_ns = now_ns
-        for text in faults or ():
-            nodes.inject(text, now_ns)
-
-    @property
-    def not_thrown(self) -> list[str]:
-        """Faults of the sequence that were not thrown."""
-        return list(self._queue)
-
-    def look(self, now_ns: int) -> None:
-        """Note which faults hold, and throw the next one of the sequence when the nodes are at work."""
-        holding = [fault for node in self._nodes.nodes for fault in node.holding]
-        for fault in holding:
-            if fault not in self._holding:
-                given = "".join(f" {name}={value:g}" for name, value in fault.values.items())
-                text = f"node {fault.node_id}: {fault.kind.name}{given}"
-                self._holding[fault] = one = Thrown(text, self._last_ns, now_ns)
-                self.thrown.append(one)
-        for fault in [fault for fault in self._holding if fault not in holding]:
-            self._holding.pop(fault).end_ns = now_ns
-        for one in self._holding.values():
-            one.end_ns = now_ns
-        self._last_ns = now_ns
-        if self._queue and not self._holding:
-            self._throw_next(now_ns)
-
-    def _throw_next(self, now_ns: int) -> None:
-        at_work = _at_work(self._nodes.nodes)
-        if at_work is None:
-            self._calm_ns = None
-            return
-        self._calm_ns = now_ns if self._calm_ns is None else self._calm_ns
-        if now_ns - self._calm_ns >= _CALM_NS:
-            text = f"node {at_work.node_id}: {self._queue.pop(0)}"
-            try:
-                self._nodes.inject(text, now_ns)
-            except UsageError:  # the node is no drive, which this kind needs
-                return
-            self._calm_ns = None
-
-
-def _at_work(nodes: Iterable[FaultyNode]) -> FaultyNode | None:
-    """The first node that does what it is for: a drive that is enabled, or without drives a node in operational."""
-    drives = [node for node in nodes if node.node.dictionary.has_index(0x6041)]
-    for node in drives:
-        if known_state(node.node.dictionary.number(0x6041)) is DriveState.OPERATION_ENABLED:
-            return node
-    others = [] if drives else [node for node in nodes if node.node.state is NmtState.OPERATIONAL]
-    return others[0] if others else None
-
 
 _AFTER_NS = 500_000_000
 """Time for which the nodes are served after the end of the command."""
