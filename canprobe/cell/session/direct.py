@@ -31,12 +31,12 @@ from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
 from canprobe.fieldbus.drive.drive import DriveApplication
-from canprobe.fieldbus.node.abort import SdoAbort
 from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.rpdo import Rpdo
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
+from canprobe.fieldbus.protocol.sdo import SdoAbort
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 
 HEARTBEAT_CONSUMER = 0x1016

@@ -28,8 +28,6 @@ Dialogue = Generator[bytes | None, bytes, Any]
 _SDO_BYTES = 8
 _DOWNLOAD_ANSWER, _UPLOAD_ANSWER, _SEGMENT_ANSWER = 0x60, 0x40, 0x00
 _EXPEDITED_FLAG = 0x02
-_NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
-_TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
 MAX_UPLOAD_BYTES = 4096
 """Longest value that is read; names and numbers are far shorter. The transfer of a longer one is aborted."""
 MAX_TRANSFER_TIMEOUTS = 10
@@ -111,7 +109,7 @@ def _answered(request: bytes, expected: int) -> Generator[bytes | None, bytes, b
 
 def _segments(place: sdo.Place, announced: int | None) -> Generator[bytes | None, bytes, bytes]:
     if announced is not None and announced > MAX_UPLOAD_BYTES:
-        yield from _give_up(place, _OUT_OF_MEMORY, f"{announced} bytes announced, {MAX_UPLOAD_BYTES} at most")
+        yield from _give_up(place, sdo.Abort.MEMORY, f"{announced} bytes announced, {MAX_UPLOAD_BYTES} at most")
     data, toggle, last = b"", 0, False
     while not last:
         answer = yield bytes((0x60 | toggle,)) + bytes(7)
@@ -119,19 +117,19 @@ def _segments(place: sdo.Place, announced: int | None) -> Generator[bytes | None
             answer = yield None  # a late one, to the request that began this transfer
         _check_abort(answer)
         if answer[0] & 0xF0 != toggle:
-            yield from _give_up(place, _NOT_TOGGLED, "Toggle bit mismatch")
+            yield from _give_up(place, sdo.Abort.TOGGLE, "Toggle bit mismatch")
         piece = sdo.segment_value(answer)
         data += piece
         toggle ^= 0x10
         last = bool(answer[0] & 1)
         if announced is not None and len(data) > announced:
-            yield from _give_up(place, _TOO_LONG, f"{announced} bytes announced, more sent")
+            yield from _give_up(place, sdo.Abort.TOO_LONG, f"{announced} bytes announced, more sent")
         if len(data) > MAX_UPLOAD_BYTES:
-            yield from _give_up(place, _OUT_OF_MEMORY, f"no end after {MAX_UPLOAD_BYTES} bytes")
+            yield from _give_up(place, sdo.Abort.MEMORY, f"no end after {MAX_UPLOAD_BYTES} bytes")
         if not piece and not last:
-            yield from _give_up(place, _GENERAL, "a segment without a byte that is not the last")
+            yield from _give_up(place, sdo.Abort.GENERAL, "a segment without a byte that is not the last")
     if announced is not None and len(data) < announced:
-        yield from _give_up(place, _TOO_SHORT, f"{announced} bytes announced, {len(data)} sent")
+        yield from _give_up(place, sdo.Abort.TOO_SHORT, f"{announced} bytes announced, {len(data)} sent")
     return data
 
 
@@ -177,7 +175,7 @@ class _Talk:
             self._go_on(lambda answer=answer: self._dialogue.send(answer))  # type: ignore[misc]
         if self.over or self.due_ns > self._network.port.clock.now_ns():
             return
-        self._transmit(sdo.pack_abort(*self._place, _TIMED_OUT))
+        self._transmit(sdo.pack_abort(*self._place, sdo.Abort.TIMED_OUT))
         if self._tries <= self._retries and not self._asks_for_segment:  # which cannot be asked for twice
             self.repeated += 1
             self._ask()

@@ -9,10 +9,10 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.mode import REACHED_FLAG, CyclicMode, DriveParts
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
 from canprobe.fieldbus.drive.profile import torque_run, uniform
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.cia402 import ENABLE_INTERPOLATION_BIT, INTERPOLATION_ACTIVE_BIT, OperationMode
 from canprobe.fieldbus.protocol.emcy import REFERENCE_LIMIT_CODE
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 MAX_ROUNDING_COUNTS = 2
 POSITION_TARGET_KEY, _POSITION_OFFSET_KEY = key_of(0x607A), key_of(0x60B0)

@@ -21,7 +21,6 @@ from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS, Drive
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
@@ -38,6 +37,7 @@ from canprobe.fieldbus.protocol.cia402 import (
 )
 from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE, HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 MODES: tuple[type[DriveMode], ...] = (
     DriveMode,

@@ -25,9 +25,9 @@ from canprobe.fieldbus.drive.feedback import NEGATIVE_SWITCH_FLAG, POSITIVE_SWIT
 from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED_BIT, HOMING_ERROR_BIT, HOMING_START_BIT, OperationMode
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 PRESENT_POSITION_METHODS = frozenset({35, 37})
 INDEX_DIRECTIONS = {33: -1, 34: 1}

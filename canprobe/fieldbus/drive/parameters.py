@@ -10,9 +10,9 @@ from math import inf
 
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery, Units
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME, SYNC_FACTOR, SYNC_FACTOR_NAME
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 STAYING_QUICK_STOP_OPTIONS = frozenset({5, 6})  # values of 605Ah by which the drive stays in QUICK_STOP_ACTIVE
 UNLIMITED_WINDOW = 0xFFFFFFFF

@@ -8,7 +8,6 @@ Each service of the standard is one module:
     timers              the deadlines of one node
     entry               one entry of the dictionary: type, rights, limits, bytes
     dictionary          all values, with the checks that an access over the bus must pass
-    abort               SDO abort codes
     sdo_states          the state machine of an SDO server as a table
     sdo_transfers       segmented and block transfers, each an object with its state
     sdo_server          expedited transfers, and the beginning and end of the others

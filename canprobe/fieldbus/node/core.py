@@ -6,12 +6,12 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.fieldbus.bus.port import nothing
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.timers import Holder, Timers
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, Frame, NmtState, is_restricted
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 Route = Callable[[bytes, int], None]
 NO_ROUTES: Mapping[int, Route] = {}

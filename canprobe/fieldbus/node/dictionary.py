@@ -12,8 +12,8 @@ from dataclasses import replace
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.bus.port import nothing
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Entry, Value, key_of, read_entries
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 Check = Callable[[int, Value], None]
 Hook = Callable[[int, Value], None]

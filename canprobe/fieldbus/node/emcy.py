@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Hashable
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import TALKING_STATES, NodeCore, Service, check_cob_id
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 _GENERIC_FLAG = 0x01
 # Bits of 1001h by the first nibble of the code: current, voltage, temperature, communication/profile, manufacturer.

@@ -14,7 +14,7 @@ from canopen.objectdictionary import ObjectDictionary, datatypes
 
 from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.values import REAL_FORMS
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 Value = int | float | bytes
 _STATED = [field.name for field in fields(DescribedEntry)]

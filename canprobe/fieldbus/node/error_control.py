@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.timers import Timer
 from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState, pack_heartbeat
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 _MASTER_SOURCE = 0  # source of the error: the protocol does not carry the id of the master
 _TOGGLE_FLAG = 0x80

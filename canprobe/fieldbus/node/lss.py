@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from canprobe.fieldbus.node.abort import SdoAbort
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
 from canprobe.fieldbus.node.store import Store
 from canprobe.fieldbus.protocol.lss import (
@@ -27,6 +26,7 @@ from canprobe.fieldbus.protocol.lss import (
     pack_lss,
     pack_number,
 )
+from canprobe.fieldbus.protocol.sdo import SdoAbort
 
 _SELECT_COMMANDS = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
 _IDENTIFY_COMMANDS = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)

@@ -8,12 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import check_cob_id
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import MAX_FD_PDO_BITS, MAX_PDO_BITS, PdoEntry
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 COB_ID_SUB, TYPE_SUB, INHIBIT_SUB, EVENT_SUB, START_SUB = 1, 2, 3, 5, 6
 _RESERVED_RPDO_TYPES = range(0xF1, 0xFE)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, DelayedFrames, NodeCore, Route, Service, check_cob_id
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
@@ -24,6 +23,7 @@ from canprobe.fieldbus.node.sdo_transfers import (
 )
 from canprobe.fieldbus.protocol import sdo
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, SDO_RX_BASE, SDO_TX_BASE
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 SDO_TIMEOUT_NS = 1_000_000_000
 """Time without a frame of the client after which a transfer is aborted with 05040000h."""

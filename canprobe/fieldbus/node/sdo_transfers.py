@@ -14,9 +14,9 @@ from abc import ABC, abstractmethod
 from binascii import crc_hqx
 from collections.abc import Callable
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Entry
 from canprobe.fieldbus.node.sdo_states import SdoState
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 MAX_VALUE_BYTES = 1 << 20
 """Longest value that a node takes; a longer one is refused with 05040005h."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from canprobe.fieldbus.bus.port import nothing
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 SAVE_SIGNATURE = int.from_bytes(b"save", "little")
 LOAD_SIGNATURE = int.from_bytes(b"load", "little")

@@ -8,10 +8,10 @@ from typing import Any
 
 from canprobe.errors import CanprobeError, UsageError, check_schema
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 SCHEMA = 1
 

@@ -1,6 +1,13 @@
-"""SDO frames: requests packed, and what stands where in requests and answers. Source: CiA 301, "SDO protocols"."""
+"""SDO frames: requests packed, what stands where in requests and answers, and abort codes.
+
+Source: CiA 301, "SDO protocols", table "SDO abort codes".
+"""
 
 from __future__ import annotations
+
+from enum import IntEnum
+
+from canprobe.errors import ProtocolError
 
 ABORT = 0x80
 """Command byte of an abort, from either side."""
@@ -9,6 +16,53 @@ _READ = 0x40
 _SIZE_FLAG = 0x01
 Place = tuple[int, int]
 """Index and sub-index of an entry."""
+
+
+class Abort(IntEnum):
+    """SDO abort codes."""
+
+    TOGGLE = 0x05030000
+    TIMED_OUT = 0x05040000
+    COMMAND = 0x05040001
+    BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
+    MEMORY = 0x05040005
+    UNSUPPORTED_ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    MAPPING_LENGTH = 0x06040042
+    PARAMETER_INCOMPATIBLE = 0x06040043
+    INTERNAL_INCOMPATIBILITY = 0x06040047
+    HARDWARE = 0x06060000
+    LENGTH_DOES_NOT_MATCH = 0x06070010
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    VALUE = 0x06090030
+    VALUE_HIGH = 0x06090031
+    VALUE_LOW = 0x06090032
+    MAXIMUM_BELOW_MINIMUM = 0x06090036
+    RESOURCE_NOT_AVAILABLE = 0x060A0023
+    GENERAL = 0x08000000
+    CANNOT_STORE = 0x08000020
+    LOCAL_CONTROL_PREVENTS_IT = 0x08000021
+    DEVICE_STATE = 0x08000022
+    NO_DATA = 0x08000024
+
+
+class SdoAbort(ProtocolError):  # noqa: N818 - the standard's word
+    """The dictionary or the server refuses an access.
+
+    Attributes:
+        code: abort code that goes to the client.
+    """
+
+    def __init__(self, code: Abort) -> None:
+        self.code = code
+        super().__init__(f"{code.name.lower().replace('_', ' ')} ({code:08X}h)")
 
 
 def pack_request(command: int, index: int, subindex: int = 0, data: bytes = b"") -> bytes:

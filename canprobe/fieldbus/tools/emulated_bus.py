@@ -31,10 +31,10 @@ from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.drive.from_eds import make_eds_node
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.abort import SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.serve import serve
 from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol.sdo import SdoAbort
 from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
 from canprobe.fieldbus.tools.faults.text import node_of
 

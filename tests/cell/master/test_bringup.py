@@ -21,7 +21,7 @@ from canprobe.errors import BusError, InterfaceError, NodeError
 from canprobe.fieldbus.bus.sdo import upload
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import eds_path
-from canprobe.fieldbus.node.abort import Abort, SdoAbort
+from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault
 
 MS = 1_000_000

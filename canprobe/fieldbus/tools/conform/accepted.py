@@ -7,49 +7,39 @@ Source: CiA 301, table "SDO abort codes"; CANopenDemo, test/test_report_CCT.md (
 
 from __future__ import annotations
 
-from canprobe.fieldbus.node.abort import Abort
+from canprobe.fieldbus.protocol.sdo import Abort
 
 AbortSet = tuple[int, ...]
 """Accepted codes, the most exact one first."""
 
-_GENERAL = 0x08000000
-READ_ONLY: AbortSet = (0x06010002, 0x06010000, _GENERAL)
-WRITE_ONLY: AbortSet = (0x06010001, 0x06010000, _GENERAL)
-NO_OBJECT: AbortSet = (0x06020000, _GENERAL)
-NO_SUBINDEX: AbortSet = (0x06090011, _GENERAL)
-NO_ENTRY: AbortSet = (0x06090011, 0x06020000, _GENERAL)
-UNKNOWN_COMMAND: AbortSet = (0x05040001, _GENERAL)
-TOO_LONG: AbortSet = (0x06070012, 0x06070010, _GENERAL)
-TOO_SHORT: AbortSet = (0x06070013, 0x06070010, _GENERAL)
-ABOVE: AbortSet = (0x06090031, 0x06090030, _GENERAL)
-BELOW: AbortSet = (0x06090032, 0x06090030, _GENERAL)
-TOGGLE: AbortSet = (0x05030000, _GENERAL)
-TIMED_OUT: AbortSet = (0x05040000,)
-BLOCK_SIZE: AbortSet = (0x05040002, 0x05040001, _GENERAL)
-SEQUENCE: AbortSet = (0x05040003, 0x05040001, _GENERAL)
-CRC: AbortSet = (0x05040004, 0x05040001, _GENERAL)
-MAPPING_LOCKED: AbortSet = (0x06010000, 0x06040041, 0x08000022, _GENERAL)
-MAPPING_LENGTH: AbortSet = (0x06040042, 0x06040041, 0x06010000, 0x06020000, _GENERAL)
-NOT_MAPPABLE: AbortSet = (0x06040041, 0x06020000, 0x06010000, _GENERAL)
-PDO_LOCKED: AbortSet = (0x06090030, 0x06010000, 0x08000022, _GENERAL)
-VALUE: AbortSet = (0x06090030, 0x06090031, 0x06090032, _GENERAL)
-SYNC_LOCKED: AbortSet = (0x08000022, _GENERAL)
-DUPLICATE: AbortSet = (0x06040043, 0x06090030, _GENERAL)
-NO_DATA: AbortSet = (0x08000024, _GENERAL)
-
-_WORDS = {
-    0x06040047: "internal incompatibility",
-    0x06070010: "length does not match",
-    0x06090023: "sub-index does not exist",
-    0x06090036: "maximum below minimum",
-    0x060A0023: "resource not available",
-    0x08000021: "local control prevents it",
-}
+READ_ONLY = (Abort.READ_ONLY, Abort.UNSUPPORTED_ACCESS, Abort.GENERAL)
+WRITE_ONLY = (Abort.WRITE_ONLY, Abort.UNSUPPORTED_ACCESS, Abort.GENERAL)
+NO_OBJECT = (Abort.NO_OBJECT, Abort.GENERAL)
+NO_SUBINDEX = (Abort.NO_SUBINDEX, Abort.GENERAL)
+NO_ENTRY = (Abort.NO_SUBINDEX, Abort.NO_OBJECT, Abort.GENERAL)
+UNKNOWN_COMMAND = (Abort.COMMAND, Abort.GENERAL)
+TOO_LONG = (Abort.TOO_LONG, Abort.LENGTH_DOES_NOT_MATCH, Abort.GENERAL)
+TOO_SHORT = (Abort.TOO_SHORT, Abort.LENGTH_DOES_NOT_MATCH, Abort.GENERAL)
+ABOVE = (Abort.VALUE_HIGH, Abort.VALUE, Abort.GENERAL)
+BELOW = (Abort.VALUE_LOW, Abort.VALUE, Abort.GENERAL)
+TOGGLE = (Abort.TOGGLE, Abort.GENERAL)
+TIMED_OUT = (Abort.TIMED_OUT,)
+BLOCK_SIZE = (Abort.BLOCK_SIZE, Abort.COMMAND, Abort.GENERAL)
+SEQUENCE = (Abort.SEQUENCE, Abort.COMMAND, Abort.GENERAL)
+CRC = (Abort.CRC, Abort.COMMAND, Abort.GENERAL)
+MAPPING_LOCKED = (Abort.UNSUPPORTED_ACCESS, Abort.NOT_MAPPABLE, Abort.DEVICE_STATE, Abort.GENERAL)
+MAPPING_LENGTH = (Abort.MAPPING_LENGTH, Abort.NOT_MAPPABLE, Abort.UNSUPPORTED_ACCESS, Abort.NO_OBJECT, Abort.GENERAL)
+NOT_MAPPABLE = (Abort.NOT_MAPPABLE, Abort.NO_OBJECT, Abort.UNSUPPORTED_ACCESS, Abort.GENERAL)
+PDO_LOCKED = (Abort.VALUE, Abort.UNSUPPORTED_ACCESS, Abort.DEVICE_STATE, Abort.GENERAL)
+VALUE = (Abort.VALUE, Abort.VALUE_HIGH, Abort.VALUE_LOW, Abort.GENERAL)
+SYNC_LOCKED = (Abort.DEVICE_STATE, Abort.GENERAL)
+DUPLICATE = (Abort.PARAMETER_INCOMPATIBLE, Abort.VALUE, Abort.GENERAL)
+NO_DATA = (Abort.NO_DATA, Abort.GENERAL)
 
 
 def abort_text(code: int) -> str:
     """An abort code with its words."""
-    words = _WORDS.get(code) or (Abort(code).name.lower().replace("_", " ") if code in tuple(Abort) else "unknown code")
+    words = Abort(code).name.lower().replace("_", " ") if code in tuple(Abort) else "unknown code"
     return f"{code:08X}h ({words})"
 
 

@@ -127,7 +127,7 @@ class SdoClient(FrameLink):
 
     def abort(self, index: int) -> None:
         """End a transfer of an entry from the client's side."""
-        self.send(self.request_id, sdo.pack_abort(index, 0, 0x08000000))
+        self.send(self.request_id, sdo.pack_abort(index, 0, sdo.Abort.GENERAL))
 
     def ignores(self, can_id: int, data: bytes = b"") -> bool:
         """Send a frame; whether no SDO answer comes."""

@@ -9,10 +9,10 @@ from canprobe.fieldbus.drive.drive import DriveApplication
 from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.sdo import Abort
 from canprobe.fieldbus.tools.faults.fault import LOST, Effect, Fault, Host, Parameter, error_code, numbers
 from canprobe.fieldbus.tools.faults.service_faults import ObjectAborted
 
-VALUE_ABORT_CODE = 0x06090030
 _MODE_INDEX = 0x6060
 _MAX_TORQUE_INDEX = 0x6072
 _FAULT_STATES = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
@@ -74,7 +74,7 @@ class ModeRefused(ObjectAborted):
     name, what = "mode-refused", "writes to 6060h are refused"
     clause, reaction = "CiA 402-2, 6060h, 6061h", "sends no targets"
     fails, incoming, needs = "49 50 51 53 54 55", True, "drive"
-    code = VALUE_ABORT_CODE
+    code = Abort.VALUE
 
     def index(self, data: bytes) -> int:
         return _MODE_INDEX if data[0] >> 5 == 1 else -1

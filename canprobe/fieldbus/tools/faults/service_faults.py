@@ -14,7 +14,7 @@ from canprobe.fieldbus.protocol.frames import (
     SDO_TX_BASE,
     Frame,
 )
-from canprobe.fieldbus.protocol.sdo import pack_abort, place_of
+from canprobe.fieldbus.protocol.sdo import Abort, pack_abort, place_of
 from canprobe.fieldbus.tools.faults.fault import MOST, UNANSWERED, Effect, Parameter, error_code, in_ms, numbers
 from canprobe.fieldbus.tools.faults.frame_faults import Babble
 
@@ -82,7 +82,7 @@ class ObjectAborted(Effect):
     fails, incoming = "77", True
     parameters = numbers(
         index=Parameter(0x1017, 0, 0xFFFF, "index of the object"),
-        code=Parameter(0x08000020, 0, 0xFFFFFFFF, "abort code"),
+        code=Parameter(Abort.CANNOT_STORE, 0, 0xFFFFFFFF, "abort code"),
     )
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:

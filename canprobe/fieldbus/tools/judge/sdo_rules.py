@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.protocol.sdo import Place, place_text
+from canprobe.fieldbus.protocol.sdo import Abort, Place, place_text
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.enable import enables
 from canprobe.fieldbus.tools.judge.events import AbortSeen, AnswerSeen, ControlSeen, RequestSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity, Watch
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
-_TIMED_OUT = 0x05040000
 _SHORT_NS = 50_000_000
 """Time after which a second request may be that of a client that gave the first one up."""
 
@@ -73,7 +72,7 @@ class TimeoutTooShort(Rule):
         late_answers = 0  # in a row; two show that the time is too short
         while event := (yield):
             if isinstance(event, AbortSeen):
-                if not event.by_client or event.code != _TIMED_OUT or event.request is None:
+                if not event.by_client or event.code != Abort.TIMED_OUT or event.request is None:
                     continue
                 abort = event
                 waited_ns = event.frame.t_ns - event.request.t_ns

@@ -18,7 +18,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     describe_state,
     known_state,
 )
-from canprobe.fieldbus.protocol.sdo import pack_write
+from canprobe.fieldbus.protocol.sdo import Abort, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -126,7 +126,9 @@ def mode_display(bench: Bench) -> None:
         request = pack_write(cia402.MODE, 0, bytes((mode,)))
         if not modes >> mode - 1 & 1:
             bench.must_refuse(
-                request, (*accepted.VALUE, 0x06040043, 0x06010000), f"mode {mode}, which 6502h does not list"
+                request,
+                (*accepted.VALUE, Abort.PARAMETER_INCOMPATIBLE, Abort.UNSUPPORTED_ACCESS),
+                f"mode {mode}, which 6502h does not list",
             )
             continue
         bench.put(cia402.MODE, 0, mode, 1)

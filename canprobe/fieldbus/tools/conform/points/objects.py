@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
-from canprobe.fieldbus.protocol.sdo import ABORT, pack_read, pack_write, place_text
+from canprobe.fieldbus.protocol.sdo import ABORT, Abort, pack_read, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
@@ -17,7 +17,7 @@ point = PointGroup("objects")
 _MANDATORY = ((0x1000, 0), (0x1001, 0), (0x1018, 1))
 _SHOWN = 5
 """Entries that a verdict names."""
-_MAY_HAVE_NOTHING = (0x08000024, 0x08000022, 0x08000021)
+_MAY_HAVE_NOTHING = (Abort.NO_DATA, Abort.DEVICE_STATE, Abort.LOCAL_CONTROL_PREVENTS_IT)
 """Codes of an entry that is there and has no value now."""
 _RESTRICTED = (0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x780, 0x7FF)
 

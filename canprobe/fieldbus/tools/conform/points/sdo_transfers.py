@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 
-from canprobe.fieldbus.protocol.sdo import ABORT, abort_code, pack_request
+from canprobe.fieldbus.protocol.sdo import ABORT, Abort, abort_code, pack_request
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import AbortSet
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -17,7 +17,6 @@ point = PointGroup("sdo")
 SEGMENTS = "CiA 301, SDO segmented transfer"
 BLOCKS = "CiA 301, SDO block transfer"
 _SERVER_TIMEOUT_S = 5.0
-_COMMAND_UNSUPPORTED = 0x05040001
 _HEARTBEAT = 0x1017
 
 
@@ -149,7 +148,7 @@ def segmented_download(bench: Bench) -> None:
 def _block_answer(bench: Bench, request: bytes) -> bytes:
     """Begin a block transfer; where the device has none, the point does not apply."""
     answer = bench.ask(request)
-    if answer[0] == ABORT and abort_code(answer) == _COMMAND_UNSUPPORTED:
+    if answer[0] == ABORT and abort_code(answer) == Abort.COMMAND:
         bench.does_not_apply("the device has no block transfer (05040001h)")
     return answer
 
