@@ -96,6 +96,16 @@ class Bench(SdoClient):
         if (answer := self.request(0x40, 0x1000)) != self.first_answer:
             self.deviates(f"1000h is answered with {answer.hex(' ')} after {what}")
 
+    def expect(self, holds: object, text: str) -> None:
+        """Fail the point unless something holds."""
+        if not holds:
+            raise Deviation(text)
+
+    def require(self, holds: object, why: str) -> None:
+        """End the point unless something holds, without which it cannot be examined on this device."""
+        if not holds:
+            raise PointNotApplicable(why)
+
     def deviates(self, text: str) -> NoReturn:
         """Fail the point."""
         raise Deviation(text)

@@ -39,8 +39,7 @@ def _reach(bench: Bench, state: DriveState, what: str) -> None:
     """Wait for a state of the drive. Raises Deviation."""
     until_ns = bench.now_ns + round(_REACH_S * 1e9)
     while known_state(word := bench.number(cia402.STATUSWORD)) is not state:
-        if bench.now_ns >= until_ns:
-            bench.deviates(f"{what}: the drive is {describe_state(word)}, expected {state.name}")
+        bench.expect(bench.now_ns < until_ns, f"{what}: the drive is {describe_state(word)}, expected {state.name}")
         bench.pass_time(0.01)
 
 
@@ -91,8 +90,7 @@ def _go(bench: Bench, state: DriveState) -> None:
 def statusword(bench: Bench) -> None:
     """The bits of 6041h are those of a state."""
     word = bench.number(cia402.STATUSWORD)
-    if known_state(word) is None:
-        bench.deviates(f"6041h is {word:04X}h, which is no state")
+    bench.expect(known_state(word) is not None, f"6041h is {word:04X}h, which is no state")
 
 
 @point(
@@ -133,8 +131,7 @@ def mode_display(bench: Bench) -> None:
             continue
         bench.put(cia402.MODE, 0, mode, 1)
         bench.pass_time(0.05)
-        if (shown := bench.number(cia402.MODE_DISPLAY)) != mode:
-            bench.deviates(f"6061h is {shown} after mode {mode}")
+        bench.expect((shown := bench.number(cia402.MODE_DISPLAY)) == mode, f"6061h is {shown} after mode {mode}")
 
 
 @point(49, "transitions", AUTOMATON, "every command leads where the table says", needs="drive motion")
@@ -210,5 +207,4 @@ def homing(bench: Bench) -> None:
             if word >> cia402.HOMING_ERROR_BIT & 1 or bench.now_ns >= until_ns:
                 bench.deviates(f"homing is not attained: 6041h is {word:04X}h")
             bench.pass_time(0.01)
-        if word >> cia402.HOMING_ERROR_BIT & 1:
-            bench.deviates(f"homing is attained with an error: 6041h is {word:04X}h")
+        bench.expect(not word >> cia402.HOMING_ERROR_BIT & 1, f"homing is attained with an error: 6041h is {word:04X}h")

@@ -39,10 +39,8 @@ def history(bench: Bench) -> None:
     _provoke(bench)
     count, newest = bench.number(0x1003), bench.number(0x1003, 1)
     bench.sync_and_wait()
-    if count not in (before, before + 1) or not count:
-        bench.deviates(f"1003h:00 is {count} after an error, it was {before}")
-    if newest & 0xFFFF != SYNC_LENGTH_CODE:
-        bench.deviates(f"1003h:01 is {newest:08X}h after EMCY 8240h")
+    bench.expect(count and count in (before, before + 1), f"1003h:00 is {count} after an error, it was {before}")
+    bench.expect(newest & 0xFFFF == SYNC_LENGTH_CODE, f"1003h:01 is {newest:08X}h after EMCY 8240h")
 
 
 @point(42, "write to the history", "CiA 301, 1003h", accepted.VALUE)
@@ -77,8 +75,7 @@ def identifier(bench: Bench) -> None:
     value = bench.number(0x1014)
     if value & 0x7FF != 0x80 + bench.node_id:
         bench.notes.append(f"1014h is {value:08X}h, the default is {0x80 + bench.node_id:08X}h")
-    if value >> 31:
-        bench.does_not_apply("bit 31 of 1014h says that there is no EMCY")
+    bench.require(not value >> 31, "bit 31 of 1014h says that there is no EMCY")
     others = [can_id for can_id in range(EMCY_BASE + 1, EMCY_BASE + 128) if can_id != bench.emcy_id]
     for can_id in others:
         bench.taken(can_id)

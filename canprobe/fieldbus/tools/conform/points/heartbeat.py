@@ -39,15 +39,13 @@ def producer(bench: Bench) -> None:
     bench.put(0x1017, 0, _PERIOD_MS)
     period_s = _PERIOD_MS * 1e-3
     frames = bench.during((_PRODUCED + 1) * period_s + bench.times.slack_s, [bench.beat_id])
-    if len(frames) < _PRODUCED:
-        bench.deviates(f"{len(frames)} heartbeats in {_PRODUCED + 1} periods of {_PERIOD_MS} ms")
+    bench.expect(len(frames) >= _PRODUCED, f"{len(frames)} heartbeats in {_PRODUCED + 1} periods of {_PERIOD_MS} ms")
     mean_s = (frames[-1].t_ns - frames[0].t_ns) * 1e-9 / (len(frames) - 1)
     if abs(mean_s - period_s) > _SHARE * period_s + bench.times.slack_s / len(frames):
         bench.deviates(f"the heartbeat comes every {mean_s * 1e3:.1f} ms, expected {_PERIOD_MS} ms")
     bench.put(0x1017, 0, 0)
     bench.pass_time(bench.times.slack_s)
-    if bench.during(3 * period_s, [bench.beat_id]):
-        bench.deviates("heartbeats come although 1017h is 0")
+    bench.expect(not bench.during(3 * period_s, [bench.beat_id]), "heartbeats come although 1017h is 0")
 
 
 def _need_guarding(bench: Bench) -> None:
@@ -80,14 +78,12 @@ def guarding(bench: Bench) -> None:
 def life_guarding(bench: Bench) -> None:
     """Two requests, then none for the life time."""
     _need_guarding(bench)
-    if bench.guarded() is None:
-        bench.does_not_apply("the device does not answer guarding")
+    bench.require(bench.guarded() is not None, "the device does not answer guarding")
     bench.put(0x100C, 0, _GUARD_MS)
     bench.put(0x100D, 0, _LIFE_FACTOR)
     bench.nmt(0x01)
     for _ in range(2):
-        if bench.guarded() is None:
-            bench.deviates("guarding is not answered while life guarding runs")
+        bench.expect(bench.guarded() is not None, "guarding is not answered while life guarding runs")
     bench.emcy(HEARTBEAT_LOST_CODE, _GUARD_MS * _LIFE_FACTOR * 1e-3)
     bench.put(0x100D, 0, 0)
 
@@ -103,8 +99,7 @@ def heartbeat_wins(bench: Bench) -> None:
     bench.send(bench.beat_id | RTR_FLAG)
     bench.pass_time(3 * _GUARD_MS * 1e-3)
     frames = bench.taken(bench.beat_id)
-    if len(frames) < 3:
-        bench.deviates("no heartbeat comes while guarding is configured, too")
+    bench.expect(len(frames) >= 3, "no heartbeat comes while guarding is configured, too")
     if any(len(frame.data) != 1 or frame.data[0] & 0x80 for frame in frames):
         bench.deviates("a heartbeat has the toggle bit of guarding")
 
@@ -122,14 +117,12 @@ def consumer(bench: Bench) -> None:
     bench.nmt(0x01)
     period_s = _CONSUMED_MS * 1e-3
     bench.pass_time(1.5 * period_s)
-    if bench.errors():
-        bench.deviates("EMCY before the first heartbeat of the producer")
+    bench.expect(not bench.errors(), "EMCY before the first heartbeat of the producer")
     last_ns = 0
     for _ in range(4):
         last_ns = _beat(bench, producer)
         bench.pass_time(0.5 * period_s)
-    if bench.errors():
-        bench.deviates("EMCY although the heartbeats come in time")
+    bench.expect(not bench.errors(), "EMCY although the heartbeats come in time")
     _, t_ns = bench.emcy(HEARTBEAT_LOST_CODE, period_s)
     if (t_ns - last_ns) * 1e-9 < (1 - _SHARE) * period_s - bench.times.slack_s:
         bench.deviates(f"EMCY 8130h after {(t_ns - last_ns) * 1e-6:.0f} ms, the consumer time is {_CONSUMED_MS} ms")

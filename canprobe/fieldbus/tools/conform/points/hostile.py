@@ -31,8 +31,7 @@ _PACE_S = 0.02
 def sdo_lengths(bench: Bench) -> None:
     """A request cut to 0 to 7 bytes. Some devices answer shorter requests on purpose, which is noted."""
     answered = [length for length in range(8) if not bench.ignores(bench.request_id, _READ_TYPE[:length])]
-    if any(length < 4 for length in answered):
-        bench.deviates(f"requests of {answered} bytes are answered")
+    bench.expect(not any(length < 4 for length in answered), f"requests of {answered} bytes are answered")
     if answered:
         bench.notes.append(f"requests of {answered} bytes are answered, as for old PLCs")
     bench.serves("short requests")
@@ -42,8 +41,7 @@ def sdo_lengths(bench: Bench) -> None:
 def remote_requests(bench: Bench) -> None:
     """Remote requests under every identifier of the device but guarding and TPDOs."""
     for can_id in (bench.request_id, bench.answer_id, EMCY_BASE + bench.node_id):
-        if not bench.ignores(can_id | RTR_FLAG):
-            bench.deviates(f"a remote request for {can_id:03X}h is answered")
+        bench.expect(bench.ignores(can_id | RTR_FLAG), f"a remote request for {can_id:03X}h is answered")
     bench.serves("remote requests")
 
 
@@ -82,8 +80,7 @@ def every_command(bench: Bench) -> None:
 @point(97, "CAN FD frames", "ISO 11898-1, FD format", "an FD frame is no SDO request", needs="alone")
 def fd_frames(bench: Bench) -> None:
     """A request in a frame of twelve bytes, where the bus carries such frames."""
-    if not bench.fd:
-        bench.does_not_apply("the bus carries no CAN FD frames")
+    bench.require(bench.fd, "the bus carries no CAN FD frames")
     if not bench.ignores(bench.request_id, _READ_TYPE.ljust(_FD_BYTES, b"\0")):
         bench.deviates("an SDO request of twelve bytes is answered")
     bench.serves("CAN FD frames")

@@ -65,8 +65,7 @@ def _configuration(bench: Bench) -> Iterator[None]:
     """
     answer = _select(bench, _address(bench))
     try:
-        if answer is None:
-            bench.does_not_apply("the device does not answer switch state selective, which is point 66")
+        bench.require(answer is not None, "the device does not answer switch state selective, which is point 66")
         yield
     finally:
         _release(bench)
@@ -86,8 +85,7 @@ def switch_selective(bench: Bench) -> None:
         bench.does_not_apply("the device does not speak LSS")
     answer = _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID))
     _release(bench)
-    if answer is None:
-        bench.deviates("the device answers no inquiry after it was selected")
+    bench.expect(answer is not None, "the device answers no inquiry after it was selected")
     if _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID), silent=True) is not None:
         bench.deviates("an inquiry is answered in waiting state")
 
@@ -143,8 +141,7 @@ def configure_bit_timing(bench: Bench) -> None:
         answer = _ask(bench, pack_lss(LssCommand.CONFIGURE_BIT_TIMING, bytes((0, _NO_BIT_RATE))))
         if answer is not None and (answer[0] != LssCommand.CONFIGURE_BIT_TIMING or not answer[1]):
             bench.deviates(f"a reserved bit rate is answered with {answer.hex(' ')}, expected an error")
-        if answer is None:
-            bench.deviates("no answer to configure bit timing")
+        bench.expect(answer is not None, "no answer to configure bit timing")
 
 
 @point(73, "inquire", "CiA 305, inquire services", "the four numbers of 1018h and the node-ID", needs="alone")

@@ -28,8 +28,7 @@ def boot_up(bench: Bench) -> None:
         bench.notes.append("the device starts by itself (1F80h)")
     elif state != NmtState.PRE_OPERATIONAL:
         bench.deviates(f"state {state:02X}h after the boot-up, expected 7Fh")
-    if bench.boots != before + 1:
-        bench.deviates(f"{bench.boots - before} boot-up messages after one reset")
+    bench.expect(bench.boots == before + 1, f"{bench.boots - before} boot-up messages after one reset")
 
 
 @point(1, "power on", "CiA 301, NMT boot-up", "700h+id with 00h after the power came back", needs="nmt")
@@ -39,8 +38,7 @@ def power_on(bench: Bench) -> None:
     if not bench.by_hand(f"switch node {bench.node_id} off and on, then confirm"):
         bench.does_not_apply("it needs somebody who switches the device off and on")
     bench.pass_time(bench.times.boot_s)
-    if bench.boots == before:
-        bench.deviates("no boot-up message after the power came back")
+    bench.expect(bench.boots != before, "no boot-up message after the power came back")
 
 
 @point(
@@ -125,8 +123,7 @@ def stopped(bench: Bench) -> None:
     """SDO is silent in stopped, and served again in pre-operational."""
     bench.watch_state()
     bench.go(NmtState.STOPPED)
-    if not bench.ignores(bench.request_id, _READ_TYPE):
-        bench.deviates("an SDO request is answered in stopped")
+    bench.expect(bench.ignores(bench.request_id, _READ_TYPE), "an SDO request is answered in stopped")
     bench.go(NmtState.PRE_OPERATIONAL)
     bench.serves("the return to pre-operational")
 
@@ -141,8 +138,7 @@ def stopped(bench: Bench) -> None:
 def pdos_in_operational(bench: Bench) -> None:
     """SYNC and remote requests in pre-operational and stopped; frames that were queued before may still come."""
     tpdos = bench.device.valid_pdos(TPDOS)
-    if not tpdos:
-        bench.does_not_apply("the device has no valid TPDO")
+    bench.require(tpdos, "the device has no valid TPDO")
     for state in (NmtState.PRE_OPERATIONAL, NmtState.STOPPED):
         bench.nmt(NmtCommand.START)
         changed_ns = bench.settle(state)
@@ -173,8 +169,7 @@ def request_pdo(bench: Bench, cob_id: int) -> None:
 )
 def reaches_operational(bench: Bench) -> None:
     """What was seen before the first point; points that need operational do not apply where it is not reached."""
-    if bench.kept_out:
-        bench.deviates(f"{bench.kept_out}; end this error, and examine the device again")
+    bench.expect(not bench.kept_out, f"{bench.kept_out}; end this error, and examine the device again")
 
 
 @point(

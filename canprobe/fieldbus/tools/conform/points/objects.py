@@ -44,8 +44,7 @@ def read_all(bench: Bench) -> None:
             continue
         if size and len(value) != size and not (len(value) == 4 > size):
             wrong.append(f"{place} has {len(value)} bytes, its type {size}")
-    if wrong:
-        bench.deviates(_named(wrong))
+    bench.expect(not wrong, _named(wrong))
 
 
 @point(78, "write every ro", "CiA 306-1, AccessType", accepted.READ_ONLY, needs="eds")
@@ -61,8 +60,7 @@ def write_every_read_only(bench: Bench) -> None:
             tried += 1
             what = f"write to {place_text(*entry.place)}"
             bench.must_refuse(pack_write(*entry.place, value), accepted.READ_ONLY, what)
-    if not tried:
-        bench.does_not_apply("the EDS describes no further entry as ro in the communication area")
+    bench.require(tried, "the EDS describes no further entry as ro in the communication area")
 
 
 @point(79, "sub-index FFh", "CiA 301, structure of an object", "four bytes, or " + accepted.text(accepted.NO_ENTRY))
@@ -133,8 +131,7 @@ def restricted_identifiers(bench: Bench) -> None:
         for cob_id in _RESTRICTED:
             request = pack_write(index, 0, cob_id.to_bytes(4, "little"))
             bench.must_refuse(request, accepted.VALUE, f"{cob_id:03X}h for {index:04X}h")
-    if not found:
-        bench.does_not_apply("none of 1005h, 1012h and 1014h can be written")
+    bench.require(found, "none of 1005h, 1012h and 1014h can be written")
 
 
 @point(90, "identity", "CiA 306-1, DeviceInfo; CiA 301, 1018h", "the numbers of the EDS", needs="eds")

@@ -87,10 +87,8 @@ def type_0(bench: Bench) -> None:
     syncs(bench, cob_id, [None])
     quiet = syncs(bench, cob_id, [None, None])
     bench.put(*entry.place, bench.number(*entry.place) ^ 1)
-    if (found := quiet + syncs(bench, cob_id, [None, None])) == [0, 0, 0, 0]:
-        bench.does_not_apply(_NO_EVENT)
-    if found != [0, 0, 1, 0]:
-        bench.deviates(f"two SYNCs, an event and two SYNCs bring {found} TPDOs, expected [0, 0, 1, 0]")
+    bench.require((found := quiet + syncs(bench, cob_id, [None, None])) != [0, 0, 0, 0], _NO_EVENT)
+    bench.expect(found == [0, 0, 1, 0], f"two SYNCs, an event and two SYNCs bring {found} TPDOs, expected [0, 0, 1, 0]")
 
 
 @point(30, "type 255", TRANSMISSION, "an event brings a TPDO at once, SYNC brings none", needs="nmt sync eds")
@@ -100,18 +98,15 @@ def type_255(bench: Bench) -> None:
     bench.taken(cob_id)
     bench.put(*entry.place, bench.number(*entry.place) ^ 1)
     at_once = bench.next(cob_id, bench.times.slack_s)
-    if syncs(bench, cob_id, [None]) != [0]:
-        bench.deviates("SYNC brings a TPDO of type 255")
-    if at_once is None:
-        bench.does_not_apply(_NO_EVENT)
+    bench.expect(syncs(bench, cob_id, [None]) == [0], "SYNC brings a TPDO of type 255")
+    bench.require(at_once is not None, _NO_EVENT)
 
 
 @point(30, "remote request", TRANSMISSION, "type 253 answers a remote request, and no SYNC", needs="nmt")
 def remote_request(bench: Bench) -> None:
     """A remote request for a TPDO whose bit 30 permits it."""
     pdo = changeable_pdo(bench, TPDOS)
-    if bench.device.number(pdo, 1) & NO_RTR_FLAG:
-        bench.does_not_apply("bit 30 of the COB-ID permits no remote request")
+    bench.require(not bench.device.number(pdo, 1) & NO_RTR_FLAG, "bit 30 of the COB-ID permits no remote request")
     switch_off(bench, pdo)
     cob_id = put_to_work(bench, pdo, 253)
     bench.start()
@@ -145,8 +140,7 @@ def inhibit_time(bench: Bench) -> None:
     gaps = [(after - before) * 1e-6 for before, after in pairwise(times)]
     if gaps and min(gaps) < (1 - _SHARE) * _INHIBIT_MS:
         bench.deviates(f"two TPDOs within {min(gaps):.0f} ms, the inhibit time is {_INHIBIT_MS} ms")
-    if not gaps:
-        bench.deviates("no TPDOs come with an event time of 20 ms")
+    bench.expect(gaps, "no TPDOs come with an event time of 20 ms")
 
 
 @point(
@@ -160,11 +154,9 @@ def synchronous_rpdo(bench: Bench) -> None:
     bench.start()
     before = bench.number(*entry.place)
     _send_value(bench, cob_id, before ^ 1, entry.bits)
-    if bench.number(*entry.place) != before:
-        bench.deviates("a synchronous RPDO is applied before SYNC")
+    bench.expect(bench.number(*entry.place) == before, "a synchronous RPDO is applied before SYNC")
     bench.sync_and_wait()
-    if bench.number(*entry.place) != before ^ 1:
-        bench.deviates("a synchronous RPDO is not applied at SYNC")
+    bench.expect(bench.number(*entry.place) == before ^ 1, "a synchronous RPDO is not applied at SYNC")
 
 
 def _send_value(bench: Bench, cob_id: int, value: int, bits: int) -> None:
@@ -180,8 +172,7 @@ def short_rpdo(bench: Bench) -> None:
     bench.start()
     bench.send(cob_id, bytes(length))
     bench.pass_time(bench.times.slack_s)
-    if bench.errors():
-        bench.deviates("EMCY after an RPDO of the right length")
+    bench.expect(not bench.errors(), "EMCY after an RPDO of the right length")
     bench.send(cob_id, bytes(length - 1))
     bench.emcy(PDO_TOO_SHORT_CODE)
     bench.send(cob_id, bytes(length))
@@ -192,16 +183,14 @@ def short_rpdo(bench: Bench) -> None:
 def short_rpdo_applied(bench: Bench) -> None:
     """An entry that the user lets be written keeps its value."""
     entry = permitted_entry(bench, transmits=False)
-    if entry.bits < 16:
-        bench.does_not_apply("the entry has one byte only")
+    bench.require(entry.bits >= 16, "the entry has one byte only")
     cob_id = rpdo_of(bench, entry, EVENT_TYPE)
     bench.start()
     before = bench.number(*entry.place)
     bench.asked.add(PDO_TOO_SHORT_CODE)
     bench.send(cob_id, bytes((before & 0xFF ^ 1,)))
     bench.pass_time(bench.times.slack_s)
-    if bench.number(*entry.place) != before:
-        bench.deviates("a short RPDO is applied")
+    bench.expect(bench.number(*entry.place) == before, "a short RPDO is applied")
     _send_value(bench, cob_id, before, entry.bits)
 
 
@@ -211,13 +200,11 @@ def long_rpdo(bench: Bench) -> None:
     entry = permitted_entry(bench, transmits=False)
     cob_id = rpdo_of(bench, entry, EVENT_TYPE)
     bench.start()
-    if entry.bits >= 64:
-        bench.does_not_apply("the entry fills a whole frame")
+    bench.require(entry.bits < 64, "the entry fills a whole frame")
     bench.asked.add(PDO_TOO_LONG_CODE)
     before = bench.number(*entry.place)
     _send_value(bench, cob_id, before ^ 1, entry.bits + 8)
-    if bench.number(*entry.place) != before ^ 1:
-        bench.deviates("the first bytes of a long RPDO are not used")
+    bench.expect(bench.number(*entry.place) == before ^ 1, "the first bytes of a long RPDO are not used")
     _send_value(bench, cob_id, before, entry.bits)
 
 
@@ -233,8 +220,7 @@ def rpdo_event_timer(bench: Bench) -> None:
     for _ in range(2):
         last_ns = bench.send(cob_id, bytes(length))
         bench.pass_time(0.5e-3 * _WATCHED_MS)
-    if bench.errors():
-        bench.deviates("EMCY before the first RPDO, or while they come in time")
+    bench.expect(not bench.errors(), "EMCY before the first RPDO, or while they come in time")
     t_ns = bench.optional_emcy(RPDO_TIMEOUT_CODE, 1e-3 * _WATCHED_MS)
     if (t_ns - last_ns) * 1e-6 < (1 - _SHARE) * _WATCHED_MS:
         bench.deviates(f"EMCY 8250h {(t_ns - last_ns) * 1e-6:.0f} ms after the last RPDO, the time is {_WATCHED_MS} ms")
@@ -264,8 +250,7 @@ def synchronous_window(bench: Bench) -> None:
         _send_value(bench, cob_id, before ^ (2 if wait_s else 1), entry.bits)
         bench.sync_and_wait()
         seen.append(bench.number(*entry.place) ^ before)
-    if seen[0] != 1:
-        bench.deviates("an RPDO within the window is not applied at the next SYNC")
+    bench.expect(seen[0] == 1, "an RPDO within the window is not applied at the next SYNC")
     if seen[1] != 1:
         bench.notes.append("an RPDO behind the window is applied; it may be dropped")
 

@@ -61,8 +61,7 @@ def mapping_while_valid(bench: Bench) -> None:
     """An entry of a PDO in use gets another value, and its count 0."""
     pdo = _valid(bench, TPDOS, mapping=True)
     first = _refused_entry(bench, pdo, "an entry of a PDO in use")
-    if bench.number(pdo + 0x200, 1) != first:
-        bench.deviates("a mapping entry has changed although the write was refused")
+    bench.expect(bench.number(pdo + 0x200, 1) == first, "a mapping entry has changed although the write was refused")
 
 
 @point(
@@ -141,8 +140,7 @@ def map_unmappable(bench: Bench) -> None:
         tried += 1
         switch_off(bench, pdo)
         _refused_at_last(bench, pdo, [word_of(entry)], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
-    if not tried:
-        bench.does_not_apply("no mapping can be changed, or the EDS lets everything be mapped")
+    bench.require(tried, "no mapping can be changed, or the EDS lets everything be mapped")
 
 
 @point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
@@ -165,8 +163,7 @@ def times_while_valid(bench: Bench) -> None:
             tried += 1
             value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
             bench.must_refuse(pack_write(pdo, subindex, value), accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
-    if not tried:
-        bench.does_not_apply("the TPDOs have neither inhibit time nor start value")
+    bench.require(tried, "the TPDOs have neither inhibit time nor start value")
 
 
 @point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE, needs="nmt")
@@ -199,8 +196,7 @@ def dummies(bench: Bench) -> None:
     description = bench.device.description
     assert description is not None
     allowed = sorted(description.dummies & {0x0005, 0x0006, 0x0007})
-    if not allowed:
-        bench.does_not_apply("the EDS allows no dummy")
+    bench.require(allowed, "the EDS allows no dummy")
     pdo = idle_pdo(bench, RPDOS, mapping=True)
     for data_type in allowed:
         map_entries(bench, pdo, [data_type << 16 | 8 << data_type - 5])
@@ -252,10 +248,8 @@ def heard_lengths(bench: Bench) -> None:
         if mapped and (others := sorted(heard[cob_id] - {mapped})):
             got = " and ".join(map(str, others))
             wrong.append(f"TPDO {cob_id:03X}h ({pdo:04X}h) has {got} bytes, its mapping {mapped}")
-    if wrong:
-        bench.deviates("; ".join(wrong))
-    if not any(heard.values()):
-        bench.does_not_apply("no TPDO is heard")
+    bench.expect(not wrong, "; ".join(wrong))
+    bench.require(any(heard.values()), "no TPDO is heard")
     if silent := [f"{cob_id:03X}h" for cob_id, lengths in heard.items() if not lengths]:
         bench.notes.append(f"not heard: TPDO {', '.join(silent)}")
 

@@ -29,8 +29,7 @@ def write_read_only(bench: Bench) -> None:
 def read_write_only(bench: Bench) -> None:
     """Every entry that the EDS describes as wo."""
     entries = [entry for entry in bench.device.entries() if not entry.readable]
-    if not entries:
-        bench.does_not_apply("the EDS describes no entry as wo")
+    bench.require(entries, "the EDS describes no entry as wo")
     for entry in entries:
         bench.must_refuse(pack_read(*entry.place), accepted.WRITE_ONLY, f"read of {place_text(*entry.place)}")
 
@@ -96,8 +95,7 @@ def limits(bench: Bench) -> None:
         request = pack_write(*entry.place, bench.packed(*entry.place, value))
         what = f"{value} for {place_text(*entry.place)}"
         bench.must_refuse(request, accepted.ABOVE if above else accepted.BELOW, what)
-    if not found:
-        bench.does_not_apply("no entry that may be written has a limit; --write names more")
+    bench.require(found, "no entry that may be written has a limit; --write names more")
 
 
 @point(75, "default channel", "CiA 301, 1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
@@ -122,8 +120,7 @@ def two_channels(bench: Bench) -> None:
     """A segmented upload on the default channel, and an expedited one on 1201h within it."""
     bench.need((0x1201, 1), (0x1201, 2), written=False)
     request_id, answer_id = bench.number(0x1201, 1), bench.number(0x1201, 2)
-    if (request_id | answer_id) >> 11:
-        bench.does_not_apply("channel 1201h is not in use")
+    bench.require(not (request_id | answer_id) >> 11, "channel 1201h is not in use")
     name = bench.device.values.get((0x1008, 0), b"")
     answer = bench.request(0x40, 0x1008)
     bench.send(request_id, pack_read(0x1000))

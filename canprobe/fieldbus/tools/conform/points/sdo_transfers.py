@@ -87,8 +87,7 @@ def client_abort(bench: Bench) -> None:
     _segmented_download(bench)
     bench.taken(bench.answer_id)
     bench.abort(_HEARTBEAT)
-    if not bench.is_silent():
-        bench.deviates("the abort of the client is answered")
+    bench.expect(bench.is_silent(), "the abort of the client is answered")
     bench.must_refuse(_segment(_own_value(bench)), accepted.UNKNOWN_COMMAND, "a segment after the abort")
     bench.serves("the transfer")
 
@@ -118,8 +117,7 @@ def expedited(bench: Bench) -> None:
         bench.deviates(f"1000h has four bytes, its upload is answered with command {answer[0]:02X}h")
     if bench.device.writable(_HEARTBEAT):
         bench.put(_HEARTBEAT, 0, int.from_bytes(_own_value(bench), "little"))
-        if bench.upload(_HEARTBEAT) != _own_value(bench):
-            bench.deviates("1017h does not keep the value that was written")
+        bench.expect(bench.upload(_HEARTBEAT) == _own_value(bench), "1017h does not keep the value that was written")
 
 
 @point(23, "segmented upload", SEGMENTS, "a text in segments, as long as announced")
@@ -139,10 +137,8 @@ def segmented_download(bench: Bench) -> None:
     _segmented_download(bench)
     value = (int.from_bytes(_own_value(bench), "little") ^ 0x1000).to_bytes(2, "little")
     answer = bench.ask(_segment(value))
-    if answer[0] & 0xF0 != 0x20:
-        bench.deviates(f"a segment is answered with {answer.hex(' ')}")
-    if bench.upload(_HEARTBEAT) != value:
-        bench.deviates("1017h does not have the value of the segment")
+    bench.expect(answer[0] & 0xF0 == 0x20, f"a segment is answered with {answer.hex(' ')}")
+    bench.expect(bench.upload(_HEARTBEAT) == value, "1017h does not have the value of the segment")
 
 
 def _block_answer(bench: Bench, request: bytes) -> bytes:
@@ -163,8 +159,7 @@ def _text_index(bench: Bench) -> int:
 def _block_segments(bench: Bench, index: int) -> tuple[bytes, int, int]:
     """Begin a block upload; return the bytes of its first block, the number of segments, and the bit of the CRC."""
     answer = _block_answer(bench, pack_request(0xA4, index, 0, bytes((127, 0))))
-    if answer[0] >> 5 != 6:
-        bench.deviates(f"a block upload is answered with {answer.hex(' ')}")
+    bench.expect(answer[0] >> 5 == 6, f"a block upload is answered with {answer.hex(' ')}")
     bench.taken(bench.answer_id)
     bench.send(bench.request_id, b"\xa3" + bytes(7))
     value, number, last = b"", 0, False
@@ -184,12 +179,10 @@ def block_upload(bench: Bench) -> None:
     wanted = bench.device.values[index, 0]
     value, number, with_crc = _block_segments(bench, index)
     end = bench.ask(bytes((0xA2, number, 127)) + bytes(5))
-    if end[0] & 0xE3 != 0xC1:
-        bench.deviates(f"the end of a block upload is {end.hex(' ')}")
+    bench.expect(end[0] & 0xE3 == 0xC1, f"the end of a block upload is {end.hex(' ')}")
     value = value[: len(value) - (end[0] >> 2 & 7)]
     bench.send(bench.request_id, b"\xa1" + bytes(7))
-    if value != wanted:
-        bench.deviates(f"a block upload of {index:04X}h gives {value.hex()}, segments gave {wanted.hex()}")
+    bench.expect(value == wanted, f"a block upload of {index:04X}h gives {value.hex()}, segments gave {wanted.hex()}")
     if with_crc and int.from_bytes(end[1:3], "little") != crc_hqx(value, 0):
         bench.deviates("the CRC of a block upload is wrong")
     bench.serves("the transfer")
@@ -225,10 +218,8 @@ def block_download(bench: Bench) -> None:
     """1017h gets another value in a block of one segment."""
     value = b"\x10\x27"
     answer = _block_download(bench, value)
-    if answer[0] & 0xE3 != 0xA1:
-        bench.deviates(f"the end of a block download is answered with {answer.hex(' ')}")
-    if bench.upload(_HEARTBEAT) != value:
-        bench.deviates("1017h does not have the value of the block")
+    bench.expect(answer[0] & 0xE3 == 0xA1, f"the end of a block download is answered with {answer.hex(' ')}")
+    bench.expect(bench.upload(_HEARTBEAT) == value, "1017h does not have the value of the block")
 
 
 @point(23, "CRC of a block", BLOCKS, accepted.CRC)
@@ -236,8 +227,7 @@ def block_crc(bench: Bench) -> None:
     """A wrong CRC, where the device announces that it checks it."""
     answer = _block_answer(bench, pack_request(0xC6, _HEARTBEAT, 0, bytes((2, 0, 0, 0))))
     bench.abort(_HEARTBEAT)
-    if not answer[0] & 4:
-        bench.does_not_apply("the device does not check a CRC")
+    bench.require(answer[0] & 4, "the device does not check a CRC")
     value = b"\x10\x27"
     last = _block_download(bench, value, crc=crc_hqx(value, 0) ^ 0xFFFF)
     bench.check_abort(last, accepted.CRC, "a block with a wrong CRC")

@@ -42,8 +42,7 @@ def wrong_length(bench: Bench) -> None:
     cob_id = synchronous_tpdo(bench)
     bench.start()
     syncs(bench, cob_id, [None])
-    if syncs(bench, cob_id, [1]) != [0]:
-        bench.deviates("a SYNC with a byte too many brings a TPDO")
+    bench.expect(syncs(bench, cob_id, [1]) == [0], "a SYNC with a byte too many brings a TPDO")
     bench.emcy(SYNC_LENGTH_CODE)
     syncs(bench, cob_id, [None])
 
@@ -62,8 +61,7 @@ def lost_sync(bench: Bench) -> None:
     for _ in range(5):
         last_ns = bench.sync()
         bench.pass_time(_PERIOD_US * 1e-6)
-    if bench.errors():
-        bench.deviates("EMCY although SYNC comes in its period")
+    bench.expect(not bench.errors(), "EMCY although SYNC comes in its period")
     t_ns = bench.optional_emcy(SYNC_LOST_CODE, 3e-6 * _PERIOD_US)
     if (t_ns - last_ns) * 1e-3 < 1.1 * _PERIOD_US:
         bench.deviates(f"EMCY 8100h {(t_ns - last_ns) * 1e-6:.0f} ms after a SYNC, the period is 100 ms")
