@@ -57,11 +57,12 @@ class TargetAtEnable(Rule):
             target, position = node.target(node.mode), node.known(cia402.POSITION)
             if target is None or position is None:
                 continue
-            self.looked += 1
             command, armed, off = armed, None, abs(target.value - position.value)
-            if off > (allowed := node.tolerance(self.bus.period_ns)):
-                where = f"target {target.value} while the axis is at {position.value}"
-                self.blame(node, f"{where}: {off} off, {allowed:.0f} allowed", position, target, command)
+            allowed, where = (
+                node.tolerance(self.bus.period_ns),
+                f"target {target.value} while the axis is at {position.value}",
+            )
+            self.expect(node, off <= allowed, f"{where}: {off} off, {allowed:.0f} allowed", position, target, command)
 
 
 class SpeedAtEnable(Rule):
@@ -134,11 +135,9 @@ class ModeNotConfirmed(Rule):
                 begins, does = node.enabled and event.value != event.before and of_mode, "sends targets"
             if not begins:
                 continue
-            self.looked += 1
-            if not node.mode_confirmed:
-                shown = node.known(cia402.MODE_DISPLAY)
-                display = f"6061h was {shown.value}" if shown is not None else "6061h was not read"
-                self.blame(node, f"{does} in mode {asked.value}; {display}", asked, shown, event)
+            shown = node.known(cia402.MODE_DISPLAY)
+            display = f"6061h was {shown.value}" if shown is not None else "6061h was not read"
+            self.expect(node, node.mode_confirmed, f"{does} in mode {asked.value}; {display}", asked, shown, event)
 
 
 class SteppedBlind(Rule):
@@ -154,14 +153,12 @@ class SteppedBlind(Rule):
             command = command_of(event.word, event.before or 0)
             if command is None or (before, command) not in _STEPS_UP:
                 continue
-            self.looked += 1
             status, wanted = node.known(cia402.STATUSWORD), _STATES_FOR[command]
             if before is DriveCommand.SWITCH_ON:
                 wanted = wanted - {DriveState.READY_TO_SWITCH_ON}
-            if status is None or node.state not in wanted:
-                seen = f"6041h was {status.value:04X}h" if status is not None else "6041h was not seen"
-                what = f"6040h = {event.word:04X}h after {event.before or 0:04X}h; {seen}"
-                self.blame(node, what, status, event)
+            seen = f"6041h was {status.value:04X}h" if status is not None else "6041h was not seen"
+            what = f"6040h = {event.word:04X}h after {event.before or 0:04X}h; {seen}"
+            self.expect(node, node.state in wanted, what, status, event)
 
 
 class ResetHeld(Rule):

@@ -30,9 +30,8 @@ class HomesAgain(Rule):
                 done, failed = event.word >> cia402.HOMING_ATTAINED_BIT & 1, event.word >> cia402.HOMING_ERROR_BIT & 1
                 referenced = (referenced or event.frame) if done and not failed else None
             elif event.word & ~(event.before or 0) & 1 << cia402.HOMING_START_BIT and node.enabled:
-                self.looked += 1
-                if referenced is not None:
-                    self.blame(node, "homing is started on an axis that has its reference", referenced, event)
+                what = "homing is started on an axis that has its reference"
+                self.expect(node, referenced is None, what, referenced, event)
 
 
 class HomingStart(Rule):
@@ -54,11 +53,9 @@ class HomingStart(Rule):
             if asked is None or asked.value != OperationMode.HOMING:
                 continue
             if first is event.frame:
-                self.looked += 1
-                if not node.mode_confirmed:
-                    shown = node.known(cia402.MODE_DISPLAY)
-                    display = shown.value if shown is not None else "not read"
-                    self.blame(node, f"bit 4 rises while 6061h is {display}", asked, shown, event)
+                shown = node.known(cia402.MODE_DISPLAY)
+                what = f"bit 4 rises while 6061h is {shown.value if shown is not None else 'not read'}"
+                self.expect(node, node.mode_confirmed, what, asked, shown, event)
             elif self.in_a_row(
                 node, first.t_ns < asked.t_ns and event.frame.t_ns - asked.t_ns > self._LONGEST_NS and node.enabled
             ):

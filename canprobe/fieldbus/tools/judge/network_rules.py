@@ -45,10 +45,8 @@ class WaitsForBootUp(Rule):
         if first is None or self.bus.now_ns - first.t_ns < _PATIENCE_NS:
             return
         if node.nmt in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):  # else somebody has started it before
-            self.looked += 1
-            if not node.addressed:
-                seconds = (self.bus.now_ns - first.t_ns) * 1e-9
-                self.blame(node, f"the node runs, and in {seconds:.1f} s nothing was sent to it", first)
+            seconds = (self.bus.now_ns - first.t_ns) * 1e-9
+            self.expect(node, node.addressed, f"the node runs, and in {seconds:.1f} s nothing was sent to it", first)
 
 
 class ResetsEnabled(BusRule):
@@ -159,11 +157,10 @@ class IrregularSync(BusRule):
         period_ns, intervals = self.bus.period_ns, self.intervals_ns
         if len(intervals) < self._LEAST or not period_ns:
             return
-        self.looked += 1
         off = sorted(abs(interval - period_ns) for interval in intervals)[int(0.99 * len(intervals))]
-        if off > self._SHARE * period_ns:
-            within = f"99 % of {len(intervals)} intervals are within {off * 1e-3:.0f} µs of {period_ns * 1e-3:.0f} µs"
-            self.blame(None, f"{within}: {100 * off / period_ns:.1f} %", *worst[1:])
+        within = f"99 % of {len(intervals)} intervals are within {off * 1e-3:.0f} µs of {period_ns * 1e-3:.0f} µs"
+        share = f"{100 * off / period_ns:.1f} %"
+        self.expect(None, off <= self._SHARE * period_ns, f"{within}: {share}", *worst[1:])
 
 
 class SyncGaps(BusRule):
@@ -221,11 +218,10 @@ class InterpolationTime(Rule):
             if not value or power is None or not node.is_sure(cia402.INTERPOLATION_TIME):
                 continue
             judged = True
-            self.looked += 1
             period_ns, time_ns = self.bus.period_ns, value * 10.0 ** (power + 9)
-            if abs(time_ns - period_ns) > self._SHARE * period_ns:
-                what = f"60C2h is {time_ns * 1e-6:.3f} ms; SYNC comes every {period_ns * 1e-6:.3f} ms"
-                self.blame(node, what, node.known(cia402.INTERPOLATION_TIME, 1), event)
+            near = abs(time_ns - period_ns) <= self._SHARE * period_ns
+            what = f"60C2h is {time_ns * 1e-6:.3f} ms; SYNC comes every {period_ns * 1e-6:.3f} ms"
+            self.expect(node, near, what, node.known(cia402.INTERPOLATION_TIME, 1), event)
 
 
 class NoWatchdog(Rule):
@@ -247,10 +243,8 @@ class NoWatchdog(Rule):
             if judged or event.frame.t_ns - first.t_ns < _SECOND_NS or not node.is_sure(0x1016):
                 continue
             judged = True
-            self.looked += 1
-            if not self._is_watched(node):
-                what = "enabled for a second, and neither 1016h, 14xxh:05, guarding nor 1006h watches the master"
-                self.blame(node, what, first, event)
+            what = "enabled for a second, and neither 1016h, 14xxh:05, guarding nor 1006h watches the master"
+            self.expect(node, self._is_watched(node), what, first, event)
 
     def _is_watched(self, node: SeenNode) -> bool:
         consumers = (node.value(0x1016, sub) or 0 for sub in range(1, 9))
@@ -282,10 +276,9 @@ class StarvesWatchdog(Rule):
             before, last[key] = last.get(key), event.frame
             if before is None or node.started_ns is None or before.t_ns < node.started_ns:
                 continue
-            self.looked += 1
             gap_ns, allowed_ns = event.frame.t_ns - before.t_ns, allowed_ms * 1_000_000
-            if allowed_ns + _SLACK_NS + self.bus.arbitration_ns < gap_ns < _GONE * allowed_ns:
-                self.blame(node, f"{gap_ns * 1e-6:.0f} ms without {what} {allowed_ms} ms", before, event)
+            late = allowed_ns + _SLACK_NS + self.bus.arbitration_ns < gap_ns < _GONE * allowed_ns
+            self.expect(node, not late, f"{gap_ns * 1e-6:.0f} ms without {what} {allowed_ms} ms", before, event)
 
 
 def _consumer_ms(node: SeenNode, producer_id: int) -> int:

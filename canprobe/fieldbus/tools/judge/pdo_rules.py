@@ -79,11 +79,10 @@ class NeverSent(Rule):
         for pdo in node.rpdos.values():
             if not pdo.used or not pdo.maps(cia402.CONTROLWORD, *TARGETS):
                 continue
-            self.looked += 1
-            if not node.rpdo_counts.get(pdo.number) and not (by_sdo and not pdo.maps(*TARGETS)):
-                seconds, kind = (self.bus.now_ns - started_ns) * 1e-9, f"type {pdo.layout.transmission_type}"
-                what = f"RPDO {pdo.number} ({kind}) was not sent in {seconds:.1f} s of operational"
-                self.blame(node, what, node.known(0x13FF + pdo.number, 1))
+            sent = bool(node.rpdo_counts.get(pdo.number)) or (by_sdo and not pdo.maps(*TARGETS))
+            seconds, kind = (self.bus.now_ns - started_ns) * 1e-9, f"type {pdo.layout.transmission_type}"
+            what = f"RPDO {pdo.number} ({kind}) was not sent in {seconds:.1f} s of operational"
+            self.expect(node, sent, what, node.known(0x13FF + pdo.number, 1))
 
 
 class WrittenWhileOperational(Rule):
@@ -97,9 +96,8 @@ class WrittenWhileOperational(Rule):
         while event := (yield):
             if not event.writes or event.place[0] not in range(0x1400, 0x1C00) or node.nmt is None:
                 continue
-            self.looked += 1
-            if node.operational and event.frame.t_ns - node.nmt_ns > QUEUED_NS:
-                self.blame(node, f"{place_text(*event.place)} is written while the node is operational", event)
+            in_time = not node.operational or event.frame.t_ns - node.nmt_ns <= QUEUED_NS
+            self.expect(node, in_time, f"{place_text(*event.place)} is written while the node is operational", event)
 
 
 class RemappedWhileValid(Rule):
@@ -118,12 +116,10 @@ class RemappedWhileValid(Rule):
                 continue
             parameters = index - 0x200
             cob_id, count = node.sure_value(parameters, 1), node.sure_value(index)
-            self.looked += 1
             valid = cob_id is not None and not cob_id & INVALID_FLAG
-            if valid or count:
-                why = f"{parameters:04X}h:01 is {cob_id:08X}h, valid" if valid else f"{index:04X}h:00 is {count}, not 0"
-                shown = node.known(parameters, 1) if valid else node.known(index)
-                self.blame(node, f"{place_text(*event.place)} is written while {why}", shown, event)
+            why = f"{parameters:04X}h:01 is {cob_id:08X}h, valid" if valid else f"{index:04X}h:00 is {count}, not 0"
+            shown, what = node.known(parameters, 1) if valid else node.known(index), place_text(*event.place)
+            self.expect(node, not (valid or count), f"{what} is written while {why}", shown, event)
 
 
 class LengthNotMapping(Rule):

@@ -112,6 +112,12 @@ class Rule:
             node_id = node.node_id if node is not None else None
             self.findings.append(RuleFinding(self.bus.now_ns, node_id, what, ordered))
 
+    def expect(self, node: SeenNode | None, good: bool, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
+        """Judge once: note a finding, as `blame` does, unless all is well."""
+        self.looked += 1
+        if not good:
+            self.blame(node, what, *shown)
+
     def in_a_row(self, key: Hashable, bad: bool, wanted: int = 2) -> bool:
         """Count what is bad in a row; whether it has just become `wanted`. While a fault excuses it nothing counts."""
         self.looked += 1

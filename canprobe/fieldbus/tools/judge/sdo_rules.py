@@ -76,9 +76,8 @@ class TimeoutTooShort(Rule):
                     continue
                 abort = event
                 waited_ns = event.frame.t_ns - event.request.t_ns
-                self.looked += 1
-                if waited_ns < self._STALE_NS:
-                    self.blame(node, f"time-out {waited_ns * 1e-6:.1f} ms after the request", event.request, event)
+                what = f"time-out {waited_ns * 1e-6:.1f} ms after the request"
+                self.expect(node, waited_ns >= self._STALE_NS, what, event.request, event)
             elif event.late and abort is not None:
                 self.looked += 1
                 late_answers += 1

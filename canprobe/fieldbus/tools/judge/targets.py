@@ -66,9 +66,8 @@ class ModeWhileMoving(Rule):
         while event := (yield):
             if not node.enabled or event.mode in (event.before, 0):
                 continue
-            self.looked += 1
-            if node.moves(event.frame.t_ns):
-                self.blame(node, f"6060h = {event.mode} while the axis moves", *motion_of(node), event)
+            still, what = not node.moves(event.frame.t_ns), f"6060h = {event.mode} while the axis moves"
+            self.expect(node, still, what, *motion_of(node), event)
 
 
 class StepTooLarge(Rule):
@@ -166,19 +165,16 @@ class EndsMoving(Rule):
                     continue
                 last = None
                 if node.enabled:
-                    self.looked += 1
-                    if self._unstopped(node):
-                        what = f"NMT {event.command.name.lower().replace('_', ' ')} while the axis moves"
-                        self.blame(node, what, *motion_of(node), event)
+                    what = f"NMT {event.command.name.lower().replace('_', ' ')} while the axis moves"
+                    self.expect(node, not self._unstopped(node), what, *motion_of(node), event)
             elif isinstance(event, RpdoSeen):
                 last = event.frame if event.pdo.maps(*TARGETS) else last
             elif last is not None:
                 silent_ns = event.frame.t_ns - last.t_ns
                 if silent_ns > max(self._SILENCE_NS, 20 * self.bus.period_ns):
-                    self.looked += 1
-                    if node.enabled and self._unstopped(node):
-                        what = f"the axis moves, and the last RPDO came {silent_ns * 1e-6:.0f} ms ago"
-                        self.blame(node, what, last, *motion_of(node))
+                    left_moving = node.enabled and self._unstopped(node)
+                    what = f"the axis moves, and the last RPDO came {silent_ns * 1e-6:.0f} ms ago"
+                    self.expect(node, not left_moving, what, last, *motion_of(node))
                     last = None
 
     def _unstopped(self, node: SeenNode) -> bool:
@@ -203,9 +199,8 @@ class PowerOffMoving(Rule):
                 continue
             if event.before is None or command_of(event.before) is not DriveCommand.ENABLE_OPERATION:
                 continue
-            self.looked += 1
-            if node.moves(event.frame.t_ns):
-                self.blame(node, f"6040h = {event.word:04X}h while the axis moves", *motion_of(node), event)
+            still, what = not node.moves(event.frame.t_ns), f"6040h = {event.word:04X}h while the axis moves"
+            self.expect(node, still, what, *motion_of(node), event)
 
 
 def motion_of(node: SeenNode) -> tuple[Known | None, ...]:
