@@ -366,7 +366,7 @@ class Examination:
             self._check_power()
             self._put_back()
             self.journal.close()
-            if surroundings.state_of(self._node_id) == NmtState.OPERATIONAL and not surroundings.lacks("nmt"):
+            if surroundings.states.get(self._node_id) == NmtState.OPERATIONAL and not surroundings.lacks("nmt"):
                 bench.settle(NmtState.OPERATIONAL)
         except CanprobeError as error:
             path = self.journal.path

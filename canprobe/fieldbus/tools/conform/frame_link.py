@@ -48,13 +48,11 @@ class CameFrame(NamedTuple):
         can_id: identifier, with the flags of `port`.
         data: its data.
         t_ns: time of its reception.
-        order: its number among all that came; several may have one time.
     """
 
     can_id: int
     data: bytes
     t_ns: int
-    order: int
 
 
 class FrameLink:
@@ -89,7 +87,6 @@ class FrameLink:
         self.sent: deque[Frame] = deque(maxlen=_KEPT_FRAMES)
         self.came: deque[Frame] = deque(maxlen=_KEPT_FRAMES)
         self._inbox: dict[int, deque[CameFrame]] = {}
-        self._came_count = 0
         self._next_load_ns = 0
         self._load_count = 0
 
@@ -133,15 +130,13 @@ class FrameLink:
     def taken(self, can_id: int) -> list[CameFrame]:
         """Frames with an identifier that came and were not taken yet; they are taken now."""
         self._receive(self.now_ns)
-        box = self._inbox.pop(can_id, deque())
-        return list(box)
+        return list(self._inbox.pop(can_id, ()))
 
-    def during(self, seconds: float, can_ids: Sequence[int]) -> list[CameFrame]:
-        """Frames with some identifiers that come from now on for some time, in the order in which they came."""
-        for can_id in can_ids:
-            self.taken(can_id)
+    def during(self, seconds: float, can_id: int) -> list[CameFrame]:
+        """Frames with an identifier that come from now on for some time."""
+        self.taken(can_id)
         self.pass_time(seconds)
-        return sorted((frame for can_id in can_ids for frame in self.taken(can_id)), key=lambda frame: frame.order)
+        return self.taken(can_id)
 
     def forget(self) -> None:
         """Drop all frames that nobody took, and begin a new record."""
@@ -186,6 +181,4 @@ class FrameLink:
             self.odd_ids.add(can_id)
         if can_id & 0x7F == self.node_id or can_id > MAX_BASE_ID:
             self.came.append((can_id, data))
-        self._came_count += 1
-        box = self._inbox.setdefault(can_id, deque(maxlen=_KEPT_INBOX))
-        box.append(CameFrame(can_id, data, t_ns, self._came_count))
+        self._inbox.setdefault(can_id, deque(maxlen=_KEPT_INBOX)).append(CameFrame(*frame))

@@ -223,7 +223,7 @@ def _silent(text: str, step: Mapping[str, Any]) -> Step:
     can_id, for_s = _code(text), _seconds(step, "for_ms")
 
     def act(bench: Bench) -> None:
-        bench.expect(not bench.during(for_s, [can_id]), f"a frame {can_id:03X}h comes")
+        bench.expect(not bench.during(for_s, can_id), f"a frame {can_id:03X}h comes")
 
     return act
 

@@ -6,8 +6,8 @@ for some time; only where nobody but the device was heard is every other node id
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.presence import answering_nodes
@@ -19,7 +19,7 @@ MAX_BASE_ID = 0x7FF
 """Highest identifier of 11 bits; with more the flags of a remote request or of 29 bits are set."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Surroundings:
     """What was heard on the bus before the examination.
 
@@ -29,30 +29,20 @@ class Surroundings:
         master: what showed that there is another master; empty: nothing did.
         strangers: identifiers of frames that belong to no service of a known node.
         states: NMT states by node id, as heartbeats reported them.
-        lengths: identifiers and lengths of the frames that may be PDOs of the device.
-        seconds: time of listening, s.
+        lengths: lengths of the frames that may be PDOs of the device, by identifier.
     """
 
-    others: frozenset[int] = frozenset()
+    others: set[int] = field(default_factory=set)
     sync: bool = False
     master: str = ""
-    strangers: frozenset[int] = frozenset()
-    states: tuple[tuple[int, int], ...] = ()
-    seconds: float = 0.0
-    lengths: frozenset[tuple[int, int]] = frozenset()
+    strangers: set[int] = field(default_factory=set)
+    states: dict[int, int] = field(default_factory=dict)
+    lengths: dict[int, set[int]] = field(default_factory=dict)
 
     @property
     def alone(self) -> bool:
         """Whether nobody else was heard."""
         return not (self.others or self.sync or self.master or self.strangers)
-
-    def state_of(self, node_id: int) -> int | None:
-        """NMT state that a node reported; None where it sent no heartbeat."""
-        return dict(self.states).get(node_id)
-
-    def lengths_of(self, can_id: int) -> set[int]:
-        """Lengths of the frames that were heard with an identifier."""
-        return {length for one, length in self.lengths if one == can_id}
 
     def lacks(self, need: str) -> str:
         """Why a need of a point is not met here; empty where it is met."""
@@ -81,44 +71,35 @@ def hear(port: Port, node_id: int, seconds: float) -> Surroundings:
     frames: list[TimedFrame] = list(port.drain())
     while port.clock.now_ns() < end_ns:
         frames += port.wait_and_drain(end_ns)
-    found = surroundings_of(frames, node_id, seconds)
-    if not found.alone:
-        return found
-    others = answering_nodes(PumpedNetwork(port), (n for n in range(1, 128) if n != node_id), 0.05)
-    return replace(found, others=frozenset(others))
+    found = surroundings_of(frames, node_id)
+    if found.alone:
+        others = (n for n in range(1, 128) if n != node_id)
+        found.others.update(answering_nodes(PumpedNetwork(port), others, 0.05))
+    return found
 
 
-def surroundings_of(frames: Collection[TimedFrame], node_id: int, seconds: float) -> Surroundings:
+def surroundings_of(frames: Iterable[TimedFrame], node_id: int) -> Surroundings:
     """What frames show of others than one node."""
-    others: set[int] = set()
-    strangers: set[int] = set()
-    states: dict[int, int] = {}
-    sync, master = False, ""
+    found = Surroundings()
     for can_id, data, _ in frames:
         base, number = can_id & ~0x7F, can_id & 0x7F
+        if 0x180 <= can_id < SDO_TX_BASE:
+            found.lengths.setdefault(can_id, set()).add(len(data))
         if can_id == SYNC_ID:
-            sync = True
+            found.sync = True
         elif can_id == NMT_ID:
-            master = "NMT commands"
+            found.master = "NMT commands"
         elif base == SDO_RX_BASE and number:
-            master = f"SDO requests to node {number}"
-        elif base == HEARTBEAT_BASE and number:
-            states[number] = data[0] & 0x7F if data else 0
-            others.add(number)
-        elif base in (EMCY_BASE, SDO_TX_BASE) and number:
-            others.add(number)
+            found.master = f"SDO requests to node {number}"
+        elif base in (HEARTBEAT_BASE, EMCY_BASE, SDO_TX_BASE) and number:
+            found.others.add(number)
+            if base == HEARTBEAT_BASE:
+                found.states[number] = data[0] & 0x7F if data else 0
         elif number == node_id and ((0x180 <= base < 0x580 and base & 0x80) or can_id > MAX_BASE_ID):
             pass  # a default TPDO of the device, or a frame that it should not send
         elif can_id not in (LSS_REQUEST_ID, LSS_ANSWER_ID):
-            strangers.add(can_id)
+            found.strangers.add(can_id)
         else:
-            master = "LSS"
-    return Surroundings(
-        frozenset(others - {node_id}),
-        sync,
-        master,
-        frozenset(strangers),
-        tuple(sorted(states.items())),
-        seconds,
-        frozenset((can_id, len(data)) for can_id, data, _ in frames if 0x180 <= can_id < SDO_TX_BASE),
-    )
+            found.master = "LSS"
+    found.others.discard(node_id)
+    return found

@@ -120,7 +120,7 @@ def _event_driven(bench: Bench, event_ms: int, inhibit: int = 0) -> list[int]:
     """A TPDO of type 255 with its times; return when it came in half a second."""
     cob_id = put_to_work(bench, idle_pdo(bench, TPDOS), EVENT_TYPE, inhibit=inhibit, event_ms=event_ms)
     bench.start()
-    return [frame.t_ns for frame in bench.during(0.5, [cob_id])]
+    return [frame.t_ns for frame in bench.during(0.5, cob_id)]
 
 
 @point(31, "event timer", "CiA 301, 18xxh:05", "the TPDO repeats within 10 % of its event time", needs="nmt")

@@ -233,7 +233,7 @@ def heard_lengths(bench: Bench) -> None:
     """Every TPDO that was heard before, and that comes in operational by SYNC, request, event timer or by itself."""
     pdos = bench.device.valid_pdos(TPDOS)
     surroundings = bench.permits.surroundings
-    heard = {cob_id: surroundings.lengths_of(cob_id) for cob_id in pdos}
+    heard = {cob_id: surroundings.lengths.get(cob_id, set()) for cob_id in pdos}
     for cob_id in pdos:
         bench.taken(cob_id)
     if not surroundings.lacks("nmt"):

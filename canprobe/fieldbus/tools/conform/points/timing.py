@@ -65,7 +65,7 @@ def heartbeat_time(bench: Bench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
     bench.put(0x1017, 0, HEARTBEAT_MS)
-    frames = bench.during((_BEAT_COUNT + 2) * 1e-3 * HEARTBEAT_MS, [bench.beat_id])
+    frames = bench.during((_BEAT_COUNT + 2) * 1e-3 * HEARTBEAT_MS, bench.beat_id)
     gaps = tuple((b.t_ns - a.t_ns) * 1e-6 for a, b in pairwise(frames[1:]))
     bench.distributions[HEARTBEAT_TIME] = gaps
     allowed_ms = _BEAT_SHARE * HEARTBEAT_MS + bench.times.slack_s * 1e3
@@ -88,7 +88,7 @@ def under_load(bench: Bench) -> None:
     bench.put(0x1017, 0, HEARTBEAT_MS)
     bench.load = [(can_id, bytes(range(8))) for can_id in _LOAD_IDS], _LOAD_GAP_BITS * NS_PER_S // bench.bitrate
     began_ns = bench.now_ns
-    beats = bench.during(4e-3 * HEARTBEAT_MS, [bench.beat_id])
+    beats = bench.during(4e-3 * HEARTBEAT_MS, bench.beat_id)
     bench.distributions[f"{SDO_TIME} under load"] = _sdo_times(bench, _LOADED_COUNT)
     bench.expect(len(beats) >= 3, f"{len(beats)} heartbeats in {(bench.now_ns - began_ns) * 1e-6:.0f} ms under load")
     bench.load = None
