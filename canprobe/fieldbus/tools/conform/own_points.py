@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.errors import UsageError, did_you_mean, regular_file
-from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.protocol.frames import Frame, NmtCommand
 from canprobe.fieldbus.protocol.sdo import Place, place_text
 from canprobe.fieldbus.tools.conform.accepted import abort_text
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -40,12 +40,15 @@ FIRST_NUMBER = 201
 """Number of the first point of a file."""
 _KEYS = ("name", "clause", "expected", "hint", "needs", "steps")
 _NEEDS = ("eds", "nmt", "sync", "alone", "drive", "motion")
-_NMT = {command.name.lower().replace("_", "-"): command for command in NmtCommand}
+_COMMANDS = {command.name.lower().replace("_", "-"): command for command in NmtCommand}
 _MAX_BYTES = 1 << 20
 _DEFAULT_MS = 100.0
 _PLACE = re.compile(r"([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2})h?)?")
 _FRAME = re.compile(r"([0-9A-Fa-f]{3})#((?:[0-9A-Fa-f]{2}){0,8})")
-Step = Callable[[Bench], None]
+Number = int | None
+Step = Callable[[Bench], object]
+Parser = Callable[[str, Any], Any]
+"""Called with a key of a step and its value, None where it is missing; raises ValueError, TypeError or KeyError."""
 
 
 def read_points(path: Path) -> tuple[Point, ...]:
@@ -94,42 +97,62 @@ def _parse_step(where: str, step: object) -> Step:
     words = [word for word in STEPS if isinstance(step, dict) and word in step]
     if not isinstance(step, dict) or not words:
         raise UsageError(f"{where}: expected a table with one of {', '.join(STEPS)}, got {step!r}")
-    word = words[0]
-    parse, keys = STEPS[word]
-    _check_keys(where, step, (word, *keys))
-    value = step[word]
+    act, parsers = STEPS[words[0]]
+    _check_keys(where, step, tuple(parsers))
     try:
-        return parse(value, step)
+        return partial(act, **{key: parse(key, step.get(key)) for key, parse in parsers.items()})
     except (ValueError, TypeError, KeyError) as error:
-        raise UsageError(f"{where}: {word} = {value!r}: {error}") from error
+        raise UsageError(f"{where}: {words[0]} = {step[words[0]]!r}: {error}") from error
 
 
-def _place(text: str) -> Place:
+def _place(_key: str, text: str) -> Place:
     match = _PLACE.fullmatch(text)
     if match is None:
         raise ValueError("expected an object such as 2100h:01")
     return int(match[1], 16), int(match[2] or "0", 16)
 
 
-def _code(text: str) -> int:
-    return int(text.removesuffix("h"), 16)
+def _code(_key: str, text: str | None) -> Number:
+    return None if text is None else int(text.removesuffix("h"), 16)
 
 
-def _number(step: Mapping[str, Any], key: str) -> int | None:
-    value = step.get(key)
+def _bytes(_key: str, text: str | None) -> bytes:
+    return bytes.fromhex(text or "")
+
+
+def _number(key: str, value: object) -> Number:
     if value is not None and (not isinstance(value, int) or isinstance(value, bool)):
         raise TypeError(f"{key}: expected a whole number, got {value!r}")
     return value
 
 
-def _seconds(step: Mapping[str, Any], key: str) -> float:
-    value = float(step.get(key, _DEFAULT_MS))
-    if not 0 <= value <= 3_600_000:
-        raise ValueError(f"{key}: expected milliseconds up to an hour, got {value:g}")
-    return value * 1e-3
+def _value(key: str, value: object) -> Number:
+    if value is None:
+        raise KeyError("a value is missing")
+    return _number(key, value)
 
 
-def _refused(bench: Bench, what: str, code: int | None, access: Callable[[], object]) -> bool:
+def _milliseconds(key: str, value: Any) -> float:
+    number_ms = float(_DEFAULT_MS if value is None else value)
+    if not 0 <= number_ms <= 3_600_000:
+        raise ValueError(f"{key}: expected milliseconds up to an hour, got {number_ms:g}")
+    return number_ms
+
+
+def _command(_key: str, text: str) -> NmtCommand:
+    if text not in _COMMANDS:
+        raise ValueError(f"expected one of {', '.join(_COMMANDS)}")
+    return _COMMANDS[text]
+
+
+def _frame(_key: str, text: str) -> Frame:
+    match = _FRAME.fullmatch(text)
+    if match is None:
+        raise ValueError("expected a frame such as 205#0102")
+    return int(match[1], 16), bytes.fromhex(match[2])
+
+
+def _refused(bench: Bench, what: str, code: Number, access: Callable[[], object]) -> bool:
     """Access an entry; return whether it was refused, as it had to be."""
     try:
         access()
@@ -142,115 +165,69 @@ def _refused(bench: Bench, what: str, code: int | None, access: Callable[[], obj
     return False
 
 
-def _read(text: str, step: Mapping[str, Any]) -> Step:
-    place, code = _place(text), _code(step["abort"]) if "abort" in step else None
-    equals, mask = _number(step, "equals"), _number(step, "mask")
-    low, high = _number(step, "low"), _number(step, "high")
+def _read(bench: Bench, read: Place, *, equals: Number, mask: Number, low: Number, high: Number, abort: Number) -> None:
+    what = f"read of {place_text(*read)}"
+    if _refused(bench, what, abort, lambda: bench.upload(*read)):
+        return
+    data, entry = bench.upload(*read), bench.device.described(*read)
+    value = int.from_bytes(data, "little", signed=entry is not None and entry.signed)
+    value = value if mask is None else value & mask
+    if (equals is not None and value != equals) or not (low is None or low <= value):
+        bench.deviates(f"{what}: {value}, expected {equals if equals is not None else f'at least {low}'}")
+    bench.expect(high is None or value <= high, f"{what}: {value}, expected at most {high}")
 
-    def act(bench: Bench) -> None:
-        what = f"read of {place_text(*place)}"
-        if _refused(bench, what, code, lambda: bench.upload(*place)):
+
+def _write(bench: Bench, write: Place, value: int, abort: Number) -> None:
+    data = bench.packed(*write, value)
+    _refused(bench, f"write of {value} to {place_text(*write)}", abort, lambda: bench.download(*write, data))
+
+
+def _nmt(bench: Bench, nmt: NmtCommand) -> None:
+    if nmt in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
+        bench.reset(nmt)
+    else:
+        bench.nmt(nmt)
+        bench.pass_time(0.01)
+
+
+def _send(bench: Bench, send: Frame, emcy: Number, within_ms: float) -> None:
+    bench.send(*send)
+    if emcy is not None:
+        bench.emcy(emcy, 1e-3 * within_ms)
+
+
+def _expect(bench: Bench, expect: int, data: bytes, within_ms: float) -> None:
+    until_ns, seen = bench.now_ns + round(1e6 * within_ms), "none"
+    while (frame := bench.next(expect, max(0, until_ns - bench.now_ns) * 1e-9)) is not None:
+        if frame.data.startswith(data):
             return
-        data, entry = bench.upload(*place), bench.device.described(*place)
-        value = int.from_bytes(data, "little", signed=entry is not None and entry.signed)
-        value = value if mask is None else value & mask
-        if (equals is not None and value != equals) or not (low is None or low <= value):
-            bench.deviates(f"{what}: {value}, expected {equals if equals is not None else f'at least {low}'}")
-        if high is not None and value > high:
-            bench.deviates(f"{what}: {value}, expected at most {high}")
-
-    return act
+        seen = frame.data.hex(" ")
+    wanted = f" that begins with {data.hex(' ')}, the last was {seen}" if data else ""
+    bench.deviates(f"no frame {expect:03X}h within {within_ms:g} ms{wanted}")
 
 
-def _write(text: str, step: Mapping[str, Any]) -> Step:
-    place, code, value = _place(text), _code(step["abort"]) if "abort" in step else None, _number(step, "value")
-    if value is None:
-        raise KeyError("a value is missing")
-
-    def act(bench: Bench) -> None:
-        data = bench.packed(*place, value)
-        _refused(bench, f"write of {value} to {place_text(*place)}", code, lambda: bench.download(*place, data))
-
-    return act
+def _silent(bench: Bench, silent: int, for_ms: float) -> None:
+    bench.expect(not bench.during(1e-3 * for_ms, silent), f"a frame {silent:03X}h comes")
 
 
-def _nmt(text: str, _step: Mapping[str, Any]) -> Step:
-    if text not in _NMT:
-        raise ValueError(f"expected one of {', '.join(_NMT)}")
-    command = _NMT[text]
-
-    def act(bench: Bench) -> None:
-        if text.startswith("reset"):
-            bench.reset(command)
-        else:
-            bench.nmt(command)
-            bench.pass_time(0.01)
-
-    return act
-
-
-def _send(text: str, step: Mapping[str, Any]) -> Step:
-    match = _FRAME.fullmatch(text)
-    if match is None:
-        raise ValueError("expected a frame such as 205#0102")
-    can_id, data, within_s = int(match[1], 16), bytes.fromhex(match[2]), _seconds(step, "within_ms")
-    code = _code(step["emcy"]) if "emcy" in step else None
-
-    def act(bench: Bench) -> None:
-        bench.send(can_id, data)
-        if code is not None:
-            bench.emcy(code, within_s)
-
-    return act
-
-
-def _expect(text: str, step: Mapping[str, Any]) -> Step:
-    can_id, begin, within_s = _code(text), bytes.fromhex(step.get("data", "")), _seconds(step, "within_ms")
-
-    def act(bench: Bench) -> None:
-        until_ns, seen = bench.now_ns + round(within_s * 1e9), "none"
-        while (frame := bench.next(can_id, max(0, until_ns - bench.now_ns) * 1e-9)) is not None:
-            if frame.data.startswith(begin):
-                return
-            seen = frame.data.hex(" ")
-        wanted = f" that begins with {begin.hex(' ')}, the last was {seen}" if begin else ""
-        bench.deviates(f"no frame {can_id:03X}h within {within_s * 1e3:g} ms{wanted}")
-
-    return act
-
-
-def _silent(text: str, step: Mapping[str, Any]) -> Step:
-    can_id, for_s = _code(text), _seconds(step, "for_ms")
-
-    def act(bench: Bench) -> None:
-        bench.expect(not bench.during(for_s, can_id), f"a frame {can_id:03X}h comes")
-
-    return act
-
-
-def _emcy(text: str, step: Mapping[str, Any]) -> Step:
-    code, within_s = _code(text), _seconds(step, "within_ms")
-    return lambda bench: (bench.emcy(code, within_s), None)[1]
-
-
-def _wait(value: float, _step: Mapping[str, Any]) -> Step:
-    seconds = _seconds({"wait_ms": value}, "wait_ms")
-    return lambda bench: bench.pass_time(seconds)
-
-
-def _ask(text: str, _step: Mapping[str, Any]) -> Step:
-    return lambda bench: None if bench.by_hand(str(text)) else bench.does_not_apply(f"it was not done by hand: {text}")
-
-
-STEPS: Mapping[str, tuple[Callable[[Any, Mapping[str, Any]], Step], tuple[str, ...]]] = {
-    "read": (_read, ("equals", "mask", "low", "high", "abort")),
-    "write": (_write, ("value", "abort")),
-    "nmt": (_nmt, ()),
-    "send": (_send, ("emcy", "within_ms")),
-    "expect": (_expect, ("data", "within_ms")),
-    "silent": (_silent, ("for_ms",)),
-    "emcy": (_emcy, ("within_ms",)),
-    "wait_ms": (_wait, ()),
-    "ask": (_ask, ()),
+STEPS: Mapping[str, tuple[Callable[..., object], Mapping[str, Parser]]] = {
+    "read": (
+        _read,
+        {"read": _place, "equals": _number, "mask": _number, "low": _number, "high": _number, "abort": _code},
+    ),
+    "write": (_write, {"write": _place, "value": _value, "abort": _code}),
+    "nmt": (_nmt, {"nmt": _command}),
+    "send": (_send, {"send": _frame, "emcy": _code, "within_ms": _milliseconds}),
+    "expect": (_expect, {"expect": _code, "data": _bytes, "within_ms": _milliseconds}),
+    "silent": (_silent, {"silent": _code, "for_ms": _milliseconds}),
+    "emcy": (
+        lambda bench, emcy, within_ms: bench.emcy(emcy, 1e-3 * within_ms),
+        {"emcy": _code, "within_ms": _milliseconds},
+    ),
+    "wait_ms": (lambda bench, wait_ms: bench.pass_time(1e-3 * wait_ms), {"wait_ms": _milliseconds}),
+    "ask": (
+        lambda bench, ask: bench.require(bench.by_hand(ask), f"it was not done by hand: {ask}"),
+        {"ask": lambda _key, text: str(text)},
+    ),
 }
-"""Words of a step: what parses it, and what else it may have."""
+"""Words of a step: what does it, and what parses each of its keys."""
