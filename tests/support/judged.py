@@ -12,5 +12,5 @@ def rules_raised(plan, frames, *, charges_ns=()):
     nodes = {node.node_id: Description(load_eds(node.eds, node.node_id)) for node in plan.nodes}
     ordered = (BusFrame(t_ns, can_id, data) for can_id, data, t_ns in frames)
     judge = Judge(nodes, served=True, charges_ns=charges_ns).hear(ordered)
-    assert sum(rule.looked > 0 for rule in judge.rules) > 5, "there was something to judge"
-    return {rule.number: rule.findings[0].what for rule in judge.rules if rule.count}
+    assert sum(case.looked > 0 for case in judge.cases.values()) > 5, "there was something to judge"
+    return {number: case.findings[0].what for number, case in judge.cases.items() if case.count}

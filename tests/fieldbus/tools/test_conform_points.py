@@ -35,7 +35,7 @@ from canprobe.fieldbus.node.slave_node import Application, SlaveNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, NmtState
 from canprobe.fieldbus.tools.conform import POINTS, ExaminationSettings, WriteList
-from canprobe.fieldbus.tools.conform.hints import HINTS
+from canprobe.fieldbus.tools.conform.point import HINTS
 from canprobe.fieldbus.tools.reports import Verdict
 
 TPDO, RPDO, EMCY, HEARTBEAT, LSS, LSS_ANSWER = 0x185, 0x205, 0x085, 0x705, 0x7E5, 0x7E4
@@ -361,7 +361,7 @@ def test_every_point_has_its_defect():
     titles = [f"{point.group} {point.title}" for point in POINTS]
     assert len(set(titles)) == len(titles)
     assert {*DEFECTS, *DRIVE_DEFECTS} | INFORMATION == set(titles)
-    assert HINTS.keys() == {point.number for point in POINTS}
+    assert HINTS.keys() == {str(point.number) for point in POINTS}
 
 
 def test_a_device_without_a_defect_passes_every_point_of_cia_301(whole_eds):

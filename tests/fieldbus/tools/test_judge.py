@@ -24,7 +24,7 @@ def judged(master):
 
 
 def found(judge):
-    return {rule.number: rule.findings[0].what for rule in judge.rules if rule.count}
+    return {number: case.findings[0].what for number, case in judge.cases.items() if case.count}
 
 
 @pytest.mark.parametrize("master", GOOD, ids=lambda master: master.__name__)
@@ -36,8 +36,8 @@ def test_a_good_master_raises_no_rule(master):
 def test_a_bad_master_raises_its_rule_alone(master):
     judge = judged(master())
     assert tuple(found(judge)) == master.numbers, found(judge)
-    (rule,) = (rule for rule in judge.rules if rule.count)
-    assert rule.findings[0].frames, "the frames that show it"
+    (case,) = (case for case in judge.cases.values() if case.count)
+    assert case.findings[0].frames, "the frames that show it"
 
 
 def test_every_rule_has_a_bad_master():
@@ -46,8 +46,7 @@ def test_every_rule_has_a_bad_master():
 
 @pytest.mark.parametrize(("master", "number", "judged_times"), [(DrivesMuteAxis, 46, 0), (MutePassedOver, 46, 1)])
 def test_a_mute_axis_that_is_alone_has_no_others_to_stop(master, number, judged_times):
-    (rule,) = (rule for rule in judged(master()).rules if rule.number == number)
-    assert rule.looked == judged_times
+    assert judged(master()).cases[number].looked == judged_times
 
 
 @pytest.mark.parametrize("seed", range(3))

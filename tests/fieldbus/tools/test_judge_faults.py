@@ -85,7 +85,7 @@ class SineMaster:
         thrown = self.injections.thrown
         spans = [(one.begin_ns, one.end_ns) for one in thrown]
         judge = Judge(nodes, served=True, charges_ns=spans).hear(self.frames)
-        return {rule.number for rule in judge.rules if rule.count}, first_answers(self.frames, thrown, nodes)
+        return {number for number, case in judge.cases.items() if case.count}, first_answers(self.frames, thrown, nodes)
 
 
 def test_a_stubborn_master_is_found_in_each_fault_of_the_sequence():

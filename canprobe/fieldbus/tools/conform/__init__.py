@@ -14,7 +14,7 @@ on disk before the first write; it is put back and read back after each point an
 read before and after each point: where the power stage is on, the examination ends.
 
     point, registry     a point; the list of all; outcome: how one may end
-    points/             the points, one module a service; hints: what to look at where one fails
+    points/             the points, one module a service; hints.toml: what to look at where one fails
     examination         the order of things: hear, read, examine, put back
     bench               what points use: entries, states, EMCY; below it sdo_client and frame_link
     permits, journal    what may be sent; what is put back

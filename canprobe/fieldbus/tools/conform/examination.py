@@ -26,7 +26,6 @@ from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import RPDOS, ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
-from canprobe.fieldbus.tools.conform.hints import HINTS
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
 from canprobe.fieldbus.tools.conform.outcome import (
     BenchFailure,
@@ -376,8 +375,8 @@ class Examination:
 
 def _row(point: Point, verdict: Verdict, detail: str, **more: Any) -> ReportRow:
     failed = verdict is Verdict.FAIL
-    hint = (point.hint or HINTS.get(point.number, "")) if failed else ""
-    more |= {"clause": point.clause, "expected": point.expected, "hint": hint, "severity": "wrong" if failed else ""}
+    more |= {"clause": point.clause, "expected": point.expected}
+    more |= {"hint": point.hint, "severity": "wrong"} if failed else {}
     return ReportRow(point.group, point.title, verdict, detail=detail, **more)
 
 

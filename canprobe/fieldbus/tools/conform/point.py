@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.resources import files
 
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
+
+HINTS = tomllib.loads(files(__package__).joinpath("hints.toml").read_text(encoding="utf-8"))
+"""What the author of a firmware can look at where a point fails, by its number."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -22,7 +27,7 @@ class Point:
         run: function that examines it: it returns where the device conforms, else raises an error of `outcome`.
         needs: what must be there: ``eds``, ``nmt`` (no other master), ``sync`` (no other SYNC producer), ``alone`` (no
             other node), ``drive``, ``motion`` (permission to switch the power stage on).
-        hint: what the author of a firmware can look at; of our points `hints` has it.
+        hint: what the author of a firmware can look at.
     """
 
     number: int
@@ -57,6 +62,6 @@ class PointGroup:
         text = expected if isinstance(expected, str) else accepted.text(expected)
 
         def make(run: Callable[[Bench], None]) -> Point:
-            return Point(number, self.name, name, clause, text, run, frozenset(needs.split()))
+            return Point(number, self.name, name, clause, text, run, frozenset(needs.split()), HINTS[str(number)])
 
         return make

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 from canprobe.fieldbus.eds.description import Description
@@ -11,19 +13,14 @@ from canprobe.fieldbus.tools.judge import enable, homing_rules, network_rules, p
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
-from canprobe.fieldbus.tools.judge.network_rules import IrregularSync
-from canprobe.fieldbus.tools.judge.rule import BusRule, Rule, Watch
+from canprobe.fieldbus.tools.judge.rule import Case, Rule, Watch
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
 _MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, homing_rules, reactions)
-_FOUND = {
-    one
-    for module in _MODULES
-    for one in vars(module).values()
-    if isinstance(one, type) and issubclass(one, Rule) and one not in (Rule, BusRule)
-}
-RULES: tuple[type[Rule], ...] = tuple(sorted(_FOUND, key=lambda rule: rule.number))
+RULES = sorted(
+    (one for module in _MODULES for one in vars(module).values() if isinstance(one, Rule)), key=attrgetter("number")
+)
 """All rules, in the order of their numbers."""
 NO_RULES: tuple[tuple[str, str], ...] = (
     ("12 enabling as part of initialisation", "the bus does not show whether a person asked for it"),
@@ -45,7 +42,7 @@ class Judge:
 
     Attributes:
         bus: state of the bus.
-        rules: the rules.
+        cases: each rule at work, by its number.
         frame_count: number of frames taken.
     """
 
@@ -59,16 +56,16 @@ class Judge:
         without: Collection[int] = (),
     ) -> None:
         self.bus = BusState(nodes, served=served, bitrate=bitrate)
-        self.rules: list[Rule] = [rule(self.bus, charges_ns) for rule in RULES if rule.number not in without]
+        self.cases = {rule.number: Case(rule, self.bus, charges_ns) for rule in RULES if rule.number not in without}
         self._left_out = [(f"{r.number:02} {r.name}", "left out on request") for r in RULES if r.number in without]
         self.frame_count = 0
         self._watches: list[Watch[Any]] = []
         self._ears: dict[_Key, list[Watch[Any]]] = {}
-        for rule in self.rules:
-            for node, watch in rule.watches():
+        for case in self.cases.values():
+            for node, watch in case.watches():
                 next(watch)
                 self._watches.append(watch)
-                for kind in rule.hears():
+                for kind in case.rule.hears():
                     self._ears.setdefault((kind, node), []).append(watch)
 
     def hear(self, frames: Iterable[BusFrame], end_ns: int = 0) -> Judge:
@@ -98,32 +95,29 @@ class Judge:
             facts: facts on bench and command.
             log: path of the recorded frames; None where they were not kept.
         """
-        report = Report("judge", title, dict(facts), [_row(rule) for rule in self.rules], log=log)
+        report = Report("judge", title, dict(facts), [_row(case) for case in self.cases.values()], log=log)
         report.left_out += [*NO_RULES, *self._left_out]
-        for rule in self.rules:
-            if isinstance(rule, IrregularSync) and rule.intervals_ns:
-                report.distributions["SYNC interval"] = tuple(ns * 1e-6 for ns in rule.intervals_ns)
+        for case in self.cases.values():
+            if case.intervals_ns:
+                report.distributions["SYNC interval"] = tuple(ns * 1e-6 for ns in case.intervals_ns)
         return report
 
 
-def _row(rule: Rule) -> ReportRow:
+def _row(case: Case) -> ReportRow:
     """A row of the report for one rule."""
-    name = f"{rule.number:02} {rule.name}"
-    if not rule.count:
-        verdict = Verdict.PASS if rule.looked else Verdict.NOT_APPLICABLE
-        detail = "" if rule.looked else "the bus gave nothing to judge it by"
-        return ReportRow(rule.group, name, verdict, rule.source, rule.expected, detail=detail)
-    first = rule.findings[0]
+    rule = case.rule
+    row = ReportRow(rule.group, f"{rule.number:02} {rule.name}", Verdict.PASS, rule.source, rule.expected)
+    if not case.looked and not case.count:
+        return replace(row, verdict=Verdict.NOT_APPLICABLE, detail="the bus gave nothing to judge it by")
+    if not case.count:
+        return row
+    first = case.findings[0]
     node = f"node {first.node_id}: " if first.node_id is not None else ""
-    more = f" ({rule.count} times)" if rule.count > 1 else ""
-    frames = tuple(str(frame) for finding in rule.findings for frame in finding.frames)
-    return ReportRow(
-        rule.group,
-        name,
-        Verdict.FAIL,
-        rule.source,
-        rule.expected,
-        came=frames,
+    more = f" ({case.count} times)" if case.count > 1 else ""
+    return replace(
+        row,
+        verdict=Verdict.FAIL,
+        came=tuple(str(frame) for finding in case.findings for frame in finding.frames),
         detail=f"{node}{first.what} at {first.t_ns * 1e-9:.6f} s{more}",
         hint=rule.hint,
         severity=rule.severity.value,

@@ -19,7 +19,7 @@ from canprobe.fieldbus.tools.judge.events import (
     SyncSeen,
     TargetSeen,
 )
-from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, BusRule, Rule, Severity, Watch
+from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.judge.targets import Onward
 
@@ -28,139 +28,114 @@ _COMMUNICATION = (0x81, 0x82)
 _FAULTY = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
 _DOWN = (DriveCommand.DISABLE_VOLTAGE, DriveCommand.QUICK_STOP, DriveCommand.SHUTDOWN, DriveCommand.DISABLE_OPERATION)
 _SECOND_NS = 1_000_000_000
+LossEvent = SyncSeen | HeartbeatSeen | TargetSeen | ControlSeen | StatusSeen
+_SOON_NS = 100_000_000
+_PATIENCE_NS = 2_000_000_000
 
 
-class TargetsAfterFault(Rule):
+@rule(15, answers=True)
+def targets_after_fault(case: Case, node: SeenNode) -> Watch[EmcySeen | StatusSeen | TargetSeen]:
     """The targets of a faulty axis go on."""
-
-    number, name, group, severity = 15, "targets after a fault", "reactions", Severity.UNSAFE
-    source = "ros2_canopen PR 360"
-    expected = "from two cycles after an emergency of the device or bit 3 of 6041h on, the axis gets no new targets"
-    hint = "hold the target at 6064h, and disable the axis"
-    answers = True
-
-    def watch(self, node: SeenNode) -> Watch[EmcySeen | StatusSeen | TargetSeen]:
-        onward: Onward | None = None
-        while event := (yield):
-            if isinstance(event, TargetSeen):
-                if onward is not None and onward.goes_on(event):
-                    late_ms = (event.frame.t_ns - onward.cause.t_ns) * 1e-6
-                    self.blame(node, f"{late_ms:.0f} ms after the fault the targets go on", onward.cause, event)
-                    onward = None
-                continue
-            if isinstance(event, EmcySeen):
-                begins = event.code and event.code >> 8 not in _COMMUNICATION and node.is_drive
-                ends = not event.code and node.state not in _FAULTY
-            else:
-                begins = node.state in _FAULTY
-                ends = node.state in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)
-            if begins and onward is None:
-                self.looked += 1
-                since_ns = event.frame.t_ns + 2 * self.bus.period_ns + QUEUED_NS
-                onward = Onward(node, since_ns, self.bus.period_ns, event.frame)
-            elif ends:
+    onward: Onward | None = None
+    while event := (yield):
+        if isinstance(event, TargetSeen):
+            if onward is not None and onward.goes_on(event):
+                late_ms = (event.frame.t_ns - onward.cause.t_ns) * 1e-6
+                case.blame(node, f"{late_ms:.0f} ms after the fault the targets go on", onward.cause, event)
                 onward = None
+            continue
+        if isinstance(event, EmcySeen):
+            begins = event.code and event.code >> 8 not in _COMMUNICATION and node.is_drive
+            ends = not event.code and node.state not in _FAULTY
+        else:
+            begins = node.state in _FAULTY
+            ends = node.state in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)
+        if begins and onward is None:
+            case.looked += 1
+            since_ns = event.frame.t_ns + 2 * case.bus.period_ns + QUEUED_NS
+            onward = Onward(node, since_ns, case.bus.period_ns, event.frame)
+        elif ends:
+            onward = None
 
 
-class ResetTakenForError(BusRule):
+@rule(16, answers=True)
+def reset_taken_for_error(case: Case) -> Watch[EmcySeen | StatusSeen | ControlSeen | NmtSeen]:
     """The end of an error is taken for an error."""
-
-    number, name, group, severity = 16, "EMCY 0000h taken for an error", "reactions", Severity.MINOR
-    source = "ros_canopen#396"
-    expected = "EMCY 0000h, error reset, stops nothing"
-    hint = "test the code for 0 first"
-    answers = True
-    _SOON_NS = 100_000_000
-
-    def watch(self) -> Watch[EmcySeen | StatusSeen | ControlSeen | NmtSeen]:
-        resets: dict[SeenNode, BusFrame] = {}  # messages that healthy, enabled drives sent
-        errors_ns: dict[SeenNode, int] = {}
-        while event := (yield):
-            stopped: tuple[SeenNode, ...] = ()
-            if isinstance(event, EmcySeen):
-                recent = event.frame.t_ns - errors_ns.get(event.node, -_SECOND_NS) < _SECOND_NS
-                if event.code:
-                    errors_ns[event.node] = event.frame.t_ns
-                    resets.clear()
-                elif event.node.enabled and not recent:
-                    self.looked += 1
-                    resets[event.node] = event.frame
-            elif isinstance(event, StatusSeen):
-                if not event.node.enabled:
-                    resets.pop(event.node, None)
-            elif isinstance(event, ControlSeen):
-                stopped = (event.node,) if command_of(event.word) in _DOWN and event.node.enabled else ()
-            elif event.command is not NmtCommand.START:
-                stopped = event.nodes
-            for node in stopped:
-                if node in resets and (waited_ns := event.frame.t_ns - resets[node].t_ns) < self._SOON_NS:
-                    self.blame(node, f"a stop {waited_ns * 1e-6:.1f} ms after EMCY 0000h", resets.pop(node), event)
+    resets: dict[SeenNode, BusFrame] = {}  # messages that healthy, enabled drives sent
+    errors_ns: dict[SeenNode, int] = {}
+    while event := (yield):
+        stopped: tuple[SeenNode, ...] = ()
+        if isinstance(event, EmcySeen):
+            recent = event.frame.t_ns - errors_ns.get(event.node, -_SECOND_NS) < _SECOND_NS
+            if event.code:
+                errors_ns[event.node] = event.frame.t_ns
+                resets.clear()
+            elif event.node.enabled and not recent:
+                case.looked += 1
+                resets[event.node] = event.frame
+        elif isinstance(event, StatusSeen):
+            if not event.node.enabled:
+                resets.pop(event.node, None)
+        elif isinstance(event, ControlSeen):
+            stopped = (event.node,) if command_of(event.word) in _DOWN and event.node.enabled else ()
+        elif event.command is not NmtCommand.START:
+            stopped = event.nodes
+        for node in stopped:
+            if node in resets and (waited_ns := event.frame.t_ns - resets[node].t_ns) < _SOON_NS:
+                case.blame(node, f"a stop {waited_ns * 1e-6:.1f} ms after EMCY 0000h", resets.pop(node), event)
 
 
-class BootUpIgnored(Rule):
+@rule(21, answers=True)
+def boot_up_ignored(case: Case, node: SeenNode) -> Watch[HeartbeatSeen | TargetSeen | ControlSeen | AnswerSeen]:
     """A node boots by itself, and the master goes on as before."""
-
-    number, name, group, severity = 21, "boot-up ignored", "reactions", Severity.UNSAFE
-    source = "ros_canopen#337; linuxcnc-ethercat PR 523"
-    expected = "a node that boots gets no targets, and is configured before it is enabled again"
-    hint = "watch for boot-ups; bring the node up from the beginning"
-    answers = True
-
-    def watch(self, node: SeenNode) -> Watch[HeartbeatSeen | TargetSeen | ControlSeen | AnswerSeen]:
-        onward: Onward | None = None  # targets after a boot-up that nobody asked for
-        stale: BusFrame | None = None  # that boot-up, until the node is configured
-        while event := (yield):
-            if isinstance(event, HeartbeatSeen):
-                if event.state is NmtState.INITIALISING and event.before is NmtState.OPERATIONAL:
-                    self.looked += 1
-                    onward = Onward(node, event.frame.t_ns + QUEUED_NS, self.bus.period_ns, event.frame)
-                    stale = event.frame if node.configured else stale
-            elif isinstance(event, AnswerSeen):
-                if event.writes:
-                    onward = stale = None
-            elif isinstance(event, TargetSeen):
-                if onward is not None and onward.goes_on(event):
-                    late_ms = (event.frame.t_ns - onward.cause.t_ns) * 1e-6
-                    self.blame(node, f"targets go on {late_ms:.0f} ms after a boot-up", onward.cause, event)
-                    onward = None
-            elif stale is not None and node.operational and enables(event):
-                self.blame(node, "enabled after a boot-up without being configured", stale, event)
-                stale = None
+    onward: Onward | None = None  # targets after a boot-up that nobody asked for
+    stale: BusFrame | None = None  # that boot-up, until the node is configured
+    while event := (yield):
+        if isinstance(event, HeartbeatSeen):
+            if event.state is NmtState.INITIALISING and event.before is NmtState.OPERATIONAL:
+                case.looked += 1
+                onward = Onward(node, event.frame.t_ns + QUEUED_NS, case.bus.period_ns, event.frame)
+                stale = event.frame if node.configured else stale
+        elif isinstance(event, AnswerSeen):
+            if event.writes:
+                onward = stale = None
+        elif isinstance(event, TargetSeen):
+            if onward is not None and onward.goes_on(event):
+                late_ms = (event.frame.t_ns - onward.cause.t_ns) * 1e-6
+                case.blame(node, f"targets go on {late_ms:.0f} ms after a boot-up", onward.cause, event)
+                onward = None
+        elif stale is not None and node.operational and enables(event):
+            case.blame(node, "enabled after a boot-up without being configured", stale, event)
+            stale = None
 
 
-class LossIgnored(BusRule):
-    """A node falls silent, and the master drives it on; or only its heartbeat is lost, and axes go on."""
+class _Losses:
+    """Nodes that are lost, and whether they are driven on, or other axes are."""
 
-    number, name, group, severity = 19, "heartbeat lost, no reaction", "reactions", Severity.UNSAFE
-    source = "canopen#543; CiA 301, 1016h"
-    expected = (
-        "within the consumer time (1016h, or three times 1017h) and two cycles after the last heartbeat, a stop; a lost"
-        " axis is not kept enabled"
-    )
-    hint = "consume the heartbeat of each node, and stop all axes when it is missing"
-    answers = True
-
-    def watch(self) -> Watch[SyncSeen | HeartbeatSeen | TargetSeen | ControlSeen | StatusSeen]:
+    def __init__(self, case: Case) -> None:
+        self._case, self._bus = case, case.bus
         self._lost: dict[SeenNode, BusFrame] = {}
         self._onward: dict[SeenNode, Onward] = {}
         self._beat: dict[SeenNode, BusFrame] = {}
         self._report: dict[SeenNode, BusFrame] = {}
         self._still_ns: dict[SeenNode, int] = {}
         self._blamed: set[SeenNode] = set()
-        while event := (yield):
-            if isinstance(event, HeartbeatSeen):
-                self._beat[event.node] = event.frame
-                self._find(event.node)
-            elif isinstance(event, StatusSeen):
-                if event.frame.can_id in event.node.tpdos:
-                    self._report[event.node] = event.frame
-                    if not self._beats(event.node):
-                        self._find(event.node)
-            elif isinstance(event, SyncSeen) or (isinstance(event, TargetSeen) and not self.bus.syncs_ns):
-                for node in self.bus.nodes.values():
-                    self._look(node)
-            if isinstance(event, TargetSeen | ControlSeen) and event.node.enabled and self._lost:
-                self._follow(event)
+
+    def hear(self, event: LossEvent) -> None:
+        """Take an event."""
+        if isinstance(event, HeartbeatSeen):
+            self._beat[event.node] = event.frame
+            self._find(event.node)
+        elif isinstance(event, StatusSeen):
+            if event.frame.can_id in event.node.tpdos:
+                self._report[event.node] = event.frame
+                if not self._beats(event.node):
+                    self._find(event.node)
+        elif isinstance(event, SyncSeen) or (isinstance(event, TargetSeen) and not self._bus.syncs_ns):
+            for node in self._bus.nodes.values():
+                self._look(node)
+        if isinstance(event, TargetSeen | ControlSeen) and event.node.enabled and self._lost:
+            self._follow(event)
 
     def _find(self, node: SeenNode) -> None:
         """A lost node is back."""
@@ -174,9 +149,9 @@ class LossIgnored(BusRule):
         if last is None or node in self._lost or not node.operational:
             return
         limit_ns = self._limit_ns(node)
-        if limit_ns and self.bus.now_ns - last.t_ns > limit_ns:
+        if limit_ns and self._bus.now_ns - last.t_ns > limit_ns:
             self._lost[node] = last
-            self.looked += self._concerned(node)
+            self._case.looked += self._concerned(node)
 
     def _concerned(self, lost: SeenNode) -> bool:
         """Whether there is an axis whose targets the rule follows when this node is lost."""
@@ -188,10 +163,10 @@ class LossIgnored(BusRule):
 
     def _is_silent(self, node: SeenNode) -> bool:
         """Whether nothing else of a node comes, either."""
-        return self.bus.now_ns - node.heard_ns > self._silence_ns()
+        return self._bus.now_ns - node.heard_ns > self._silence_ns()
 
     def _silence_ns(self) -> int:
-        return max(50_000_000, 10 * self.bus.period_ns)
+        return max(50_000_000, 10 * self._bus.period_ns)
 
     def _beats(self, node: SeenNode) -> bool:
         """Whether heartbeats show that a node lives; else its synchronous statuswords do, which come with each SYNC."""
@@ -202,14 +177,14 @@ class LossIgnored(BusRule):
     def _limit_ns(self, node: SeenNode) -> int:
         """Age of the last sign of life at which a node is lost; 0 where it is not known."""
         if not self._beats(node):
-            return self._silence_ns() + 2 * self.bus.period_ns
+            return self._silence_ns() + 2 * self._bus.period_ns
         times = list(node.heartbeats_ns)
         if len(times) < 3:
             return 0
         usual_ns = sorted(b - a for a, b in pairwise(times))[(len(times) - 1) // 2]
         consumers = [node.number(0x1016, sub) or 0 for sub in range(1, 9)]
         consumed_ms = max(word & 0xFFFF for word in consumers)
-        return max(3 * usual_ns, consumed_ms * 1_000_000) + 2 * self.bus.period_ns
+        return max(3 * usual_ns, consumed_ms * 1_000_000) + 2 * self._bus.period_ns
 
     def _follow(self, event: TargetSeen | ControlSeen) -> None:
         node = event.node
@@ -219,7 +194,7 @@ class LossIgnored(BusRule):
         last = self._lost[lost]
         since_ns = last.t_ns + self._limit_ns(lost)
         if isinstance(event, TargetSeen):
-            onward = self._onward.setdefault(node, Onward(node, since_ns, self.bus.period_ns, last))
+            onward = self._onward.setdefault(node, Onward(node, since_ns, self._bus.period_ns, last))
             found = onward.goes_on(event)
             if event.value != event.before:
                 self._still_ns[node] = event.frame.t_ns
@@ -232,48 +207,53 @@ class LossIgnored(BusRule):
         if found:
             sign = "sign" if self._is_silent(lost) else "heartbeat"
             age_ms = (event.frame.t_ns - last.t_ns) * 1e-6
-            self.blame(lost, f"the last {sign} of node {lost.node_id} is {age_ms:.0f} ms old, and {what}", last, event)
+            age = f"the last {sign} of node {lost.node_id} is {age_ms:.0f} ms old"
+            self._case.blame(lost, f"{age}, and {what}", last, event)
             self._blamed.add(node)
 
 
-class MuteIgnored(LossIgnored):
-    """One axis says nothing, and the others go on."""
-
-    number, name, group, severity = 46, "mute axis ignored", "reactions", Severity.UNSAFE
-    source = "openarm_can"
-    expected = "when one axis falls silent the others stop, too"
-    hint = "watch the TPDOs and heartbeats of each axis, and stop all"
+class _MuteLosses(_Losses):
+    """Axes that say nothing, and whether the others are driven on."""
 
     def _concerned(self, lost: SeenNode) -> bool:
-        return self._is_silent(lost) and any(node.is_drive and node is not lost for node in self.bus.nodes.values())
+        return self._is_silent(lost) and any(node.is_drive and node is not lost for node in self._bus.nodes.values())
 
     def _follows(self, node: SeenNode, lost: SeenNode) -> bool:
         return node not in self._lost and self._is_silent(lost)
 
 
-class MissingFromStart(BusRule):
+@rule(19, answers=True)
+def loss_ignored(case: Case) -> Watch[LossEvent]:
+    """A node falls silent, and the master drives it on; or only its heartbeat is lost, and axes go on."""
+    losses = _Losses(case)
+    while event := (yield):
+        losses.hear(event)
+
+
+@rule(46, answers=True)
+def mute_ignored(case: Case) -> Watch[LossEvent]:
+    """One axis says nothing, and the others go on."""
+    losses = _MuteLosses(case)
+    while event := (yield):
+        losses.hear(event)
+
+
+@rule(20, answers=True)
+def missing_from_start(case: Case) -> Watch[StatusSeen]:
     """A node has never been heard, or never answered, and others are enabled."""
-
-    number, name, group, severity = 20, "enabled without all nodes", "reactions", Severity.WRONG
-    expected = "no axis is enabled before all nodes have been heard, and have answered"
-    hint = "wait for each node, and stop where one does not answer"
-    answers = True
-    _PATIENCE_NS = 2_000_000_000
-
-    def watch(self) -> Watch[StatusSeen]:
-        first: BusFrame | None = None  # that shows an enabled axis
-        blamed: set[SeenNode] = set()
-        while event := (yield):
-            if not event.node.enabled:
+    first: BusFrame | None = None  # that shows an enabled axis
+    blamed: set[SeenNode] = set()
+    while event := (yield):
+        if not event.node.enabled:
+            continue
+        first = first or event.frame
+        if event.frame.t_ns - first.t_ns < _PATIENCE_NS:
+            continue
+        for node in case.bus.nodes.values():
+            case.looked += 1
+            if node in blamed or (node.seen and (node.answers or not node.asked)):
                 continue
-            first = first or event.frame
-            if event.frame.t_ns - first.t_ns < self._PATIENCE_NS:
-                continue
-            for node in self.bus.nodes.values():
-                self.looked += 1
-                if node in blamed or (node.seen and (node.answers or not node.asked)):
-                    continue
-                blamed.add(node)
-                heard = "has never answered" if node.seen else "was never heard"
-                what = f"node {event.node.node_id} is enabled, and node {node.node_id} {heard}"
-                self.blame(node, what, first, event)
+            blamed.add(node)
+            heard = "has never answered" if node.seen else "was never heard"
+            what = f"node {event.node.node_id} is enabled, and node {node.node_id} {heard}"
+            case.blame(node, what, first, event)

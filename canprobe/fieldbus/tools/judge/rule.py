@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib.resources import files
 from types import NoneType
-from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
@@ -19,6 +21,7 @@ QUEUED_NS = 5_000_000
 CHARGED_NS = 1_000_000_000
 """Time after a fault of ours for which what follows is charged to it."""
 _KEPT_FINDINGS = 5
+_FACTS = tomllib.loads(files(__package__).joinpath("rules.toml").read_text(encoding="utf-8"))
 Event = TypeVar("Event", bound=BusEvent)
 Watch = Generator[None, Event | None, None]
 """Gets the events that its annotation names, one after the other, and None at the end of the bus."""
@@ -50,56 +53,75 @@ class RuleFinding:
     frames: tuple[BusFrame, ...]
 
 
+@dataclass(frozen=True, slots=True)
 class Rule:
-    """One rule, which follows each node by itself; a `BusRule` follows the whole bus.
-
-    Subclasses set the class attributes and write `watch`: a generator that gets the events one after the other, each
-    when the state of the bus has it already. What the rule remembers are the variables of the generator.
-
-    Args:
-        bus: state of the bus.
-        charges_ns: begin and end of each fault of ours; what happens meanwhile is charged to it, not to the master.
+    """One rule: its facts, which `rules.toml` has, and the generator that judges by it.
 
     Attributes:
         number: number of the fault, stable.
+        watch: function that makes the generator of a `Case`: for each node, where it takes one, else for the bus.
+        answers: whether it judges the reaction to a fault, so that faults of ours do not excuse it.
         name: a few words, stable.
         group: family.
         severity: what the fault costs.
         source: where the fault was seen, or the clause.
         expected: what a good master does.
         hint: what to change.
-        answers: whether it judges the reaction to a fault, so that faults of ours do not excuse it.
-        watch: the generator; its annotation names the kinds of the events that it gets.
-        looked: number of times that there was something to judge.
-        findings: first findings; `count` has the number of all.
     """
 
-    number: ClassVar[int]
-    name: ClassVar[str]
-    group: ClassVar[str]
-    severity: ClassVar[Severity]
-    source: ClassVar[str] = "CiA 301, CiA 402-2"
-    expected: ClassVar[str]
-    hint: ClassVar[str]
-    answers: ClassVar[bool] = False
+    number: int
     watch: Callable[..., Watch[Any]]
+    answers: bool
+    name: str
+    group: str
+    severity: Severity
+    source: str
+    expected: str
+    hint: str
 
-    def __init__(self, bus: BusState, charges_ns: Sequence[tuple[int, int]]) -> None:
-        self.bus = bus
-        self.looked = 0
-        self.count = 0
+    def hears(self) -> tuple[type[BusEvent], ...]:
+        """Kinds of the events that `watch` gets, which its annotation names."""
+        _, sent, _ = get_args(get_type_hints(self.watch)["return"])
+        return tuple(kind for kind in get_args(sent) if kind is not NoneType)
+
+
+def rule(number: int, *, answers: bool = False) -> Callable[[Callable[..., Watch[Any]]], Rule]:
+    """Make a `Rule` of the function below: a generator that gets events, each when the state of the bus has it.
+
+    What the rule remembers are the variables of the generator.
+    """
+    facts = _FACTS[str(number)]
+    return lambda watch: Rule(number, watch, answers, **facts | {"severity": Severity(facts["severity"])})
+
+
+class Case:
+    """One rule at work on one bus.
+
+    Args:
+        rule: the rule.
+        bus: state of the bus.
+        charges_ns: begin and end of each fault of ours; what happens meanwhile is charged to it, not to the master.
+
+    Attributes:
+        looked: number of times that there was something to judge.
+        findings: first findings; `count` has the number of all.
+        intervals_ns: times that the rule has measured.
+    """
+
+    def __init__(self, rule: Rule, bus: BusState, charges_ns: Sequence[tuple[int, int]]) -> None:
+        self.rule, self.bus = rule, bus
+        self.looked = self.count = 0
         self.findings: list[RuleFinding] = []
+        self.intervals_ns: list[int] = []
         self._charges_ns = charges_ns
         self._runs: Counter[Hashable] = Counter()
 
     def watches(self) -> Iterable[tuple[SeenNode | None, Watch[Any]]]:
         """Each node with the generator that follows it; None with the one that follows the bus."""
-        return [(node, self.watch(node)) for node in self.bus.nodes.values()]
-
-    def hears(self) -> tuple[type[BusEvent], ...]:
-        """Kinds of the events that `watch` gets."""
-        _, sent, _ = get_args(get_type_hints(self.watch)["return"])
-        return tuple(kind for kind in get_args(sent) if kind is not NoneType)
+        watch = self.rule.watch
+        if "node" not in watch.__annotations__:
+            return [(None, watch(self))]
+        return [(node, watch(self, node)) for node in self.bus.nodes.values()]
 
     def blame(self, node: SeenNode | None, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
         """Note a finding at the present time, with the frames that show it."""
@@ -125,12 +147,5 @@ class Rule:
         return self._runs[key] == wanted
 
     def _is_excused(self) -> bool:
-        spans = () if self.answers else self._charges_ns
+        spans = () if self.rule.answers else self._charges_ns
         return any(begin <= self.bus.now_ns <= end + CHARGED_NS for begin, end in spans)
-
-
-class BusRule(Rule):
-    """A rule on what several nodes, or frames of nobody, show."""
-
-    def watches(self) -> Iterable[tuple[SeenNode | None, Watch[Any]]]:
-        return [(None, self.watch())]

@@ -7,7 +7,7 @@ from canprobe.fieldbus.protocol.cia402 import DriveCommand, OperationMode, comma
 from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import ControlSeen, ModeSeen, NmtSeen, RpdoSeen, StatusSeen, TargetSeen
-from canprobe.fieldbus.tools.judge.rule import Rule, Severity, Watch
+from canprobe.fieldbus.tools.judge.rule import Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import TARGET_OF_MODE, TARGETS, Known, SeenNode
 
 _PLACES = (cia402.TARGET_POSITION, cia402.INTERPOLATION_DATA)
@@ -16,6 +16,7 @@ _CREEP_SHARE = 0.2
 """Share of the speed of a moving axis below which targets stand, as those that follow a noisy position."""
 _LOST_SHARE = 3.0
 """A step of so many limits is blamed at once; less may be the way of lost frames."""
+_SILENCE_NS = 250_000_000
 
 
 class Onward:
@@ -54,153 +55,116 @@ class Onward:
         return found
 
 
-class ModeWhileMoving(Rule):
+@rule(5)
+def mode_while_moving(case: Case, node: SeenNode) -> Watch[ModeSeen]:
     """The mode is changed while the axis moves."""
-
-    number, name, group, severity = 5, "mode changed while moving", "targets", Severity.UNSAFE
-    source = "ipa_canopen PR 29"
-    expected = "6060h is written while the axis stands"
-    hint = "stop the axis, and write 6060h after that"
-
-    def watch(self, node: SeenNode) -> Watch[ModeSeen]:
-        while event := (yield):
-            if not node.enabled or event.mode in (event.before, 0):
-                continue
-            still, what = not node.moves(event.frame.t_ns), f"6060h = {event.mode} while the axis moves"
-            self.expect(node, still, what, *motion_of(node), event)
+    while event := (yield):
+        if not node.enabled or event.mode in (event.before, 0):
+            continue
+        still, what = not node.moves(event.frame.t_ns), f"6060h = {event.mode} while the axis moves"
+        case.expect(node, still, what, *motion_of(node), event)
 
 
-class StepTooLarge(Rule):
+@rule(38)
+def step_too_large(case: Case, node: SeenNode) -> Watch[TargetSeen]:
     """Targets step or accelerate more than the drive may."""
-
-    number, name, group, severity = 38, "steps of targets", "targets", Severity.UNSAFE
-    source = "eRob_SOEM_linux#9"
-    expected = "in CSP, steps of 607Ah of at most 607Fh times the period, and changes of them of at most 60C5h"
-    hint = "interpolate between the points of the path, and limit speed and acceleration"
-
-    def watch(self, node: SeenNode) -> Watch[TargetSeen]:
-        last: int | None = None
-        while event := (yield):
-            period_ns = self.bus.period_ns
-            cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == cia402.TARGET_POSITION
-            if not (cyclic and node.enabled and node.settled and period_ns and event.before is not None):
-                last = None
-                continue
-            limit = node.step_limit(period_ns)
-            step, took_ns = event.value - event.before, event.frame.t_ns - event.before_ns
-            periods = max(1, round(took_ns / period_ns))
-            if limit is not None:
-                allowed = 1.05 * limit * periods + 2
-                if self.in_a_row(node, abs(step) > allowed) or abs(step) > _LOST_SHARE * allowed:
-                    what = f"607Ah steps by {abs(step)} in {periods} periods; 607Fh allows {limit * periods:.0f}"
-                    self.blame(node, what, event)
-            acceleration = node.value(0x60C5)
-            if acceleration and not node.value(0x60AA) and periods == 1:
-                change = 0 if last is None else abs(step - last)
-                most = acceleration * (period_ns * 1e-9) ** 2
-                if self.in_a_row(("acceleration", node), change > 1.05 * most + 3, 4):
-                    what = f"steps of 607Ah change by {change} in a period; 60C5h allows {most:.0f}"
-                    self.blame(node, what, event)
-            last = step
+    last: int | None = None
+    while event := (yield):
+        period_ns = case.bus.period_ns
+        cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == cia402.TARGET_POSITION
+        if not (cyclic and node.enabled and node.settled and period_ns and event.before is not None):
+            last = None
+            continue
+        limit = node.step_limit(period_ns)
+        step, took_ns = event.value - event.before, event.frame.t_ns - event.before_ns
+        periods = max(1, round(took_ns / period_ns))
+        if limit is not None:
+            allowed = 1.05 * limit * periods + 2
+            if case.in_a_row(node, abs(step) > allowed) or abs(step) > _LOST_SHARE * allowed:
+                what = f"607Ah steps by {abs(step)} in {periods} periods; 607Fh allows {limit * periods:.0f}"
+                case.blame(node, what, event)
+        acceleration = node.value(0x60C5)
+        if acceleration and not node.value(0x60AA) and periods == 1:
+            change = 0 if last is None else abs(step - last)
+            most = acceleration * (period_ns * 1e-9) ** 2
+            if case.in_a_row(("acceleration", node), change > 1.05 * most + 3, 4):
+                what = f"steps of 607Ah change by {change} in a period; 60C5h allows {most:.0f}"
+                case.blame(node, what, event)
+        last = step
 
 
-class OutsideLimits(Rule):
+@rule(39)
+def outside_limits(case: Case, node: SeenNode) -> Watch[TargetSeen]:
     """Targets lie outside the software limits."""
-
-    number, name, group, severity = 39, "targets outside limits", "targets", Severity.WRONG
-    source = "ros2_canopen, motor.cpp"
-    expected = "607Ah within 607Dh, as the drive stops at its limits and sets bit 11"
-    hint = "read 607Dh and keep the targets inside"
-
-    def watch(self, node: SeenNode) -> Watch[TargetSeen]:
-        while event := (yield):
-            limits = node.soft_limits()
-            to_position = event.index == cia402.TARGET_POSITION and node.mode in _POSITION_MODES
-            if not to_position or not node.enabled or not limits:
-                continue
-            low, high = limits
-            if self.in_a_row(node, not low <= event.value <= high):
-                self.blame(node, f"607Ah is {event.value}; 607Dh allows {low} to {high}", event)
+    while event := (yield):
+        limits = node.soft_limits()
+        to_position = event.index == cia402.TARGET_POSITION and node.mode in _POSITION_MODES
+        if not to_position or not node.enabled or not limits:
+            continue
+        low, high = limits
+        if case.in_a_row(node, not low <= event.value <= high):
+            case.blame(node, f"607Ah is {event.value}; 607Dh allows {low} to {high}", event)
 
 
-class FollowingErrorIgnored(Rule):
+@rule(40, answers=True)
+def following_error_ignored(case: Case, node: SeenNode) -> Watch[StatusSeen | TargetSeen]:
     """The axis does not follow, and the targets go on."""
-
-    number, name, group, severity = 40, "following error ignored", "targets", Severity.WRONG
-    source = "CiA 402-2, 6041h bit 13"
-    expected = "targets stop when bit 13 of 6041h is set for more than three cycles"
-    hint = "hold the target, or stop the axis, when bit 13 is set"
-    answers = True
-
-    def watch(self, node: SeenNode) -> Watch[StatusSeen | TargetSeen]:
-        onward: Onward | None = None
-        while event := (yield):
-            if isinstance(event, StatusSeen):
-                late = bool(event.word >> cia402.FOLLOWING_ERROR_BIT & 1)
-                lags = late and node.enabled and node.mode in _POSITION_MODES
-                if self.in_a_row(node, lags, 4):
-                    onward = Onward(node, event.frame.t_ns, self.bus.period_ns, event.frame)
-                elif not lags:
-                    onward = None
-            elif onward is not None and onward.goes_on(event):
-                what = "bit 13 of 6041h is set, and the targets go on"
-                self.blame(node, what, onward.cause, node.known(cia402.POSITION), event)
+    onward: Onward | None = None
+    while event := (yield):
+        if isinstance(event, StatusSeen):
+            late = bool(event.word >> cia402.FOLLOWING_ERROR_BIT & 1)
+            lags = late and node.enabled and node.mode in _POSITION_MODES
+            if case.in_a_row(node, lags, 4):
+                onward = Onward(node, event.frame.t_ns, case.bus.period_ns, event.frame)
+            elif not lags:
                 onward = None
+        elif onward is not None and onward.goes_on(event):
+            what = "bit 13 of 6041h is set, and the targets go on"
+            case.blame(node, what, onward.cause, node.known(cia402.POSITION), event)
+            onward = None
 
 
-class EndsMoving(Rule):
+@rule(17)
+def ends_moving(case: Case, node: SeenNode) -> Watch[NmtSeen | RpdoSeen | StatusSeen]:
     """The master goes while an axis moves."""
-
-    number, name, group, severity = 17, "ends while moving", "targets", Severity.UNSAFE
-    source = "ros2_canopen#288"
-    expected = "a moving axis is stopped (0002h, or halt) before RPDOs end or NMT takes the node out of operational"
-    hint = "stop the axis on every way out"
-    _SILENCE_NS = 250_000_000
-
-    def watch(self, node: SeenNode) -> Watch[NmtSeen | RpdoSeen | StatusSeen]:
-        last: BusFrame | None = None  # RPDO with a target
-        while event := (yield):
-            if isinstance(event, NmtSeen):
-                if event.command is NmtCommand.START:
-                    continue
+    last: BusFrame | None = None  # RPDO with a target
+    while event := (yield):
+        if isinstance(event, NmtSeen):
+            if event.command is NmtCommand.START:
+                continue
+            last = None
+            if node.enabled:
+                what = f"NMT {event.command.name.lower().replace('_', ' ')} while the axis moves"
+                case.expect(node, not _unstopped(case, node), what, *motion_of(node), event)
+        elif isinstance(event, RpdoSeen):
+            last = event.frame if event.pdo.maps(*TARGETS) else last
+        elif last is not None:
+            silent_ns = event.frame.t_ns - last.t_ns
+            if silent_ns > max(_SILENCE_NS, 20 * case.bus.period_ns):
+                left_moving = node.enabled and _unstopped(case, node)
+                what = f"the axis moves, and the last RPDO came {silent_ns * 1e-6:.0f} ms ago"
+                case.expect(node, not left_moving, what, last, *motion_of(node))
                 last = None
-                if node.enabled:
-                    what = f"NMT {event.command.name.lower().replace('_', ' ')} while the axis moves"
-                    self.expect(node, not self._unstopped(node), what, *motion_of(node), event)
-            elif isinstance(event, RpdoSeen):
-                last = event.frame if event.pdo.maps(*TARGETS) else last
-            elif last is not None:
-                silent_ns = event.frame.t_ns - last.t_ns
-                if silent_ns > max(self._SILENCE_NS, 20 * self.bus.period_ns):
-                    left_moving = node.enabled and self._unstopped(node)
-                    what = f"the axis moves, and the last RPDO came {silent_ns * 1e-6:.0f} ms ago"
-                    self.expect(node, not left_moving, what, last, *motion_of(node))
-                    last = None
-
-    def _unstopped(self, node: SeenNode) -> bool:
-        word = node.number(cia402.CONTROLWORD)
-        halted = word is not None and word >> cia402.HALT_BIT & 1
-        return node.moves(self.bus.now_ns) and not halted
 
 
-class PowerOffMoving(Rule):
+def _unstopped(case: Case, node: SeenNode) -> bool:
+    word = node.number(cia402.CONTROLWORD)
+    halted = word is not None and word >> cia402.HALT_BIT & 1
+    return node.moves(case.bus.now_ns) and not halted
+
+
+@rule(47)
+def power_off_moving(case: Case, node: SeenNode) -> Watch[ControlSeen]:
     """The voltage is taken away while the axis moves."""
-
-    number, name, group, severity = 47, "power off while moving", "targets", Severity.UNSAFE
-    source = "openarm_can"
-    expected = "a moving axis is stopped (0002h, or halt) before 0000h or 0006h"
-    hint = "send 0002h and wait until the axis stands"
-
-    def watch(self, node: SeenNode) -> Watch[ControlSeen]:
-        while event := (yield):
-            command = command_of(event.word, event.before or 0)
-            ramps = command is DriveCommand.SHUTDOWN and node.value(0x605B) == 1
-            if command not in (DriveCommand.DISABLE_VOLTAGE, DriveCommand.SHUTDOWN) or ramps or not node.enabled:
-                continue
-            if event.before is None or command_of(event.before) is not DriveCommand.ENABLE_OPERATION:
-                continue
-            still, what = not node.moves(event.frame.t_ns), f"6040h = {event.word:04X}h while the axis moves"
-            self.expect(node, still, what, *motion_of(node), event)
+    while event := (yield):
+        command = command_of(event.word, event.before or 0)
+        ramps = command is DriveCommand.SHUTDOWN and node.value(0x605B) == 1
+        if command not in (DriveCommand.DISABLE_VOLTAGE, DriveCommand.SHUTDOWN) or ramps or not node.enabled:
+            continue
+        if event.before is None or command_of(event.before) is not DriveCommand.ENABLE_OPERATION:
+            continue
+        still, what = not node.moves(event.frame.t_ns), f"6040h = {event.word:04X}h while the axis moves"
+        case.expect(node, still, what, *motion_of(node), event)
 
 
 def motion_of(node: SeenNode) -> tuple[Known | None, ...]:
