@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from canprobe.fieldbus.tools.emulated_bus import EmulatedBus
-from canprobe.fieldbus.tools.faults.fault import FOREVER_NS
 from canprobe.fieldbus.tools.judge import Judge, read_record
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
@@ -28,19 +27,12 @@ class JudgedBus:
         """What is to be said of the master until now; faults that were thrown excuse what follows them."""
         self._bus.flush()
         frames = read_record(self._bus.log, self._bus.channel)
-        judge = Judge(self._bus.descriptions, bitrate=self._bitrate, charges_ns=self._charges_ns()).hear(frames)
+        start_ns = self._bus.start_ns
+        charges_ns = [(begin_ns - start_ns, end_ns - start_ns) for _, begin_ns, end_ns in self._bus.faulty.spans()]
+        judge = Judge(self._bus.descriptions, bitrate=self._bitrate, charges_ns=charges_ns).hear(frames)
         return judge.report("the master", {"bit rate": f"{self._bitrate} bit/s"}, log=str(self._bus.log))
 
     def findings(self) -> list[ReportRow]:
         """Rules that found something and are not allowed."""
         rows = self.report().rows
         return [row for row in rows if row.verdict is Verdict.FAIL and row.name[:2] not in self._allowed]
-
-    def _charges_ns(self) -> list[tuple[int, int]]:
-        """Begin and end of each fault, on the clock of the log."""
-        spans: dict[int, tuple[int, int]] = {}
-        for node in self._bus.faulty.nodes:
-            for t_ns, word, fault in node.history:
-                now_ns = t_ns - self._bus.start_ns
-                spans[id(fault)] = (now_ns, FOREVER_NS) if word == "begins" else (spans[id(fault)][0], now_ns)
-        return list(spans.values())

@@ -82,7 +82,7 @@ class SineMaster:
 
     def judged(self):
         nodes = {node: Description(load_eds("puma260_joint", node)) for node in NODES}
-        thrown = self.injections.thrown
+        thrown = self.injections.thrown()
         spans = [(one.begin_ns, one.end_ns) for one in thrown]
         judge = Judge(nodes, served=True, charges_ns=spans).hear(self.frames)
         return {number for number, case in judge.cases.items() if case.count}, first_answers(self.frames, thrown, nodes)
@@ -90,7 +90,7 @@ class SineMaster:
 
 def test_a_stubborn_master_is_found_in_each_fault_of_the_sequence():
     master = SineMaster(None, careful=False).run(35)
-    assert [one.text.split(": ")[1].split()[0] for one in master.injections.thrown] == [
+    assert [one.text.split(": ")[1].split()[0] for one in master.injections.thrown()] == [
         text.split()[0] for text in STANDARD_FAULTS
     ]
     found, answers = master.judged()

@@ -6,10 +6,11 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from operator import itemgetter
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.drive.drive import DriveApplication
-from canprobe.fieldbus.tools.faults.fault import Fault, FaultKind
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Fault, FaultKind
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
 from canprobe.fieldbus.tools.faults.frame_faults import HEADER_INDEX
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
@@ -66,6 +67,15 @@ class FaultyNodes:
     def faults(self) -> list[Fault]:
         """Faults that hold, and those that are to come."""
         return [fault for node in self.nodes for fault in node.faults]
+
+    def spans(self) -> list[tuple[Fault, int, int]]:
+        """Faults that have begun, in order, with begin and end on the clock of the bus; one that holds ends never."""
+        spans: dict[int, tuple[Fault, int, int]] = {}
+        for node in self.nodes:
+            for t_ns, word, fault in node.history:
+                begin_ns, end_ns = (t_ns, FOREVER_NS) if word == "begins" else (spans[id(fault)][1], t_ns)
+                spans[id(fault)] = fault, begin_ns, end_ns
+        return sorted(spans.values(), key=itemgetter(1))
 
     def _node(self, node_id: int, text: str) -> FaultyNode:
         for node in self.nodes:

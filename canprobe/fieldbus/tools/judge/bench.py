@@ -125,10 +125,7 @@ class MasterBench:
 
     def thrown(self) -> list[Thrown]:
         """The faults that held, with times from the beginning."""
-        found = self.injections.thrown if self.injections is not None else []
-        return [
-            replace(one, begin_ns=one.begin_ns - self._begin_ns, end_ns=one.end_ns - self._begin_ns) for one in found
-        ]
+        return self.injections.thrown(self._begin_ns) if self.injections is not None else []
 
     def judged(self, nodes: Mapping[int, Description], bitrate: int, without: Collection[int] = ()) -> Judge:
         """The frames, judged."""

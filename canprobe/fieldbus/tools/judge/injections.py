@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
+from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
 
 STANDARD_FAULTS = (
     "sdo-slow ms=200 for 2 s",
@@ -22,7 +22,7 @@ _CALM_NS = 2_000_000_000
 """Time for which the nodes must have been at work before the next fault."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Thrown:
     """A fault that was thrown.
 
@@ -43,18 +43,13 @@ class Injections:
         nodes: the served nodes.
         faults: faults with their nodes, as `parse_fault` reads them; None for the standard sequence.
         now_ns: present time, from which `at` counts.
-
-    Attributes:
-        thrown: faults that held, in order.
     """
 
     def __init__(self, nodes: FaultyNodes, faults: Sequence[str] | None, now_ns: int) -> None:
         self._nodes = nodes
-        self.thrown: list[Thrown] = []
-        self._holding: dict[Fault, Thrown] = {}
         self._queue = list(STANDARD_FAULTS) if faults is None else []
         self._calm_ns: int | None = None
-        self._last_ns = now_ns
+        self._now_ns = now_ns
         for text in faults or ():
             nodes.inject(text, now_ns)
 
@@ -63,21 +58,19 @@ class Injections:
         """Faults of the sequence that were not thrown."""
         return list(self._queue)
 
+    def thrown(self, start_ns: int = 0) -> list[Thrown]:
+        """Faults that held, in order, with times from a beginning; one that holds ends at the last look."""
+        found = []
+        for fault, begin_ns, end_ns in self._nodes.spans():
+            given = "".join(f" {name}={value:g}" for name, value in fault.values.items())
+            text = f"node {fault.node_id}: {fault.kind.name}{given}"
+            found.append(Thrown(text, begin_ns - start_ns, min(end_ns, self._now_ns) - start_ns))
+        return found
+
     def look(self, now_ns: int) -> None:
-        """Note which faults hold, and throw the next one of the sequence when the nodes are at work."""
-        holding = [fault for node in self._nodes.nodes for fault in node.holding]
-        for fault in holding:
-            if fault not in self._holding:
-                given = "".join(f" {name}={value:g}" for name, value in fault.values.items())
-                text = f"node {fault.node_id}: {fault.kind.name}{given}"
-                self._holding[fault] = one = Thrown(text, self._last_ns, now_ns)
-                self.thrown.append(one)
-        for fault in [fault for fault in self._holding if fault not in holding]:
-            self._holding.pop(fault).end_ns = now_ns
-        for one in self._holding.values():
-            one.end_ns = now_ns
-        self._last_ns = now_ns
-        if self._queue and not self._holding:
+        """Throw the next fault of the sequence when no other holds and the nodes are at work."""
+        self._now_ns = now_ns
+        if self._queue and not any(node.holding for node in self._nodes.nodes):
             self._throw_next(now_ns)
 
     def _throw_next(self, now_ns: int) -> None:
