@@ -17,6 +17,7 @@ from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.node.rpdo import Rpdo
 from canprobe.fieldbus.node.tpdo import BUFFERED_TYPE, Packing, Sampler, Tpdo
 from canprobe.fieldbus.protocol.frames import Frame, NmtState
+from canprobe.fieldbus.protocol.pdo import PdoLayout
 
 
 class _Group:
@@ -132,6 +133,11 @@ class PdoEngine(Service):
                 rpdo.receive(data, t_ns)
 
         return inside_window
+
+    @property
+    def layouts(self) -> dict[int, PdoLayout]:
+        """Layouts of the TPDOs in use, by identifier."""
+        return {tpdo.layout.cob_id: tpdo.layout for tpdo in self._tpdos if tpdo.active}
 
     def rpdo(self, cob_id: int) -> Rpdo:
         """The RPDO with this identifier. Raises StopIteration where there is none."""

@@ -36,6 +36,7 @@ class Tpdo:
     Attributes:
         active: whether the PDO is valid and maps something.
         samplers: functions that bring mapped values up to date, each called as `sampler(t_ns)`.
+        layout: its mapping, while it is active.
         keys: mapped dictionary keys.
         packing: identifier, packer and source of the values of an active PDO.
         type: transmission type.
@@ -48,8 +49,8 @@ class Tpdo:
         self._core, self._rules = core, rules
         self._event_timer = core.timers.new(self._event_due)
         self._inhibit_timer = core.timers.new(self._send_now)
-        self._layout = PdoLayout(0, ())
-        self.packing: Packing = 0, self._layout.raw_pack, lambda _values: ()
+        self.layout = PdoLayout(0, ())
+        self.packing: Packing = 0, self.layout.raw_pack, lambda _values: ()
         self._cob_id = self._event_ns = self._inhibit_ns = self._earliest_ns = 0
         self.active = self.requested = False
         self._buffer: bytes | None = None
@@ -71,8 +72,8 @@ class Tpdo:
         self._inhibit_ns = number(index, INHIBIT_SUB) * 100_000
         self._event_ns = number(index, EVENT_SUB) * 1_000_000
         if self.active:
-            self._layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
-            self.packing = self._cob_id, self._layout.raw_pack, _fetcher(self.keys)
+            self.layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
+            self.packing = self._cob_id, self.layout.raw_pack, _fetcher(self.keys)
 
     @property
     def by_event(self) -> bool:
@@ -131,7 +132,7 @@ class Tpdo:
         if t_ns is not None:
             for sampler in self.samplers:
                 sampler(t_ns)
-        return self._layout.pack(*self.packing[2](self._core.dictionary.values))
+        return self.layout.pack(*self.packing[2](self._core.dictionary.values))
 
     def _send_now(self, t_ns: int) -> None:
         self.send(t_ns)

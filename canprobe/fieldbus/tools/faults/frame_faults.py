@@ -15,7 +15,6 @@ from canprobe.fieldbus.protocol.frames import (
     EFF_FLAG,
     EMCY_BASE,
     HEARTBEAT_BASE,
-    INVALID_FLAG,
     RTR_FLAG,
     SYNC_ID,
     Frame,
@@ -183,13 +182,14 @@ class WrongData(Effect):
 
     def _wrong_position(self, frame: Frame) -> Frame:
         can_id, data = frame
-        start = _position_in(self.node, can_id)
-        if start is None or len(data) < start + 4:
+        layout = self.node.pdos.layouts.get(can_id)
+        places = [] if layout is None else [signal.index for signal in layout.signals]
+        if layout is None or POSITION_INDEX not in places or len(data) != layout.length:
             return frame
         self.host.hits += 1
-        position = int.from_bytes(data[start : start + 4], "little", signed=True)
-        position += self.rng.choice((-1, 1)) * 2 ** self.rng.randrange(20)
-        return can_id, data[:start] + position.to_bytes(4, "little", signed=True) + data[start + 4 :]
+        values = list(layout.unpack(data))
+        values[places.index(POSITION_INDEX)] += self.rng.choice((-1, 1)) * 2 ** self.rng.randrange(20)
+        return can_id, layout.pack(*values)
 
     def _wrong_header(self, frames: list[Frame], ids: tuple[int, ...]) -> list[Frame]:
         parts = dict(frames)
@@ -322,33 +322,11 @@ class BusOff(Effect):
         return self.node.advance(t_ns)
 
 
-def tpdos(node: SlaveNode) -> dict[int, list[int]]:
-    """Mapped entries, each index << 16 | subindex << 8 | bits, of the valid TPDOs of a node by identifier."""
-    dictionary = node.dictionary
-    found: dict[int, list[int]] = {}
-    for index in dictionary.indices_in(range(0x1800, 0x1A00)):
-        cob_id = dictionary.number(index, 1, INVALID_FLAG)
-        if not cob_id & INVALID_FLAG:
-            count = dictionary.number(index + 0x200)
-            found[cob_id & 0x7FF] = [dictionary.number(index + 0x200, sub) for sub in range(1, count + 1)]
-    return found
-
-
 def tactile_ids(node: SlaveNode) -> tuple[int, ...]:
     """Identifiers of the PDOs of a tactile frame, header first; empty for a node that is no tactile array."""
-    mapped = tpdos(node) if node.dictionary.has_index(HEADER_INDEX) else {}
-    headers = [can_id for can_id, entries in mapped.items() if entries and entries[0] >> 16 == HEADER_INDEX]
+    mapped = node.pdos.layouts if node.dictionary.has_index(HEADER_INDEX) else {}
+    headers = [can_id for can_id, layout in mapped.items() if layout.entries[0].index == HEADER_INDEX]
     return (*headers, *(can_id for can_id in mapped if can_id not in headers)) if headers else ()
-
-
-def _position_in(node: SlaveNode, can_id: int) -> int | None:
-    """First byte of 6064h in a TPDO; None where it does not carry it."""
-    bits = 0
-    for entry in tpdos(node).get(can_id, ()):
-        if entry >> 16 == POSITION_INDEX:
-            return bits // 8
-        bits += entry & 0xFF
-    return None
 
 
 def _flip_bit(data: bytes, rng: Random) -> bytes:
