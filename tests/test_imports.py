@@ -267,7 +267,14 @@ def test_no_class_has_the_name_of_another():
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
-@pytest.mark.parametrize("door", ["canprobe", "canprobe.fieldbus", "canprobe.mechanics", "canprobe.mechanics.touch"])
+@pytest.mark.parametrize(
+    "door",
+    [
+        "canprobe",
+        *("canprobe.fieldbus", "canprobe.fieldbus.node", "canprobe.fieldbus.drive", "canprobe.fieldbus.tools"),
+        *("canprobe.mechanics", "canprobe.mechanics.touch"),
+    ],
+)
 def test_every_public_name_of_a_door_can_be_had(door):
     module = importlib.import_module(door)
     assert [name for name in module.__all__ if not hasattr(module, name)] == []

@@ -30,6 +30,8 @@ is seen. Start reading at `protocol.frames`, then `bus.port`, then `node.slave_n
 from __future__ import annotations
 
 import importlib
+import sys
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
@@ -43,6 +45,7 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus as LockstepBus
     from canprobe.fieldbus.bus.virtual.timed import TimedBus as TimedBus
     from canprobe.fieldbus.drive.from_eds import make_eds_node as make_eds_node
+    from canprobe.fieldbus.eds.description import Description as Description
     from canprobe.fieldbus.eds.packaged import check_eds as check_eds
     from canprobe.fieldbus.eds.packaged import eds_path as eds_path
     from canprobe.fieldbus.eds.packaged import load_eds as load_eds
@@ -51,6 +54,7 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
 
 _MODULES = {
     "CandumpWriter": "bus.candump",
+    "Description": "eds.description",
     "LockstepBus": "bus.virtual.lockstep",
     "MonotonicClock": "bus.clock",
     "PortNetwork": "bus.canopen_network",
@@ -69,12 +73,20 @@ _MODULES = {
 __all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562)."""
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+def door(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Functions `__getattr__` and `__dir__` of a package here whose names are imported on first use (PEP 562).
+
+    Args:
+        package: the package.
+        modules: module of each name, below `canprobe.fieldbus`.
+    """
+
+    def load(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{__name__}.{modules[name]}"), name)
+
+    return load, lambda: sorted({*vars(sys.modules[package]), *modules})
 
 
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+__getattr__, __dir__ = door(__name__, _MODULES)

@@ -21,3 +21,26 @@ table of states in `protocol.cia402` and runs one mode at a time.
 Invariants: outside operation enabled the drive holds. Loss of SYNC, RPDOs or heartbeat quick-stops it (6007h, 605Ah): a
 dead master never leaves it moving. An object that the EDS lacks has a default. Start reading at `drive`, then `mode`.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from canprobe.fieldbus import door
+
+if TYPE_CHECKING:  # for type checkers, which do not read the table
+    from canprobe.fieldbus.drive.drive import make_drive_node as make_drive_node
+    from canprobe.fieldbus.drive.from_eds import IdealAxis as IdealAxis
+    from canprobe.fieldbus.drive.from_eds import make_eds_node as make_eds_node
+    from canprobe.fieldbus.drive.profile import MotorDynamics as MotorDynamics
+    from canprobe.fieldbus.drive.reference import AxisPlant as AxisPlant
+
+_MODULES = {
+    "AxisPlant": "drive.reference",
+    "IdealAxis": "drive.from_eds",
+    "MotorDynamics": "drive.profile",
+    "make_drive_node": "drive.drive",
+    "make_eds_node": "drive.from_eds",
+}
+__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
+__getattr__, __dir__ = door(__name__, _MODULES)

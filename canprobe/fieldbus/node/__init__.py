@@ -28,3 +28,26 @@ never sleeps, opens or waits, so that the same node runs in virtual time and on 
 `receive` never raises, whatever is on the bus. Each point of the conformance list is a test named after its clause.
 Start reading at `slave_node`, then `core`.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from canprobe.fieldbus import door
+
+if TYPE_CHECKING:  # for type checkers, which do not read the table
+    from canprobe.fieldbus.node.quirks import Quirks as Quirks
+    from canprobe.fieldbus.node.slave_node import Application as Application
+    from canprobe.fieldbus.node.slave_node import SlaveNode as SlaveNode
+    from canprobe.fieldbus.protocol.sdo import Abort as Abort
+    from canprobe.fieldbus.protocol.sdo import SdoAbort as SdoAbort
+
+_MODULES = {
+    "Abort": "protocol.sdo",
+    "Application": "node.slave_node",
+    "Quirks": "node.quirks",
+    "SdoAbort": "protocol.sdo",
+    "SlaveNode": "node.slave_node",
+}
+__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
+__getattr__, __dir__ = door(__name__, _MODULES)
