@@ -62,8 +62,7 @@ class ImageFault(ArrayEffect):
 class DeadRows(ImageFault):
     """Some rows of taxels measure nothing."""
 
-    name, what = "dead-rows", "rows of taxels measure nothing"
-    clause, reaction = "tactile node, 2100h", "names them; interpolates, or retreats"
+    name = "dead-rows"
     parameters = numbers(
         first=Parameter(7, 0, 255, "first row, 0-based"),
         rows=Parameter(1, 1, 256, "number of rows"),
@@ -78,8 +77,7 @@ class DeadRows(ImageFault):
 class StuckImage(ImageFault):
     """The array samples the same image again and again; its counters go on."""
 
-    name, what = "stuck-image", "the same image again and again"
-    clause, reaction = "tactile node, 2120h", "does not press on"
+    name = "stuck-image"
     _kept: Raw | None = None
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
@@ -93,8 +91,7 @@ class ReplayedImage(ImageFault):
     One image with fresh noise looks alive, and so does a recorded stretch: no image of it equals the one before.
     """
 
-    name, what = "replayed-image", "a recorded stretch of images again and again, or one image with fresh noise"
-    clause, reaction = "tactile node, 2120h", "does not press on"
+    name = "replayed-image"
     parameters = numbers(
         images=Parameter(1, 1, 1000, "images of the recorded stretch"),
         noise=Parameter(1.3, 0, 255, "standard deviation of the fresh noise, counts"),
@@ -118,8 +115,7 @@ class ReplayedImage(ImageFault):
 class GainLost(ImageFault):
     """Every taxel measures a share of its load."""
 
-    name, what = "gain-lost", "all taxels measure a share of their load"
-    clause, reaction = "tactile node, 2003h", "does not press on"
+    name = "gain-lost"
     parameters = numbers(gain=Parameter(0.3, 0, 10, "measured over true load"))
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
@@ -129,8 +125,7 @@ class GainLost(ImageFault):
 class StuckRows(ImageFault):
     """Some rows of taxels keep their last values; the others go on."""
 
-    name, what = "stuck-rows", "rows of taxels keep their last values"
-    clause, reaction = "tactile node, 2100h", "does not press on"
+    name = "stuck-rows"
     parameters = numbers(
         first=Parameter(6, 0, 255, "first row, 0-based"),
         rows=Parameter(4, 1, 256, "number of rows"),
@@ -147,8 +142,7 @@ class StuckRows(ImageFault):
 class Drift(ImageFault):
     """All taxels drift upward, in whole counts where the array has such."""
 
-    name, what = "drift", "all taxels drift upward"
-    clause, reaction = "tactile node, 2003h", "retreats at the limit of the force"
+    name = "drift"
     parameters = numbers(counts_s=Parameter(5, 0, 1e6, "rate, counts/s"))
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
@@ -160,8 +154,7 @@ class Drift(ImageFault):
 class Saturation(ImageFault):
     """Every taxel that is pressed is at full scale."""
 
-    name, what = "saturation", "every pressed taxel is at full scale"
-    clause, reaction = "tactile node, 2005h", "retreats"
+    name = "saturation"
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
         image = raw.copy()
@@ -185,9 +178,7 @@ def _as_sampled(counts: Floats, raw: Raw) -> Raw:
 class Torn(ArrayEffect):
     """One PDO of each tactile frame is lost, the header never."""
 
-    name, what = "torn", "a PDO of each tactile frame is lost"
-    clause, reaction = "tactile node, 2120h", "drops the frame, and counts it"
-    trips = "torn_frame"
+    name = "torn"
 
     def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
         taxels = tactile_ids(self.node)[1:]
@@ -202,9 +193,7 @@ class Torn(ArrayEffect):
 class HeaderCrc(ArrayEffect):
     """A bit of the CRC of each tactile header is wrong."""
 
-    name, what = "header-crc", "the CRC of each tactile header is wrong"
-    clause, reaction = "tactile node, 2120h", "drops the frame, and counts it"
-    trips = "torn_frame"
+    name = "header-crc"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         can_id, data = frame

@@ -11,7 +11,7 @@ change the frames that come in and go out, or the node itself. `FaultyNodes` thr
 Invariants: the same seed does the same; a fault holds from the next frame or deadline of its node on, so within one
 cycle; when it ends, what it changed in the node is undone; a node without faults is the node itself.
 
-    fault           what a fault is; the base class of the kinds, with their facts
+    fault           what a fault is; the base class of the kinds, with their facts of kinds.toml
     faulty_node     the node that has them
     frame_faults    the link: lost, late, twice, changed, made up; power and bus-off
     service_faults  heartbeat, NMT, SDO, EMCY, mapping

@@ -10,7 +10,7 @@ from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.sdo import Abort
-from canprobe.fieldbus.tools.faults.fault import LOST, Effect, Fault, Host, Parameter, error_code, numbers
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault, Host, Parameter, error_code, numbers
 from canprobe.fieldbus.tools.faults.service_faults import ObjectAborted
 
 _MODE_INDEX = 0x6060
@@ -35,9 +35,7 @@ class DriveEffect(Effect):
 class DriveFault(DriveEffect):
     """The drive detects a fault. One that is not resettable comes back at once after a fault reset."""
 
-    name, what = "drive-fault", "the drive detects a fault"
-    clause, reaction = "CiA 402-2, 605Eh, 603Fh", "stops the others; resets by an edge only"
-    trips = "drive_fault"
+    name = "drive-fault"
     parameters = numbers(
         code=error_code(0x4310, "error code"), resettable=Parameter(1, 0, 1, "0: it comes back after a reset")
     )
@@ -55,9 +53,7 @@ class DriveFault(DriveEffect):
 class Sto(DriveEffect):
     """Safe torque off: the drive has no power, and leaves switch-on disabled for no command."""
 
-    name, what = "sto", "safe torque off"
-    clause, reaction = "CiA 402-2, state automaton", "does not enable it again and again"
-    trips, fails = "drive_fault", "49 50 51 54 55"
+    name = "sto"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         return self.watch(t_ns)
@@ -71,9 +67,8 @@ class Sto(DriveEffect):
 class ModeRefused(ObjectAborted):
     """Writes to 6060h are refused: value range exceeded."""
 
-    name, what = "mode-refused", "writes to 6060h are refused"
-    clause, reaction = "CiA 402-2, 6060h, 6061h", "sends no targets"
-    fails, incoming, needs = "49 50 51 53 54 55", True, "drive"
+    name = "mode-refused"
+    incoming, needs = True, "drive"
     code = Abort.VALUE
 
     def index(self, data: bytes) -> int:
@@ -83,9 +78,7 @@ class ModeRefused(ObjectAborted):
 class BrakeStuck(DriveEffect):
     """The motor stays where it is, whatever its reference; at the end it goes on from the next one."""
 
-    name, what = "brake-stuck", "the motor stays where it is"
-    clause, reaction = "CiA 402-2, 6065h, 8611h", "the drive finds a following error"
-    trips = "following"
+    name = "brake-stuck"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         self.drive.parts.motion.block(t_ns)
@@ -113,9 +106,7 @@ class EncoderFault(DriveEffect):
 class EncoderJump(EncoderFault):
     """The encoder is wrong by so many counts from the beginning on."""
 
-    name, what = "encoder-jump", "the encoder is wrong by some counts"
-    clause, reaction = "CiA 402-2, 6064h", "drops what cannot be"
-    trips = LOST
+    name = "encoder-jump"
     parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "error, counts"))
 
     def measured(self, counts: float) -> float:
@@ -125,9 +116,7 @@ class EncoderJump(EncoderFault):
 class EncoderFrozen(EncoderFault):
     """The encoder keeps the last position."""
 
-    name, what = "encoder-frozen", "the encoder keeps its position"
-    clause, reaction = "CiA 402-2, 6064h", "the drive finds a following error"
-    trips = "following"
+    name = "encoder-frozen"
     _kept: float | None = None
 
     def measured(self, counts: float) -> float:
@@ -138,8 +127,7 @@ class EncoderFrozen(EncoderFault):
 class HomingLost(DriveEffect):
     """The drive forgets that it was homed: bit 12 of the homing mode is gone."""
 
-    name, what = "homing-lost", "the drive forgets that it was homed"
-    clause, reaction = "CiA 402-2, homing, bit 12", "moves nothing before it is homed"
+    name = "homing-lost"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         self.drive.forget_homing()
@@ -149,9 +137,7 @@ class HomingLost(DriveEffect):
 class ZeroShift(DriveEffect):
     """The zero of the drive is elsewhere from the beginning on: every position is reported and taken beside it."""
 
-    name, what = "zero-shift", "the zero of the drive is elsewhere"
-    clause, reaction = "CiA 402-2, 607Ch", "does not hold the old zero"
-    trips = "pdo_missed emcy"
+    name = "zero-shift"
     parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "way of the zero, units of position"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
@@ -163,8 +149,7 @@ class ZeroShift(DriveEffect):
 class TorqueLimit(DriveEffect):
     """The torque is limited to a share of the rated one, as if 6072h had been written."""
 
-    name, what = "torque-limit", "the torque is limited"
-    clause, reaction = "CiA 402-2, 6072h, bit 11", "goes no faster than the drive follows"
+    name = "torque-limit"
     parameters = numbers(permille=Parameter(10, 0, 10_000, "limit, 1/1000 of the rated torque"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:

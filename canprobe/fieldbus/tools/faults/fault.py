@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from random import Random
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
@@ -16,10 +18,7 @@ FOREVER_NS = 1 << 62
 ENDLESS_HITS = 1 << 62
 SHORT_NS = 100_000_000
 """Duration of a power failure and of bus-off where none is given."""
-UNANSWERED, MOST = "unanswered", "most"
-"""In the place of points: the device does not answer, so that none is examined; most of those examined fail."""
-LOST = "pdo_missed drive_late drive_silent"
-"""Conditions of a drive whose TPDOs do not come."""
+_FACTS = tomllib.loads(files(__package__).joinpath("kinds.toml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,21 +133,15 @@ class Host(Protocol):
         """Send a frame that the node did not make, with its next answers."""
 
 
-_DEFAULTS: Mapping[str, Any] = {
-    "trips": "",
-    "fails": "",
-    "parameters": numbers(),
-    "incoming": False,
-    "lasts_ns": FOREVER_NS,
-}
-"""Facts of a kind that states nothing else."""
+_DEFAULTS: Mapping[str, Any] = {"parameters": numbers(), "incoming": False, "lasts_ns": FOREVER_NS}
+"""What a kind has that states nothing else."""
 
 
 class Effect:
     """A kind of fault: its facts, and what a fault of it does while it holds.
 
-    A subclass with a name is a row of the registry. It states the facts, of which it inherits none but `needs`, and
-    overrides what it needs of the methods; here they do nothing.
+    A subclass with a name is a row of the registry, whose facts `kinds.toml` has. It states parameters and direction,
+    of which it inherits none, and overrides what it needs of the methods; here they do nothing.
 
     Args:
         fault: the fault.
@@ -159,10 +152,8 @@ class Effect:
         what: what happens.
         clause: clause or object of the standard that it breaks, or that says how to answer it.
         reaction: what a conforming peer does.
-        trips: keys of the supervision's conditions that it trips in a cell in motion, at full share, with blanks;
-            `conditions` has them as a set.
-        fails: numbers of the points of `conform` that a drive fails with it, thrown from the start with `--motion`; or
-            `UNANSWERED` or `MOST`; `points` has them as a set.
+        conditions: keys of the supervision's conditions that it trips in a cell in motion, at full share.
+        points: numbers of the points of `conform` that a drive fails with it; or "unanswered", or "most".
         parameters: its numbers by name.
         incoming: whether it hits frames that the node receives; None: either, as the fault says, else those it sends.
         needs: device that it needs: a node, a drive, or an array.
@@ -177,8 +168,6 @@ class Effect:
     what: ClassVar[str]
     clause: ClassVar[str]
     reaction: ClassVar[str]
-    trips: ClassVar[str]
-    fails: ClassVar[str]
     conditions: ClassVar[frozenset[str]]
     points: ClassVar[frozenset[str]]
     parameters: ClassVar[Mapping[str, Parameter]]
@@ -191,7 +180,9 @@ class Effect:
     def __init_subclass__(cls) -> None:
         for fact, default in _DEFAULTS.items():
             setattr(cls, fact, vars(cls).get(fact, default))
-        cls.conditions, cls.points = frozenset(cls.trips.split()), frozenset(cls.fails.split())
+        facts = _FACTS.get(vars(cls).get("name", ""), {})
+        cls.what, cls.clause, cls.reaction = (facts.get(key, "") for key in ("what", "clause", "reaction"))
+        cls.conditions, cls.points = (frozenset(facts.get(key, "").split()) for key in ("trips", "fails"))
 
     def __init__(self, fault: Fault, host: Host) -> None:
         self.fault, self.host, self.node = fault, host, host.node

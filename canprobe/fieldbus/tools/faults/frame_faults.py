@@ -20,7 +20,7 @@ from canprobe.fieldbus.protocol.frames import (
     Frame,
 )
 from canprobe.fieldbus.protocol.tactile import TactileHeader, crc16_ccitt
-from canprobe.fieldbus.tools.faults.fault import LOST, MOST, SHORT_NS, UNANSWERED, Effect, Parameter, in_ms, numbers
+from canprobe.fieldbus.tools.faults.fault import SHORT_NS, Effect, Parameter, in_ms, numbers
 
 BUS_OFF_RECOVERED_CODE = 0x8140
 HEADER_INDEX, POSITION_INDEX = 0x2120, 0x6064
@@ -38,9 +38,7 @@ def is_pdo(can_id: int) -> bool:
 class Drop(Effect):
     """Frames are lost."""
 
-    name, what = "drop", "frames are lost"
-    clause, reaction = "CiA 301, PDO", "misses them, then the node is lost"
-    trips, fails = LOST, UNANSWERED
+    name = "drop"
     incoming: ClassVar[bool | None] = None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
@@ -50,8 +48,7 @@ class Drop(Effect):
 class Delay(Effect):
     """Frames come later."""
 
-    name, what = "delay", "frames come later"
-    clause, reaction = "CiA 301, 1007h", "takes a late PDO for a missed one"
+    name = "delay"
     parameters, incoming = numbers(ms=in_ms(1, "delay, ms")), None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
@@ -61,10 +58,8 @@ class Delay(Effect):
 class Duplicate(Effect):
     """Frames come twice, or more often."""
 
-    name, what = "duplicate", "frames come twice"
-    clause, reaction = "ISO 11898-1, acknowledgement", "takes the first"
+    name = "duplicate"
     parameters, incoming = numbers(n=Parameter(2, 2, 100, "number of frames for each")), None
-    fails = "1 8 19 23 30 31 37 102"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
         return [frame] * int(self.fault.value("n"))
@@ -73,9 +68,8 @@ class Duplicate(Effect):
 class Corrupt(Effect):
     """A bit of each frame is another, or its end is missing, as the CRC of the wire lets it pass once in a lifetime."""
 
-    name, what = "corrupt", "a bit is another, or the end is missing"
-    clause, reaction = "ISO 11898-1, CRC", "drops what cannot be"
-    trips, fails, incoming = "pdo_missed drive_late drive_fault", MOST, None
+    name = "corrupt"
+    incoming = None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
         return ((frame[0], _flip_bit(frame[1], self.rng)),)
@@ -84,9 +78,8 @@ class Corrupt(Effect):
 class Reorder(Effect):
     """A frame comes behind the next ones."""
 
-    name, what = "reorder", "a frame comes behind the next ones"
-    clause, reaction = "CiA 301, PDO", "goes by the identifier, not by the order"
-    trips, fails, incoming = LOST, UNANSWERED, None
+    name = "reorder"
+    incoming = None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
         self.host.swap(frame)
@@ -96,25 +89,21 @@ class Reorder(Effect):
 class Mute(Drop):
     """The node sends nothing."""
 
-    name, what = "mute", "the node sends nothing"
-    clause, reaction = "CiA 301, 1016h", "stops the others"
-    trips, fails = LOST, UNANSWERED
+    name = "mute"
 
 
 class Deaf(Drop):
     """The node hears nothing."""
 
-    name, what = "deaf", "the node hears nothing"
-    clause, reaction = "CiA 301, 1016h, 6007h", "the node stops by itself: 8130h, 8250h"
-    trips, fails, incoming = f"{LOST} emcy_communication", UNANSWERED, True
+    name = "deaf"
+    incoming = True
 
 
 class Reboot(Effect):
     """The power fails for the duration; the node boots when it is back."""
 
-    name, what = "reboot", "the power fails for the duration"
-    clause, reaction = "CiA 301, boot-up", "sends no targets; configures it anew"
-    trips, fails, lasts_ns = f"{LOST} emcy_communication", UNANSWERED, SHORT_NS
+    name = "reboot"
+    lasts_ns = SHORT_NS
     dark = True
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
@@ -129,18 +118,14 @@ class Reboot(Effect):
 class Freeze(Effect):
     """The node stands still: it neither hears nor sends, and goes on where it was."""
 
-    name, what = "freeze", "the node stands still for the duration"
-    clause, reaction = "CiA 301, 1016h", "stops the others"
-    trips, fails = f"{LOST} emcy_communication", UNANSWERED
+    name = "freeze"
     dark = True
 
 
 class Babble(Effect):
     """The node sends frames that nobody asked for; each seed has its own sort."""
 
-    name, what = "babble", "frames that nobody asked for; the seed chooses their sort"
-    clause, reaction = "ISO 11898-1, arbitration", "stays below the load that it bears"
-    trips, fails = "pdo_missed", "6 30 31 37 40"
+    name = "babble"
     parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
 
     def begin(self, t_ns: int) -> None:
@@ -170,9 +155,7 @@ class Babble(Effect):
 class WrongData(Effect):
     """A drive reports another position, an array another SYNC counter (even seeds) or age, with the right CRC."""
 
-    name, what = "wrong-data", "another position, or another tactile header with the right CRC"
-    clause, reaction = "CiA 402-2, 6064h", "drops what cannot be"
-    trips = LOST
+    name = "wrong-data"
 
     def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
         if self.rng.random() >= self.fault.share:
@@ -213,9 +196,8 @@ class WrongData(Effect):
 class Short(Effect):
     """PDOs have a byte too few."""
 
-    name, what = "short", "PDOs have a byte too few"
-    clause, reaction = "CiA 301, PDO length, 8210h", "does not apply them"
-    trips, fails, incoming = LOST, "30 83", None
+    name = "short"
+    incoming = None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return ((frame[0], frame[1][:-1]),) if is_pdo(frame[0]) and frame[1] else None
@@ -224,8 +206,7 @@ class Short(Effect):
 class Long(Effect):
     """PDOs have a byte too many, where a classical frame has room for it."""
 
-    name, what = "long", "PDOs have a byte too many"
-    clause, reaction = "CiA 301, PDO length, 8220h", "applies or drops them"
+    name = "long"
     incoming = None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
@@ -235,19 +216,15 @@ class Long(Effect):
 class Burst(Duplicate):
     """Frames come many times."""
 
-    name, what = "burst", "frames come many times"
-    clause, reaction = "CiA 301, inhibit time", "takes the first"
+    name = "burst"
     parameters, incoming = numbers(n=Parameter(10, 2, 100, "number of frames for each")), None
-    trips, fails = f"{LOST} emcy_communication", "1 8 19 23 30 31 37 45 102"
 
 
 class WrongId(Effect):
     """PDOs come under another identifier."""
 
-    name, what = "wrong-id", "PDOs come under another identifier"
-    clause, reaction = "CiA 301, 18xxh:01", "misses them"
+    name = "wrong-id"
     parameters, incoming = numbers(offset=Parameter(16, -0x180, 0x180, "distance of the identifiers")), None
-    trips, fails = LOST, "30 31 37 101"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return ((frame[0] + int(self.fault.value("offset")), frame[1]),) if is_pdo(frame[0]) else None
@@ -256,8 +233,7 @@ class WrongId(Effect):
 class OddFrames(Babble):
     """Remote requests for PDOs that allow none, and 29-bit frames with the bits of an RPDO."""
 
-    name, what = "odd-frames", "remote requests and 29-bit frames under the node's PDOs"
-    clause, reaction = "CiA 301, COB-ID bits 29 and 30", "ignores them"
+    name = "odd-frames"
     parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
 
     def made(self) -> Frame:
@@ -269,8 +245,7 @@ class OddFrames(Babble):
 class SyncJitter(Effect):
     """SYNC reaches the node later, each time by another time."""
 
-    name, what = "sync-jitter", "SYNC reaches the node late, each time otherwise"
-    clause, reaction = "CiA 301, 1006h", "bears half a period"
+    name = "sync-jitter"
     parameters, incoming = numbers(us=Parameter(200, 1, 1e6, "longest delay, µs")), True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
@@ -282,9 +257,8 @@ class SyncJitter(Effect):
 class SyncLost(Effect):
     """SYNC does not reach the node."""
 
-    name, what = "sync-lost", "SYNC does not reach the node"
-    clause, reaction = "CiA 301, 1006h, 8100h, 6007h", "the node stops by itself: 8100h"
-    trips, fails, incoming = f"{LOST} emcy_communication", "30 37 40 101", True
+    name = "sync-lost"
+    incoming = True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return () if frame[0] == SYNC_ID else None
@@ -293,9 +267,8 @@ class SyncLost(Effect):
 class SyncDouble(Effect):
     """SYNC reaches the node twice."""
 
-    name, what = "sync-double", "SYNC reaches the node twice"
-    clause, reaction = "CiA 301, 1019h", "goes by the counter"
-    fails, incoming = "30 37", True
+    name = "sync-double"
+    incoming = True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return (frame, frame) if frame[0] == SYNC_ID else None
@@ -304,9 +277,8 @@ class SyncDouble(Effect):
 class BusOff(Effect):
     """The controller is off the bus; the node itself goes on, and reports its return by EMCY 8140h."""
 
-    name, what = "bus-off", "the controller is off the bus for the duration"
-    clause, reaction = "CiA 301, 8140h", "stops the others; the node reports its return"
-    trips, fails, incoming, lasts_ns = LOST, UNANSWERED, True, SHORT_NS
+    name = "bus-off"
+    incoming, lasts_ns = True, SHORT_NS
 
     def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
         self.host.hits += len(frames)

@@ -1,6 +1,6 @@
 """The registry of faults: every kind with its clause, the reaction to it, and the conditions that it trips.
 
-A row is a class of the modules below, with its facts and what it does. Its conditions are those of a node of a cell in
+A row is a class of the modules below, with its facts in `kinds.toml`. Its conditions are those of a node of a cell in
 motion: node 3, a drive, of the packaged scene `free`; its points those of a drive that `conform` examines. A test
 throws each kind and compares.
 """

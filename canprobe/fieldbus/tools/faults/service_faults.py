@@ -15,7 +15,7 @@ from canprobe.fieldbus.protocol.frames import (
     Frame,
 )
 from canprobe.fieldbus.protocol.sdo import Abort, pack_abort, place_of
-from canprobe.fieldbus.tools.faults.fault import MOST, UNANSWERED, Effect, Parameter, error_code, in_ms, numbers
+from canprobe.fieldbus.tools.faults.fault import Effect, Parameter, error_code, in_ms, numbers
 from canprobe.fieldbus.tools.faults.frame_faults import Babble
 
 _BOOT_UP = b"\0"
@@ -29,9 +29,7 @@ _EXPEDITED_FLAGS = 0x43
 class HeartbeatOff(Effect):
     """The heartbeat is not sent; the boot-up message is."""
 
-    name, what = "heartbeat-off", "no heartbeat"
-    clause, reaction = "CiA 301, 1016h, 8130h, 1029h", "stops the others"
-    trips, fails = "heartbeat", "1 2 3 5 7 8 9 45 89 95 98 102 103"
+    name = "heartbeat-off"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return () if frame[0] == HEARTBEAT_BASE + self.node.node_id and frame[1] != _BOOT_UP else None
@@ -40,9 +38,7 @@ class HeartbeatOff(Effect):
 class HeartbeatState(Effect):
     """The heartbeat reports a state in which the node is not."""
 
-    name, what = "heartbeat-state", "the heartbeat reports another state"
-    clause, reaction = "CiA 301, heartbeat", "takes the node for what it says"
-    trips, fails = "nmt_state", "1 2 3 5 7 95 98"
+    name = "heartbeat-state"
     parameters = numbers(state=Parameter(4, 0, 127, "state: 4 stopped, 127 pre-operational"))
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
@@ -54,9 +50,7 @@ class HeartbeatState(Effect):
 class NoBootUp(Effect):
     """The boot-up message is not sent."""
 
-    name, what = "no-boot-up", "no boot-up message"
-    clause, reaction = "CiA 301, boot-up", "reads 1000h"
-    fails = "1 2 4"
+    name = "no-boot-up"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return () if frame == (HEARTBEAT_BASE + self.node.node_id, _BOOT_UP) else None
@@ -65,9 +59,7 @@ class NoBootUp(Effect):
 class Nmt(Effect):
     """The node changes its NMT state as if commanded, without a command on the bus."""
 
-    name, what = "nmt", "the node changes its state by itself"
-    clause, reaction = "CiA 301, NMT", "stops the others"
-    trips, fails = "nmt_state pdo_missed", UNANSWERED
+    name = "nmt"
     parameters = numbers(command=Parameter(2, 1, 130, "command: 2 stop, 128 pre-operational, 129 reset"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
@@ -77,9 +69,8 @@ class Nmt(Effect):
 class ObjectAborted(Effect):
     """Accesses to one object are aborted."""
 
-    name, what = "sdo-abort", "accesses to one object are aborted"
-    clause, reaction = "CiA 301, SDO abort", "names node and object, and does not go on"
-    fails, incoming = "77", True
+    name = "sdo-abort"
+    incoming = True
     parameters = numbers(
         index=Parameter(0x1017, 0, 0xFFFF, "index of the object"),
         code=Parameter(Abort.CANNOT_STORE, 0, 0xFFFFFFFF, "abort code"),
@@ -108,9 +99,8 @@ class ObjectAborted(Effect):
 class SdoSilent(Effect):
     """SDO requests are not answered."""
 
-    name, what = "sdo-silent", "SDO requests are not answered"
-    clause, reaction = "CiA 301, SDO, 05040000h", "times out"
-    fails, incoming = UNANSWERED, True
+    name = "sdo-silent"
+    incoming = True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return () if frame[0] == SDO_RX_BASE + self.node.node_id else None
@@ -119,8 +109,7 @@ class SdoSilent(Effect):
 class SdoSlow(Effect):
     """SDO answers come late."""
 
-    name, what = "sdo-slow", "SDO answers come late"
-    clause, reaction = "CiA 301, SDO, 05040000h", "waits, or times out once"
+    name = "sdo-slow"
     parameters = numbers(ms=in_ms(100, "delay, ms"))
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
@@ -147,9 +136,7 @@ class SdoAnswer(Effect):
 class SdoToggle(SdoAnswer):
     """Segments have the wrong toggle bit."""
 
-    name, what = "sdo-toggle", "segments have the wrong toggle bit"
-    clause, reaction = "CiA 301, SDO, 05030000h", "aborts the transfer"
-    fails = "23 77"
+    name = "sdo-toggle"
 
     def changed(self, data: bytes) -> bytes | None:
         return bytes((data[0] ^ _TOGGLE_FLAG,)) + data[1:] if data[0] >> 5 in _SEGMENT_ANSWERS else None
@@ -158,9 +145,7 @@ class SdoToggle(SdoAnswer):
 class SdoWrongObject(SdoAnswer):
     """Answers name the index behind the one that was asked for."""
 
-    name, what = "sdo-wrong-object", "answers name another object"
-    clause, reaction = "CiA 301, SDO", "drops them"
-    fails = "47 77 82 92"
+    name = "sdo-wrong-object"
 
     def changed(self, data: bytes) -> bytes | None:
         index = (place_of(data)[0] + 1) & 0xFFFF
@@ -170,9 +155,7 @@ class SdoWrongObject(SdoAnswer):
 class SdoSize(SdoAnswer):
     """Expedited answers announce a byte too few; one byte becomes four."""
 
-    name, what = "sdo-size", "expedited answers have a byte too few"
-    clause, reaction = "CiA 301, SDO, 06070010h", "refuses the value"
-    fails = MOST
+    name = "sdo-size"
 
     def changed(self, data: bytes) -> bytes | None:
         if data[0] & 0xF3 != _EXPEDITED_FLAGS:
@@ -184,9 +167,7 @@ class SdoSize(SdoAnswer):
 class EmcyOnce(Effect):
     """The node reports an error in EMCY, 1001h and 1003h, and that it is gone at the end of the fault."""
 
-    name, what = "emcy", "an error in EMCY, 1001h and 1003h, until the end"
-    clause, reaction = "CiA 301, EMCY", "stops for a device error"
-    trips = "emcy"
+    name = "emcy"
     parameters = numbers(code=error_code(0x5000, "emergency error code"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
@@ -199,9 +180,7 @@ class EmcyOnce(Effect):
 class EmcyStorm(Babble):
     """An error comes and goes without an end, whatever the inhibit time."""
 
-    name, what = "emcy-storm", "an error comes and goes without an end"
-    clause, reaction = "CiA 301, 1015h", "counts, and stays below the load"
-    trips, fails = "emcy_communication", MOST
+    name = "emcy-storm"
     parameters = numbers(
         gap_ms=in_ms(1, "time between two messages, ms"), code=error_code(0x8210, "emergency error code")
     )
@@ -219,9 +198,7 @@ class Remapped(Effect):
     At the end they are exchanged back, unless somebody has mapped anew.
     """
 
-    name, what = "remapped", "two entries of a TPDO are exchanged"
-    clause, reaction = "CiA 301, 1A00h", "reads 1Axxh at bring-up; drops what cannot be"
-    trips = "pdo_missed drive_fault"
+    name = "remapped"
     _exchanged: tuple[int, int, int] | None = None
 
     def begin(self, t_ns: int) -> Sequence[Frame] | None:
