@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
@@ -52,41 +52,40 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.node.serve import serve as serve
     from canprobe.fieldbus.node.slave_node import SlaveNode as SlaveNode
 
-_MODULES = {
-    "CandumpWriter": "bus.candump",
-    "Description": "eds.description",
-    "LockstepBus": "bus.virtual.lockstep",
-    "MonotonicClock": "bus.clock",
-    "PortNetwork": "bus.canopen_network",
-    "SlaveNode": "node.slave_node",
-    "SocketCanPort": "bus.real.socketcan",
-    "TimedBus": "bus.virtual.timed",
-    "VirtualClock": "bus.clock",
-    "check_eds": "eds.packaged",
-    "eds_path": "eds.packaged",
-    "load_eds": "eds.packaged",
-    "make_eds_node": "drive.from_eds",
-    "open_port": "bus.real.opening",
-    "read_candump": "bus.candump",
-    "serve": "node.serve",
-}
-__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
 
-
-def door(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Functions `__getattr__` and `__dir__` of a package here whose names are imported on first use (PEP 562).
+def door(
+    package: str, modules: Mapping[str, Sequence[str]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package here whose names are imported on first use (PEP 562).
 
     Args:
         package: the package.
-        modules: module of each name, below `canprobe.fieldbus`.
+        modules: names by the module that has them, below `canprobe.fieldbus`.
     """
+    module_of = {name: module for module, names in modules.items() for name in names}
 
     def load(name: str) -> Any:
-        if name not in modules:
+        if name not in module_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{__name__}.{modules[name]}"), name)
+        return getattr(importlib.import_module(f"{__name__}.{module_of[name]}"), name)
 
-    return load, lambda: sorted({*vars(sys.modules[package]), *modules})
+    return load, lambda: sorted({*vars(sys.modules[package]), *module_of}), [*module_of]
 
 
-__getattr__, __dir__ = door(__name__, _MODULES)
+__getattr__, __dir__, __all__ = door(
+    __name__,
+    {
+        "bus.candump": ("CandumpWriter", "read_candump"),
+        "bus.canopen_network": ("PortNetwork",),
+        "bus.clock": ("MonotonicClock", "VirtualClock"),
+        "bus.real.opening": ("open_port",),
+        "bus.real.socketcan": ("SocketCanPort",),
+        "bus.virtual.lockstep": ("LockstepBus",),
+        "bus.virtual.timed": ("TimedBus",),
+        "drive.from_eds": ("make_eds_node",),
+        "eds.description": ("Description",),
+        "eds.packaged": ("check_eds", "eds_path", "load_eds"),
+        "node.serve": ("serve",),
+        "node.slave_node": ("SlaveNode",),
+    },
+)

@@ -35,12 +35,12 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.drive.profile import MotorDynamics as MotorDynamics
     from canprobe.fieldbus.drive.reference import AxisPlant as AxisPlant
 
-_MODULES = {
-    "AxisPlant": "drive.reference",
-    "IdealAxis": "drive.from_eds",
-    "MotorDynamics": "drive.profile",
-    "make_drive_node": "drive.drive",
-    "make_eds_node": "drive.from_eds",
-}
-__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
-__getattr__, __dir__ = door(__name__, _MODULES)
+__getattr__, __dir__, __all__ = door(
+    __name__,
+    {
+        "drive.drive": ("make_drive_node",),
+        "drive.from_eds": ("IdealAxis", "make_eds_node"),
+        "drive.profile": ("MotorDynamics",),
+        "drive.reference": ("AxisPlant",),
+    },
+)

@@ -42,12 +42,11 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.protocol.sdo import Abort as Abort
     from canprobe.fieldbus.protocol.sdo import SdoAbort as SdoAbort
 
-_MODULES = {
-    "Abort": "protocol.sdo",
-    "Application": "node.slave_node",
-    "Quirks": "node.quirks",
-    "SdoAbort": "protocol.sdo",
-    "SlaveNode": "node.slave_node",
-}
-__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
-__getattr__, __dir__ = door(__name__, _MODULES)
+__getattr__, __dir__, __all__ = door(
+    __name__,
+    {
+        "node.quirks": ("Quirks",),
+        "node.slave_node": ("Application", "SlaveNode"),
+        "protocol.sdo": ("Abort", "SdoAbort"),
+    },
+)

@@ -29,17 +29,12 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.tools.reports import write_json as write_json
     from canprobe.fieldbus.tools.reports import write_junit as write_junit
 
-_MODULES = {
-    "Examination": "tools.conform",
-    "ExaminationSettings": "tools.conform",
-    "FaultyNode": "tools.faults",
-    "Judge": "tools.judge",
-    "Report": "tools.reports",
-    "closing_text": "tools.reports",
-    "inject": "tools.faults",
-    "read_record": "tools.judge",
-    "write_json": "tools.reports",
-    "write_junit": "tools.reports",
-}
-__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
-__getattr__, __dir__ = door(__name__, _MODULES)
+__getattr__, __dir__, __all__ = door(
+    __name__,
+    {
+        "tools.conform": ("Examination", "ExaminationSettings"),
+        "tools.faults": ("FaultyNode", "inject"),
+        "tools.judge": ("Judge", "read_record"),
+        "tools.reports": ("Report", "closing_text", "write_json", "write_junit"),
+    },
+)
