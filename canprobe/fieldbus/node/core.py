@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.node.dictionary import Dictionary
@@ -54,27 +55,20 @@ class NodeCore:
 def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
     """Add the checks of a node that refuses writes, before any other check."""
 
-    def refuse(subindex: int, value: Value) -> None:
-        raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
+    def refuse(code: Abort, only: int | None, subindex: int, value: Value) -> None:
+        if only in (None, subindex):
+            raise SdoAbort(code)
 
-    def refuse_cob_id(subindex: int, value: Value) -> None:
-        if subindex == 1:
-            raise SdoAbort(Abort.READ_ONLY)
-
-    def refuse_mapping(subindex: int, value: Value) -> None:
-        raise SdoAbort(Abort.READ_ONLY)
+    def keep_bit30(index: int, subindex: int, value: Value) -> None:
+        if subindex == 1 and (int(value) ^ dictionary.number(index, 1)) & NO_RTR_FLAG:
+            raise SdoAbort(Abort.VALUE)
 
     for index in quirks.refuse:
-        dictionary.on_check(index, refuse)
+        dictionary.on_check(index, partial(refuse, Abort.UNSUPPORTED_ACCESS, None))
     for index in dictionary.indices_in(range(0x1400, 0x1C00)) if quirks.fixed_mapping else ():
-        dictionary.on_check(index, refuse_mapping if index & 0x200 else refuse_cob_id)
+        dictionary.on_check(index, partial(refuse, Abort.READ_ONLY, None if index & 0x200 else 1))
     for index in dictionary.indices_in(range(0x1800, 0x1A00)) if quirks.keep_bit30 else ():
-
-        def keep_bit30(subindex: int, value: Value, index: int = index) -> None:
-            if subindex == 1 and (int(value) ^ dictionary.number(index, 1)) & NO_RTR_FLAG:
-                raise SdoAbort(Abort.VALUE)
-
-        dictionary.on_check(index, keep_bit30)
+        dictionary.on_check(index, partial(keep_bit30, index))
 
 
 class DelayedFrames:

@@ -8,8 +8,8 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
     sdo_channel which SDO transfer is open, and what it carried
     bus_state   frames → events; nothing that was not on the bus
     rule        what a rule is: its facts, which rules.toml has, and a generator that gets events; a `Case` is one at
-                work. One module a family: enable, targets, pdo_rules, sdo_rules, network_rules (NMT, SYNC, watchdogs),
-                homing_rules, reactions
+                work. One module a family: enable (and homing), targets, pdo_rules, sdo_rules, network_rules (NMT,
+                SYNC, watchdogs), reactions
     judging     the table of all rules, and `Judge`: events to rules, findings to a report
     bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile
 

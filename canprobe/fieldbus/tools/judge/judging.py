@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import Any
 
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.tools.judge import enable, homing_rules, network_rules, pdo_rules, reactions, sdo_rules, targets
+from canprobe.fieldbus.tools.judge import enable, network_rules, pdo_rules, reactions, sdo_rules, targets
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
@@ -17,7 +17,7 @@ from canprobe.fieldbus.tools.judge.rule import Case, Rule, Watch
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
-_MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, homing_rules, reactions)
+_MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, reactions)
 RULES = sorted(
     (one for module in _MODULES for one in vars(module).values() if isinstance(one, Rule)), key=attrgetter("number")
 )

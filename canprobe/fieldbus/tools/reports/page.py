@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import statistics
 from collections.abc import Iterable, Sequence
+from importlib.resources import files
 from pathlib import Path
 
 from canprobe.fieldbus.bus.files import write_text
@@ -16,27 +17,7 @@ NO_CERTIFICATE = (
     " came, and what the cited clauses accept."
 )
 _CLASSES = {Verdict.PASS: "pass", Verdict.FAIL: "fail", Verdict.NOT_APPLICABLE: "na", Verdict.ERROR: "error"}
-_STYLE = """
-:root { color-scheme: light dark; --line: #8884; --pass: #1a7f37; --fail: #cf222e; --na: #6e7781; --error: #9a6700 }
-@media (prefers-color-scheme: dark) { :root { --pass: #3fb950; --fail: #ff7b72; --na: #8d96a0; --error: #d29922 } }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
-h1 { font-size: 1.5rem; margin-bottom: 0 } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem }
-table { border-collapse: collapse; width: 100% }
-th, td { text-align: left; vertical-align: top; padding: .2rem .8rem .2rem 0 }
-tr { border-bottom: 1px solid var(--line) } th { font-weight: 600; white-space: nowrap } td { overflow-wrap: anywhere }
-table.facts th { width: 9.5rem; white-space: normal }
-td.number, th.number { text-align: right; font-variant-numeric: tabular-nums }
-.pass { color: var(--pass) } .fail { color: var(--fail) } .na { color: var(--na) } .error { color: var(--error) }
-.counts span { font-size: 1.1rem; font-weight: 600; margin-right: 1.5rem }
-.counts span.none { color: var(--na); font-weight: 400 }
-.counts ~ p { margin: .2rem 0 }
-details { border-bottom: 1px solid var(--line); padding: .25rem 0 } summary { cursor: pointer }
-summary b { display: inline-block; min-width: 9.5rem } summary small { opacity: .75 }
-details table { margin: .3rem 0 .6rem 1.1rem; width: calc(100% - 1.1rem) } details tr { border: 0 }
-pre { margin: 0; white-space: pre-wrap; overflow-wrap: anywhere; font-size: 13px }
-footer { margin-top: 2rem; opacity: .75 } svg { display: block } svg rect { fill: var(--na) }
-@media print { body { max-width: none } details { break-inside: avoid } }
-"""
+_STYLE = files(__package__).joinpath("page.css").read_text(encoding="utf-8")
 _WORST_ROWS = 10
 """Rows of each verdict that the page begins with."""
 _BARS = 40
@@ -75,7 +56,7 @@ def write_html(report: Report, path: Path, change: ReportChange | None = None) -
     head = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{_STYLE}</style></head><body>"
+        f"<title>{title}</title><style>\n{_STYLE}</style></head><body>"
     )
     write_text(path, "\n".join([head, *body, "</body></html>\n"]))
 
