@@ -35,15 +35,9 @@ class DriveFeedback:
     """
 
     def __init__(self, node: SlaveNode, motion: Motion, units: Units, noise: Callable[[], float] | None) -> None:
-        self._core, self._axis, self._plant, self._units, self._noise = (
-            node.core,
-            motion.axis,
-            motion.plant,
-            units,
-            noise,
-        )
-        self.counts = 0.0
-        self._velocity = 0.0
+        self._core, self._units, self._noise = node.core, units, noise
+        self._axis, self._plant = motion.axis, motion.plant
+        self.counts = self._velocity = 0.0
         self.distortions: list[Callable[[float], float]] = []
         self._t_ns: int | None = None
         self.plant_torque = partial(motion.plant.torque_permille, motion.axis)

@@ -117,10 +117,8 @@ class Dictionary:
     def slot(self, key: int) -> Slot:
         """Slot of a value for cyclic RPDOs. It does not have hooks and checks that are added later."""
         entry, index = self.entries[key], key >> 8
-        low, high = (
-            -_BEYOND_INTEGERS if entry.low is None else entry.low,
-            _BEYOND_INTEGERS if entry.high is None else entry.high,
-        )
+        low = -_BEYOND_INTEGERS if entry.low is None else entry.low
+        high = _BEYOND_INTEGERS if entry.high is None else entry.high
         return key, key & 0xFF, low, high, tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
 
     def find(self, index: int, subindex: int) -> Entry:

@@ -168,9 +168,7 @@ class SocketCanPort:
         self._setting = setting_line(channel, bitrate, data_bitrate)
         self._waits = waits
         self._reports = reports or Reports()
-        check_interface(channel, self._setting)
-        if fd:
-            _check_fd(channel, self._setting)
+        check_interface(channel, self._setting, fd)
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
@@ -414,15 +412,17 @@ def has_socketcan() -> bool:
     return True
 
 
-def check_interface(channel: str, setting: str | None = None) -> None:
+def check_interface(channel: str, setting: str | None = None, fd: bool = False) -> None:
     """Return if `channel` is a CAN interface that is up.
 
     Args:
         channel: name of the interface.
         setting: line to type that sets it up; None where it needs no setting.
+        fd: whether it has to carry CAN FD frames.
 
     Raises:
-        InterfaceError: the interface is missing, down or no CAN interface; the message has the line to type.
+        InterfaceError: the interface is missing, down, no CAN interface or not set up for CAN FD; the message has the
+            line to type.
     """
     if not has_socketcan():
         raise InterfaceError(
@@ -433,6 +433,7 @@ def check_interface(channel: str, setting: str | None = None) -> None:
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:
             flags = struct.unpack("=16sH14x", system.ioctl(probe, _SIOCGIFFLAGS, _ifreq(channel)))[1]
+            mtu = struct.unpack("=16si12x", system.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
         except OSError as error:
             raise InterfaceError(f"{channel}: no such interface; {how_to_make(channel)}") from error
         try:
@@ -441,16 +442,7 @@ def check_interface(channel: str, setting: str | None = None) -> None:
             raise InterfaceError(f"{channel}: not a CAN interface: {error.strerror}") from error
         if not flags & _IFF_UP:
             raise _down(channel, setting or ip_line(f"{channel} up"))
-
-
-def _check_fd(channel: str, setting: str) -> None:
-    """Return if the interface carries CAN FD frames; else raise InterfaceError."""
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
-        try:
-            mtu = struct.unpack("=16si12x", system.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
-        except OSError as error:
-            raise InterfaceError(f"{channel}: no such interface; {how_to_make(channel)}") from error
-    if mtu < FD_MTU_BYTES:
+    if fd and mtu < FD_MTU_BYTES:
         raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
 
 

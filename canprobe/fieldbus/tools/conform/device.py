@@ -78,9 +78,7 @@ class ExaminedDevice:
     def _read_record(self, bench: SdoClient, index: int) -> None:
         if not (count := self._read(bench, (index, 0))):
             return
-        if (
-            0x1600 <= index < 0x1800 or index >= 0x1A00
-        ):  # sub-index 0 counts the entries in use, of which there are more
+        if 0x1600 <= index < 0x1800 or index >= 0x1A00:  # its sub-index 0 counts the entries in use only
             for subindex in range(1, _MAX_ENTRIES + 1):
                 if self._read(bench, (index, subindex)) is None:
                     return

@@ -6,7 +6,6 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from importlib.resources import files
 from types import NoneType
 from typing import Any, TypeVar, get_args, get_type_hints
@@ -15,6 +14,7 @@ from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
 from canprobe.fieldbus.tools.judge.seen_node import Known, SeenNode
+from canprobe.fieldbus.tools.reports.report import Severity
 
 QUEUED_NS = 5_000_000
 """Time for which a frame may have waited in its sender's queue."""
@@ -25,15 +25,6 @@ _FACTS = tomllib.loads(files(__package__).joinpath("rules.toml").read_text(encod
 Event = TypeVar("Event", bound=BusEvent)
 Watch = Generator[None, Event | None, None]
 """Gets the events that its annotation names, one after the other, and None at the end of the bus."""
-
-
-class Severity(StrEnum):
-    """What a fault of a master costs."""
-
-    UNSAFE = "unsafe"
-    WRONG = "wrong"
-    REFUSED = "refused"
-    MINOR = "minor"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from canprobe.errors import UsageError, check_schema, regular_file
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.fieldbus.tools.reports.report import SEVERITIES, Report, ReportRow, Verdict
+from canprobe.fieldbus.tools.reports.report import Report, ReportRow, Severity, Verdict
 
 SCHEMA = 1
 """Version of the document; it rises when a key goes or changes its meaning."""
@@ -72,8 +72,8 @@ def _parse_report(document: dict[str, Any]) -> Report:
 
 def _parse_row(row: dict[str, Any]) -> ReportRow:
     values = {one.name: _PARSERS.get(one.name, _text)(row[one.name]) for one in fields(ReportRow)}
-    if values["severity"] not in SEVERITIES:
-        raise ValueError(f"severity: expected one of {', '.join(SEVERITIES[1:])}, got {values['severity']!r}")
+    if values["severity"] not in ("", *Severity):
+        raise ValueError(f"severity: expected one of {', '.join(Severity)}, got {values['severity']!r}")
     return ReportRow(**values)
 
 

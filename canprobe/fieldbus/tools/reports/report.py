@@ -16,8 +16,15 @@ class Verdict(StrEnum):
     ERROR = "ERROR"
 
 
-SEVERITIES = ("", "unsafe", "wrong", "refused", "minor")
-"""Severities of a finding, worst first; the empty one is that of a row without a finding."""
+class Severity(StrEnum):
+    """What a finding costs, worst first; a row without one has an empty text."""
+
+    UNSAFE = "unsafe"
+    WRONG = "wrong"
+    REFUSED = "refused"
+    MINOR = "minor"
+
+
 IDENTITY = ("vendor", "product", "revision", "serial", "device name", "hardware version", "firmware")
 """Facts of a report that name the device: 1018h:01 to :04, 1008h, 1009h, 100Ah."""
 
@@ -36,7 +43,7 @@ class ReportRow:
         came: frames that came, decoded and in hex.
         detail: what was wrong, or why the point does not apply, in one sentence.
         hint: what the reader can do about it.
-        severity: one of `SEVERITIES`.
+        severity: a `Severity`; empty where nothing was found.
         written: objects that were written, and whether they were restored.
         seconds: time that the point took, s.
     """
