@@ -17,7 +17,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canprobe.fieldbus.drive.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, InterpolatedPosition
 from canprobe.fieldbus.drive.homing import HomingMode
 from canprobe.fieldbus.drive.mode import DriveMode, DriveParts
-from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS, DriveParameters
+from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS, DriveParameters, check_among
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
@@ -107,7 +107,7 @@ class DriveApplication(Application):
             dictionary.on_check(index, self._check_not_moving)
         dictionary.on_write(0x6040, self._controlword)
         dictionary.on_read(0x6041, lambda _sub: self._take_word(self._core.now_ns))
-        dictionary.on_check(0x6060, self._check_mode)
+        dictionary.on_check(0x6060, partial(check_among, self._modes))
         dictionary.on_write(0x6060, lambda _sub, value: self._select_mode(int(value)))
 
     def reset(self, t_ns: int) -> None:
@@ -184,10 +184,6 @@ class DriveApplication(Application):
         """Make transition 4 after 3, when the controlword that switched on also enables."""
         if self.state is DriveState.SWITCHED_ON and self._command is DriveCommand.ENABLE_OPERATION:
             self._go(_ENABLED_STATE, t_ns)
-
-    def _check_mode(self, subindex: int, value: Value) -> None:
-        if value not in self._modes:
-            raise SdoAbort(Abort.VALUE)
 
     def _select_mode(self, number: int) -> None:
         mode = self._modes[number]

@@ -19,15 +19,16 @@ Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah.
 from __future__ import annotations
 
 from enum import Enum, auto
+from functools import partial
 from math import ceil, floor
 
 from canprobe.fieldbus.drive.feedback import NEGATIVE_SWITCH_FLAG, POSITIVE_SWITCH_FLAG
 from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.parameters import check_among
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
-from canprobe.fieldbus.node.entry import Value, key_of
+from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED_BIT, HOMING_ERROR_BIT, HOMING_START_BIT, OperationMode
-from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 PRESENT_POSITION_METHODS = frozenset({35, 37})
 INDEX_DIRECTIONS = {33: -1, 34: 1}
@@ -69,7 +70,7 @@ class HomingMode(ProfiledMode):
         self._method = 0
         self._direction = 1  # direction of the motor in which it passes the edge or the pulse
         self._passed = self._home = 0.0  # counts: position before the pulse; the home position
-        parts.node.dictionary.on_check(0x6098, _check_method)
+        parts.node.dictionary.on_check(0x6098, partial(check_among, HOMING_METHODS))
 
     def reset(self) -> None:
         """Power on: the drive is not homed."""
@@ -203,8 +204,3 @@ def next_pulse(counts: float, direction: int, turn: float) -> float:
     """Position of the next index pulse behind `counts`, in a direction; a pulse right there has been passed."""
     turns = counts / turn
     return (floor(turns) + 1 if direction > 0 else ceil(turns) - 1) * turn
-
-
-def _check_method(subindex: int, value: Value) -> None:
-    if value not in HOMING_METHODS:
-        raise SdoAbort(Abort.VALUE)

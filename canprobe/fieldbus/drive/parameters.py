@@ -5,6 +5,7 @@ Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h–6068h, 6072h, 607Dh, 60
 
 from __future__ import annotations
 
+from collections.abc import Container
 from functools import partial
 from math import inf
 
@@ -61,7 +62,7 @@ class DriveParameters:
         self.read()
         dictionary.on_change(self.read, *_INDICES)
         for index, allowed in _ALLOWED_OPTIONS.items():
-            dictionary.on_check(index, partial(_check_among, allowed))
+            dictionary.on_check(index, partial(check_among, allowed))
         dictionary.on_check(0x60C2, partial(_check_interpolation, dictionary.number(0x60C2, 1, -1)))
 
     def read(self) -> None:
@@ -111,7 +112,8 @@ class DriveParameters:
         return target if low <= target <= high or low >= high else min(max(target, low), high)
 
 
-def _check_among(allowed: frozenset[int], subindex: int, value: Value) -> None:
+def check_among(allowed: Container[Value], subindex: int, value: Value) -> None:
+    """Check that a value is an allowed one. Raises SdoAbort."""
     if value not in allowed:
         raise SdoAbort(Abort.VALUE)
 

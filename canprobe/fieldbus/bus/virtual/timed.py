@@ -157,7 +157,7 @@ class TimedBus(LockstepBus):
                 if entry is None and self._ready:
                     start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
                     if start <= until_ns and (due is None or start < due):
-                        entry, self._hit = heappop(self._ready), False  # inlined `_fly`, for speed
+                        entry, self._hit = heappop(self._ready), False  # as `_start` does, for speed
                         bits = length(*entry[3]) - INTERMISSION_BITS
                         self._end_ns = end_ns = start + (bits * bit_ns or self._bits_ns(bits))
                         self._free_ns = end_ns + gap_ns
@@ -247,16 +247,11 @@ class TimedBus(LockstepBus):
             hit = bits - 9  # the ACK slot, in which nobody acknowledges it
         if hit is not None:
             bits = hit + 1 + _ERROR_BITS
-        self._fly(entry, t_ns, t_ns + self._bits_ns(bits))
-        self._hit = hit is not None
+        self._flying, self._hit = entry, hit is not None
+        self._end_ns = t_ns + self._bits_ns(bits)
+        self._free_ns = self._end_ns + self._gap_ns
+        self.busy_ns += self._free_ns - t_ns
         return True
-
-    def _fly(self, entry: _Entry, start_ns: int, end_ns: int) -> None:
-        """Put a frame on the wire."""
-        self._flying, self._hit = entry, False
-        self._end_ns = end_ns
-        self._free_ns = end_ns + self._gap_ns
-        self.busy_ns += self._free_ns - start_ns
 
     def _winner(self, t_ns: int) -> _Entry | None:
         """Winner among the nodes that do not have to wait after a frame of their own."""

@@ -163,7 +163,7 @@ class Permits:
             NotPermitted: it must not be sent here.
         """
         if can_id & (EFF_FLAG | RTR_FLAG):
-            self._need("alone" if can_id & EFF_FLAG or not self._is_own(can_id & 0x7FF) else "")
+            self._need("alone" if can_id & EFF_FLAG or can_id & 0x7F != self.node_id else "")
         elif can_id == NMT_ID:
             self._check_nmt(data)
         elif can_id == SYNC_ID:
@@ -185,9 +185,6 @@ class Permits:
     def _need(self, need: str) -> None:
         if why := self.surroundings.lacks(need):
             raise NotPermitted(why)
-
-    def _is_own(self, can_id: int) -> bool:
-        return can_id & 0x7F == self.node_id
 
     def _check_nmt(self, data: bytes) -> None:
         self._need("nmt")

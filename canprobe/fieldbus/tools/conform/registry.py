@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from types import ModuleType
 
 from canprobe.errors import UsageError, did_you_mean
 from canprobe.fieldbus.tools.conform.point import Point
@@ -33,15 +32,9 @@ LEFT_OUT: tuple[tuple[str, str], ...] = (
 """Points that are never examined, and why."""
 
 
-def points_of(*modules: ModuleType) -> tuple[Point, ...]:
-    """The points of modules, in the order in which they stand there."""
-    return tuple(point for module in modules for point in vars(module).values() if isinstance(point, Point))
-
-
-POINTS = points_of(
-    objects, sdo, sdo_transfers, nmt, heartbeat, pdo_parameters, pdo, sync, emcy, lss, hostile, drive402, timing
-)
-"""All points; those that read come first."""
+_MODULES = objects, sdo, sdo_transfers, nmt, heartbeat, pdo_parameters, pdo, sync, emcy, lss, hostile, drive402, timing
+POINTS = tuple(point for module in _MODULES for point in vars(module).values() if isinstance(point, Point))
+"""All points, in the order of the modules; those that read come first."""
 
 
 def chosen_points(points: Sequence[Point], names: Iterable[str]) -> tuple[Point, ...]:

@@ -206,11 +206,10 @@ class FaultyNode(WrappedNode):
         for effect in self._effects:
             batch = effect.batch(batch, t_ns)
         sent = self._through(batch, t_ns, incoming=False)
-        return [*sent, *self._unswapped()] if sent else sent
-
-    def _unswapped(self) -> list[Frame]:
-        swapped, self._swapped = self._swapped, []
-        return swapped
+        if sent:
+            sent += self._swapped
+            self._swapped = []
+        return sent
 
     def _through(self, frames: list[Frame], t_ns: int, *, incoming: bool) -> list[Frame]:
         for effect in self._effects:

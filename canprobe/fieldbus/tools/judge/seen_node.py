@@ -266,19 +266,17 @@ class SeenNode:
 
     def target(self, mode: int | None) -> Known | None:
         """Last target of a mode."""
-        index = TARGET_OF_MODE.get(mode) if mode is not None else None
-        if index is None:
-            return None
-        if index == cia402.INTERPOLATION_DATA:
-            return self.known(index, 1)
-        return self.known(index)
+        index = TARGET_OF_MODE.get(mode or 0)
+        return None if index is None else self.known(index, index == cia402.INTERPOLATION_DATA)
+
+    def _speed_limit(self) -> int:
+        """Largest speed (607Fh), user units a second; 0 where it is not known in these units."""
+        speed = self.value(_SPEED_LIMIT) or 0
+        return speed if 0 < speed < _UNLIMITED and not self.value(_SPEED_UNIT) else 0
 
     def step_limit(self, period_ns: int) -> float | None:
-        """Way in a period at the largest speed (607Fh), user units; None where it is not known in these units."""
-        speed = self.value(_SPEED_LIMIT)
-        if not speed or speed >= _UNLIMITED or self.value(_SPEED_UNIT):
-            return None
-        return speed * period_ns * 1e-9
+        """Way in a period at the largest speed, user units; None where it is not known."""
+        return self._speed_limit() * period_ns * 1e-9 or None
 
     def tolerance(self, period_ns: int) -> float:
         """Difference of positions that is not a jump: the way of a period, or 0.1 % of the range."""
@@ -297,9 +295,7 @@ class SeenNode:
     @property
     def least_speed(self) -> float:
         """Speed from which on the axis moves, user units a second."""
-        speed = self.value(_SPEED_LIMIT) or 0
-        usable = 0 < speed < _UNLIMITED and not self.value(_SPEED_UNIT)
-        return _MOVING_SHARE * speed if usable else 1e-4 * self._range()
+        return _MOVING_SHARE * self._speed_limit() or 1e-4 * self._range()
 
     def moves(self, t_ns: int) -> bool:
         """Whether the axis moves: by 606Ch, or by the last positions."""

@@ -52,8 +52,7 @@ def _at_rest(bench: Bench, mode: int = 0) -> Iterator[None]:
     """The drive switched off in a mode, with its target where it is; switched off afterwards, whatever happens."""
     modes = _supported(bench)
     mode = mode or next((m for m in (OperationMode.PROFILE_POSITION, 8, 9, 10, 3, 7) if modes >> m - 1 & 1), 0)
-    if not mode or (modes and not modes >> mode - 1 & 1):
-        bench.does_not_apply(f"6502h does not list mode {mode}")
+    bench.require(mode and (not modes or modes >> mode - 1 & 1), f"6502h does not list mode {mode}")
     _off(bench)
     bench.put(cia402.MODE, 0, mode, 1)
     bench.put(cia402.TARGET_POSITION, 0, bench.number(cia402.POSITION), 4)
@@ -103,8 +102,7 @@ def statusword(bench: Bench) -> None:
 def supported_modes(bench: Bench) -> None:
     """6502h beside the EDS, and the mode that 6061h shows."""
     entry = bench.device.described(cia402.SUPPORTED_MODES)
-    if bench.device.description is not None and entry is None:
-        bench.does_not_apply("the EDS describes no 6502h")
+    bench.require(entry is not None or bench.device.description is None, "the EDS describes no 6502h")
     modes = bench.number(cia402.SUPPORTED_MODES)
     if entry is not None and isinstance(entry.default, int) and entry.default and entry.default != modes:
         bench.notes.append(f"6502h is {modes:08X}h, the EDS says {entry.default:08X}h")

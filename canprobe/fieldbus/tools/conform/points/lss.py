@@ -155,5 +155,4 @@ def inquire(bench: Bench) -> None:
             if answer is None or answer[:5] != pack_number(command, number)[:5]:
                 bench.deviates(f"inquiry {command:02X}h does not give {number:#x} of 1018h:{n + 1:02X}")
         answer = _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID))
-        if answer is None or answer[1] != bench.node_id:
-            bench.deviates("the inquiry of the node-ID does not give the id")
+        bench.expect(answer and answer[1] == bench.node_id, "the inquiry of the node-ID does not give the id")

@@ -126,20 +126,12 @@ def map_unmappable(bench: Bench) -> None:
             pdo = changeable_pdo(bench, area, mapping=True)
         except PointNotApplicable:
             continue
-        entry = next(
-            (
-                entry
-                for entry in bench.device.entries()
-                if entry.bits and not (entry.in_tpdo if area is TPDOS else entry.in_rpdo) and entry.is_integer
-                if area is TPDOS or entry.in_tpdo
-            ),
-            None,
-        )
-        if entry is None:
-            continue
-        tried += 1
-        switch_off(bench, pdo)
-        _refused_at_last(bench, pdo, [word_of(entry)], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
+        numbers = [entry for entry in bench.device.entries() if entry.bits and entry.is_integer]
+        unmappable = [e for e in numbers if (not e.in_tpdo if area is TPDOS else e.in_tpdo and not e.in_rpdo)]
+        for entry in unmappable[:1]:
+            tried += 1
+            switch_off(bench, pdo)
+            _refused_at_last(bench, pdo, [word_of(entry)], accepted.NOT_MAPPABLE, f"mapping of {entry.index:04X}h")
     bench.require(tried, "no mapping can be changed, or the EDS lets everything be mapped")
 
 
