@@ -8,7 +8,7 @@ import can
 import pytest
 
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus import MonotonicClock, open_port
 from canprobe.fieldbus.bus.real import adapters
 from canprobe.fieldbus.bus.real.adapters import (
     BACKENDS,
@@ -19,7 +19,6 @@ from canprobe.fieldbus.bus.real.adapters import (
     missing_here,
 )
 from canprobe.fieldbus.bus.real.link import LinkState
-from canprobe.fieldbus.bus.real.opening import open_port
 
 
 def lacking(monkeypatch: pytest.MonkeyPatch) -> None:

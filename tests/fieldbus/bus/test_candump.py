@@ -16,11 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canprobe.errors import UsageError
+from canprobe.fieldbus import LockstepBus, VirtualClock
 from canprobe.fieldbus.bus.candump import CandumpReader, CandumpWriter, RecordingPort, read_candump
-from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import ERR_FLAG
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
 
 LINES = [

@@ -10,9 +10,8 @@ import can
 import pytest
 
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus import MonotonicClock, open_port
 from canprobe.fieldbus.bus.real.mmsg import FrameSocket
-from canprobe.fieldbus.bus.real.opening import open_port
 
 LONG = bytes(range(64))
 FRAMES = [(0x181, b"\x01\x02"), (0x512, LONG), (0x80, b""), (0x513, LONG[:12])]

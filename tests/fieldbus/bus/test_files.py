@@ -5,7 +5,7 @@ import os
 import pytest
 
 from canprobe.errors import ResultsError
-from canprobe.fieldbus.bus.candump import CandumpWriter
+from canprobe.fieldbus import CandumpWriter
 from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text
 
 WHOLE_TEXT = b"what was there before"

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from timed_buses import Scripted
 
 from canprobe.errors import BusError, InterfaceError
-from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+from canprobe.fieldbus import LockstepBus, VirtualClock
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 MS = 1_000_000

@@ -8,7 +8,7 @@ import can
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus import read_candump
 from canprobe.fieldbus.bus.logs import SUFFIXES, ForeignLog, open_log
 from canprobe.fieldbus.bus.port import ERR_FLAG
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG

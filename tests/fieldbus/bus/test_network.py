@@ -10,7 +10,7 @@ import pytest
 from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
-from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus import VirtualClock
 from canprobe.fieldbus.bus.lss import Lss, LssAnswerError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (

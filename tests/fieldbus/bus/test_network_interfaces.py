@@ -14,9 +14,8 @@ from network_buses import bare, group  # noqa: F401
 from patience import patience_s
 
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus import MonotonicClock, open_port
 from canprobe.fieldbus.bus.real.adapters import configured_bus
-from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.python_can import Echoes
 
 SECOND = 1_000_000_000

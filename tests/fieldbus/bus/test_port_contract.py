@@ -9,11 +9,9 @@ import can
 import pytest
 
 from canprobe.errors import BusError, InterfaceError, UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
+from canprobe.fieldbus import LockstepBus, MonotonicClock, VirtualClock, open_port
 from canprobe.fieldbus.bus.port import ControllerState, Port, Reports, TimedFrame
-from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.python_can import PythonCanPort
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
 
 HOUR_NS = 3600 * 10**9

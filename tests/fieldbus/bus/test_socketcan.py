@@ -14,11 +14,10 @@ from collections.abc import Iterator, Sequence
 import pytest
 
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
+from canprobe.fieldbus import MonotonicClock, SocketCanPort, VirtualClock
 from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, Reports, TimedFrame
 from canprobe.fieldbus.bus.real.mmsg import Row
 from canprobe.fieldbus.bus.real.python_can import PythonCanPort
-from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, Frame
 from canprobe.fieldbus.vcan.guest_setup import make_link, set_link
 

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from conformance_bench import Bench, connect, pytest_terminal_summary  # noqa: F401
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from conformance_bench import ON_BOTH_BUSES
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
 
 CYCLE_MS = 100  # 60C2h as the bench sets it
 SHUTDOWN, SWITCH_ON, ENABLE, VOLTAGE, QUICK, RESET = 0x06, 0x07, 0x0F, 0x00, 0x02, 0x80

@@ -7,9 +7,8 @@ from functools import partial
 import pytest
 from conformance_bench import ON_BOTH_BUSES
 
-from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
+from canprobe.fieldbus import SlaveNode, load_eds
+from canprobe.fieldbus.node import Abort, SdoAbort
 
 EDS = "puma260_joint"
 VENDOR, PRODUCT, REVISION, SERIAL = NUMBERS = (0xCA5E, 0x260, 0x10000, 0xA5000321)

@@ -9,9 +9,7 @@ from functools import partial
 
 from defects import write_whole_device
 
-from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus import Description, SlaveNode, load_eds
 from canprobe.fieldbus.tools.conform import POINTS, Examination, ExaminationSettings, WriteList
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.reports import Verdict

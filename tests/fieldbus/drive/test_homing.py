@@ -7,8 +7,8 @@ from copy import deepcopy
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
 
 START, HALT = 0x1F, 0x10F
 UNDER_WAY, NOT_STARTED, DONE = (0, 0, 0), (0, 0, 1), (0, 1, 1)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
 
 CYCLE = 10_000_000
 ENABLED, ACTIVE, HALTED = 0x0F, 0x1F, 0x11F

@@ -8,9 +8,8 @@ import pytest
 from canopen.objectdictionary import ObjectDictionary
 from makes import MAKES, Make, changed, pdo, standard_drive, without, word, write_eds
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.drive.from_eds import IdealAxis
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import IdealAxis, make_drive_node
 
 CYCLE = 10_000_000
 RPDO, TPDO = 0x201, 0x181

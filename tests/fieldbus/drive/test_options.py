@@ -6,8 +6,8 @@ from copy import deepcopy
 
 import pytest
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
 from canprobe.fieldbus.protocol.cia402 import DriveState as S
 
 SLOW, QUICK = 50_000, 400_000

@@ -8,9 +8,8 @@ import pytest
 from makes import MAKES, write_eds
 from random_orders import WORDS, live
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.drive.from_eds import IdealAxis
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import IdealAxis, make_drive_node
 from canprobe.fieldbus.protocol.cia402 import state_of
 
 

@@ -7,8 +7,8 @@ from copy import deepcopy
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 from canopen.objectdictionary.eds import import_eds
 
-from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.eds.packaged import eds_path, load_eds
+from canprobe.fieldbus import Description, eds_path, load_eds
 
 MESSY = Path(__file__).parent / "messy"
 

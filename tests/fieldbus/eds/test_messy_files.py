@@ -10,8 +10,7 @@ import pytest
 from canopen.objectdictionary.eds import import_eds
 
 from canprobe.errors import EdsError
-from canprobe.fieldbus.drive.from_eds import make_eds_node
-from canprobe.fieldbus.eds.packaged import check_eds, eds_path, load_eds
+from canprobe.fieldbus import check_eds, eds_path, load_eds, make_eds_node
 
 FOLDER = Path(__file__).parent / "messy"
 FILES = sorted(FOLDER.iterdir())

@@ -7,8 +7,7 @@ from functools import partial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus import SlaveNode, load_eds
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.protocol.lss import LssCommand
 

@@ -5,12 +5,12 @@ import io
 import pytest
 from canopen.objectdictionary.eds import import_eds
 
+from canprobe.fieldbus import SlaveNode
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, load_eds
+from canprobe.fieldbus.node import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
-from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 MS = 1_000_000
 OFF = 0x80000000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.fieldbus.node.quirks import Quirks
+from canprobe.fieldbus.node import Quirks
 from canprobe.fieldbus.protocol.frames import NmtState
 
 PRE, OP, STOPPED = NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_fuzz import COMMANDS, GUARD, Watched, rage
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
 
 
 def make_node(kind, make_bench, plant):

@@ -6,9 +6,9 @@ from statistics import fmean, stdev
 
 import pytest
 
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.quirks import Quirks
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.drive import make_drive_node
+from canprobe.fieldbus.node import Quirks
 
 MS = 1_000_000
 REFUSED, READ_ONLY, VALUE = 0x06010000, 0x06010002, 0x06090030

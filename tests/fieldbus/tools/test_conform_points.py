@@ -27,11 +27,8 @@ from defects import (
 )
 from examined import NODE_ID, Examined, eds_device, failed
 
-from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.virtual.timed import TimedBus
-from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.quirks import Quirks
-from canprobe.fieldbus.node.slave_node import Application, SlaveNode
+from canprobe.fieldbus import SlaveNode, TimedBus, VirtualClock, load_eds
+from canprobe.fieldbus.node import Application, Quirks
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, NmtState
 from canprobe.fieldbus.tools.conform import POINTS, ExaminationSettings, WriteList

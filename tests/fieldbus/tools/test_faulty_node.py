@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus import VirtualClock, load_eds, make_eds_node
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
-from canprobe.fieldbus.drive.from_eds import make_eds_node
-from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
 
 MS = 1_000_000

@@ -7,8 +7,7 @@ import random
 import pytest
 from scripted_masters import Careful, DrivesMuteAxis, Master, MutePassedOver, all_masters
 
-from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import Description, load_eds
 from canprobe.fieldbus.tools.judge import RULES, BusFrame, Judge
 
 GOOD = [Master, *all_masters(Careful)]

@@ -7,11 +7,7 @@ import struct
 
 import pytest
 
-from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
-from canprobe.fieldbus.drive.from_eds import make_eds_node
-from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus import Description, LockstepBus, VirtualClock, load_eds, make_eds_node
 from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
 from canprobe.fieldbus.tools.judge import BusFrame, Judge, first_answers
 from canprobe.fieldbus.tools.judge.injections import STANDARD_FAULTS, Injections

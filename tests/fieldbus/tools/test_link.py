@@ -7,8 +7,7 @@ from random import Random
 
 import pytest
 
-from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+from canprobe.fieldbus import LockstepBus, VirtualClock
 from canprobe.fieldbus.tools.link import AnswerFigures, Fitness, LinkFigures, LinkLimits, LinkMeter, judge_link
 from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts
 
