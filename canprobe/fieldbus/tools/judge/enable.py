@@ -27,10 +27,15 @@ _STATES_FOR = {
 }
 """States in which a step up may be commanded: it leads on from them, or they are its goal."""
 _LONGEST_RESET_NS = 500_000_000
+"""Longest time for which bit 7 may stay set."""
 _RESETS_WINDOW_NS = 10_000_000_000
+"""Time within which a fourth fault reset is one too many."""
 _STOP_SEEN_NS = 50_000_000
+"""Time from a quick stop of the drive's own to the answer of its master."""
 _LONGEST_HALT_NS = 1_000_000_000
+"""Longest time for which targets may change under halt."""
 _LONGEST_START_NS = 500_000_000
+"""Longest time for which bit 4 may be set in the homing mode without an edge."""
 
 
 def enables(event: ControlSeen) -> bool:
@@ -148,8 +153,7 @@ def reset_held(case: Case, node: SeenNode) -> Watch[ControlSeen]:
         first = first or event.frame
         held_ns = event.frame.t_ns - first.t_ns
         if case.in_a_row(node, held_ns > _LONGEST_RESET_NS):
-            what = f"bit 7 of 6040h has been set for {held_ns * 1e-9:.2f} s without an edge"
-            case.blame(node, what, first, event)
+            case.blame(node, f"bit 7 of 6040h has been set for {held_ns * 1e-9:.2f} s without an edge", first, event)
 
 
 @rule(10, answers=True)
@@ -205,8 +209,7 @@ def halt_kept(case: Case, node: SeenNode) -> Watch[TargetSeen | ModeSeen]:
             first = first or event.frame
             held_ns = event.frame.t_ns - first.t_ns
             if case.in_a_row(node, held_ns > _LONGEST_HALT_NS):
-                what = f"targets have changed under halt for {held_ns * 1e-9:.1f} s"
-                case.blame(node, what, word, first, event)
+                case.blame(node, f"targets have changed under halt for {held_ns * 1e-9:.1f} s", word, first, event)
 
 
 @rule(13)

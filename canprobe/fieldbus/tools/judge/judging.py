@@ -18,9 +18,8 @@ from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
 _MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, reactions)
-RULES = sorted(
-    (one for module in _MODULES for one in vars(module).values() if isinstance(one, Rule)), key=attrgetter("number")
-)
+_FOUND = (one for module in _MODULES for one in vars(module).values() if isinstance(one, Rule))
+RULES = tuple(sorted(_FOUND, key=attrgetter("number")))
 """All rules, in the order of their numbers."""
 NO_RULES: tuple[tuple[str, str], ...] = (
     ("12 enabling as part of initialisation", "the bus does not show whether a person asked for it"),

@@ -28,8 +28,11 @@ _SLACK_NS = 2_000_000
 _GONE = 20
 """A gap of so many times is a master that was ended and begins again."""
 _JITTER_SHARE, _LEAST_INTERVALS = 0.05, 200
+"""Share of the period by which 99 % of the intervals of SYNC may differ, and how many there must be."""
 _NEAR_NS = 1_000_000_000
+"""Time within which two bad SYNCs are blamed."""
 _ENOUGH_SYNCS, _PERIOD_SHARE = 5, 0.05
+"""SYNCs from which on the period is known, and the share by which 60C2h may differ from it."""
 
 
 @rule(22, answers=True)

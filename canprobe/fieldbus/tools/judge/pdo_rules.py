@@ -19,9 +19,13 @@ _HARMLESS = {cia402.CONTROLWORD, cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE, 0
 """Objects of which 0 is a quiet value."""
 _PROFILE = range(0x6040, 0x6100)
 _CYCLIC_SYNCS = 10
+"""SYNCs in a row with one RPDO each from which on one is expected at every SYNC."""
 _WANTED_TARGETS = 10
+"""Targets in a row that show that they are not bound to SYNC."""
 _USUAL_GAPS = 10
+"""Intervals of an RPDO whose median is the usual one."""
 _BURST_FRAMES = 3
+"""RPDOs behind a gap, each closer than half the usual interval, that are a backlog."""
 
 
 @rule(6)
@@ -56,8 +60,7 @@ def zero_filled(case: Case, node: SeenNode) -> Watch[RpdoSeen | StatusSeen]:
 def _judge_target(case: Case, node: SeenNode, first: BusFrame) -> None:
     position = node.known(cia402.POSITION)
     if position is not None and abs(position.value) > node.tolerance(case.bus.period_ns):
-        what = f"607Ah is 0 in the first RPDO, and the axis is at {position.value}"
-        case.blame(node, what, position, first)
+        case.blame(node, f"607Ah is 0 in the first RPDO, and the axis is at {position.value}", position, first)
 
 
 @rule(7)

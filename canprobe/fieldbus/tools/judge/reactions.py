@@ -30,7 +30,9 @@ _DOWN = (DriveCommand.DISABLE_VOLTAGE, DriveCommand.QUICK_STOP, DriveCommand.SHU
 _SECOND_NS = 1_000_000_000
 LossEvent = SyncSeen | HeartbeatSeen | TargetSeen | ControlSeen | StatusSeen
 _SOON_NS = 100_000_000
+"""Time after EMCY 0000h within which a stop is an answer to it."""
 _PATIENCE_NS = 2_000_000_000
+"""Time of an enabled axis after which every node must have been heard."""
 
 
 @rule(15, answers=True)
@@ -255,5 +257,4 @@ def missing_from_start(case: Case) -> Watch[StatusSeen]:
                 continue
             blamed.add(node)
             heard = "has never answered" if node.seen else "was never heard"
-            what = f"node {event.node.node_id} is enabled, and node {node.node_id} {heard}"
-            case.blame(node, what, first, event)
+            case.blame(node, f"node {event.node.node_id} is enabled, and node {node.node_id} {heard}", first, event)

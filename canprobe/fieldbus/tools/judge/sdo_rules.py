@@ -12,7 +12,9 @@ from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 _SHORT_NS = 50_000_000
 """Time after which a second request may be that of a client that gave the first one up."""
 _POLLED_PERIODS = 50
+"""Periods of SYNC in a row with a read of one object that are polling."""
 _STALE_NS = 10_000_000
+"""Waiting time below which a time-out is that of another request."""
 
 
 @rule(26, answers=True)
@@ -90,8 +92,7 @@ def abort_without_object(case: Case, node: SeenNode) -> Watch[AbortSeen | Answer
                 what = f"the abort of the transfer of {place_text(*event.place)} names {named}"
                 case.blame(node, what, event.request, event)
         elif over is None or over[0] != event.named or event.frame.t_ns - over[1].t_ns > QUEUED_NS:
-            what = f"an abort that names {named}, and no transfer is open"
-            case.blame(node, what, over[1] if over else None, event)
+            case.blame(node, f"an abort that names {named}, and no transfer is open", over[1] if over else None, event)
 
 
 @rule(31)

@@ -17,6 +17,7 @@ _CREEP_SHARE = 0.2
 _LOST_SHARE = 3.0
 """A step of so many limits is blamed at once; less may be the way of lost frames."""
 _SILENCE_NS = 250_000_000
+"""Time without an RPDO with targets after which the master is gone."""
 
 
 class Onward:
@@ -88,8 +89,7 @@ def step_too_large(case: Case, node: SeenNode) -> Watch[TargetSeen]:
             change = 0 if last is None else abs(step - last)
             most = acceleration * (period_ns * 1e-9) ** 2
             if case.in_a_row(("acceleration", node), change > 1.05 * most + 3, 4):
-                what = f"steps of 607Ah change by {change} in a period; 60C5h allows {most:.0f}"
-                case.blame(node, what, event)
+                case.blame(node, f"steps of 607Ah change by {change} in a period; 60C5h allows {most:.0f}", event)
         last = step
 
 
