@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import groupby
 
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.tapped import TappedPort
@@ -12,43 +13,36 @@ from canprobe.fieldbus.tools.link.figures import AnswerFigures
 
 
 class NodeAnswers:
-    """Counts the answers of one node, each of one or more frames.
+    """The answers of one node, each of one or more frames.
 
     Args:
         frames: number of frames of an answer.
+
+    Attributes:
+        now, before: times of its frames behind the last SYNC and the one before it, ns; None before there is one.
     """
 
-    __slots__ = ("_frames", "_row", "absent", "before", "expected", "late", "now", "rows", "times_ns")
+    __slots__ = ("_cycles", "_frames", "before", "now")
 
     def __init__(self, frames: int) -> None:
         self._frames = frames
-        self.times_ns: list[int] = []
-        self.expected = self.late = self.absent = self._row = 0
-        self.rows: list[int] = []
+        self._cycles: list[int | None] = []  # time of the last frame; None where the answer is not whole
         self.now: list[int] = []
         self.before: list[int] | None = None
 
-    def next_cycle(self, wait_ns: int) -> None:
+    def next_cycle(self) -> None:
         """Begin a cycle. The one before the last is over: late answers to the last one may still be read."""
         if self.before is not None:
-            self.expected += 1
-            whole = len(self.before) >= self._frames
-            late = whole and max(self.before) > wait_ns
-            self.absent += not whole
-            self.late += late
-            if whole:
-                self.times_ns.append(max(self.before))
-            if late or not whole:
-                self._row += 1
-            elif self._row:
-                self.rows.append(self._row)
-                self._row = 0
+            self._cycles.append(max(self.before) if len(self.before) >= self._frames else None)
         self.before, self.now = self.now, []
 
-    def figures(self, node_id: int) -> AnswerFigures:
-        """The figures, with the row that is not over."""
-        rows = (*self.rows, *([self._row] if self._row else ()))
-        return AnswerFigures(node_id, self.expected, tuple(sorted(self.times_ns)), self.late, self.absent, rows)
+    def figures(self, node_id: int, wait_ns: int) -> AnswerFigures:
+        """The figures, for a cell that waits for answers until `wait_ns` behind SYNC."""
+        times = sorted(time for time in self._cycles if time is not None)
+        missed = groupby(time is None or time > wait_ns for time in self._cycles)
+        rows = tuple(len([*row]) for is_missed, row in missed if is_missed)
+        late, absent = sum(time > wait_ns for time in times), len(self._cycles) - len(times)
+        return AnswerFigures(node_id, len(self._cycles), tuple(times), late, absent, rows)
 
 
 class LinkMeter(TappedPort):
@@ -95,7 +89,7 @@ class LinkMeter(TappedPort):
             if can_id == SYNC_ID:
                 if self._sync_ns is not None:
                     for one in self._nodes.values():
-                        one.next_cycle(self._wait_ns)
+                        one.next_cycle()
                 self._sync_before_ns, self._sync_ns = self._sync_ns, t_ns
 
     def hear_received(self, frames: Sequence[TimedFrame]) -> None:
@@ -123,7 +117,7 @@ class LinkMeter(TappedPort):
 
     def answers(self) -> tuple[AnswerFigures, ...]:
         """Figures of the nodes."""
-        return tuple(one.figures(node_id) for node_id, one in self._nodes.items())
+        return tuple(one.figures(node_id, self._wait_ns) for node_id, one in self._nodes.items())
 
     @property
     def work_ns(self) -> int:
