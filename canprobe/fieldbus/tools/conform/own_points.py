@@ -117,7 +117,7 @@ def _code(_key: str, text: str | None) -> Number:
 
 
 def _bytes(_key: str, text: str | None) -> bytes:
-    return bytes.fromhex(text or "")
+    return bytes.fromhex("" if text is None else text)
 
 
 def _number(key: str, value: object) -> Number:
