@@ -106,7 +106,7 @@ def summarise(
         "faults": [*cell.notes.lines(), *(observers.faults if observers is not None else ())],
     }
     if record.explored is not None:
-        summary["explore"] = record.explored.summarised()
+        summary["explore"] = record.explored
     if scene.task.kind == "listen":
         summary["listen"] = _listened(log)
     return {name: without_nan(value) for name, value in summary.items()}

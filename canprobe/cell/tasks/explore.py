@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.regain import SEARCH_SPEED, Search
-from canprobe.cell.tasks.task import Exploration, TaskRecord
+from canprobe.cell.tasks.task import TaskRecord
 from canprobe.cell.tasks.touch import RAMP_S, TouchTask
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
@@ -200,8 +201,18 @@ class Return(Search):
         return max(0.0, SEARCH_SPEED * (t - float(self._times[-1])) - LIFT_M)
 
 
-def end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
-    """The end of an exploration of a duration, s, whose time was over or which had nothing more to gain."""
+def end_of(explorer: Explorer, seconds: float, *, over: bool) -> dict[str, Any]:
+    """The section ``explore`` of ``summary.json``.
+
+    Args:
+        explorer: at the end of its way.
+        seconds: time of the scan, s.
+        over: its time was over; else it had nothing more to gain.
+
+    Returns:
+        The largest stated deviation is None where a cell was not touched. The shares of the rectangle are those within
+        the target, beyond where the contact turned back, and where contacts contradict every smooth surface.
+    """
     ground = explorer.ground
     target, sigma, is_open = ground.target, ground.sigma, ~ground.closed
     within = is_open & (sigma <= target)
@@ -224,15 +235,17 @@ def end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
         )
     if over and ground.wanting.any():
         causes.append(f"the time was over with {100 * ground.wanting.mean():.0f} % still above what can be reached")
-    return Exploration(
-        target=target,
-        sigma_max=ground.largest if ground.largest < UNKNOWN_M else None,
-        common=ground.common,
-        path=explorer.path,
-        seconds=seconds,
-        done=float(within.mean()),
-        closed=float(ground.closed.mean()),
-        rough=float(rough.mean()),
-        reached=bool(within.all()),
-        why=None if within.all() else "; ".join(causes) or "the last cells are within a tenth of what can be reached",
-    )
+    reached = bool(within.all())
+    why = None if reached else "; ".join(causes) or "the last cells are within a tenth of what can be reached"
+    return {
+        "target_sigma_um": 1e6 * target,
+        "sigma_max_um": 1e6 * ground.largest if ground.largest < UNKNOWN_M else None,
+        "reached": reached,
+        "why_not": why,
+        "path_mm": 1e3 * explorer.path,
+        "time_s": seconds,
+        "done_fraction": float(within.mean()),
+        "closed_fraction": float(ground.closed.mean()),
+        "rough_fraction": float(rough.mean()),
+        "common_sigma_um": 1e6 * ground.common,
+    }

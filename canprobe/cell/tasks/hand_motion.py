@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from canprobe.cell.master.array import PatchReader, make_patch_reader
+from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.tasks.hand_way import HandWay
@@ -46,7 +46,7 @@ class HandMotion(Controller):
         self._model, self._way, self._renewed = arm.model, way, renewed
         self._jog_force = plan.setup.limits.jog_force
         self._count = np.abs(arm.model.q_per_unit).sum(axis=1)
-        self._reader = make_patch_reader(plan.setup)
+        self.reader = make_patch_reader(plan.setup)
         self._time = MotionTime(plan.sync.period_ns)
         self._motion = way.profile()
         self._back: MotionProfile | None = None
@@ -54,10 +54,6 @@ class HandMotion(Controller):
         self._late_ns = 0
         self._interrupt: KeyboardInterrupt | None = None
         self.ended_by: str | None = None
-
-    @property
-    def reader(self) -> PatchReader | None:
-        return self._reader
 
     def inspect(self, q: Floats) -> str | None:
         away = np.abs(q - self._way.q[0]) / self._model.radian
@@ -100,9 +96,9 @@ class HandMotion(Controller):
     def _feel(self, measurement: Measurement) -> None:
         """Begin the way back where the array shows the force of a jog."""
         sample = measurement.tactile
-        if self._reader is None or sample is None or self._back is not None:
+        if self.reader is None or sample is None or self._back is not None:
             return
-        force = self._reader.read(sample).force
+        force = self.reader.read(sample).force
         if force < max(self._jog_force, TOUCH_FORCE):
             return
         self._touched_at = self._motion.at(self._t)[0]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import PatchReader, force_columns
+from canprobe.cell.master.array import force_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import Finding, TouchState, limits_of
@@ -74,7 +74,7 @@ class ProbingTask(Task):
 
     def __init__(self, plan: Plan, lag_s: float, sensing: ContactSensing, *, holds: bool = False) -> None:
         self.phase = Phase.MOVE
-        self.sensing = sensing
+        self.sensing, self.reader = sensing, sensing.reader
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
         self._setup = plan.setup
@@ -105,10 +105,6 @@ class ProbingTask(Task):
             Phase.DONE: self._stay,
             Phase.REGAIN: self._regain,
         }
-
-    @property
-    def reader(self) -> PatchReader:
-        return self.sensing.reader
 
     def record(self) -> TaskRecord:
         slowed = self._motion.slowed if self._motion is not None else 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,9 +24,6 @@ from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
 from canprobe.mechanics.touch.strategies import PathFollower, Rectangle
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    pass
 
 
 LONGEST_GAP_S = 0.02
@@ -123,7 +119,7 @@ class TouchTask(ProbingTask):
         self._updated = True
 
     @property
-    def restarts(self) -> int:
+    def restarts(self) -> int:  # type: ignore[override]
         """How often its estimator diverged and started afresh."""
         return self.shape.restarts if self.shape is not None else 0
 
