@@ -191,7 +191,6 @@ class Controller:
         return None
 
 
-
 def _of_inner(name: str) -> Any:
     """An attribute that is the inner controller's; without one it is the default, and what is set is dropped."""
 

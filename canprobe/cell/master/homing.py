@@ -91,8 +91,7 @@ class Homing:
         record: Path | None,
         say: Callable[[str], None],
     ) -> None:
-        arm = plan.setup.arm
-        assert arm is not None
+        arm = plan.setup.needed_arm()
         self._command_line = plan.setup.line_to_type("home")
         self._model = arm.model
         self.link = SdoLink(network, watch, plan.setup.bring_up, supervise)

@@ -67,8 +67,7 @@ class JointGuard:
     """
 
     def __init__(self, plan: Plan) -> None:
-        arm, probe, safety = plan.setup.arm, plan.setup.probe, plan.setup.limits
-        assert arm is not None
+        arm, probe, safety = plan.setup.needed_arm(), plan.setup.probe, plan.setup.limits
         model, margin = arm.model, safety.joint_margin - _ROUNDING * arm.model.radian
         self.low, self.high = model.q_min + margin, model.q_max - margin
         self.count = np.abs(model.q_per_unit).sum(axis=1)

@@ -215,8 +215,7 @@ def plan_drive_pdos(planning: PdoPlanning) -> None:
 
 def _plan_feedback(planning: PdoPlanning, node_id: int) -> None:
     """Statusword and position, and the torque where the device can send it too."""
-    device, arm = planning.devices[node_id], planning.setup.arm
-    assert arm is not None
+    device, arm = planning.devices[node_id], planning.setup.needed_arm()
     chosen = planning.choose(node_id, "tpdo", (STATUSWORD, POSITION))
     if chosen and not any(TORQUE in _places(one) for one in chosen) and arm.torque:
         first, torque = chosen[0], device.entry(*TORQUE, "tpdo")

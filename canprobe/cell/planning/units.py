@@ -152,8 +152,7 @@ def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tu
     if setup.arm is None:
         return setup, ()
     setup, ranges = _within_ranges(setup, setup.arm, devices)
-    assert setup.arm is not None
-    setup, speeds = _within_speeds(setup, setup.arm, devices)
+    setup, speeds = _within_speeds(setup, setup.needed_arm(), devices)
     return setup, (*ranges, *speeds)
 
 
@@ -188,8 +187,7 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilit
 
 def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, DeviceCapabilities], wanted: float) -> _SpeedLimit:
     """The lowest limit in the drive of an axis, where a speed of `wanted` position units/s is needed."""
-    arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
-    assert arm is not None
+    arm, rounding = setup.needed_arm(), ROUNDING_COUNTS * setup.rate_hz
     device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
     limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
     entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY_UNIT_INDEX)

@@ -141,9 +141,7 @@ class OpenCell:
             UsageError: the scene has no arm.
         """
         setup = self.plan.setup
-        if setup.arm is None:
-            raise UsageError(f"{setup.name}: expected a scene with an arm; got one without")
-        return forward_jacobian(setup.arm.model.chain, q, setup.probe.T_flange_probe)
+        return forward_jacobian(setup.needed_arm().model.chain, q, setup.probe.T_flange_probe)
 
     def run(
         self,
@@ -295,8 +293,7 @@ class OpenCell:
 
     def _stands(self) -> Floats:
         """Joint positions (n,), rad or m."""
-        if self.plan.setup.arm is None:
-            raise UsageError(f"{self.plan.setup.name}: expected a scene with an arm; got one without")
+        self.plan.setup.needed_arm()
         measurement = self.cell.idle(READ_S)
         assert measurement.q is not None
         return measurement.q

@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
 from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
+from canprobe.errors import UsageError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
@@ -490,6 +491,19 @@ class Setup:
             return scene
 
         return replace(self, scene=chosen(self.scene), saved=chosen(self.saved))
+
+    def needed_arm(self, what: str = "") -> Arm:
+        """The arm.
+
+        Args:
+            what: what needs one, for the message; empty: the scene.
+
+        Raises:
+            UsageError: there is none.
+        """
+        if self.arm is None:
+            raise UsageError(f"{what or self.name}: expected a scene with an arm; got one without")
+        return self.arm
 
     @property
     def touch(self) -> Touch | Calibrate | None:

@@ -89,8 +89,7 @@ class JointRecord:
 
     def _settings(self, axis: int, serial: int | None) -> dict[str, Any]:
         """The values with which what was seen is valid, as JSON gives them back; None where one is not known."""
-        arm = self._plan.setup.arm
-        assert arm is not None
+        arm = self._plan.setup.needed_arm()
         drive, model = arm.drives[axis], arm.model
         identity = next(node.identity for node in self._plan.nodes if node.node_id == drive.node_id)
         return {

@@ -122,8 +122,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
     plan = make_plan(resolve(scene))
-    assert plan.setup.arm is not None
-    arm, check, record = plan.setup.arm, JointCheck(plan, operator), JointRecord(plan)
+    arm, check, record = plan.setup.needed_arm(), JointCheck(plan, operator), JointRecord(plan)
     serials: dict[int, int] = {}
     try:
         with Session(plan, RunOptions(say=say, rows_kept=ROWS_OF_UP)) as session:

@@ -41,8 +41,7 @@ class HandMotion(Controller):
     """
 
     def __init__(self, plan: Plan, way: HandWay, renewed: Callable[[], bool] = lambda: True) -> None:
-        arm = plan.setup.arm
-        assert arm is not None
+        arm = plan.setup.needed_arm()
         self._model, self._way, self._renewed = arm.model, way, renewed
         self._jog_force = plan.setup.limits.jog_force
         self._count = np.abs(arm.model.q_per_unit).sum(axis=1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.first_touch import blind_s, depth_at
@@ -72,9 +73,7 @@ def goal_of(plan: Plan, to: str | npt.ArrayLike) -> Floats:
     Raises:
         UsageError: no arm, no such posture, or no n numbers.
     """
-    arm = plan.setup.arm
-    if arm is None:
-        raise UsageError(f"{plan.setup.name}: expected a scene with an arm; got one without")
+    arm = plan.setup.needed_arm()
     if not isinstance(to, str):
         return checked("posture", to, (arm.model.n,))
     if (q := arm.postures.get(to)) is None:
@@ -92,8 +91,7 @@ def joint_way(plan: Plan, start: Floats, goal: Floats, speed: float = USUAL_SPEE
         speed: share of the speed limits of the joints.
         bounded: it is so slow that it can stop at what it touches, see `touch_speed`.
     """
-    arm = plan.setup.arm
-    assert arm is not None
+    arm = plan.setup.needed_arm()
     steps = np.abs(goal - start) / (arm.model.radian * STEP_RAD)
     count = max(1, math.ceil(float(steps.max())))
     return _limited(plan, start + np.linspace(0.0, 1.0, count + 1)[:, None] * (goal - start), speed, bounded=bounded)
@@ -112,15 +110,14 @@ def probe_way(plan: Plan, start: Floats, way: Floats, turn: Floats, speed: float
     Raises:
         UsageError: the arm cannot go there, as at the end of its reach.
     """
-    arm = plan.setup.arm
-    assert arm is not None
+    arm = plan.setup.needed_arm()
     length, angle = float(np.linalg.norm(way)), float(np.linalg.norm(turn))
     count = max(1, math.ceil(max(length / STEP_M, angle / STEP_RAD)))
     guard, rows = JointGuard(plan), [start]
     T = guard.T_base_tip(start)
     for share in np.linspace(0.0, 1.0, count + 1)[1:]:
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = _rotation(share * turn) @ T[:3, :3], T[:3, 3] + share * way
+        pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(share * turn).as_matrix() @ T[:3, :3], T[:3, 3] + share * way
         try:
             rows.append(inverse_near(arm.model, pose, guard.T_flange_tip, rows[-1], max_move_rad=MAX_MOVE_RAD))
         except PlanError as error:
@@ -147,8 +144,7 @@ def jog_way(
     Raises:
         UsageError: not one of joint, along and about; no such joint; no speed; or the probe cannot go there.
     """
-    arm = plan.setup.arm
-    assert arm is not None
+    arm = plan.setup.needed_arm()
     if [joint, along, about].count(None) != 2:
         raise UsageError("jog: expected one of joint, along and about")
     length = float(checked("jog: velocity", velocity, ())) * float(checked("jog: for_s", for_s, ()))
@@ -195,8 +191,7 @@ def refuse(plan: Plan, way: HandWay) -> None:
         UsageError: a joint would leave its range, the probe its workspace, or the arm would come near what it keeps
             out of.
     """
-    arm, limits, guard = plan.setup.arm, plan.setup.limits, JointGuard(plan)
-    assert arm is not None
+    arm, limits, guard = plan.setup.needed_arm(), plan.setup.limits, JointGuard(plan)
     low, high = np.minimum(guard.low, way.q[0]), np.maximum(guard.high, way.q[0])
     for k, q in enumerate(way.q):
         why = None
@@ -227,8 +222,7 @@ def _time_at(way: HandWay, share: float) -> float:
 
 def _limited(plan: Plan, q: Floats, speed: float, most: float = math.inf, *, bounded: bool) -> HandWay:
     """A way with the limits of the joints, no faster than `most`, and slow enough for what it may touch."""
-    arm, guard = plan.setup.arm, JointGuard(plan)
-    assert arm is not None
+    arm, guard = plan.setup.needed_arm(), JointGuard(plan)
     rates = np.abs(np.diff(q, axis=0)).max(axis=0) * (len(q) - 1)  # of each joint, per way
     moves = rates > 0.0
     if not moves.any():
@@ -256,14 +250,3 @@ def touch_speed(plan: Plan) -> float | None:
 
 def _tips(guard: JointGuard, q: Floats) -> Floats:
     return np.array([guard.T_base_tip(one)[:3, 3] for one in q])
-
-
-def _rotation(turn: Floats) -> Floats:
-    """(3, 3) rotation of a rotation vector (3,), rad (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = turn / angle
-    K = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    rotation: Floats = np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * K @ K
-    return rotation

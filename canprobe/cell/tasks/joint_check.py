@@ -68,8 +68,7 @@ class JointCheck(Controller):
     compares_motion = True
 
     def __init__(self, plan: Plan, operator: Operator | None) -> None:
-        assert plan.setup.arm is not None
-        self._guard, self._model = JointGuard(plan), plan.setup.arm.model
+        self._guard, self._model = JointGuard(plan), plan.setup.needed_arm().model
         self._highest = plan.setup.limits.speed_share * self._model.qd_max / self._model.radian
         self._period_s, self._operator = plan.sync.period_ns * 1e-9, operator
         self.reader = make_patch_reader(plan.setup)

@@ -25,7 +25,6 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
 from canprobe.mechanics.touch.strategies import PathFollower, Rectangle
 from canprobe.mechanics.types import Floats
 
-
 LONGEST_GAP_S = 0.02
 """Longest gap between two contacts for the servo's surface: after a longer gap it does not rest on one sample alone."""
 REST_SHARE = 0.7

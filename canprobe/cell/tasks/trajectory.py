@@ -56,9 +56,7 @@ class Trajectory(Controller):
         *,
         hold_s: float = 0.5,
     ) -> None:
-        arm = instance("trajectory: plan", plan, Plan).setup.arm
-        if arm is None:
-            raise UsageError("trajectory: expected a scene with an arm; got one without")
+        arm = instance("trajectory: plan", plan, Plan).setup.needed_arm("trajectory")
         self._model: ArmModel = arm.model
         self._limits: SafetyLimits = plan.setup.limits
         self._guard = JointGuard(plan)
