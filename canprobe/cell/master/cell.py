@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from types import TracebackType
 
 from canprobe.cell.master.arm_power import ArmPower
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
@@ -186,9 +185,7 @@ class Cell:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self.close()
         if error is not None:
             self._name_another_master(error)
