@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -65,14 +66,11 @@ class JointHistory:
         """Joint positions (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
         if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
             return None
-        for i in range(len(self._times) - 1, -1, -1):
-            t = self._times[i]
-            if t <= t_ns:
-                if t == t_ns:
-                    return self._joints[i]
-                share = (t_ns - t) / (self._times[i + 1] - t)
-                return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
-        return None
+        i = bisect_right(self._times, t_ns) - 1
+        if self._times[i] == t_ns:
+            return self._joints[i]
+        share = (t_ns - self._times[i]) / (self._times[i + 1] - self._times[i])
+        return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
 
 
 def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
