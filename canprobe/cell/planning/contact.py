@@ -18,8 +18,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from canprobe.cell.planning.array import measured_share
 from canprobe.cell.planning.force import highest_known_force
-from canprobe.cell.planning.window import measured_share
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
 from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward

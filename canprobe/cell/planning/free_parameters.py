@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from canprobe.cell.planning.array import window_choices, windows_of
 from canprobe.cell.planning.model import Choice, Traffic
-from canprobe.cell.planning.window import window_choices, windows_of
 from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW

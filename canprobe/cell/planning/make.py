@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from canprobe.cell.planning.array import array_problems, as_supported, speed_over_array_problems
+from canprobe.cell.planning.array import array_problems, as_supported, cut_patch, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities, missing_bitrate, missing_objects
@@ -34,7 +34,6 @@ from canprobe.cell.planning.sync import interpolations, period_problem, plan_rat
 from canprobe.cell.planning.traffic import plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.planning.warnings import warnings
-from canprobe.cell.planning.window import cut_patch
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
 from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies

@@ -14,8 +14,15 @@ from canprobe.cell.planning.contact import contact_problems, saturation_problem
 from canprobe.cell.planning.first_touch import first_touch_problems
 from canprobe.cell.planning.force import force_problems
 from canprobe.cell.planning.model import JointSpeeds
-from canprobe.cell.planning.surface_path import SurfacePath, in_mm, surface_path
-from canprobe.cell.planning.task_way import joints_on_way, over_path, poles_at_contacts, round_ball
+from canprobe.cell.planning.surface_path import (
+    SurfacePath,
+    in_mm,
+    joints_on_way,
+    over_path,
+    poles_at_contacts,
+    round_ball,
+    surface_path,
+)
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.errors import PlanError, at_least, at_most
 from canprobe.mechanics.robot.chain import forward, forward_jacobian

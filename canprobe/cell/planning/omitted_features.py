@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Container, Iterator
 
-from canprobe.cell.planning.array import support_of
+from canprobe.cell.planning.array import measured_share, patch_across_taxels, support_of
 from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
-from canprobe.cell.planning.window import measured_share, patch_across_taxels
 from canprobe.cell.scene.setup import Setup, Touch, Touching
 from canprobe.errors import install_line
 

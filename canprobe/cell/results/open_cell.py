@@ -29,8 +29,7 @@ from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import home_joints
 from canprobe.cell.tasks.from_plan import estimates_of
-from canprobe.cell.tasks.hand_motion import HandMotion
-from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_way, joint_way, refuse, share_of_speed
+from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandMotion, HandWay, jog_way, joint_way, refuse
 from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
 from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
@@ -189,7 +188,7 @@ class OpenCell:
         Raises:
             UsageError: there is no such posture, or the way leads through a limit or what the arm keeps out of.
         """
-        way = joint_way(self.plan, self._stands(), goal_of(self.plan, to), share_of_speed(speed))
+        way = joint_way(self.plan, self._stands(), to, speed)
         refuse(self.plan, way)
         return way
 

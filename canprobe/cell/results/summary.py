@@ -31,7 +31,6 @@ from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
-from canprobe.cell.tasks.regain import summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.errors import ResultsError, UsageError
@@ -169,9 +168,8 @@ def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) ->
                 figures["speed_mean_m_s"] = None
         else:
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
-    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, **error} | {
-        "losses": summarise_losses(record.losses)
-    }
+    losses = [loss.summarised for loss in record.losses]
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, **error, "losses": losses}
 
 
 def _witnesses(session: Session, record: TaskRecord) -> dict[str, Any] | None:

@@ -61,6 +61,12 @@ class Loss:
     searched: float = 0.0
     regained_s: float | None = None
 
+    @property
+    def summarised(self) -> dict[str, float | None]:
+        """The loss in ``summary.json``: `regained_after_ms` is None where the contact was not regained."""
+        after_ms = None if self.regained_s is None else 1e3 * self.regained_s
+        return {"searched_mm": 1e3 * self.searched, "regained_after_ms": after_ms}
+
 
 @dataclass(frozen=True, slots=True)
 class TaskRecord:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,6 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.cell.tasks.contact_learning import ContactLearning
 from canprobe.cell.tasks.probing import Phase, ProbingTask
-from canprobe.cell.tasks.regain import REST_S, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
@@ -35,7 +35,35 @@ RETREAT_WAY = 6e-3
 """Way off the object, m."""
 RAMP_S = 0.05
 """Time to reach the scan's speed, at its begin and where its path has turned back."""
+SEARCH_SPEED = 2e-3
+"""Speed of the search, m/s: until the first sample of the new touch takes effect, 27 ms, the layer sinks in 0.05 mm."""
+BRAKE_S = 0.02
+"""Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
+REST_S = 0.25
+"""Time at rest on the surface that was found, until the wanted force is reached and the scan goes on."""
 _LEAVING = (Phase.RETREAT, Phase.DONE)
+
+
+class Search:
+    """The probe's motion from a lost contact to the object, along its pole.
+
+    Args:
+        pose: pose of the probe where the contact was lost.
+        velocity: velocity of its centre then (3,), m/s; its part along the path fades out.
+    """
+
+    def __init__(self, pose: ProbePose, velocity: Floats) -> None:
+        self._start = pose
+        self._sideways = velocity - pose.pole * float(velocity @ pose.pole)
+
+    def pose(self, t: float) -> ProbePose:
+        """Pose ``t`` seconds after the loss."""
+        sideways = self._sideways * (BRAKE_S * (1.0 - math.exp(-t / BRAKE_S)))
+        return ProbePose(self._start.centre + sideways + self._start.pole * (SEARCH_SPEED * t), self._start.pole)
+
+    def searched(self, t: float) -> float:
+        """Distance towards the object that was searched by then, m."""
+        return SEARCH_SPEED * t
 
 
 class Sinking:
