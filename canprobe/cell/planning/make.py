@@ -18,8 +18,6 @@ from canprobe.cell.planning.model import (
     Direction,
     NodeKind,
     Plan,
-    PlannedBus,
-    PlannedFrames,
     PlannedNode,
     PlannedPdo,
     SyncPlan,
@@ -31,7 +29,7 @@ from canprobe.cell.planning.operation import choose_mode, early_stops, operation
 from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.cell.planning.raw_frames import plan_raw_frames, raw_frame_problems
 from canprobe.cell.planning.sync import interpolations, period_problem, plan_ratio, plan_sync
-from canprobe.cell.planning.traffic import plan_traffic
+from canprobe.cell.planning.traffic import PlannedTraffic, plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.planning.warnings import warnings
 from canprobe.cell.scene.setup import Node, Setup
@@ -76,8 +74,8 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
-        ways = _ways_out(bus) if bus is not None and bus.overload and find_ways else []
-        alone = bus is not None and set(problems) <= {*bus.overload}
+        ways = _ways_out(bus) if bus is not None and bus.traffic.problems and find_ways else []
+        alone = bus is not None and set(problems) <= {*bus.traffic.problems}
         problems = [problem if bus is None else _with_rates(problem, bus, devices) for problem in problems]
         raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
     chosen = {choice.key: choice.value for choice in bus.choices}
@@ -85,17 +83,17 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     absent = omitted_features(setup)
     plan = Plan(
         setup=setup,
-        nodes=_nodes(setup, devices, bus.pdos, bus.sync),
-        pdos=bus.pdos,
-        raw=bus.raw,
+        nodes=_nodes(setup, devices, bus.traffic.pdos, bus.sync),
+        pdos=bus.traffic.pdos,
+        raw=bus.traffic.raw,
         sync=bus.sync,
-        buses=bus.buses,
+        buses=bus.traffic.buses,
         choices=bus.choices,
         joint_speeds=joint_speeds,
         outputs=outputs(setup, dict(absent)),
         left_out=(*absent, *_unused_axes(setup, devices)),
         not_available=(*bus.not_available, *unavailable_bridges(setup)),
-        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
+        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.traffic.pdos)),
     )
     return _with_configurations(plan)
 
@@ -160,27 +158,24 @@ class _BusPlan:
     Attributes:
         setup: the closed setup: no key is "auto".
         choices: values of the keys that were open.
+        traffic: traffic of its buses, with the problems of the bit rate.
         problems: what is wrong at any bit rate.
-        overload: what does not fit the bit rate.
         untaken: problems with a rate, each with other rates as text and the setups that have them.
     """
 
     setup: Setup
     choices: tuple[Choice, ...]
     sync: SyncPlan
-    pdos: tuple[PlannedPdo, ...]
-    raw: tuple[PlannedFrames, ...]
-    buses: tuple[PlannedBus, ...]
+    traffic: PlannedTraffic
     problems: list[str]
-    overload: list[str]
     not_available: tuple[tuple[str, str], ...]
     untaken: list[tuple[str, list[tuple[str, Setup]]]]
 
     @property
     def rank(self) -> tuple[int, float]:
         """Sort key of a candidate: number of problems, then the largest share of bus or trigger time used."""
-        shares = [bus.traffic.load for bus in self.buses]
-        shares += [demand.used_ns / demand.available_ns for bus in self.buses for demand in bus.traffic.demands]
+        shares = [bus.traffic.load for bus in self.traffic.buses]
+        shares += [demand.used_ns / demand.available_ns for bus in self.traffic.buses for demand in bus.traffic.demands]
         return len(self.problems), max(shares)
 
 
@@ -194,7 +189,7 @@ def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: l
     found: list[_BusPlan] = []
     for candidate, choices in candidates(setup):
         bus = _plan_bus(candidate, devices, choices)
-        if not bus.overload and not bus.problems:
+        if not bus.traffic.problems and not bus.problems:
             return bus
         found.append(bus)
     wanted = setup.arm is None or setup.arm.torque
@@ -203,7 +198,7 @@ def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: l
     if len(found) > 1:
         chosen = ", ".join(f"{choice.key} = {choice.written}" for choice in nearest.choices)
         problems.append(f"none of {len(found)} ways to fill what is left open fits; the nearest: {chosen}")
-    problems += [*nearest.problems, *nearest.overload]
+    problems += [*nearest.problems, *nearest.traffic.problems]
     return nearest
 
 
@@ -240,11 +235,8 @@ def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: 
         setup=setup,
         choices=choices,
         sync=sync,
-        pdos=traffic.pdos,
-        raw=traffic.raw,
-        buses=traffic.buses,
+        traffic=traffic,
         problems=[*(problem for problem, _ in untaken), *planning.problems],
-        overload=traffic.problems,
         not_available=tuple(dict.fromkeys(planning.not_available)),
         untaken=untaken,
     )
@@ -262,7 +254,7 @@ def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, DeviceCapabil
     fitting, in_turn = [], []
     for text, changed in changes:
         other = _plan_bus(changed, devices)
-        if other.overload or not known.issuperset(other.problems):
+        if other.traffic.problems or not known.issuperset(other.problems):
             continue
         if further := _keys(_problems_beside_bus(other.setup)) - elsewhere:
             in_turn.append((text, ", which asks for another " + " and ".join(sorted(further))))
@@ -323,8 +315,8 @@ def _fits(setup: Setup, known: frozenset[str]) -> tuple[Setup, Traffic] | None:
         return None
     for candidate, _ in candidates(setup):
         bus = _plan_bus(candidate, devices)
-        if not bus.overload and known.issuperset(bus.problems):
-            return candidate, max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
+        if not bus.traffic.problems and known.issuperset(bus.problems):
+            return candidate, max((one.traffic for one in bus.traffic.buses), key=lambda traffic: traffic.load)
     return None
 
 

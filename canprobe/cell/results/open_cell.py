@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy.typing as npt
 
@@ -35,10 +35,8 @@ from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
 from canprobe.mechanics.robot.chain import forward_jacobian
+from canprobe.mechanics.touch import Patch
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.mechanics.touch import Patch
 
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,

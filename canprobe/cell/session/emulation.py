@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.npz import write_npz
@@ -29,14 +29,11 @@ from canprobe.fieldbus.bus.presence import answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import check_eds
+from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
-
-if TYPE_CHECKING:
-    from canprobe.fieldbus.bus.virtual.lockstep import Participant
-    from canprobe.fieldbus.node.slave_node import SlaveNode
-
 
 ALL_CYCLES_PERCENT = 100
 """`limits.late_cycles_max_percent` with which late cycles stop nothing."""

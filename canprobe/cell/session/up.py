@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
 
+from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
@@ -20,12 +21,8 @@ from canprobe.cell.tasks.joint_check import JointCheck
 from canprobe.cell.tasks.joint_finding import Answer, JointFinding, Operator, SeenWay
 from canprobe.errors import NodeError, ResultsError, UsageError
 from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.cell.master.cell import Cell
-    from canprobe.cell.planning.model import Plan
-    from canprobe.mechanics.robot.model import ArmModel
 
 ROWS_OF_UP = 4000
 """Number of cycles whose rows are kept: `up` runs for days."""

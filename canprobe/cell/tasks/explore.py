@@ -130,7 +130,6 @@ class ExploreTask(TouchTask):
 
     def _ground_ends(self, explorer: Explorer) -> bool:
         """Whether the probe turns round an edge, the contact comes to the array's edge, or a joint to its limit."""
-        assert self._motion is not None
         return explorer.at_edge or self._near_rim or self._motion.near_limit(LIMIT_S)
 
     def _at_hollow(self, radius: float) -> None:
@@ -166,7 +165,7 @@ class ExploreTask(TouchTask):
     def _look_for_contact(self) -> None:
         """Return to where the contact was, in the air over the path."""
         super()._look_for_contact()
-        assert self.explorer is not None and self._motion is not None
+        assert self.explorer is not None
         self._brake_from = None
         self.explorer.turn_back(without=BACK_M)
         self._search = Return([self._motion.pose, *reversed(self._gone)])

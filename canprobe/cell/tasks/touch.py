@@ -14,7 +14,7 @@ from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.cell.tasks.contact_learning import ContactLearning
-from canprobe.cell.tasks.probing import Phase, ProbingTask
+from canprobe.cell.tasks.probing import LEAVING, Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
@@ -41,7 +41,6 @@ BRAKE_S = 0.02
 """Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
 REST_S = 0.25
 """Time at rest on the surface that was found, until the wanted force is reached and the scan goes on."""
-_LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
 class Search:
@@ -126,6 +125,8 @@ class TouchTask(ProbingTask):
         check: CalibrationCheck | None = None,
     ) -> None:
         super().__init__(plan, task.lag_s, sensing, holds=task.scan is None)
+        self._phases |= {Phase.APPROACH: self._approach, Phase.SETTLE: self._settle, Phase.SCAN: self._scan}
+        self._phases[Phase.REGAIN] = self._regain
         self.shape = shape
         self.learned = ContactLearning(sensing, shape, check)
         self.remarks = self.learned.remarks
@@ -177,7 +178,7 @@ class TouchTask(ProbingTask):
             if contact is not None and servo is not None:
                 all_observed = learned.follow(estimate, contact, servo.surface)
                 self._columns = self._columns | learned.columns
-                if all_observed and self.phase not in _LEAVING and is_too_hollow(estimate, self.sensing.radius):
+                if all_observed and self.phase not in LEAVING and is_too_hollow(estimate, self.sensing.radius):
                     self._at_hollow(-1.0 / float(estimate.kappa[1]))
         learned.doubt()
 
@@ -215,7 +216,7 @@ class TouchTask(ProbingTask):
         self.retreat(f"a hollow of radius {1e3 * radius:.0f} mm: as tight as the probe, no contact in one place")
 
     def _watch(self) -> None:
-        if self.phase in _LEAVING:
+        if self.phase in LEAVING:
             return
         touch = self._touch
         least_force = 0.0  # below it the contact is lost; an array that has let go shows a tenth of it for a while
@@ -237,7 +238,7 @@ class TouchTask(ProbingTask):
 
     def retreat(self, reason: str | None) -> None:
         """Let go, for a reason or because the work is done; nothing changes where the task is letting go already."""
-        if self._motion is None or self.phase in _LEAVING:
+        if not self._begun or self.phase in LEAVING:
             return
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
@@ -317,7 +318,6 @@ class TouchTask(ProbingTask):
 
     def _look_for_contact(self) -> None:
         """Leave the path for where the object should be."""
-        assert self._motion is not None
         if self.phase is Phase.SCAN:
             self.losses.append(Loss(self._cycle))
         self._search = Search(self._motion.pose, self._velocity)
