@@ -334,7 +334,7 @@ def _array_given(plan: Plan, dictionary: Any) -> tuple[FixedEntry, ...]:
     assert array is not None
     if not has_full_scale(dictionary):
         return ()
-    pascals = round(array.full_scale)
+    pascals = round(array.pad.full_scale_pa)
     key = "sensor.full_scale_kpa"
     otherwise = f"force would be read wrong by their ratio; put right {key}"
     return (FixedEntry(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)

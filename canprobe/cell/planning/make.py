@@ -15,7 +15,6 @@ from canprobe.cell.planning.identifiers import identifier_problems, order_by_dea
 from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
     Choice,
-    Direction,
     NodeKind,
     Plan,
     PlannedNode,
@@ -352,30 +351,23 @@ def _devices(setup: Setup) -> tuple[dict[int, DeviceCapabilities], list[str]]:
 def _nodes(
     setup: Setup, devices: Mapping[int, DeviceCapabilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
 ) -> tuple[PlannedNode, ...]:
-    nodes = [
-        PlannedNode(
-            node_id=node.node_id,
-            kind=kind,
-            role=role,
-            eds=node.eds,
-            dictionary=devices[node.node_id].od,
-            identity=replace(devices[node.node_id].identity, serial_number=node.serial),
-            emulated=node.emulated,
-            channel=node.channel,
-            switched_off=_switched_off(node.node_id, devices[node.node_id], pdos),
-            mode=choose_mode(devices[node.node_id]) if kind == "drive" else None,
-            interpolation=interpolations(devices[node.node_id], sync.period_us) if kind == "drive" else (),
+    nodes = []
+    for kind, role, node in _roles(setup):
+        device, is_drive = devices[node.node_id], kind == "drive"
+        used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node.node_id}
+        nodes.append(
+            PlannedNode(
+                node_id=node.node_id,
+                kind=kind,
+                role=role,
+                eds=node.eds,
+                dictionary=device.od,
+                identity=replace(device.identity, serial_number=node.serial),
+                emulated=node.emulated,
+                channel=node.channel,
+                switched_off=tuple(one for one in device.switchable_pdos if one not in used),
+                mode=choose_mode(device) if is_drive else None,
+                interpolation=interpolations(device, sync.period_us) if is_drive else (),
+            )
         )
-        for kind, role, node in _roles(setup)
-    ]
     return tuple(sorted(nodes, key=lambda node: node.node_id))
-
-
-def _switched_off(
-    node_id: int, device: DeviceCapabilities, pdos: tuple[PlannedPdo, ...]
-) -> tuple[tuple[Direction, int], ...]:
-    """PDOs that the device has, that the scene does not need and that can be switched off."""
-    used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node_id}
-    directions: tuple[Direction, ...] = ("rpdo", "tpdo")
-    has = [(direction, number) for direction in directions for number in device.pdo_numbers(direction)]
-    return tuple(one for one in has if one not in used and device.fixed_cob_id(*one) is None)

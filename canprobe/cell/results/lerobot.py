@@ -318,7 +318,7 @@ def _tactile_features(setup: Setup, log: Columns, tactile: Columns) -> dict[str,
     last = np.searchsorted(tactile["t_s"], times + 1e-9, side="right") - 1
     there = last >= 0
     taxels = tactile["taxels"].reshape(len(tactile["t_s"]), -1)
-    kpa = (taxels * (setup.array.full_scale * 1e-3 / COUNTS_MAX)).astype(np.float32)
+    kpa = (taxels * (setup.array.pad.full_scale_pa * 1e-3 / COUNTS_MAX)).astype(np.float32)
     if not len(kpa):
         kpa, last = np.zeros((1, taxels.shape[1]), np.float32), np.zeros(len(times), np.intp)
     image = np.where(there[:, None], kpa[np.maximum(last, 0)], np.float32(0.0))

@@ -70,7 +70,9 @@ def summarise(
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
     log = dict(cell.log.columns()) if log is None else log
-    contact = _contact(session, record, log)
+    contact, load = _contact(session, record, log), session.record.load
+    buses = session.plan.buses
+    loads = {bus.channel: {"planned_worst": bus.traffic.load, "measured": load(bus.channel)} for bus in buses}
     summary = {
         "schema": SCHEMA,
         "written_by": f"canprobe {__version__}",
@@ -97,7 +99,7 @@ def summarise(
         "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
         "cycle": _cycle(cell, record)
         | {"observe_us": None if observers is None else percentiles([*observers.cost_ns])},
-        "bus_load": None if direct else _bus_load(session),
+        "bus_load": None if direct else loads,
         "traffic": None if direct else _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
@@ -118,13 +120,6 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_nan(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _bus_load(session: Session) -> dict[str, Any]:
-    return {
-        bus.channel: {"planned_worst": bus.traffic.load, "measured": session.record.load(bus.channel)}
-        for bus in session.plan.buses
-    }
 
 
 def _traffic(session: Session) -> dict[str, Any]:

@@ -181,11 +181,6 @@ class Array(Node):
     raw: RawWire | None = None
 
     @property
-    def full_scale(self) -> float:
-        """Pressure of a full count, Pa."""
-        return self.pad.full_scale_pa
-
-    @property
     def newtons(self) -> str:
         """What the array's newtons rest on, in words."""
         return self.calibration.newtons if self.calibrated else NO_FORCE_REFERENCE

@@ -124,13 +124,9 @@ class ExploreTask(TouchTask):
         if self.phase is Phase.SCAN and self.explorer is not None:
             if self.explorer.astray and self._touch.limits.regain > 0.0:
                 self._look_for_contact()
-            elif self._ground_ends(self.explorer):
-                self._brake()
+            elif self.explorer.at_edge or self._near_rim or self._motion.near_limit(LIMIT_S):
+                self._brake()  # the probe turns round an edge, or the array or a joint ends
         super()._watch()
-
-    def _ground_ends(self, explorer: Explorer) -> bool:
-        """Whether the probe turns round an edge, the contact comes to the array's edge, or a joint to its limit."""
-        return explorer.at_edge or self._near_rim or self._motion.near_limit(LIMIT_S)
 
     def _at_hollow(self, radius: float) -> None:
         self._brake()
