@@ -12,13 +12,7 @@ from pathlib import Path
 from canprobe.cell.master.arm_power import ArmPower
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
 from canprobe.cell.master.bringup import BringUp
-from canprobe.cell.master.controller import (
-    Command,
-    Controller,
-    Measurement,
-    as_controller,
-    check_command,
-)
+from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.held_arm import HeldArm

@@ -19,13 +19,7 @@ from canprobe.fieldbus.bus.port import ControllerState, Port
 from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.fieldbus.tools.link import (
-    Fitness,
-    LinkFigures,
-    LinkMeter,
-    LinkVerdict,
-    judge_link,
-)
+from canprobe.fieldbus.tools.link import Fitness, LinkFigures, LinkMeter, LinkVerdict, judge_link
 from canprobe.fieldbus.tools.link.figures import IDLE_FAST_NS, quantile, us
 from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, wake_lateness
 
