@@ -134,7 +134,9 @@ class TouchTask(ProbingTask):
         self._scan_end: int | None = None
         self._task = task
         self.targets = {"target_force_n": task.force, "speed_m_s": task.scan.speed if task.scan is not None else 0.0}
-        self._servo: TactileServo | None = None
+        self._touched = False
+        self._servo: TactileServo  # from the first touch on, as the next
+        self._sinking: Sinking
         self._sample_t: float | None = None
         self.losses: list[Loss] = []
         self._search: Search | None = None
@@ -142,7 +144,6 @@ class TouchTask(ProbingTask):
         self._velocity: Floats = np.zeros(3)
         self._scan_t = self._searched_before = 0.0
         self._contact: ContactSample | None = None
-        self._sinking: Sinking | None = None
         self._at_rest = AtRest()
         self._updated = True
 
@@ -171,12 +172,12 @@ class TouchTask(ProbingTask):
         if self._updated:
             return
         self._updated = True
-        learned, contact, servo = self.learned, self._contact, self._servo
+        learned, contact = self.learned, self._contact
         if self.shape is not None and (estimate := self.shape.work()) is not None:
             if learned.check is not None:
                 learned.check.take(estimate, self.sensing.slope)
-            if contact is not None and servo is not None:
-                all_observed = learned.follow(estimate, contact, servo.surface)
+            if contact is not None and self._touched:
+                all_observed = learned.follow(estimate, contact, self._servo.surface)
                 self._columns = self._columns | learned.columns
                 if all_observed and self.phase not in LEAVING and is_too_hollow(estimate, self.sensing.radius):
                     self._at_hollow(-1.0 / float(estimate.kappa[1]))
@@ -194,12 +195,11 @@ class TouchTask(ProbingTask):
             self.sensing.dropped += 1  # it says that it is older than the one before
             contact = None
         self._contact = contact
-        if contact is not None and self._servo is not None:
+        if contact is not None and self._touched:
             elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._period_s
             self._servo.surface.correct(contact.p_base, contact.n_base, min(elapsed, LONGEST_GAP_S))
             self._sample_t = contact.t_s
             if self.phase is Phase.SETTLE:
-                assert self._sinking is not None
                 self._sinking.depth += self.learned.push(contact, self._servo.surface)
                 if self._t > REST_SHARE * SETTLE_S:
                     self._at_rest.add(contact.force_n, patch.saturated)
@@ -276,6 +276,7 @@ class TouchTask(ProbingTask):
         )
         self.depth.restart()
         self._sinking = Sinking(contact, pose, self.sensing.radius)
+        self._touched = True
         self._enter(Phase.SETTLE)
 
     def _leader(self, contact: ContactSample) -> tuple[PathFollower | None, Floats]:
@@ -289,7 +290,6 @@ class TouchTask(ProbingTask):
         return self.sensing.depth(self.targets["target_force_n"])
 
     def _settle(self) -> ProbePose:
-        assert self._servo is not None and self._sinking is not None
         depth = self._target_depth()
         share = self._sinking.share(self._t, depth, self._task.approach.speed)
         pose = self._sinking.pose(self._servo, share, depth, self._dt)
@@ -302,7 +302,6 @@ class TouchTask(ProbingTask):
         return pose
 
     def _scan(self) -> ProbePose:
-        assert self._servo is not None
         left = self._task.duration_s - self._scan_t
         pose = self._servo.step(self.targets["speed_m_s"] * self._pace(left), self._target_depth(), self._dt)
         if self._asked is not None:
@@ -328,7 +327,6 @@ class TouchTask(ProbingTask):
         self._enter(Phase.REGAIN)
 
     def _regain(self) -> ProbePose:
-        assert self._servo is not None and self._sinking is not None
         if self._scan_t >= self._task.duration_s:
             self.retreat(None)
         if self._search is None:
