@@ -99,10 +99,8 @@ class Homing:
         self._drives = [LedDrive(by_id[node_id], self.link, say) for node_id in arm.node_ids]
         self._record = NodeRecord(record, "home the drives again")
         guard = JointGuard(plan)
-        self._low, self._high = (
-            guard.low + TOLERANCE_RAD * self._model.radian,
-            guard.high - TOLERANCE_RAD * self._model.radian,
-        )
+        inside = TOLERANCE_RAD * self._model.radian
+        self._low, self._high = guard.low + inside, guard.high - inside
         self._zeros = {axis: drive.zero for axis, drive in enumerate(arm.drives) if drive.zero is not None}
         self.order = tuple(sorted(self._zeros, key=lambda axis: (self._zeros[axis].order, axis)))
         self._recorded = tuple(axis for axis in self.order if not arm.drives[axis].emulated)

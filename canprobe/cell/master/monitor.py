@@ -178,8 +178,8 @@ class Monitor:
             self._take_taxels(can_id, data, t_ns)
         elif node is not None and can_id == HEARTBEAT_BASE + node.node_id:
             self._take_heartbeat(node, data, t_ns)
-        elif can_id == NMT_ID and len(data) == 2:
-            self._take_nmt(data[0], data[1], t_ns)
+        elif can_id == NMT_ID and len(data) == 2 and data[0] in set(NmtCommand):
+            self._note(t_ns, data[1], f"NMT command {NmtCommand(data[0]).name.replace('_', ' ').lower()}")
         elif node is not None and can_id == EMCY_BASE + node.node_id and len(data) == CLASSIC_BYTES:
             emcy = Emcy.unpack(data)
             node.emcy = None if is_no_error(emcy.code) else f"{emcy.code:04X}h, {describe(emcy.code)}"
@@ -193,10 +193,6 @@ class Monitor:
                 event.nodes.add(node_id)
                 return
         self._events.append(NodeEvent(t_ns, what, {node_id}))
-
-    def _take_nmt(self, command: int, node_id: int, t_ns: int) -> None:
-        if command in set(NmtCommand):
-            self._note(t_ns, node_id, f"NMT command {NmtCommand(command).name.replace('_', ' ').lower()}")
 
     def _take_feedback(self, can_id: int, data: bytes, t_ns: int) -> None:
         node_id, frame = self._feedback[can_id]

@@ -315,11 +315,6 @@ def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
 
     if folder is not None:
         for node in nodes:
-            keep_in_file(node, folder / _file_name(node))
-
-
-def _file_name(node: SlaveNode) -> str:
-    """File of a node: named by its id, or by its serial number where it has no id yet."""
-    if node.node_id != UNCONFIGURED_ID:
-        return f"node{node.node_id:03}.json"
-    return f"serial{node.dictionary.number(0x1018, 4):08x}.json"
+            unnamed = node.node_id == UNCONFIGURED_ID  # it has no id yet, and its serial number names its file
+            name = f"serial{node.dictionary.number(0x1018, 4):08x}" if unnamed else f"node{node.node_id:03}"
+            keep_in_file(node, folder / f"{name}.json")
