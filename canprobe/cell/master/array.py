@@ -373,11 +373,9 @@ class PatchReader:
         self._force = ForceReading(calibration)
         self.image = np.zeros(pad.shape, np.uint8)
         self._last: tuple[TactileSample, Patch] | None = None
-        self.taxels = (
-            SilentTaxels(pad.shape, calibration.dead, blur_pitch=calibration.blur_m / pad.pitch_m)
-            if pad.is_grid
-            else None
-        )
+        self.taxels: SilentTaxels | None = None
+        if pad.is_grid:
+            self.taxels = SilentTaxels(pad.shape, calibration.dead, blur_pitch=calibration.blur_m / pad.pitch_m)
 
     def read(self, sample: TactileSample) -> Patch:
         """The patch of a sample, computed once; samples come in the order of their times."""

@@ -293,12 +293,8 @@ class DriveGroup:
     @property
     def brakeable(self) -> tuple[bool, ...]:
         """Whether each drive is enabled and moved a moment ago, by its reports: a target where it is brakes it."""
-        return tuple(
-            [
-                track.cycle == self._cycle and track.rested_ns < MOVED_NS and on
-                for track, on in zip(self._tracks, self.enabled_ones(), strict=True)
-            ]
-        )
+        moved = [track.cycle == self._cycle and track.rested_ns < MOVED_NS for track in self._tracks]
+        return tuple([one and on for one, on in zip(moved, self.enabled_ones(), strict=True)])
 
     def joints(self) -> Floats:
         """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""

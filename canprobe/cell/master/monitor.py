@@ -281,11 +281,9 @@ def screen(view: CellView) -> str:
 
 def lines(view: CellView) -> Iterator[str]:
     """The view, line by line."""
-    jitter = (
-        "–"
-        if view.sync_jitter_us is None
-        else f"p99 {view.sync_jitter_us[0]:.0f} µs, max {view.sync_jitter_us[1]:.0f} µs"
-    )
+    jitter = "–"
+    if view.sync_jitter_us is not None:
+        jitter = "p99 {:.0f} µs, max {:.0f} µs".format(*view.sync_jitter_us)
     names = len(view.load) > 1
     load = ", ".join(f"{name + ' ' if names else ''}{100 * share:4.1f} %" for name, share in view.load.items())
     yield f"{view.channel}  {view.t_s:8.1f} s   load {load}   {view.frames_per_s:6.0f} frames/s"

@@ -191,13 +191,9 @@ def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, DeviceCapabilit
     device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
     limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
     entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY_UNIT_INDEX)
-    if (
-        entry is not None
-        and unit is not None
-        and not (entry.writable and (wanted == math.inf or entry.allows(math.ceil((wanted + rounding) / unit))))
-    ):
-        held = device.number(PROFILE_SPEED_LIMIT)
-        limits += [_SpeedLimit(PROFILE_SPEED_LIMIT, held * unit, rounding)] if held else []
+    if entry is not None and unit is not None and (held := device.number(PROFILE_SPEED_LIMIT)):
+        rises = entry.writable and (wanted == math.inf or entry.allows(math.ceil((wanted + rounding) / unit)))
+        limits += [] if rises else [_SpeedLimit(PROFILE_SPEED_LIMIT, held * unit, rounding)]
     turn, _ = _motor_turn(device, drive)
     if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
         limits.append(_SpeedLimit(MOTOR_SPEED_LIMIT, rpm / 60.0 * turn, rounding))
