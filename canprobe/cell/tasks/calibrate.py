@@ -97,7 +97,7 @@ class CalibrateTask(ProbingTask):
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:
-        self._begin(self._stay())
+        self._begin(self._motion.pose)
 
     def _approach(self) -> ProbePose:
         self._gone = self._task.approach.speed * self._t - self._task.approach.clearance
@@ -159,5 +159,5 @@ class CalibrateTask(ProbingTask):
         return [replace(touch, depth=touch.depth * float(pushed / felt)) for touch in self.touches]
 
     def _let_go(self) -> None:
-        n = self._stay().centre - self._ball.c_base
+        n = self._motion.pose.centre - self._ball.c_base
         self._draw_back(n / np.linalg.norm(n) * (self._task.approach.clearance + EXTRA_CLEARANCE_M))

@@ -91,7 +91,7 @@ class ProbingTask(Task):
         self._line: LineMotion | ArcMotion
         self._way_here = TakenWay(plan.setup.needed_arm().model, plan.setup.probe.T_flange_probe)
         self._retrace: Retrace | None = None
-        self._growing: GrowingForce | None = None
+        self._growing: GrowingForce  # on the way back
         self._measured: Floats | None = None
         self._cycle = 0
         self._t = 0.0
@@ -101,7 +101,7 @@ class ProbingTask(Task):
         self._phases: dict[Phase, Callable[[], ProbePose]] = {
             Phase.MOVE: self._move,
             Phase.RETREAT: self._retreat,
-            Phase.DONE: self._stay,
+            Phase.DONE: lambda: self._motion.pose,
         }
 
     def record(self) -> TaskRecord:
@@ -258,30 +258,22 @@ class ProbingTask(Task):
             self._retrace = self._way_here.back(self._measured, self._motion.step_max)
         pose = self._motion.pose
         self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED_M_S, at_once=True)
-        self._growing = None
+        self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
         self._enter(Phase.RETREAT)
 
     def _retreat(self) -> ProbePose:
-        if self._witness_grows():
-            grows = f"the force grows on the way back, to {self._touch.force:.2f} N: the probe was stopped there"
+        touch = self._touch
+        if self._growing.grows(self._cycle, touch.force, a_part=math.isinf(touch.force_sigma)):
+            grows = f"the force grows on the way back, to {touch.force:.2f} N: the probe was stopped there"
             self.reason = grows if self.reason is None else f"{self.reason}; {grows}"
             self._enter(Phase.DONE)
-            return self._stay()
+            return self._motion.pose
         pose = self._line.at(self._t)
         over = self._t >= self._line.duration + self._lead_s
         if over if self._retrace is None else self._retrace.step(self._dt) is None:
             self._off()
         return pose
 
-    def _witness_grows(self) -> bool:
-        """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
-        if self._growing is None:
-            self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
-        return self._growing.grows(self._cycle, self._touch.force, a_part=math.isinf(self._touch.force_sigma))
-
     def _off(self) -> None:
         """The probe is off the object."""
         self._enter(Phase.DONE)
-
-    def _stay(self) -> ProbePose:
-        return self._motion.pose

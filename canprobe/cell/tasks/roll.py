@@ -189,7 +189,7 @@ class RollTask(ProbingTask):
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:
-        self._begin(self._stay())
+        self._begin(self._motion.pose)
 
     def _move(self) -> ProbePose:
         if self._number == 0 and self._t < self._rest_s:
