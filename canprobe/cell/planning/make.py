@@ -69,7 +69,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
     problems += [*unreachable, *narrowed] if unreachable else []
     truth, arm = setup.truth, setup.arm
-    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
+    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in setup.drives):
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
@@ -203,7 +203,7 @@ def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: l
 
 def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
     sync, exact = plan_sync(setup)
-    drives = [devices[node_id] for node_id in setup.arm.node_ids] if setup.arm is not None else []
+    drives = [devices[drive.node_id] for drive in setup.drives]
     unset, periods = period_problem(setup.rate_hz, sync.period_us, exact, drives)
     ratio, untimed, image_rates = plan_ratio(setup)
     not_available = []
@@ -321,9 +321,8 @@ def _fits(setup: Setup, known: frozenset[str]) -> tuple[Setup, Traffic] | None:
 
 def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
     """Every node with its kind and its role, the drives from the base, the array last."""
-    drives = setup.arm.drives if setup.arm is not None else ()
     roles: list[tuple[NodeKind, str, Node]] = [
-        ("drive", f"joint {axis}", drive) for axis, drive in enumerate(drives, start=1)
+        ("drive", f"joint {axis}", drive) for axis, drive in enumerate(setup.drives, start=1)
     ]
     array = setup.array
     return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]

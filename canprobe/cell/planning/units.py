@@ -220,7 +220,7 @@ def _fixed_window(device: DeviceCapabilities, wanted: int) -> int | None:
 def lag_s(setup: Setup) -> float:
     """Lag of the drives behind a ramp, s: the larger of the scene's and the emulated drives'; 0: unknown."""
     believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
-    emulated = setup.arm is not None and any(drive.emulated for drive in setup.arm.drives)
+    emulated = any(drive.emulated for drive in setup.drives)
     return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
 
 

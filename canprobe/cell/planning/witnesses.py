@@ -20,16 +20,13 @@ STEADY_S = 0.25
 
 def reports_torque(plan: Plan) -> bool:
     """Whether each drive of the arm sends its torque (6077h)."""
-    arm = plan.setup.arm
-    if arm is None:
-        return False
-    return all(
+    return plan.setup.arm is not None and all(
         any(
             (entry.index, entry.subindex) == TORQUE
-            for pdo in plan.pdos_of(node_id, "tpdo")
+            for pdo in plan.pdos_of(drive.node_id, "tpdo")
             for entry in pdo.layout.signals
         )
-        for node_id in arm.node_ids
+        for drive in plan.setup.drives
     )
 
 

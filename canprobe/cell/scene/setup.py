@@ -501,6 +501,11 @@ class Setup:
         return self.arm
 
     @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives of the arm, joint by joint; none without one."""
+        return self.arm.drives if self.arm is not None else ()
+
+    @property
     def touch(self) -> Touch | Calibrate | None:
         """The task, where it touches an object."""
         return self.task if isinstance(self.task, Touching) else None
@@ -525,8 +530,7 @@ class Setup:
         """The nodes that are emulated, ascending."""
         array = self.array
         arrays = (array,) if array is not None and array.raw is None else ()
-        nodes = (*(self.arm.drives if self.arm is not None else ()), *arrays)
-        return tuple(sorted(node.node_id for node in nodes if node.emulated))
+        return tuple(sorted(node.node_id for node in (*self.drives, *arrays) if node.emulated))
 
     @property
     def emulates(self) -> bool:

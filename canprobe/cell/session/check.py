@@ -208,11 +208,10 @@ def _controller(plan: Plan) -> str:
 
 def _traffic(plan: Plan) -> dict[str, Any]:
     """What a meter has to know of a plan."""
-    arm = plan.setup.arm.node_ids if plan.setup.arm is not None else ()
     answers = {
         pdo.cob_id: pdo.node_id
-        for node_id in arm
-        for pdo in plan.pdos_of(node_id, "tpdo")
+        for drive in plan.setup.drives
+        for pdo in plan.pdos_of(drive.node_id, "tpdo")
         if pdo.transmission_type == 1
     }
     bases = (EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE)

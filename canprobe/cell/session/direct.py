@@ -61,7 +61,7 @@ class DirectNodes:
         self._hear = hear
         self._see = see
         self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
-        self._drives = plan.setup.arm.node_ids if plan.setup.arm is not None else ()
+        self._drives = [drive.node_id for drive in plan.setup.drives]
         self._stations = [(node.core, node.pdos.exchange, node.node_id in self._drives) for node in world.nodes]
         self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
         self._plan = plan

@@ -194,8 +194,7 @@ def homed_of(plan: Plan, joints: Sequence[int] | None) -> list[int]:
     Raises:
         UsageError: one of them, or all where none is given, has an absolute encoder or does not exist.
     """
-    arm = plan.setup.arm
-    homed = [i for i, drive in enumerate(arm.drives) if drive.zero] if arm is not None else []
+    homed = [i for i, drive in enumerate(plan.setup.drives) if drive.zero]
     wanted = homed if joints is None else [joint - 1 for joint in joints]
     if not wanted or (others := set(wanted) - set(homed)):
         which = "no joint" if joints is None else f"joint {min(others) + 1}"
