@@ -140,10 +140,8 @@ class Homing:
             first, *rest = lacking
             others = ", ".join(f"{setup.node_id} ({setup.name})" for setup in rest)
             too = f"; nor are {others}" if others else ""
-            raise UnhomedError(
-                first.node_id,
-                f"({first.name}) is not homed, or was switched off or moved since{too}; type: {self._command_line}",
-            )
+            why = f"is not homed, or was switched off or moved since{too}; type: {self._command_line}"
+            raise UnhomedError(first.node_id, f"({first.name}) {why}")
 
     def keep(self) -> None:
         """Record the positions in which the drives are left, as far as their zeros are known.
@@ -246,9 +244,7 @@ class Homing:
         for other in sorted(coupled_joints(self._model, axis)):
             if other not in self.known:
                 setup, its = self._drives[axis].setup, self._drives[other].setup.name
-                raise NodeError(
-                    setup.node_id, f"({setup.name}) cannot be homed: its zero depends on {its}: home it first"
-                )
+                raise setup.error(f"cannot be homed: its zero depends on {its}: home it first")
             units[other] = self._drives[other].read(POSITION)
         return units
 

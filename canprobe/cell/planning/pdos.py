@@ -304,12 +304,8 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
         if on_event:
             seldom = all(entry.index in STATES for entry in entries)
             rate = min(1000 / RESENT_MS if seldom else sync.rate_hz, 10_000 / (inhibit_100us or 1))
-        planning.not_available.append(
-            (
-                f"TPDO{number} switched off",
-                f"{device.eds}: its COB-ID is read-only, so it is sent besides, counted with {rate:g} Hz",
-            )
-        )
+        why = f"{device.eds}: its COB-ID is read-only, so it is sent besides, counted with {rate:g} Hz"
+        planning.not_available.append((f"TPDO{number} switched off", why))
         planning.add(node_id, "tpdo", number, PdoLayout(cob_id, entries, kind))
         added, period_ns = planning.pdos.pop(), round(1e9 / rate)
         planning.pdos.append(replace(added, used=False, rate_hz=rate, deadline_ns=period_ns, event_timer_ms=0))

@@ -27,7 +27,6 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
-from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
 from canprobe.fieldbus.drive.drive import DriveApplication
@@ -167,7 +166,7 @@ def configure(node: SlaveNode, setup: NodeConfiguration) -> None:
         else:
             taken = write is not times[0][0] or any(all(_takes(node.dictionary, w) for w in time) for time in times)
         if not taken:
-            raise NodeError(node.node_id, f"({setup.name}) refuses {write.place} = {write.value:#x} ({write.purpose})")
+            raise setup.error(f"refuses {write.place} = {write.value:#x} ({write.purpose})")
     if isinstance(node.application, DriveApplication):
         node.application.parts.parameters.patience_ns = 0
 
