@@ -247,14 +247,11 @@ def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: De
 
 def _homing_writes(arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
     """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
-    zero = arm.drives[axis].zero
-    if zero is None:
+    drive, units = arm.drives[axis], abs(float(arm.model.units_per_q[axis, axis]))
+    if (zero := drive.zero) is None:
         return []
-    units = abs(float(arm.model.units_per_q[axis, axis]))
-    speed, acceleration = (
-        units / (speed_unit(device, arm.drives[axis], index) or 1.0)
-        for index in (VELOCITY_UNIT_INDEX, ACCELERATION_UNIT_INDEX)
-    )
+    speed = units / (speed_unit(device, drive, VELOCITY_UNIT_INDEX) or 1.0)
+    acceleration = units / (speed_unit(device, drive, ACCELERATION_UNIT_INDEX) or 1.0)
     ramp = "homing accelerates as the device has it"
     still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
     offset = -round(_home_units(arm, axis, zero))
@@ -280,11 +277,9 @@ def _unhomed(arm: Arm, axis: int, zero: HomingParameters, device: DeviceCapabili
         its, name = arm.drives[other].zero, joints[other].name
         if its is None or (its.order, other) < (zero.order, axis):
             continue
-        way = (
-            "each depends on the other: one of them needs an absolute encoder"
-            if axis in coupled_joints(arm.model, other)
-            else f"joints.{name}.homing_order must be lower than {zero.order}"
-        )
+        way = f"joints.{name}.homing_order must be lower than {zero.order}"
+        if axis in coupled_joints(arm.model, other):
+            way = "each depends on the other: one of them needs an absolute encoder"
         yield f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}"
     if device.has(HOME_OFFSET):
         return
