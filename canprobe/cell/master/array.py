@@ -85,9 +85,9 @@ class ArrayReceiver(ABC):
         """Count of images that were not whole."""
 
     @property
-    @abstractmethod
     def unusable(self) -> int:
         """Count of images and frames of images that could not be used."""
+        return self.torn
 
     @property
     def lost(self) -> int:
@@ -301,10 +301,6 @@ class RawReceiver(ArrayReceiver):
 
     @property
     def torn(self) -> int:
-        return self.assembler.torn
-
-    @property
-    def unusable(self) -> int:
         return self.assembler.torn
 
     def _frame(self, image: RawImage) -> TactileFrame | None:

@@ -205,18 +205,23 @@ def _of_inner(name: str) -> Any:
 
 
 class WrappingController(Controller):
-    """Base of controllers that step another one: what it and the cell tell each other of the array passes through.
+    """Base of controllers that step another one: what the cell tells it of the array, and asks of it, passes through.
 
     Attributes:
         inner: the controller that is stepped; None while there is none.
     """
 
     inner: Controller | None = None
+    retreats_itself: bool = _of_inner("retreats_itself")
     array_alive: bool = _of_inner("array_alive")
     array_blind: str | None = _of_inner("array_blind")
     reader: PatchReader | None = _of_inner("reader")
     remarks: Sequence[str] = _of_inner("remarks")
     restarts: int = _of_inner("restarts")
+
+    def retreat(self, reason: str) -> None:
+        if self.inner is not None:
+            self.inner.retreat(reason)
 
 
 class _Function(Controller):
