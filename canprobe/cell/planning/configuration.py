@@ -84,9 +84,8 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeConfiguration:
     axis = arm.node_ids.index(node.node_id) if arm is not None else 0
     drive = arm.drives[axis] if arm is not None else None
     own = _array_writes(plan, device) if arm is None else _drive_writes(plan, node, arm, axis, device)
-    writes, left_out, problems = _possible(
-        device, [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *own]
-    )
+    wanted = [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *own]
+    writes, left_out, problems = _possible(device, wanted)
     times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
     homing, not_homing, no_homing = _possible(device, _homing_writes(arm, axis, device) if arm is not None else ())
     if homing and arm is not None and drive is not None and drive.zero is not None:

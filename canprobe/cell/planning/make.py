@@ -287,12 +287,9 @@ def _unused_axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> lis
     for kind, role, node in _roles(setup):
         if kind == "drive" and (others := [axis for axis in devices[node.node_id].axes if axis > 1]):
             objects = ", ".join(f"{0x6000 + 0x800 * (axis - 1):04X}h" for axis in others)
-            what = (
-                f"ax{'es' if len(others) > 1 else 'is'} {', '.join(map(str, others))} of node {node.node_id} ({role})"
-            )
-            unused.append(
-                (what, f"{node.eds} has objects of more axes, from {objects}: a joint has the first of its node")
-            )
+            axes = f"ax{'es' if len(others) > 1 else 'is'} {', '.join(map(str, others))}"
+            why = f"{node.eds} has objects of more axes, from {objects}: a joint has the first of its node"
+            unused.append((f"{axes} of node {node.node_id} ({role})", why))
     return unused
 
 

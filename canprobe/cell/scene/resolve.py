@@ -121,6 +121,7 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
         return None, None
     settings, joints = scene.arm, scene.joints
     model, bodies, warnings = arm_model(scene.cell.name, settings, joints)
+    each = zip(scene.drives.items(), joints.values(), strict=True)
     drives = tuple(
         Drive(
             node_id=node_id,
@@ -134,9 +135,7 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
             gear=joint.gear,
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
-        for number, ((node_id, emulated), joint) in enumerate(
-            zip(scene.drives.items(), joints.values(), strict=True), start=1
-        )
+        for number, ((node_id, emulated), joint) in enumerate(each, start=1)
     )
     q_start = per_joint(joints, "start")
     postures = {START: q_start} | {name: posture_in_si(joints, posture) for name, posture in scene.postures.items()}

@@ -70,9 +70,7 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
         SceneError: the file cannot be read, or is not TOML.
     """
     try:
-        text = regular_file(path, MAX_BYTES).read_text(
-            encoding="utf-8-sig"
-        )  # some editors begin with a byte order mark
+        text = regular_file(path, MAX_BYTES).read_text("utf-8-sig")  # some editors begin with a byte order mark
     except OSError as error:
         hint = else_what if isinstance(error, FileNotFoundError) else ""
         raise SceneError([f"{file}: cannot be read: {error.strerror}{hint}"]) from error
