@@ -180,8 +180,7 @@ class TouchTask(ProbingTask):
                 all_observed = learned.follow(estimate, contact, self._servo.surface)
                 self._columns = self._columns | learned.columns
                 if all_observed and self.phase not in LEAVING and is_too_hollow(estimate, self.sensing.radius):
-                    hollow = f"a hollow of radius {-1e3 / float(estimate.kappa[1]):.0f} mm"
-                    self.retreat(f"{hollow}: as tight as the probe, no contact in one place")
+                    self._at_hollow(-1.0 / float(estimate.kappa[1]))
         learned.doubt()
 
     # sensing and supervision
@@ -211,6 +210,10 @@ class TouchTask(ProbingTask):
         felt_columns = self._felt_columns(sample, patch, contact)
         self._columns = felt_columns | self.learned.columns | {"depth_at_1n_mm": depth_at_1n_mm}
         return contact
+
+    def _at_hollow(self, radius: float) -> None:
+        """Let go: the object is as hollow as the probe, with a radius, m."""
+        self.retreat(f"a hollow of radius {1e3 * radius:.0f} mm: as tight as the probe, no contact in one place")
 
     def _watch(self) -> None:
         if self.phase in LEAVING:
