@@ -216,7 +216,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
         assert setup.array is not None
         node = make_tactile_node(dictionary, node_id, plant, od_of=od_of, pad=setup.array.pad)
         if has_full_scale(dictionary):
-            node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.full_scale))
+            node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.pad.full_scale_pa))
     serial = planned.identity.serial_number
     set_serial_number(node, planned.node_id if serial is None else serial)
     if node.lss is not None:
@@ -235,7 +235,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         object=truth.object,
         taxels=None
         if array is None
-        else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits, dead=truth.dead).without(
+        else TaxelConfig(full_scale_pa=array.pad.full_scale_pa, adc_bits=truth.adc_bits, dead=truth.dead).without(
             *truth.without
         ),
         pad=array.pad if array is not None else Pad(),

@@ -99,7 +99,6 @@ class ArmPower:
     def _stop_until(self, states: frozenset[DriveState]) -> bool:
         """Like `_cycle_until`, for a bus that may come and go: a failed cycle is tried again."""
         cycles, clock = self._cycles, self._cycles.port.clock
-        assert cycles.cycle is not None
         end_ns = clock.now_ns() + int(self._times.stop_s * 1e9)
         failure: CanprobeError | None = None
         while (left_ns := end_ns - clock.now_ns()) > 0:
@@ -117,7 +116,6 @@ class ArmPower:
     ) -> bool:
         """Cycle with held targets until every drive is in one of the states; False after the time-out."""
         cycles = self._cycles
-        assert cycles.cycle is not None
         for _ in range(int(timeout_s * 1e9 / self._period_ns)):
             measurement = cycles.begin()
             check()

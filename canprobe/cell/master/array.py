@@ -85,9 +85,9 @@ class ArrayReceiver(ABC):
         """Count of images that were not whole."""
 
     @property
-    @abstractmethod
     def unusable(self) -> int:
         """Count of images and frames of images that could not be used."""
+        return self.torn
 
     @property
     def lost(self) -> int:
@@ -303,10 +303,6 @@ class RawReceiver(ArrayReceiver):
     def torn(self) -> int:
         return self.assembler.torn
 
-    @property
-    def unusable(self) -> int:
-        return self.assembler.torn
-
     def _frame(self, image: RawImage) -> TactileFrame | None:
         """The image as a CANopen array would send it; None while it is taken for the tare."""
         wire = self.wire
@@ -373,11 +369,9 @@ class PatchReader:
         self._force = ForceReading(calibration)
         self.image = np.zeros(pad.shape, np.uint8)
         self._last: tuple[TactileSample, Patch] | None = None
-        self.taxels = (
-            SilentTaxels(pad.shape, calibration.dead, blur_pitch=calibration.blur_m / pad.pitch_m)
-            if pad.is_grid
-            else None
-        )
+        self.taxels: SilentTaxels | None = None
+        if pad.is_grid:
+            self.taxels = SilentTaxels(pad.shape, calibration.dead, blur_pitch=calibration.blur_m / pad.pitch_m)
 
     def read(self, sample: TactileSample) -> Patch:
         """The patch of a sample, computed once; samples come in the order of their times."""

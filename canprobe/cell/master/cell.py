@@ -8,18 +8,11 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from types import TracebackType
 
 from canprobe.cell.master.arm_power import ArmPower
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
 from canprobe.cell.master.bringup import BringUp
-from canprobe.cell.master.controller import (
-    Command,
-    Controller,
-    Measurement,
-    as_controller,
-    check_command,
-)
+from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.held_arm import HeldArm
@@ -186,9 +179,7 @@ class Cell:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self.close()
         if error is not None:
             self._name_another_master(error)
@@ -237,8 +228,7 @@ class Cell:
         """
 
         def stuck() -> bool:
-            assert self.cycle is not None
-            return self.port.clock.now_ns() - self.cycle.sync_ns > STUCK_NS
+            return self.port.clock.now_ns() - self.cycles.cycle.sync_ns > STUCK_NS
 
         with self._running_one(), Interrupts(stuck) as interrupts:
             for _ in repeat(None) if cycles is None else range(cycles):
@@ -248,7 +238,6 @@ class Cell:
 
     def _run_cycle(self, interrupts: Interrupts, progress: Callable[[Measurement], None]) -> bool:
         """Run one cycle of the controller; True where the controller is done."""
-        assert self.cycle is not None
         cycles, controller = self.cycles, self.cycles.controller
         measurement = cycles.begin()  # SYNC, collect
         held = self._supervise(measurement)
@@ -259,10 +248,10 @@ class Cell:
         command, finding = self.supervisor.guard_target(command if held else self._held.thaw(command, measurement))
         if finding is not None and not held:
             self._react(finding)
-        self.cycle.end(command)  # RPDOs
+        cycles.cycle.end(command)  # RPDOs
         with self._lifting_off_on_error():
             controller.update()
-        self.cycle.count_work()
+        cycles.cycle.count_work()
         cycles.record(measurement, command)
         progress(measurement)
         if command.stop_reason is not None:
@@ -305,13 +294,12 @@ class Cell:
         Raises:
             BusError: another master has come.
         """
-        assert self.cycle is not None
         if self.drives is not None:
             self.drives.goal = DriveState.SWITCH_ON_DISABLED
         for _ in range(max(1, round(seconds * 1e9 / self._plan.sync.period_ns))):
             self.cycles.recorded = self.cycles.begin()
-            self.cycle.end(None)
-            self.cycle.count_work()
+            self.cycles.cycle.end(None)
+            self.cycles.cycle.count_work()
             if self.watch.another_master is not None:
                 raise BusError(self.watch.another_master)
         return self.cycles.recorded
@@ -409,12 +397,11 @@ class Cell:
         # In a quick stop each drive brakes on a ramp of its own, from the speed of its targets: off the path, and after
         # a step of the target the wrong way (45 N at 25 mm/s). So all come to rest at their last targets before.
         rest = repeat(Command(), round(REST_S * 1e9 / self._plan.sync.period_ns))
-        assert self.cycle is not None
         try:
-            if not self.cycle.begun:  # the controller's update failed: the commands of this cycle are out
+            if not self.cycles.cycle.begun:  # the controller's update failed: the commands of this cycle are out
                 self.cycles.begin()
             for command in chain(commands, rest):
-                self.cycle.end(command)
+                self.cycles.cycle.end(command)
                 self.cycles.record(supervisor.seen.measurement, command)
                 self.cycles.begin()
                 if supervisor.must_stop():

@@ -16,11 +16,7 @@ from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.lss import Lss, LssAnswerError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.protocol.frames import (
-    HEARTBEAT_BASE,
-    NmtCommand,
-    pack_nmt,
-)
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtCommand, pack_nmt
 from canprobe.fieldbus.protocol.lss import LssAddress
 
 

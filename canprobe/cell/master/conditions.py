@@ -55,9 +55,9 @@ def _touch(*row: Any, **more: Any) -> Callable[[Check], Check]:
     return lambda check: _add(check, *row, check=check, touch=True, **more)
 
 
-def _counted(key: str, what: str, within: Callable[[Limits], int]) -> Callable[[Check], Check]:
+def _counted(key: str, what: str, within: Callable[[Limits], int], count: Callable[[CycleState], int]) -> None:
     """Add a row of a condition that is counted and does not stop the cell."""
-    return lambda count: _add(count, key, what, Reaction.DEGRADE, within, count=count)
+    _TABLE.append(Condition(key, what, Reaction.DEGRADE, within, count=count))
 
 
 def _add(function: Check, *row: Any, **more: Any) -> Check:
@@ -157,17 +157,19 @@ def _emcy(seen: CycleState) -> NodeError | None:
     return NodeError(event.node_id, event.what) if event is not None else None
 
 
-@_counted("emcy_communication", "EMCY of communication (81xxh, 82xxh)", _cycles(2))
-def _emcy_communication(seen: CycleState) -> int:
-    return seen.watch.communication
+_counted(
+    "emcy_communication", "EMCY of communication (81xxh, 82xxh)", _cycles(2), lambda seen: seen.watch.communication
+)
 
 
 # PDOs
 
 
-@_counted("pdo_missed", "TPDO of a drive missed, late, twice, malformed or impossible", _cycles(1))
 def _pdo_missed(seen: CycleState) -> int:
     return seen.drives.missed + seen.drives.implausible if seen.drives is not None else 0
+
+
+_counted("pdo_missed", "TPDO of a drive missed, late, twice, malformed or impossible", _cycles(1), _pdo_missed)
 
 
 @_checked("drive_late", "drive late", Reaction.HOLD, lambda limits: (HOLD_CYCLES + 1) * limits.period_ns)
@@ -205,19 +207,23 @@ def _following(seen: CycleState) -> NodeError | None:
     )
 
 
-@_counted("torn_frame", "tactile frame torn, corrupt or mixed", _frame)
 def _torn_frame(seen: CycleState) -> int:
     return seen.tactile.unusable if seen.tactile is not None else 0
 
 
-@_counted("sync_mismatch", "tactile frame names another SYNC than it followed", _frame)
+_counted("torn_frame", "tactile frame torn, corrupt or mixed", _frame, _torn_frame)
+
+
 def _sync_mismatch(seen: CycleState) -> int:
     return seen.tactile.stale if seen.tactile is not None else 0
 
 
-@_counted("silent_taxels", "row, column or taxel that does not measure", lambda limits: NS_PER_S)
-def _silent_taxels(seen: CycleState) -> int:
-    return seen.silent_taxels
+_counted("sync_mismatch", "tactile frame names another SYNC than it followed", _frame, _sync_mismatch)
+
+
+_counted(
+    "silent_taxels", "row, column or taxel that does not measure", _after(NS_PER_S, 0), lambda seen: seen.silent_taxels
+)
 
 
 @_touch(
@@ -236,14 +242,12 @@ def _sensor_stale(contact: TouchState) -> SafetyStop | None:
 # the bus
 
 
-@_counted("error_frames", "bus error frames", _cycles(2))
-def _error_frames(seen: CycleState) -> int:
-    return seen.counters.error_frames
+_counted("error_frames", "bus error frames", _cycles(2), lambda seen: seen.counters.error_frames)
 
 
-@_counted("frames_dropped", "frames dropped by the kernel or the controller", _cycles(2))
-def _frames_dropped(seen: CycleState) -> int:
-    return seen.counters.overruns
+_counted(
+    "frames_dropped", "frames dropped by the kernel or the controller", _cycles(2), lambda seen: seen.counters.overruns
+)
 
 
 @_checked("error_passive", "CAN controller error-passive", Reaction.HOLD, _cycles(2), enabling=True)
@@ -273,9 +277,7 @@ _unchecked("interface", "interface removed or down", Reaction.STOP, _cycles(1))
 # time
 
 
-@_counted("clock_step", "wall clock set", _cycles(2))
-def _clock_step(seen: CycleState) -> int:
-    return seen.counters.clock_steps
+_counted("clock_step", "wall clock set", _cycles(2), lambda seen: seen.counters.clock_steps)
 
 
 @_checked("overruns", "overrun budget used up", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
@@ -445,9 +447,7 @@ def _joint_stop(contact: TouchState) -> SafetyStop | None:
     return SafetyStop(contact.limit) if contact.limit is not None else None
 
 
-@_counted("target_speed", "target too far for one cycle", _cycles(1))
-def _target_speed(seen: CycleState) -> int:
-    return seen.slowed
+_counted("target_speed", "target too far for one cycle", _cycles(1), lambda seen: seen.slowed)
 
 
 @_checked("joint_speed", "measured joint motion that no joint can make", Reaction.STOP, _cycles(2), enabling=True)
@@ -455,9 +455,7 @@ def _joint_speed(seen: CycleState) -> SafetyStop | None:
     return SafetyStop(seen.speeding) if seen.speeding is not None else None
 
 
-@_counted("estimator", "shape estimator diverges", _cycles(2))
-def _estimator(seen: CycleState) -> int:
-    return seen.restarts
+_counted("estimator", "shape estimator diverges", _cycles(2), lambda seen: seen.restarts)
 
 
 # outside

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -119,6 +119,8 @@ class Controller:
         array_alive: whether an image of the array has changed since bring-up; the cell sets it before each step.
         array_blind: why the controller does not believe the array any more; None while it does.
         remarks: what the controller has found to be wrong with the cell, a line each; more come, and none goes.
+        reader: the reader of its tactile samples, which the supervision uses too; None: the cell has its own.
+        restarts: how often the estimator of this controller diverged and started again.
     """
 
     retreats_itself: bool = False
@@ -127,11 +129,8 @@ class Controller:
     array_alive: bool = False
     array_blind: str | None = None
     remarks: Sequence[str] = ()
-
-    @property
-    def reader(self) -> PatchReader | None:
-        """The reader of its tactile samples, which the supervision uses too; None: the cell has its own."""
-        return None
+    reader: PatchReader | None = None
+    restarts: int = 0
 
     def step(self, measurement: Measurement) -> Command:
         """Decide one cycle. Called when its TPDOs are in; the command is sent at once.
@@ -191,50 +190,38 @@ class Controller:
         """The way by which the probe has come, where a lift-off may go back on it; None: it goes along the pole."""
         return None
 
-    @property
-    def restarts(self) -> int:
-        """How often the estimator of this controller diverged and started again."""
-        return 0
+
+def _of_inner(name: str) -> Any:
+    """An attribute that is the inner controller's; without one it is the default, and what is set is dropped."""
+
+    def read(wrapping: WrappingController) -> Any:
+        return getattr(Controller if wrapping.inner is None else wrapping.inner, name)
+
+    def write(wrapping: WrappingController, value: object) -> None:
+        if wrapping.inner is not None:
+            setattr(wrapping.inner, name, value)
+
+    return property(read, write)
 
 
 class WrappingController(Controller):
-    """Base of controllers that step another one: what it and the cell tell each other of the array passes through.
+    """Base of controllers that step another one: what the cell tells it of the array, and asks of it, passes through.
 
     Attributes:
         inner: the controller that is stepped; None while there is none.
     """
 
     inner: Controller | None = None
+    retreats_itself: bool = _of_inner("retreats_itself")
+    array_alive: bool = _of_inner("array_alive")
+    array_blind: str | None = _of_inner("array_blind")
+    reader: PatchReader | None = _of_inner("reader")
+    remarks: Sequence[str] = _of_inner("remarks")
+    restarts: int = _of_inner("restarts")
 
-    @property
-    def array_alive(self) -> bool:
-        return self.inner is not None and self.inner.array_alive
-
-    @array_alive.setter
-    def array_alive(self, alive: bool) -> None:
+    def retreat(self, reason: str) -> None:
         if self.inner is not None:
-            self.inner.array_alive = alive
-
-    @property
-    def array_blind(self) -> str | None:
-        return None if self.inner is None else self.inner.array_blind
-
-    @array_blind.setter
-    def array_blind(self, why: str | None) -> None:
-        if self.inner is not None:
-            self.inner.array_blind = why
-
-    @property
-    def reader(self) -> PatchReader | None:
-        return None if self.inner is None else self.inner.reader
-
-    @property
-    def remarks(self) -> Sequence[str]:  # type: ignore[override]
-        return () if self.inner is None else self.inner.remarks
-
-    @property
-    def restarts(self) -> int:
-        return 0 if self.inner is None else self.inner.restarts
+            self.inner.retreat(reason)
 
 
 class _Function(Controller):

@@ -293,12 +293,8 @@ class DriveGroup:
     @property
     def brakeable(self) -> tuple[bool, ...]:
         """Whether each drive is enabled and moved a moment ago, by its reports: a target where it is brakes it."""
-        return tuple(
-            [
-                track.cycle == self._cycle and track.rested_ns < MOVED_NS and on
-                for track, on in zip(self._tracks, self.enabled_ones(), strict=True)
-            ]
-        )
+        moved = [track.cycle == self._cycle and track.rested_ns < MOVED_NS for track in self._tracks]
+        return tuple([one and on for one, on in zip(moved, self.enabled_ones(), strict=True)])
 
     def joints(self) -> Floats:
         """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""
@@ -326,9 +322,7 @@ class DriveGroup:
     @property
     def enabled(self) -> bool:
         """Every drive reports operation enabled."""
-        if all([word & _STATE_BITS == _ENABLED for word in self.statuswords]):
-            return True  # as in every cycle of operation
-        return all(state is DriveState.OPERATION_ENABLED for state in self.states)
+        return all(self.enabled_ones()) or all(state is DriveState.OPERATION_ENABLED for state in self.states)
 
     def enabled_ones(self) -> tuple[bool, ...]:
         """Whether each drive reported operation enabled last."""
@@ -469,7 +463,7 @@ def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:
     """The PDOs of the plan's drives, joint by joint; empty without an arm."""
     modes = {node.node_id: node.mode for node in plan.nodes}
     axes = []
-    for node_id in plan.setup.arm.node_ids if plan.setup.arm is not None else ():
+    for node_id in [drive.node_id for drive in plan.setup.drives]:
         rpdos, mode = plan.pdos_of(node_id, "rpdo"), modes[node_id]
         assert mode is not None
         axes.append(

@@ -29,7 +29,7 @@ def read_entry(setup: NodeConfiguration, index: int, subindex: int) -> Generator
     try:
         return int((yield from read_value(variable)))
     except (SdoAbortedError, SdoCommunicationError, ValueError) as error:  # ValueError: octets are no integer
-        raise NodeError(setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}") from error
+        raise setup.error(f"read of {index:04X}h:{subindex:02X} failed: {error}") from error
 
 
 def write_entry(setup: NodeConfiguration, write: Write) -> Dialogue:
@@ -91,4 +91,4 @@ def _variable(setup: NodeConfiguration, index: int, subindex: int) -> Any:  # ca
         entry: Any = setup.dictionary[index]
         return entry if isinstance(entry, ODVariable) else entry[subindex]
     except KeyError:
-        raise NodeError(setup.node_id, f"({setup.name}) {index:04X}h:{subindex:02X} is not in {setup.eds}") from None
+        raise setup.error(f"{index:04X}h:{subindex:02X} is not in {setup.eds}") from None

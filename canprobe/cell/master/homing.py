@@ -91,8 +91,7 @@ class Homing:
         record: Path | None,
         say: Callable[[str], None],
     ) -> None:
-        arm = plan.setup.arm
-        assert arm is not None
+        arm = plan.setup.needed_arm()
         self._command_line = plan.setup.line_to_type("home")
         self._model = arm.model
         self.link = SdoLink(network, watch, plan.setup.bring_up, supervise)
@@ -100,10 +99,8 @@ class Homing:
         self._drives = [LedDrive(by_id[node_id], self.link, say) for node_id in arm.node_ids]
         self._record = NodeRecord(record, "home the drives again")
         guard = JointGuard(plan)
-        self._low, self._high = (
-            guard.low + TOLERANCE_RAD * self._model.radian,
-            guard.high - TOLERANCE_RAD * self._model.radian,
-        )
+        inside = TOLERANCE_RAD * self._model.radian
+        self._low, self._high = guard.low + inside, guard.high - inside
         self._zeros = {axis: drive.zero for axis, drive in enumerate(arm.drives) if drive.zero is not None}
         self.order = tuple(sorted(self._zeros, key=lambda axis: (self._zeros[axis].order, axis)))
         self._recorded = tuple(axis for axis in self.order if not arm.drives[axis].emulated)
@@ -143,10 +140,8 @@ class Homing:
             first, *rest = lacking
             others = ", ".join(f"{setup.node_id} ({setup.name})" for setup in rest)
             too = f"; nor are {others}" if others else ""
-            raise UnhomedError(
-                first.node_id,
-                f"({first.name}) is not homed, or was switched off or moved since{too}; type: {self._command_line}",
-            )
+            why = f"is not homed, or was switched off or moved since{too}; type: {self._command_line}"
+            raise UnhomedError(first.node_id, f"({first.name}) {why}")
 
     def keep(self) -> None:
         """Record the positions in which the drives are left, as far as their zeros are known.
@@ -249,9 +244,7 @@ class Homing:
         for other in sorted(coupled_joints(self._model, axis)):
             if other not in self.known:
                 setup, its = self._drives[axis].setup, self._drives[other].setup.name
-                raise NodeError(
-                    setup.node_id, f"({setup.name}) cannot be homed: its zero depends on {its}: home it first"
-                )
+                raise setup.error(f"cannot be homed: its zero depends on {its}: home it first")
             units[other] = self._drives[other].read(POSITION)
         return units
 

@@ -115,8 +115,7 @@ class LedDrive:
 
     def error(self, what: str) -> NodeError:
         """The error of this drive, with its last EMCY."""
-        setup = self.setup
-        return NodeError(setup.node_id, f"({setup.name}) {what}{self._link.watch.last_words(setup.node_id)}")
+        return self.setup.error(f"{what}{self._link.watch.last_words(self.setup.node_id)}")
 
     def enable(self, mode: OperationMode) -> None:
         """Enable the drive in a mode."""

@@ -89,8 +89,7 @@ class LiftOff:
     def __init__(
         self, plan: Plan, drives: DriveGroup, watch: NodeWatch, error: BaseException, trail: TakenWay | None = None
     ) -> None:
-        assert plan.setup.arm is not None
-        model, self._period_s = plan.setup.arm.model, plan.sync.period_ns * 1e-9
+        model, self._period_s = plan.setup.needed_arm().model, plan.sync.period_ns * 1e-9
         self._model = model
         self._drives = drives
         ages = drives.ages()

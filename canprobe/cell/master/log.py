@@ -216,10 +216,8 @@ class RunLog:
                 except _NO_NUMBERS:
                     misfits += 1
         if misfits:
-            text = (
-                f"log: {misfits} values of column {name!r} are no numbers of shape {shape}, as its first is: left NaN"
-            )
-            warnings.warn(text, stacklevel=3)
+            wanted = f"numbers of shape {shape}, as its first is"
+            warnings.warn(f"log: {misfits} values of column {name!r} are no {wanted}: left NaN", stacklevel=3)
         return out
 
 

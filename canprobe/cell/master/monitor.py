@@ -15,11 +15,11 @@ from canprobe.cell.master.drives import drive_axes, feedback_frames
 from canprobe.cell.master.notes import nodes_text
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
+from canprobe.cell.planning.wire_time import unstuffed_frame_bits
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.cia402 import DriveState, describe_state
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
-from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.fieldbus.protocol.frames import (
     CLASSIC_BYTES,
     EMCY_BASE,
@@ -136,7 +136,6 @@ class Monitor:
         self._plan = plan
         channels = [bus.channel for bus in plan.buses]
         self._view = CellView("+".join(channels))
-        self._speed_up = plan.setup.bus.data_bitrate / plan.setup.bus.bitrate
         roles = {node.node_id: node.role for node in plan.nodes} | {MASTER_NODE_ID: "master"}
         self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
         arm = plan.setup.arm
@@ -152,7 +151,7 @@ class Monitor:
             self._check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
-        self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
+        self._recent: dict[str, deque[tuple[int, int]]] = {channel: deque() for channel in channels}
         self._syncs: deque[int] = deque()
         self._events: deque[NodeEvent] = deque(maxlen=EVENTS_KEPT)
         self._silent: set[int] = set()
@@ -165,18 +164,11 @@ class Monitor:
         for can_id, data, t_ns in frames:
             if self._first_ns is None:
                 self._first_ns = t_ns
-            recent.append((t_ns, self._bits(len(data))))
+            recent.append((t_ns, unstuffed_frame_bits(len(data), self._plan.setup.bus)))
             if can_id != SYNC_ID:
                 self._take(can_id, data, t_ns)
             elif timed:
                 self._syncs.append(t_ns)
-
-    def _bits(self, length: int) -> float:
-        """Length of a frame in bits of the nominal rate, its data phase converted to them."""
-        if length <= CLASSIC_BYTES:
-            return best_case_bits(length)
-        bits = best_case_fd_bits(length)
-        return bits.nominal + bits.data / self._speed_up
 
     def _take(self, can_id: int, data: bytes, t_ns: int) -> None:
         node = self._nodes.get(can_id & 0x7F)
@@ -186,8 +178,8 @@ class Monitor:
             self._take_taxels(can_id, data, t_ns)
         elif node is not None and can_id == HEARTBEAT_BASE + node.node_id:
             self._take_heartbeat(node, data, t_ns)
-        elif can_id == NMT_ID and len(data) == 2:
-            self._take_nmt(data[0], data[1], t_ns)
+        elif can_id == NMT_ID and len(data) == 2 and data[0] in set(NmtCommand):
+            self._note(t_ns, data[1], f"NMT command {NmtCommand(data[0]).name.replace('_', ' ').lower()}")
         elif node is not None and can_id == EMCY_BASE + node.node_id and len(data) == CLASSIC_BYTES:
             emcy = Emcy.unpack(data)
             node.emcy = None if is_no_error(emcy.code) else f"{emcy.code:04X}h, {describe(emcy.code)}"
@@ -201,10 +193,6 @@ class Monitor:
                 event.nodes.add(node_id)
                 return
         self._events.append(NodeEvent(t_ns, what, {node_id}))
-
-    def _take_nmt(self, command: int, node_id: int, t_ns: int) -> None:
-        if command in set(NmtCommand):
-            self._note(t_ns, node_id, f"NMT command {NmtCommand(command).name.replace('_', ' ').lower()}")
 
     def _take_feedback(self, can_id: int, data: bytes, t_ns: int) -> None:
         node_id, frame = self._feedback[can_id]
@@ -293,11 +281,9 @@ def screen(view: CellView) -> str:
 
 def lines(view: CellView) -> Iterator[str]:
     """The view, line by line."""
-    jitter = (
-        "–"
-        if view.sync_jitter_us is None
-        else f"p99 {view.sync_jitter_us[0]:.0f} µs, max {view.sync_jitter_us[1]:.0f} µs"
-    )
+    jitter = "–"
+    if view.sync_jitter_us is not None:
+        jitter = "p99 {:.0f} µs, max {:.0f} µs".format(*view.sync_jitter_us)
     names = len(view.load) > 1
     load = ", ".join(f"{name + ' ' if names else ''}{100 * share:4.1f} %" for name, share in view.load.items())
     yield f"{view.channel}  {view.t_s:8.1f} s   load {load}   {view.frames_per_s:6.0f} frames/s"

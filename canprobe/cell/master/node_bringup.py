@@ -92,11 +92,8 @@ class NodeBringUp:
                     f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
                 )
             elif got != expected:
-                raise NodeError(
-                    setup.node_id,
-                    f"({setup.name}) is not the device of {setup.eds}: 1018h:{subindex:02X}"
-                    f" {IDENTITY_NAMES[subindex]} expected {expected:#x}, got {got:#x}",
-                )
+                place = f"1018h:{subindex:02X} {IDENTITY_NAMES[subindex]}"
+                raise setup.error(f"is not the device of {setup.eds}: {place} expected {expected:#x}, got {got:#x}")
         if SOFTWARE_VERSION in setup.dictionary:
             try:
                 version = yield from upload(SOFTWARE_VERSION, 0)
@@ -109,11 +106,8 @@ class NodeBringUp:
         for given in setup.given:
             got = yield from read_entry(setup, given.index, given.subindex)
             if got != given.value:
-                raise NodeError(
-                    setup.node_id,
-                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value},"
-                    f" {given.says}, got {got}: {given.otherwise}",
-                )
+                expected = f"{given.index:04X}h:{given.subindex:02X} expected {given.value}, {given.says}"
+                raise setup.error(f"{expected}, got {got}: {given.otherwise}")
 
     def _check_units(self) -> Dialogue:
         """Compare the units of a motor turn that the device states; what it does not answer is not compared."""

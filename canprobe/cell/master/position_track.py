@@ -43,22 +43,6 @@ class PositionTrack:
         rested_ns: time in which the reports have stayed within ``base`` of the first of them.
     """
 
-    __slots__ = (
-        "_asked",
-        "_base",
-        "_heard",
-        "_period_ns",
-        "_periods",
-        "_rate",
-        "_still",
-        "_still_ns",
-        "_t_ns",
-        "_way",
-        "counts",
-        "cycle",
-        "rested_ns",
-    )
-
     def __init__(self, base: float, period_ns: int = PERIOD_NS) -> None:
         self.counts = 0
         self.cycle = -1

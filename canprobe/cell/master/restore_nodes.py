@@ -70,10 +70,7 @@ class FoundNodes:
             if setup.mode is not None:
                 word = yield from read_entry(setup, STATUSWORD, 0)
                 if (state := state_of(word)) in POWERED_STATES:
-                    raise NodeError(
-                        setup.node_id,
-                        f"({setup.name}) is {state.name}: somebody works with this cell; a check needs it disabled",
-                    )
+                    raise setup.error(f"is {state.name}: somebody works with this cell; a check needs it disabled")
             for place in dict.fromkeys((write.index, write.subindex) for write in setup.writes):
                 try:
                     found[place] = yield from read_entry(setup, *place)

@@ -14,12 +14,7 @@ from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import decode_text, hold_dialogues, upload
-from canprobe.fieldbus.protocol.frames import (
-    HEARTBEAT_BASE,
-    SDO_TX_BASE,
-    NmtState,
-    unpack_heartbeat,
-)
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SDO_TX_BASE, NmtState, unpack_heartbeat
 
 IDENTITY_SUBINDICES = {"vendor_id": 1, "product_code": 2, "revision_number": 3, "serial_number": 4}
 IDENTITY, DEVICE_NAME = 0x1018, 0x1008

@@ -63,7 +63,8 @@ class SupervisedCycle:
         self.tactile_log: TactileLog = TactileLog(options.rows_kept, rows) if before is None else before.tactile_log
         self.notes: Notes = Notes() if before is None else before.notes
         self.say: Say = self.notes.saying(options.say)
-        self.cycle: Cycle | None = None
+        self.cycle: Cycle  # once started
+        self._started = False
         self.controller = Controller()
         self.reader: PatchReader | None = make_patch_reader(plan.setup)
         self.start_ns = 0
@@ -81,7 +82,7 @@ class SupervisedCycle:
 
     def start(self, cycle: Cycle) -> None:
         """Take the cycle on the bus, once the nodes are up."""
-        self.cycle = cycle
+        self.cycle, self._started = cycle, True
         self.start_ns = cycle.t_first_ns - self._origin_ns
         self.log.start_s = self.start_ns * 1e-9
 
@@ -99,7 +100,6 @@ class SupervisedCycle:
 
     def begin(self) -> Measurement:
         """SYNC, TPDOs, measurement. A cycle that an error has left before its commands and its row gets both first."""
-        assert self.cycle is not None
         self.record_last()
         if self.cycle.begun:  # the next SYNC keeps the period
             self.cycle.end(None)
@@ -132,7 +132,6 @@ class SupervisedCycle:
 
     def record(self, measurement: Measurement, command: Command | None) -> None:
         """Write the row of a cycle, and show it to the observers."""
-        assert self.cycle is not None
         self.recorded = measurement
         seen = self.supervisor.seen
         t_s = measurement.t_ns * 1e-9 + self.log.start_s
@@ -159,7 +158,7 @@ class SupervisedCycle:
     def record_last(self) -> None:
         """Record the last cycle, where an error left it before its row."""
         last = self.supervisor.seen.measurement
-        if self.cycle is not None and last is not self.recorded:
+        if self._started and last is not self.recorded:
             self.record(last, None)
 
     def run_s(self, measurement: Measurement) -> float:

@@ -6,7 +6,6 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +18,9 @@ from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.touch import Patch
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.mechanics.touch import Patch
 
 MAX_SPEED_SHARE = 1.5
 """Share of the speed limit above which a measured motion is no motion of the arm; SYNCs may be late by a period."""
@@ -67,8 +64,7 @@ class JointGuard:
     """
 
     def __init__(self, plan: Plan) -> None:
-        arm, probe, safety = plan.setup.arm, plan.setup.probe, plan.setup.limits
-        assert arm is not None
+        arm, probe, safety = plan.setup.needed_arm(), plan.setup.probe, plan.setup.limits
         model, margin = arm.model, safety.joint_margin - _ROUNDING * arm.model.radian
         self.low, self.high = model.q_min + margin, model.q_max - margin
         self.count = np.abs(model.q_per_unit).sum(axis=1)

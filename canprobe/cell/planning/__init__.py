@@ -14,8 +14,8 @@ changes that would fit. Nothing is opened or sent here.
    kept. It also suggests changes that would make a scene fit. `omitted_features` names what a scene does not need,
    `warnings` what is carried out and yet said first. For each candidate `make` plans PDOs and identifiers; `wire_time`
    gives the time of a PDO on the wire, and `traffic` checks SYNC, load, the peak behind one SYNC and the worst-case
-   response time of every message. `array` states what the taxels support, and `window` compares the window of the
-   array with the contact patch.
+   response time of every message. `array` states what the taxels support, and compares the window of the array with
+   the contact patch.
 3. `surface_path` lays the task's path over the object; `motion` follows it with the arm: reach, stops, speeds.
    `contact` reckons there with the layer: whether the joints' counts hold the force, and whether the array shows it.
 4. `make.make_plan` puts the answer together: `model.Plan` carries the closed setup, nodes, PDOs, buses, choices, what

@@ -1,7 +1,13 @@
-"""The array of a plan: what its taxels support, and why a task cannot be done with it.
+"""The array of a plan: what its taxels support, why a task cannot be done with it, and its window on the contact.
 
 Force is a sum over taxels. A centroid needs a few of them under the patch. The second moments of a patch, and with them
 its curvature, need about sixteen: on fewer they are those of the grid.
+
+A window holds the patch or cuts it. The patch is that on a plane, the widest on any surface without hollows. The layer
+on the probe is a bed of springs: a sphere of radius R with stiffness k a volume, pressed in by d, has the force
+F = π k R d² and a patch of radius a = √(2 R d), whose pressure falls from the middle to the rim as 1 - r²/a². The
+window follows the centroid in steps of a taxel and may be off its middle by `FOLLOWING_TAXELS`, which needs room on
+both sides. The array's blur, which carries some of the rim back inside, is left out.
 """
 
 from __future__ import annotations
@@ -10,9 +16,134 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from canprobe.cell.planning.window import patch_radius_m
-from canprobe.cell.scene.setup import Array, Calibrate, Setup, Touch
+import numpy as np
+
+from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
 from canprobe.errors import UsageError, at_most
+from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
+from canprobe.mechanics.touch.stops import depth_on_plane
+
+FOLLOWING_TAXELS = 0.75
+"""Distance of the contact's centroid from the middle of the window at which the window moves."""
+TOLERATED_LOSS_SHARE = 0.05
+"""Share of the force that a window may miss without a warning; the array itself errs by as much."""
+CARRIED_SIDE, CARRIED_SHARE = 6, 0.5
+"""Smallest window, and smallest share of the force inside it, from which the rest of a patch is computed."""
+CARRIED_ERROR = 0.1
+"""Largest error of such a force, as a share of it, on the emulated array with its spread, blur and noise."""
+_STEPS = 200
+_HALVINGS = 40
+
+
+def patch_radius_m(force_n: float, probe: Probe) -> float:
+    """Radius of the contact patch on a plane, m."""
+    return math.sqrt(2.0 * probe.radius * depth_on_plane(force_n, probe.stiffness, probe.radius))
+
+
+def patch_across_taxels(force_n: float, probe: Probe, pitch_m: float) -> float:
+    """Diameter of the contact patch on a plane, in taxels."""
+    return 2.0 * patch_radius_m(force_n, probe) / pitch_m
+
+
+def windows_of(array: Array) -> tuple[int, ...]:
+    """Taxels along each window that the array has room for."""
+    return tuple(side for side in WINDOW_SIZES if side <= min(array.pad.shape))
+
+
+def window_choices(setup: Setup) -> tuple[tuple[int, str], ...]:
+    """Windows by preference, with the reason: the smallest that holds the patch; without a force the largest first."""
+    touch, array = setup.touch, setup.array
+    windows = windows_of(array) if array is not None else WINDOW_SIZES
+    if touch is None:
+        return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(windows))
+    across = patch_across_taxels(touch.force, touch.probe, touch.array.pad.pitch_m)
+    needed = across + 2.0 * FOLLOWING_TAXELS
+    patch = (
+        f"at {touch.force:g} N the patch on a plane has {2e3 * patch_radius_m(touch.force, touch.probe):.1f} mm across"
+        f" and asks for {needed:.1f} taxels with {FOLLOWING_TAXELS:g} on each side for following it"
+    )
+    enough = [side for side in windows if side >= needed]
+    less = [side for side in reversed(windows) if side < needed]
+    return (
+        *((side, f"{patch}: the smallest that holds it") for side in enough[:1]),
+        *((side, f"{patch}: the largest that fits, cutting its rim") for side in less),
+        *((side, f"{patch}: no smaller one fits") for side in enough[1:]),
+    )
+
+
+def measured_share(
+    force_n: float, probe: Probe, side: int, pitch_m: float, off_taxels: float = FOLLOWING_TAXELS
+) -> float:
+    """Share of a force that a window measures.
+
+    Args:
+        force_n: force on a plane.
+        probe: the probe that carries the layer.
+        side: taxels along the window.
+        pitch_m: pitch of the taxels.
+        off_taxels: distance of the window's middle from the contact's, along one of its sides.
+    """
+    radius, half = patch_across_taxels(force_n, probe, pitch_m) / 2, side / 2
+    first, last = max(-radius, off_taxels - half), min(radius, off_taxels + half)
+    width = max(last - first, 0.0) / _STEPS
+    x = first + (np.arange(_STEPS) + 0.5) * width
+    y = np.minimum(half, np.sqrt(np.maximum(radius**2 - x**2, 0.0)))  # end of the column within patch and window
+    columns = 2.0 * y * (1.0 - (x / radius) ** 2) - 2.0 / 3.0 * y**3 / radius**2
+    return min(width * float(columns.sum()) / (math.pi / 2 * radius**2), 1.0)
+
+
+def true_force_n(force_n: float, probe: Probe, side: int, pitch_m: float, most_n: float) -> float | None:
+    """The largest true force where a window measures `force_n`; None where it is above `most_n`."""
+    if most_n * measured_share(most_n, probe, side, pitch_m) < force_n:
+        return None
+    low, high = force_n, most_n
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if middle * measured_share(middle, probe, side, pitch_m) < force_n else (low, middle)
+    return high
+
+
+@dataclass(frozen=True, slots=True)
+class CutPatch:
+    """A window that measures too little of the force.
+
+    Attributes:
+        text: text for people, with the numbers.
+        safe: whether the true force stays below `limits.force_max_n`, which the cell compares with the measured one.
+        ways: changes after which the window measures the force.
+    """
+
+    text: str
+    safe: bool
+    ways: tuple[str, ...]
+
+
+def cut_patch(setup: Setup) -> CutPatch | None:
+    """The cut patch of a scene; None where its window measures nearly all of the force, or the task presses nothing."""
+    touch = setup.touch
+    if touch is None or touch.array.mode != "window":
+        return None
+    force, probe, side, most = touch.force, touch.probe, int(touch.array.window), setup.limits.force_max
+    pitch = touch.array.pad.pitch_m
+    share = measured_share(force, probe, side, pitch)
+    if share >= 1.0 - TOLERATED_LOSS_SHARE:
+        return None
+    windows = windows_of(touch.array)
+    enough = [wider for wider in windows if measured_share(force, probe, wider, pitch) >= 1.0 - TOLERATED_LOSS_SHARE]
+    ways = (f"sensor.window = {enough[0]}" if enough else 'sensor.mode = "image"', "a smaller task.force_n")
+    across = patch_across_taxels(force, probe, pitch)
+    cuts = (
+        f"sensor.window = {side} cuts the contact patch, which is {across:.1f} taxels across on a plane at "
+        f"{force:g} N; as little as {100 * share:.0f} % of that force lies inside"
+    )
+    if side >= CARRIED_SIDE and share >= CARRIED_SHARE:
+        carried = f"the rest is carried on from there, and the force errs by up to {100 * CARRIED_ERROR:.0f} %"
+        return CutPatch(f"{cuts}; {carried}", True, ways)
+    true_n = true_force_n(force, probe, side, pitch, most)
+    presses = f"more than limits.force_max_n = {most:g} N" if true_n is None else f"up to {true_n:.2g} N"
+    text = f"{cuts}, and where the window measures {force:g} N, {presses} can press"
+    return CutPatch(text, true_n is not None, ways)
+
 
 PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16
 """Taxels under the patch from which a press finds the normal of a sphere, there is a centroid, and second moments."""

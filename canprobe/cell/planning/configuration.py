@@ -84,9 +84,8 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeConfiguration:
     axis = arm.node_ids.index(node.node_id) if arm is not None else 0
     drive = arm.drives[axis] if arm is not None else None
     own = _array_writes(plan, device) if arm is None else _drive_writes(plan, node, arm, axis, device)
-    writes, left_out, problems = _possible(
-        device, [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *own]
-    )
+    wanted = [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *own]
+    writes, left_out, problems = _possible(device, wanted)
     times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
     homing, not_homing, no_homing = _possible(device, _homing_writes(arm, axis, device) if arm is not None else ())
     if homing and arm is not None and drive is not None and drive.zero is not None:
@@ -247,14 +246,11 @@ def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: De
 
 def _homing_writes(arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
     """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
-    zero = arm.drives[axis].zero
-    if zero is None:
+    drive, units = arm.drives[axis], abs(float(arm.model.units_per_q[axis, axis]))
+    if (zero := drive.zero) is None:
         return []
-    units = abs(float(arm.model.units_per_q[axis, axis]))
-    speed, acceleration = (
-        units / (speed_unit(device, arm.drives[axis], index) or 1.0)
-        for index in (VELOCITY_UNIT_INDEX, ACCELERATION_UNIT_INDEX)
-    )
+    speed = units / (speed_unit(device, drive, VELOCITY_UNIT_INDEX) or 1.0)
+    acceleration = units / (speed_unit(device, drive, ACCELERATION_UNIT_INDEX) or 1.0)
     ramp = "homing accelerates as the device has it"
     still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
     offset = -round(_home_units(arm, axis, zero))
@@ -280,11 +276,9 @@ def _unhomed(arm: Arm, axis: int, zero: HomingParameters, device: DeviceCapabili
         its, name = arm.drives[other].zero, joints[other].name
         if its is None or (its.order, other) < (zero.order, axis):
             continue
-        way = (
-            "each depends on the other: one of them needs an absolute encoder"
-            if axis in coupled_joints(arm.model, other)
-            else f"joints.{name}.homing_order must be lower than {zero.order}"
-        )
+        way = f"joints.{name}.homing_order must be lower than {zero.order}"
+        if axis in coupled_joints(arm.model, other):
+            way = "each depends on the other: one of them needs an absolute encoder"
         yield f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}"
     if device.has(HOME_OFFSET):
         return
@@ -334,7 +328,7 @@ def _array_given(plan: Plan, dictionary: Any) -> tuple[FixedEntry, ...]:
     assert array is not None
     if not has_full_scale(dictionary):
         return ()
-    pascals = round(array.full_scale)
+    pascals = round(array.pad.full_scale_pa)
     key = "sensor.full_scale_kpa"
     otherwise = f"force would be read wrong by their ratio; put right {key}"
     return (FixedEntry(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)

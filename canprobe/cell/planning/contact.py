@@ -18,8 +18,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from canprobe.cell.planning.array import measured_share
 from canprobe.cell.planning.force import highest_known_force
-from canprobe.cell.planning.window import measured_share
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
 from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward
@@ -163,9 +163,8 @@ def saturation_problem(task: _Touching, kappas: Floats, holds: Callable[[_Touchi
         return None  # a calibration with a flat array is refused elsewhere
     windowed = array.mode == "window" and array.window != "auto"
     inside = measured_share(task.force, probe, int(array.window), pitch) if windowed else 1.0
-    worst = max(
-        (pressed(task.force / inside, probe, array, one) for one in kappas.tolist()), key=lambda one: one.shown_pa
-    )
+    layers = [pressed(task.force / inside, probe, array, one) for one in kappas.tolist()]
+    worst = max(layers, key=lambda one: one.shown_pa)
     if worst.shown_pa <= full_pa:
         return None
     fits = worst.depth - (worst.shown_pa - full_pa) / probe.stiffness

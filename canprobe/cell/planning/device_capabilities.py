@@ -85,6 +85,12 @@ class DeviceCapabilities:
         numbers = self.description.rpdos if direction == "rpdo" else self.description.tpdos
         return tuple(number for number in numbers if self.has(MAPPING[direction] + number - 1))
 
+    @property
+    def switchable_pdos(self) -> list[tuple[Direction, int]]:
+        """The PDOs that can be switched off."""
+        has = [(direction, number) for direction in COMMUNICATION for number in self.pdo_numbers(direction)]
+        return [one for one in has if self.fixed_cob_id(*one) is None]
+
     def capacity(self, direction: Direction, number: int) -> int:
         """Number of objects that may be mapped to a PDO; 0: its mapping is fixed."""
         index = MAPPING[direction] + number - 1

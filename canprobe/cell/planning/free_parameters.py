@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from canprobe.cell.planning.array import window_choices, windows_of
 from canprobe.cell.planning.model import Choice, Traffic
-from canprobe.cell.planning.window import window_choices, windows_of
 from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
@@ -66,7 +66,7 @@ def _channels(setup: Setup) -> list[tuple[str, str]]:
 
 def free_channel(setup: Setup) -> str:
     """The next channel that no node is on."""
-    nodes = (*(setup.arm.drives if setup.arm is not None else ()), *((setup.array,) if setup.array is not None else ()))
+    nodes = (*setup.drives, *((setup.array,) if setup.array is not None else ()))
     channel, taken = setup.bus.channel, {setup.bus.channel, *(node.channel for node in nodes)}
     while channel in taken:
         channel = second_channel(channel)
@@ -190,7 +190,7 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
 
 def _own_bus(setup: Setup, array: Array) -> Iterator[tuple[str, Setup]]:
     """The array on a separate bus, where it shares one with drives."""
-    if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
+    if any(array.channel == drive.channel for drive in setup.drives):
         own = free_channel(setup)
         yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
 

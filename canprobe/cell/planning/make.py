@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from canprobe.cell.planning.array import array_problems, as_supported, speed_over_array_problems
+from canprobe.cell.planning.array import array_problems, as_supported, cut_patch, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities, missing_bitrate, missing_objects
@@ -15,11 +15,8 @@ from canprobe.cell.planning.identifiers import identifier_problems, order_by_dea
 from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
     Choice,
-    Direction,
     NodeKind,
     Plan,
-    PlannedBus,
-    PlannedFrames,
     PlannedNode,
     PlannedPdo,
     SyncPlan,
@@ -31,10 +28,9 @@ from canprobe.cell.planning.operation import choose_mode, early_stops, operation
 from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.cell.planning.raw_frames import plan_raw_frames, raw_frame_problems
 from canprobe.cell.planning.sync import interpolations, period_problem, plan_ratio, plan_sync
-from canprobe.cell.planning.traffic import plan_traffic
+from canprobe.cell.planning.traffic import PlannedTraffic, plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.planning.warnings import warnings
-from canprobe.cell.planning.window import cut_patch
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
 from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
@@ -73,12 +69,12 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
     problems += [*unreachable, *narrowed] if unreachable else []
     truth, arm = setup.truth, setup.arm
-    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
+    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in setup.drives):
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
-        ways = _ways_out(bus) if bus is not None and bus.overload and find_ways else []
-        alone = bus is not None and set(problems) <= {*bus.overload}
+        ways = _ways_out(bus) if bus is not None and bus.traffic.problems and find_ways else []
+        alone = bus is not None and set(problems) <= {*bus.traffic.problems}
         problems = [problem if bus is None else _with_rates(problem, bus, devices) for problem in problems]
         raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
     chosen = {choice.key: choice.value for choice in bus.choices}
@@ -86,17 +82,17 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     absent = omitted_features(setup)
     plan = Plan(
         setup=setup,
-        nodes=_nodes(setup, devices, bus.pdos, bus.sync),
-        pdos=bus.pdos,
-        raw=bus.raw,
+        nodes=_nodes(setup, devices, bus.traffic.pdos, bus.sync),
+        pdos=bus.traffic.pdos,
+        raw=bus.traffic.raw,
         sync=bus.sync,
-        buses=bus.buses,
+        buses=bus.traffic.buses,
         choices=bus.choices,
         joint_speeds=joint_speeds,
         outputs=outputs(setup, dict(absent)),
         left_out=(*absent, *_unused_axes(setup, devices)),
         not_available=(*bus.not_available, *unavailable_bridges(setup)),
-        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
+        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.traffic.pdos)),
     )
     return _with_configurations(plan)
 
@@ -161,27 +157,24 @@ class _BusPlan:
     Attributes:
         setup: the closed setup: no key is "auto".
         choices: values of the keys that were open.
+        traffic: traffic of its buses, with the problems of the bit rate.
         problems: what is wrong at any bit rate.
-        overload: what does not fit the bit rate.
         untaken: problems with a rate, each with other rates as text and the setups that have them.
     """
 
     setup: Setup
     choices: tuple[Choice, ...]
     sync: SyncPlan
-    pdos: tuple[PlannedPdo, ...]
-    raw: tuple[PlannedFrames, ...]
-    buses: tuple[PlannedBus, ...]
+    traffic: PlannedTraffic
     problems: list[str]
-    overload: list[str]
     not_available: tuple[tuple[str, str], ...]
     untaken: list[tuple[str, list[tuple[str, Setup]]]]
 
     @property
     def rank(self) -> tuple[int, float]:
         """Sort key of a candidate: number of problems, then the largest share of bus or trigger time used."""
-        shares = [bus.traffic.load for bus in self.buses]
-        shares += [demand.used_ns / demand.available_ns for bus in self.buses for demand in bus.traffic.demands]
+        shares = [bus.traffic.load for bus in self.traffic.buses]
+        shares += [demand.used_ns / demand.available_ns for bus in self.traffic.buses for demand in bus.traffic.demands]
         return len(self.problems), max(shares)
 
 
@@ -195,7 +188,7 @@ def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: l
     found: list[_BusPlan] = []
     for candidate, choices in candidates(setup):
         bus = _plan_bus(candidate, devices, choices)
-        if not bus.overload and not bus.problems:
+        if not bus.traffic.problems and not bus.problems:
             return bus
         found.append(bus)
     wanted = setup.arm is None or setup.arm.torque
@@ -204,13 +197,13 @@ def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: l
     if len(found) > 1:
         chosen = ", ".join(f"{choice.key} = {choice.written}" for choice in nearest.choices)
         problems.append(f"none of {len(found)} ways to fill what is left open fits; the nearest: {chosen}")
-    problems += [*nearest.problems, *nearest.overload]
+    problems += [*nearest.problems, *nearest.traffic.problems]
     return nearest
 
 
 def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
     sync, exact = plan_sync(setup)
-    drives = [devices[node_id] for node_id in setup.arm.node_ids] if setup.arm is not None else []
+    drives = [devices[drive.node_id] for drive in setup.drives]
     unset, periods = period_problem(setup.rate_hz, sync.period_us, exact, drives)
     ratio, untimed, image_rates = plan_ratio(setup)
     not_available = []
@@ -241,11 +234,8 @@ def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: 
         setup=setup,
         choices=choices,
         sync=sync,
-        pdos=traffic.pdos,
-        raw=traffic.raw,
-        buses=traffic.buses,
+        traffic=traffic,
         problems=[*(problem for problem, _ in untaken), *planning.problems],
-        overload=traffic.problems,
         not_available=tuple(dict.fromkeys(planning.not_available)),
         untaken=untaken,
     )
@@ -263,7 +253,7 @@ def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, DeviceCapabil
     fitting, in_turn = [], []
     for text, changed in changes:
         other = _plan_bus(changed, devices)
-        if other.overload or not known.issuperset(other.problems):
+        if other.traffic.problems or not known.issuperset(other.problems):
             continue
         if further := _keys(_problems_beside_bus(other.setup)) - elsewhere:
             in_turn.append((text, ", which asks for another " + " and ".join(sorted(further))))
@@ -297,12 +287,9 @@ def _unused_axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> lis
     for kind, role, node in _roles(setup):
         if kind == "drive" and (others := [axis for axis in devices[node.node_id].axes if axis > 1]):
             objects = ", ".join(f"{0x6000 + 0x800 * (axis - 1):04X}h" for axis in others)
-            what = (
-                f"ax{'es' if len(others) > 1 else 'is'} {', '.join(map(str, others))} of node {node.node_id} ({role})"
-            )
-            unused.append(
-                (what, f"{node.eds} has objects of more axes, from {objects}: a joint has the first of its node")
-            )
+            axes = f"ax{'es' if len(others) > 1 else 'is'} {', '.join(map(str, others))}"
+            why = f"{node.eds} has objects of more axes, from {objects}: a joint has the first of its node"
+            unused.append((f"{axes} of node {node.node_id} ({role})", why))
     return unused
 
 
@@ -324,16 +311,15 @@ def _fits(setup: Setup, known: frozenset[str]) -> tuple[Setup, Traffic] | None:
         return None
     for candidate, _ in candidates(setup):
         bus = _plan_bus(candidate, devices)
-        if not bus.overload and known.issuperset(bus.problems):
-            return candidate, max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
+        if not bus.traffic.problems and known.issuperset(bus.problems):
+            return candidate, max((one.traffic for one in bus.traffic.buses), key=lambda traffic: traffic.load)
     return None
 
 
 def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
     """Every node with its kind and its role, the drives from the base, the array last."""
-    drives = setup.arm.drives if setup.arm is not None else ()
     roles: list[tuple[NodeKind, str, Node]] = [
-        ("drive", f"joint {axis}", drive) for axis, drive in enumerate(drives, start=1)
+        ("drive", f"joint {axis}", drive) for axis, drive in enumerate(setup.drives, start=1)
     ]
     array = setup.array
     return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]
@@ -361,30 +347,23 @@ def _devices(setup: Setup) -> tuple[dict[int, DeviceCapabilities], list[str]]:
 def _nodes(
     setup: Setup, devices: Mapping[int, DeviceCapabilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
 ) -> tuple[PlannedNode, ...]:
-    nodes = [
-        PlannedNode(
-            node_id=node.node_id,
-            kind=kind,
-            role=role,
-            eds=node.eds,
-            dictionary=devices[node.node_id].od,
-            identity=replace(devices[node.node_id].identity, serial_number=node.serial),
-            emulated=node.emulated,
-            channel=node.channel,
-            switched_off=_switched_off(node.node_id, devices[node.node_id], pdos),
-            mode=choose_mode(devices[node.node_id]) if kind == "drive" else None,
-            interpolation=interpolations(devices[node.node_id], sync.period_us) if kind == "drive" else (),
+    nodes = []
+    for kind, role, node in _roles(setup):
+        device, is_drive = devices[node.node_id], kind == "drive"
+        used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node.node_id}
+        nodes.append(
+            PlannedNode(
+                node_id=node.node_id,
+                kind=kind,
+                role=role,
+                eds=node.eds,
+                dictionary=device.od,
+                identity=replace(device.identity, serial_number=node.serial),
+                emulated=node.emulated,
+                channel=node.channel,
+                switched_off=tuple(one for one in device.switchable_pdos if one not in used),
+                mode=choose_mode(device) if is_drive else None,
+                interpolation=interpolations(device, sync.period_us) if is_drive else (),
+            )
         )
-        for kind, role, node in _roles(setup)
-    ]
     return tuple(sorted(nodes, key=lambda node: node.node_id))
-
-
-def _switched_off(
-    node_id: int, device: DeviceCapabilities, pdos: tuple[PlannedPdo, ...]
-) -> tuple[tuple[Direction, int], ...]:
-    """PDOs that the device has, that the scene does not need and that can be switched off."""
-    used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node_id}
-    directions: tuple[Direction, ...] = ("rpdo", "tpdo")
-    has = [(direction, number) for direction in directions for number in device.pdo_numbers(direction)]
-    return tuple(one for one in has if one not in used and device.fixed_cob_id(*one) is None)

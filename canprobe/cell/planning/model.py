@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+from canopen import ObjectDictionary
 
 from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.cell.scene.load import SAVED_AS, dump_scene
@@ -12,10 +14,6 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.cell.scene.toml_files import toml_value, written_by_line
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
-
-if TYPE_CHECKING:
-    from canopen import ObjectDictionary
-
 
 MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100

@@ -14,8 +14,15 @@ from canprobe.cell.planning.contact import contact_problems, saturation_problem
 from canprobe.cell.planning.first_touch import first_touch_problems
 from canprobe.cell.planning.force import force_problems
 from canprobe.cell.planning.model import JointSpeeds
-from canprobe.cell.planning.surface_path import SurfacePath, in_mm, surface_path
-from canprobe.cell.planning.task_way import joints_on_way, over_path, poles_at_contacts, round_ball
+from canprobe.cell.planning.surface_path import (
+    SurfacePath,
+    in_mm,
+    joints_on_way,
+    over_path,
+    poles_at_contacts,
+    round_ball,
+    surface_path,
+)
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.errors import PlanError, at_least, at_most
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
@@ -24,9 +31,8 @@ from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.touch.strategies import Rectangle, turn_radius
 from canprobe.mechanics.types import Floats
 
-_METRES_GUESS_M = (
-    6e-3  # a place so near the origin of the base was hardly meant in mm; the lifted start may add some mm
-)
+_METRES_GUESS_M = 6e-3
+"""Distance from the origin of the base below which a place was hardly meant in mm; the lifted start may add some mm."""
 _PATH_MOVE_RAD = 0.3  # between two points of a path; farther away lies another branch
 _MIN_SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
 _TOUCH_MOVE_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
@@ -254,9 +260,8 @@ def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -
             f"to turn round; make the rectangle larger, or lower task.speed_mm_s to {at_most(slower)}"
         )
     why, missed, q = "", [], q_start
-    for pose, point in zip(
-        itertools.islice(_along_path(task, path), _POSES_BEFORE_CONTACT, None), path.points, strict=True
-    ):
+    contacts = itertools.islice(_along_path(task, path), _POSES_BEFORE_CONTACT, None)
+    for pose, point in zip(contacts, path.points, strict=True):
         try:
             (found,) = _follow(task.arm, task.probe, [pose], q)
         except PlanError as error:
@@ -326,12 +331,7 @@ def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
     above = approach.start + approach.normal * approach.clearance
     lifted = path.points[0] + path.normals[0] * approach.clearance
     points, normals = (above, lifted, *path.points), (approach.normal, path.normals[0], *path.normals)
-    turns = (
-        math.inf,
-        _TOUCH_MOVE_RAD,
-        _TOUCH_MOVE_RAD,
-        *(_PATH_MOVE_RAD for _ in path.points[1:]),
-    )
+    turns = (math.inf, *[_TOUCH_MOVE_RAD] * 2, *[_PATH_MOVE_RAD] * (len(path.points) - 1))
     for point, normal, pole, most_rad in zip(points, normals, (approach.normal, poles[0], *poles), turns, strict=True):
         metres = " (are these metres?)" if np.abs(point).max() < _METRES_GUESS_M else ""
         out_of_reach = (

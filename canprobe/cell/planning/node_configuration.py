@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from canopen import ObjectDictionary
 
+from canprobe.errors import NodeError
+
 MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
 _TOLERANCE = 1e-3
 """Share by which units may differ: a factor of the device is a quotient of integers."""
@@ -148,6 +150,10 @@ class NodeConfiguration:
     homing: tuple[Write, ...] = ()
     turn: TurnUnits | None = None
     speed_unit: float = 1.0
+
+    def error(self, reason: str) -> NodeError:
+        """The error of this node, by its name."""
+        return NodeError(self.node_id, f"({self.name}) {reason}")
 
     @property
     def configuration_date(self) -> dict[int, int]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Container, Iterator
 
-from canprobe.cell.planning.array import support_of
+from canprobe.cell.planning.array import measured_share, patch_across_taxels, support_of
 from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
-from canprobe.cell.planning.window import measured_share, patch_across_taxels
 from canprobe.cell.scene.setup import Setup, Touch, Touching
 from canprobe.errors import install_line
 
@@ -83,13 +82,13 @@ def _not_computed(setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _not_emulated(setup: Setup) -> Iterator[tuple[str, str]]:
-    arm, array, kind = setup.arm, setup.array, setup.kind
+    array, kind = setup.array, setup.kind
     if not setup.emulates:
         yield "emulator", "every node is real"
         yield TRUTH_PARTS, "no emulated node"
     elif setup.truth.object is None and kind != "free":
         yield TRUTH_PARTS, "no [object]: nothing to compare with"
-    if arm is not None and setup.truth.fidelity == "ideal" and any(drive.emulated for drive in arm.drives):
+    if setup.truth.fidelity == "ideal" and any(drive.emulated for drive in setup.drives):
         yield "arm dynamics", 'plant.fidelity = "ideal": each drive tracks as a second-order system'
     for effect, what in _EFFECTS.items():
         if array is not None and effect in setup.truth.without:

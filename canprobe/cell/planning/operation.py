@@ -77,12 +77,9 @@ def early_stops(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> Iter
     early: dict[tuple[str, int, int], list[int]] = {}
     for node_id in arm.node_ids:
         device, index = devices[node_id], sync_patience(devices[node_id].od)
-        entry = device.description.entry(index) if index is not None else None
-        if (
-            index is None
-            or entry is None
-            or (index == MISSED_SYNCS and entry.writable and entry.allows(arm.missed_syncs))
-        ):
+        if index is None or (entry := device.description.entry(index)) is None:
+            continue
+        if index == MISSED_SYNCS and entry.writable and entry.allows(arm.missed_syncs):
             continue
         if 0 < (held := device.number(index) or 0) < arm.missed_syncs:
             early.setdefault((device.eds, index, held), []).append(node_id)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
@@ -215,8 +215,7 @@ def plan_drive_pdos(planning: PdoPlanning) -> None:
 
 def _plan_feedback(planning: PdoPlanning, node_id: int) -> None:
     """Statusword and position, and the torque where the device can send it too."""
-    device, arm = planning.devices[node_id], planning.setup.arm
-    assert arm is not None
+    device, arm = planning.devices[node_id], planning.setup.needed_arm()
     chosen = planning.choose(node_id, "tpdo", (STATUSWORD, POSITION))
     if chosen and not any(TORQUE in _places(one) for one in chosen) and arm.torque:
         first, torque = chosen[0], device.entry(*TORQUE, "tpdo")
@@ -305,28 +304,11 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
         if on_event:
             seldom = all(entry.index in STATES for entry in entries)
             rate = min(1000 / RESENT_MS if seldom else sync.rate_hz, 10_000 / (inhibit_100us or 1))
-        layout = PdoLayout(cob_id, entries, kind)
-        planning.not_available.append(
-            (
-                f"TPDO{number} switched off",
-                f"{device.eds}: its COB-ID is read-only, so it is sent besides, counted with {rate:g} Hz",
-            )
-        )
-        planning.pdos.append(
-            PlannedPdo(
-                node_id=node_id,
-                direction="tpdo",
-                number=number,
-                channel=planning.channels[node_id],
-                layout=layout,
-                rate_hz=rate,
-                bits_worst=frame_bits(layout.length, planning.setup.bus),
-                deadline_ns=round(1e9 / rate),
-                used=False,
-                fixed_id=True,
-                own_bits=device.own_bits("tpdo", number),
-            )
-        )
+        why = f"{device.eds}: its COB-ID is read-only, so it is sent besides, counted with {rate:g} Hz"
+        planning.not_available.append((f"TPDO{number} switched off", why))
+        planning.add(node_id, "tpdo", number, PdoLayout(cob_id, entries, kind))
+        added, period_ns = planning.pdos.pop(), round(1e9 / rate)
+        planning.pdos.append(replace(added, used=False, rate_hz=rate, deadline_ns=period_ns, event_timer_ms=0))
 
 
 def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:

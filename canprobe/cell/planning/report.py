@@ -107,13 +107,9 @@ def _witnesses(rows: Sequence[tuple[str, str]]) -> str:
 
 def id_ranges(ids: Iterable[int]) -> str:
     """Node ids as `1–6, 16`."""
-    rows: list[list[int]] = []
-    for one in sorted(ids):
-        if rows and one == rows[-1][-1] + 1:
-            rows[-1].append(one)
-        else:
-            rows.append([one])
-    return ", ".join(str(row[0]) if len(row) == 1 else f"{row[0]}–{row[-1]}" for row in rows)
+    steps = itertools.count()
+    runs = [[*run] for _, run in itertools.groupby(sorted(ids), key=lambda one: one - next(steps))]
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 
 TIMELINE_WIDTH = 100

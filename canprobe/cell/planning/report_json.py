@@ -32,14 +32,8 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "scene": setup.name,
         "fits": True,
         "title": setup.title,
-        "bus": {
-            "interface": bus.interface,
-            "channel": bus.channel,
-            "bitrate": bus.bitrate,
-            "transmit_queue": bus.transmit_queue,
-            "fd": bus.fd,
-            "data_bitrate": bus.data_bitrate if bus.fd else None,
-        },
+        "bus": _picked(bus, "interface", "channel", "bitrate", "transmit_queue", "fd")
+        | {"data_bitrate": bus.data_bitrate if bus.fd else None},
         "sync": asdict(plan.sync),
         "heartbeat": {
             "master_node_id": MASTER_NODE_ID,
@@ -124,7 +118,7 @@ def _mesh(setup: Setup) -> dict[str, Any] | None:
 
 def _node(node: PlannedNode) -> dict[str, Any]:
     """A node without its dictionary, which is as large as its EDS."""
-    return {item.name: getattr(node, item.name) for item in fields(node) if item.name != "dictionary"} | {
+    return _picked(node, *(item.name for item in fields(node) if item.name != "dictionary")) | {
         "identity": asdict(node.identity),
         "switched_off": [{"direction": way, "number": number} for way, number in node.switched_off],
         "interpolation": [asdict(period) for period in node.interpolation],
@@ -132,16 +126,8 @@ def _node(node: PlannedNode) -> dict[str, Any]:
 
 
 def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
-    return {
-        "node_id": pdo.node_id,
-        "channel": pdo.channel,
-        "direction": pdo.direction,
-        "number": pdo.number,
-        "cob_id": pdo.cob_id,
-        "entries": [
-            {"index": entry.index, "subindex": entry.subindex, "bits": entry.bits, "name": entry.name}
-            for entry in pdo.entries
-        ],
+    return _picked(pdo, "node_id", "channel", "direction", "number", "cob_id") | {
+        "entries": [_picked(entry, "index", "subindex", "bits", "name") for entry in pdo.entries],
         "transmission_type": pdo.transmission_type,
         "rate_hz": pdo.rate_hz,
         "bytes": pdo.layout.length,
@@ -152,6 +138,10 @@ def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
         "event_timer_ms": pdo.event_timer_ms or None,
         "used": pdo.used,
     }
+
+
+def _picked(part: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(part, name) for name in names}
 
 
 def _in_us(values: dict[str, Any]) -> dict[str, Any]:

@@ -152,8 +152,7 @@ def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tu
     if setup.arm is None:
         return setup, ()
     setup, ranges = _within_ranges(setup, setup.arm, devices)
-    assert setup.arm is not None
-    setup, speeds = _within_speeds(setup, setup.arm, devices)
+    setup, speeds = _within_speeds(setup, setup.needed_arm(), devices)
     return setup, (*ranges, *speeds)
 
 
@@ -188,18 +187,13 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilit
 
 def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, DeviceCapabilities], wanted: float) -> _SpeedLimit:
     """The lowest limit in the drive of an axis, where a speed of `wanted` position units/s is needed."""
-    arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
-    assert arm is not None
+    arm, rounding = setup.needed_arm(), ROUNDING_COUNTS * setup.rate_hz
     device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
     limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
     entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY_UNIT_INDEX)
-    if (
-        entry is not None
-        and unit is not None
-        and not (entry.writable and (wanted == math.inf or entry.allows(math.ceil((wanted + rounding) / unit))))
-    ):
-        held = device.number(PROFILE_SPEED_LIMIT)
-        limits += [_SpeedLimit(PROFILE_SPEED_LIMIT, held * unit, rounding)] if held else []
+    if entry is not None and unit is not None and (held := device.number(PROFILE_SPEED_LIMIT)):
+        rises = entry.writable and (wanted == math.inf or entry.allows(math.ceil((wanted + rounding) / unit)))
+        limits += [] if rises else [_SpeedLimit(PROFILE_SPEED_LIMIT, held * unit, rounding)]
     turn, _ = _motor_turn(device, drive)
     if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
         limits.append(_SpeedLimit(MOTOR_SPEED_LIMIT, rpm / 60.0 * turn, rounding))
@@ -226,7 +220,7 @@ def _fixed_window(device: DeviceCapabilities, wanted: int) -> int | None:
 def lag_s(setup: Setup) -> float:
     """Lag of the drives behind a ramp, s: the larger of the scene's and the emulated drives'; 0: unknown."""
     believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
-    emulated = setup.arm is not None and any(drive.emulated for drive in setup.arm.drives)
+    emulated = any(drive.emulated for drive in setup.drives)
     return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
 
 

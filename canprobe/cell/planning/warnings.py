@@ -5,8 +5,8 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterator, Sequence
 
+from canprobe.cell.planning.array import TOLERATED_LOSS_SHARE, cut_patch
 from canprobe.cell.planning.model import PlannedPdo
-from canprobe.cell.planning.window import TOLERATED_LOSS_SHARE, cut_patch
 from canprobe.cell.scene.setup import Arm, Array, Setup
 from canprobe.cell.scene.surface_files import mesh_warnings
 from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP

@@ -20,16 +20,13 @@ STEADY_S = 0.25
 
 def reports_torque(plan: Plan) -> bool:
     """Whether each drive of the arm sends its torque (6077h)."""
-    arm = plan.setup.arm
-    if arm is None:
-        return False
-    return all(
+    return plan.setup.arm is not None and all(
         any(
             (entry.index, entry.subindex) == TORQUE
-            for pdo in plan.pdos_of(node_id, "tpdo")
+            for pdo in plan.pdos_of(drive.node_id, "tpdo")
             for entry in pdo.layout.signals
         )
-        for node_id in arm.node_ids
+        for drive in plan.setup.drives
     )
 
 
@@ -39,9 +36,8 @@ def witness_rows(plan: Plan) -> list[tuple[str, str]]:
     if touch is None:
         return []
     within = "0.4 s, on the move only" if touch.array.calibration.noise.assumed else "0.2 s"
-    margin = depth_on_plane(limits.force_max, probe.stiffness, probe.radius) - depth_on_plane(
-        touch.force, probe.stiffness, probe.radius
-    )
+    most, held = (depth_on_plane(force, probe.stiffness, probe.radius) for force in (limits.force_max, touch.force))
+    margin = most - held
     speed = touch.scan.speed if isinstance(touch, Touch) and touch.scan is not None else 0.0
     error = CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * speed)
     known = f"{touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm"

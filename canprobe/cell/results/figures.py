@@ -27,7 +27,7 @@ from canprobe.cell.results.picture import (
     sheet,
 )
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.results.surface_figure import MapPlane, add_sheet, map_surface, true_surface
+from canprobe.cell.results.surface_figure import TWO_SIGMA, MapPlane, add_sheet, map_surface, true_surface
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
@@ -35,7 +35,6 @@ from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.types import Floats
 
 Panel = Callable[[SubFigure, RunData], None]
-TWO_SIGMA = 1.96
 MIN_SPAN_PER_M = 1.0
 """Least height of the panel of curvatures, 1/m, so that noise on a plane looks small."""
 

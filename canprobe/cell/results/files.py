@@ -72,10 +72,8 @@ def load_table(path: Path | str) -> pandas.DataFrame:
     source = Path(path)
     if source.suffix == ".npz":
         return to_frame(READERS.get(source.name, read_npz)(source))
-    reader, arrow = (
-        needed_module("pandas", "data", "a table needs pandas:"),
-        needed_module("pyarrow", "data", "Parquet needs pyarrow:"),
-    )
+    reader = needed_module("pandas", "data", "a table needs pandas:")
+    arrow = needed_module("pyarrow", "data", "Parquet needs pyarrow:")
     try:
         frame: pandas.DataFrame = reader.read_parquet(regular_file(source), engine="pyarrow")
     except (OSError, arrow.ArrowException) as error:
@@ -92,10 +90,8 @@ def write_parquet(
         UsageError: the extra is missing, or columns differ in length.
         ResultsError: the file cannot be written.
     """
-    arrow, parquet = (
-        needed_module("pyarrow", "data", "Parquet needs pyarrow:"),
-        needed_module("pyarrow.parquet", "data", "Parquet needs pyarrow:"),
-    )
+    arrow = needed_module("pyarrow", "data", "Parquet needs pyarrow:")
+    parquet = needed_module("pyarrow.parquet", "data", "Parquet needs pyarrow:")
     values, units = _scalars(columns)
     arrays = {name: arrow.array(column) for name, column in values.items()}
     fields = [arrow.field(name, array.type, metadata={"unit": units[name]}) for name, array in arrays.items()]

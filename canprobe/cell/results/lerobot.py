@@ -281,8 +281,8 @@ def _refuse_gaps(file: Path, times: NDArray[Any], rate_hz: float) -> None:
 
 def _arm_features(setup: Setup, log: Columns, rows: slice) -> Iterator[tuple[str, Feature]]:
     """State, action and torque of the joints; held where the cell had none."""
-    assert setup.arm is not None
-    names = [f"{joint.name}.pos" for joint in setup.arm.model.joints]
+    joints = setup.needed_arm().model.joints
+    names = [f"{joint.name}.pos" for joint in joints]
     unknown = np.full((len(log["t_s"]), len(names)), np.nan)
     q, target = (unknown if (found := joint_positions(log, name)) is None else found for name in ("q", "q_target"))
     q = _held(q, 0.0)
@@ -290,10 +290,7 @@ def _arm_features(setup: Setup, log: Columns, rows: slice) -> Iterator[tuple[str
     yield "action", Feature(names, _held(target, q)[rows].astype(np.float32))
     if "torque_permille" in log:
         torque = _held(log["torque_permille"], 0.0)[rows].astype(np.float32)
-        yield (
-            "observation.torque",
-            Feature([f"{joint.name}.torque_permille" for joint in setup.arm.model.joints], torque),
-        )
+        yield "observation.torque", Feature([f"{joint.name}.torque_permille" for joint in joints], torque)
 
 
 def _held(values: NDArray[Any], before: NDArray[Any] | float) -> NDArray[Any]:
@@ -321,7 +318,7 @@ def _tactile_features(setup: Setup, log: Columns, tactile: Columns) -> dict[str,
     last = np.searchsorted(tactile["t_s"], times + 1e-9, side="right") - 1
     there = last >= 0
     taxels = tactile["taxels"].reshape(len(tactile["t_s"]), -1)
-    kpa = (taxels * (setup.array.full_scale * 1e-3 / COUNTS_MAX)).astype(np.float32)
+    kpa = (taxels * (setup.array.pad.full_scale_pa * 1e-3 / COUNTS_MAX)).astype(np.float32)
     if not len(kpa):
         kpa, last = np.zeros((1, taxels.shape[1]), np.float32), np.zeros(len(times), np.intp)
     image = np.where(there[:, None], kpa[np.maximum(last, 0)], np.float32(0.0))

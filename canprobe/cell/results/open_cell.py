@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy.typing as npt
 
@@ -30,17 +29,14 @@ from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import home_joints
 from canprobe.cell.tasks.from_plan import estimates_of
-from canprobe.cell.tasks.hand_motion import HandMotion
-from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_way, joint_way, refuse, share_of_speed
+from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandMotion, HandWay, jog_way, joint_way, refuse
 from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
 from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
 from canprobe.mechanics.robot.chain import forward_jacobian
+from canprobe.mechanics.touch import Patch
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.mechanics.touch import Patch
 
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,
@@ -98,12 +94,10 @@ class OpenCell:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         failure = error
         try:
-            self.session.__exit__(kind, error, trace)
+            self.session.__exit__()
         except BaseException as late:
             failure = late
             raise
@@ -141,9 +135,7 @@ class OpenCell:
             UsageError: the scene has no arm.
         """
         setup = self.plan.setup
-        if setup.arm is None:
-            raise UsageError(f"{setup.name}: expected a scene with an arm; got one without")
-        return forward_jacobian(setup.arm.model.chain, q, setup.probe.T_flange_probe)
+        return forward_jacobian(setup.needed_arm().model.chain, q, setup.probe.T_flange_probe)
 
     def run(
         self,
@@ -194,7 +186,7 @@ class OpenCell:
         Raises:
             UsageError: there is no such posture, or the way leads through a limit or what the arm keeps out of.
         """
-        way = joint_way(self.plan, self._stands(), goal_of(self.plan, to), share_of_speed(speed))
+        way = joint_way(self.plan, self._stands(), to, speed)
         refuse(self.plan, way)
         return way
 
@@ -295,8 +287,7 @@ class OpenCell:
 
     def _stands(self) -> Floats:
         """Joint positions (n,), rad or m."""
-        if self.plan.setup.arm is None:
-            raise UsageError(f"{self.plan.setup.name}: expected a scene with an arm; got one without")
+        self.plan.setup.needed_arm()
         measurement = self.cell.idle(READ_S)
         assert measurement.q is not None
         return measurement.q

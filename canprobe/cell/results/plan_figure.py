@@ -37,12 +37,8 @@ def draw_plan(plan: Plan, path: Path | str) -> None:
         upper, lower = figure.subplots(2, 1, height_ratios=heights)
         _draw_cycles(upper, plan)
         _draw_responses(lower, plan)
-        legend(figure, [Patch(color=COLOURS[part], label=NAMES[part]) for part in _parts(plan)])
-
-
-def _parts(plan: Plan) -> list[Part]:
-    used = {slot.part for slot in timeline(plan)}
-    return [part for part in COLOURS if part in used]
+        used = {slot.part for slot in timeline(plan)}
+        legend(figure, [Patch(color=COLOURS[part], label=NAMES[part]) for part in COLOURS if part in used])
 
 
 def _draw_cycles(axes: Axes, plan: Plan) -> None:

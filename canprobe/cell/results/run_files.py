@@ -127,7 +127,7 @@ def read_log(file: Path, setup: Setup | None = None) -> Columns:
     Raises:
         UsageError: when it cannot be read, or a column is not as a run writes it.
     """
-    columns = _read(file, "the log of a run", _OF_LOG, setup)
+    columns = _checked(_columns(file, "the log of a run"), file, _OF_LOG, setup)
     times = _times(columns, "t_s", file)
     if len(times) and times[0] == 0.0:
         raise UsageError(
@@ -145,7 +145,7 @@ def read_log(file: Path, setup: Setup | None = None) -> Columns:
 
 def read_tactile(file: Path, setup: Setup | None = None) -> Columns:
     """The columns of ``tactile.npz``; for arguments and errors see `read_log`."""
-    columns = _read(file, "the tactile frames of a run", _OF_TACTILE, setup)
+    columns = _checked(_columns(file, "the tactile frames of a run"), file, _OF_TACTILE, setup)
     if not columns:
         return columns
     for name in ("t_s", "t_sample_s"):
@@ -173,11 +173,6 @@ def needed(columns: Columns, names: Iterable[str], file: Path) -> None:
 
 READERS = {LOG: read_log, TACTILE: read_tactile, TRUTH: read_truth}
 """Reader of each file of columns, by its name."""
-
-
-def _read(file: Path, what: str, shapes: _Shapes, setup: Setup | None) -> Columns:
-    """Read the columns of a file and check them."""
-    return _checked(_columns(file, what), file, shapes, setup)
 
 
 def is_recorded(file: Path) -> bool:

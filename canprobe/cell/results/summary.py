@@ -31,7 +31,6 @@ from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
-from canprobe.cell.tasks.regain import summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.errors import ResultsError, UsageError
@@ -71,7 +70,9 @@ def summarise(
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
     log = dict(cell.log.columns()) if log is None else log
-    contact = _contact(session, record, log)
+    contact, load = _contact(session, record, log), session.record.load
+    buses = session.plan.buses
+    loads = {bus.channel: {"planned_worst": bus.traffic.load, "measured": load(bus.channel)} for bus in buses}
     summary = {
         "schema": SCHEMA,
         "written_by": f"canprobe {__version__}",
@@ -98,7 +99,7 @@ def summarise(
         "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
         "cycle": _cycle(cell, record)
         | {"observe_us": None if observers is None else percentiles([*observers.cost_ns])},
-        "bus_load": None if direct else _bus_load(session),
+        "bus_load": None if direct else loads,
         "traffic": None if direct else _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
@@ -106,7 +107,7 @@ def summarise(
         "faults": [*cell.notes.lines(), *(observers.faults if observers is not None else ())],
     }
     if record.explored is not None:
-        summary["explore"] = record.explored.summarised()
+        summary["explore"] = record.explored
     if scene.task.kind == "listen":
         summary["listen"] = _listened(log)
     return {name: without_nan(value) for name, value in summary.items()}
@@ -119,13 +120,6 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_nan(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _bus_load(session: Session) -> dict[str, Any]:
-    return {
-        bus.channel: {"planned_worst": bus.traffic.load, "measured": session.record.load(bus.channel)}
-        for bus in session.plan.buses
-    }
 
 
 def _traffic(session: Session) -> dict[str, Any]:
@@ -169,9 +163,8 @@ def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) ->
                 figures["speed_mean_m_s"] = None
         else:
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
-    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, **error} | {
-        "losses": summarise_losses(record.losses)
-    }
+    losses = [loss.summarised for loss in record.losses]
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, **error, "losses": losses}
 
 
 def _witnesses(session: Session, record: TaskRecord) -> dict[str, Any] | None:

@@ -8,7 +8,6 @@ from typing import Any
 
 from canprobe.cell.results.tool_file import calibration_lines
 from canprobe.cell.session.target import VIRTUAL
-from canprobe.cell.tasks.regain import losses_text
 
 
 def _figure(value: float | None, unit: str, digits: int = 2) -> str:
@@ -100,6 +99,17 @@ def force_lines(contact: Mapping[str, Any]) -> list[str]:
         f"             measured less true: mean {bias:+.3f} N ({100 * bias / target:+.1f} %),"
         f" RMS {error:.3f} N ({100 * error / target:.1f} %){within}",
     ]
+
+
+def losses_text(losses: Sequence[Mapping[str, float | None]]) -> str:
+    """The losses of contact in a scan in words: how many, and whether each was regained."""
+    told = ", ".join(
+        f"not regained within {loss['searched_mm']:.1f} mm"
+        if loss["regained_after_ms"] is None
+        else f"regained after {loss['regained_after_ms']:.0f} ms and {loss['searched_mm']:.1f} mm"
+        for loss in losses
+    )
+    return f"contact lost {len(losses)} time{'s' * (len(losses) > 1)}: {told}"
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:

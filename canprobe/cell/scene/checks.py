@@ -198,9 +198,13 @@ def values_of(section: Any) -> Any:
     if not dataclasses.is_dataclass(section):
         return section
     values = {key: getattr(section, key) for key in annotations_of(type(section))}
-    return {
-        key: value
-        for key, value in values.items()
-        if value is not None
-        and all(values[only.key] in only.values for only in conditions_of(annotations_of(type(section))[key], Only))
-    }
+    return {key: values[key] for key in keys_that_belong(type(section), values) if values[key] is not None}
+
+
+def keys_that_belong(cls: type[Any], values: Mapping[str, Any]) -> list[str]:
+    """The keys of a section whose conditions hold with these values."""
+    return [
+        key
+        for key, annotation in annotations_of(cls).items()
+        if all(values[only.key] in only.values for only in conditions_of(annotation, Only))
+    ]

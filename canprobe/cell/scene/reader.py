@@ -24,6 +24,7 @@ from canprobe.cell.scene.checks import (
     choices_of,
     conditions_of,
     convert,
+    keys_that_belong,
 )
 from canprobe.cell.scene.toml_files import toml_key, toml_value
 from canprobe.cell.scene.units import unit_of
@@ -112,7 +113,8 @@ class Reader:
         for key in table:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
-                hint = above or did_you_mean(key, _keys_that_belong(cls, annotations, table))
+                given = {field.name: field.default for field in dataclasses.fields(cls)} | table
+                hint = above or did_you_mean(key, keys_that_belong(cls, given))
                 self.complain(f"{name}.{key}", f"unknown key{hint}")
         values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
@@ -160,16 +162,6 @@ def _other_unit(path: str, raw: object, annotation: Any) -> str:
         convert(int(value) if value.is_integer() else value, annotation)
         return f"; did you mean {value:g}, for {raw:g} {other[0]}?"
     return ""
-
-
-def _keys_that_belong(cls: type[Any], annotations: Mapping[str, Any], table: Mapping[str, Any]) -> list[str]:
-    """The keys of a section whose conditions hold in it."""
-    values = {field.name: field.default for field in dataclasses.fields(cls)} | dict(table)
-    return [
-        key
-        for key, annotation in annotations.items()
-        if all(values[only.key] in only.values for only in conditions_of(annotation, Only))
-    ]
 
 
 def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:

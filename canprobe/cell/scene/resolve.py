@@ -85,9 +85,8 @@ def resolve(scene: Scene) -> Setup:
     arm, bodies = _arm(scene)
     settings = scene.probe or ProbeSettings()
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
-    flat = array is not None and array.pad.is_flat
     T, radius = T_flange_probe(settings), settings.radius_mm * MM
-    if flat:  # a flat array is a sphere of a very large radius; the point of its pole stays
+    if array is not None and array.pad.is_flat:  # it is a sphere of a very large radius; the point of its pole stays
         T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
         radius = FLAT_RADIUS_M
     stiffness = array.calibration.image.stiffness if array is not None else LAYER_STIFFNESS
@@ -122,7 +121,8 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
         return None, None
     settings, joints = scene.arm, scene.joints
     model, bodies, warnings = arm_model(scene.cell.name, settings, joints)
-    drives = [
+    each = zip(scene.drives.items(), joints.values(), strict=True)
+    drives = tuple(
         Drive(
             node_id=node_id,
             channel=joint.channel or scene.bus.channel,
@@ -135,23 +135,12 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
             gear=joint.gear,
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
-        for number, ((node_id, emulated), joint) in enumerate(
-            zip(scene.drives.items(), joints.values(), strict=True), start=1
-        )
-    ]
+        for number, ((node_id, emulated), joint) in enumerate(each, start=1)
+    )
     q_start = per_joint(joints, "start")
     postures = {START: q_start} | {name: posture_in_si(joints, posture) for name, posture in scene.postures.items()}
-    arm = Arm(
-        model,
-        tuple(drives),
-        q_start,
-        settings.missed_syncs,
-        settings.grouped_rpdo,
-        settings.torque,
-        warnings,
-        postures,
-    )
-    return arm, bodies
+    waits, grouped, torque = settings.missed_syncs, settings.grouped_rpdo, settings.torque
+    return Arm(model, drives, q_start, waits, grouped, torque, warnings, postures), bodies
 
 
 def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:

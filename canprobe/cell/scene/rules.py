@@ -211,10 +211,8 @@ def _taxel_positions(rows: int, columns: int, pitch: object, positions: object, 
     elif isinstance(positions, tuple) and isinstance(pitch, float) and len(positions) == rows * columns > 1:
         yield from _taxels_apart(positions, pitch)
     if isinstance(normals, tuple) and sum(normal[2] for normal in normals) < 0.0:
-        yield (
-            "sensor.normals",
-            "expected outward normals, z away from the flange, got most that point inside: turn them",
-        )
+        why = "expected outward normals, z away from the flange, got most that point inside: turn them"
+        yield "sensor.normals", why
 
 
 def _taxels_apart(positions: Sequence[Vec3], pitch: float) -> _Complaint:
@@ -226,11 +224,8 @@ def _taxels_apart(positions: Sequence[Vec3], pitch: float) -> _Complaint:
             return
     across = max(math.dist(positions[0], place) for place in positions)
     if across < TINY_SHARE * pitch:
-        yield (
-            "sensor.positions_mm",
-            f"expected taxels about sensor.pitch_mm = {pitch:g} apart, got {across:g} mm from one end to the other;"
-            " are they in metres? multiply by 1000",
-        )
+        got = f"got {across:g} mm from one end to the other; are they in metres? multiply by 1000"
+        yield "sensor.positions_mm", f"expected taxels about sensor.pitch_mm = {pitch:g} apart, {got}"
 
 
 TINY_SHARE = 0.1
@@ -254,10 +249,8 @@ def _array_fits_wire(
         way_out = 'take a smaller one, or sensor.mode = "image"'
         if least < min(WINDOW_SIZES):
             way_out = f'the smallest window has {min(WINDOW_SIZES)}: set sensor.mode = "image"'
-        yield (
-            "sensor.window",
-            f"expected at most the {least} taxels of sensor.rows and columns, got {window}; {way_out}",
-        )
+        expects = f"expected at most the {least} taxels of sensor.rows and columns"
+        yield "sensor.window", f"{expects}, got {window}; {way_out}"
 
 
 def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Complaint:
@@ -271,10 +264,8 @@ def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Comp
         needs = "missing: a polled device needs it" if not wire.poll else 'only with wire.sampling = "polled"'
         yield "wire.poll", needs
     if wire.tare_images and wire.sampling == "sync":
-        yield (
-            "wire.tare_images",
-            'not with wire.sampling = "sync": nothing is sampled before the cycle; give unloaded_counts',
-        )
+        why = 'not with wire.sampling = "sync": nothing is sampled before the cycle; give unloaded_counts'
+        yield "wire.tare_images", why
     try:
         image = image_format(wire, rows, columns)
     except ProtocolError as error:
@@ -285,10 +276,8 @@ def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Comp
         if not low <= counts <= high:
             kind = "signed" if wire.signed else "unsigned"
             way = "; set wire.signed = true for two's complement" if counts < 0 and not wire.signed else ""
-            yield (
-                f"wire.{key}",
-                f"expected {low} to {high} in {image.bits} {kind} bits of wire.frames, got {counts}{way}",
-            )
+            expects = f"expected {low} to {high} in {image.bits} {kind} bits of wire.frames"
+            yield f"wire.{key}", f"{expects}, got {counts}{way}"
 
 
 def image_format(wire: WireSettings, rows: int, columns: int) -> ImageFormat:

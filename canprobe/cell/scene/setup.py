@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
 from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
+from canprobe.errors import UsageError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
@@ -178,11 +179,6 @@ class Array(Node):
     calibration: ArrayCalibration
     calibrated: bool = True
     raw: RawWire | None = None
-
-    @property
-    def full_scale(self) -> float:
-        """Pressure of a full count, Pa."""
-        return self.pad.full_scale_pa
 
     @property
     def newtons(self) -> str:
@@ -491,6 +487,24 @@ class Setup:
 
         return replace(self, scene=chosen(self.scene), saved=chosen(self.saved))
 
+    def needed_arm(self, what: str = "") -> Arm:
+        """The arm.
+
+        Args:
+            what: what needs one, for the message; empty: the scene.
+
+        Raises:
+            UsageError: there is none.
+        """
+        if self.arm is None:
+            raise UsageError(f"{what or self.name}: expected a scene with an arm; got one without")
+        return self.arm
+
+    @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives of the arm, joint by joint; none without one."""
+        return self.arm.drives if self.arm is not None else ()
+
     @property
     def touch(self) -> Touch | Calibrate | None:
         """The task, where it touches an object."""
@@ -516,8 +530,7 @@ class Setup:
         """The nodes that are emulated, ascending."""
         array = self.array
         arrays = (array,) if array is not None and array.raw is None else ()
-        nodes = (*(self.arm.drives if self.arm is not None else ()), *arrays)
-        return tuple(sorted(node.node_id for node in nodes if node.emulated))
+        return tuple(sorted(node.node_id for node in (*self.drives, *arrays) if node.emulated))
 
     @property
     def emulates(self) -> bool:

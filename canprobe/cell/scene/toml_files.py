@@ -5,6 +5,7 @@ A document is refused where it is nested deeper than any scene, before anybody w
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Mapping
@@ -18,7 +19,6 @@ WRITTEN_BY_KEY = "written_by"
 """Key above the sections of a file that canprobe wrote; its value names the version."""
 MAX_BYTES, MAX_DEPTH = 64 << 20, 32
 """Largest size of a TOML file, and deepest nesting of its tables and lists."""
-_ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
 def written_by_line() -> str:
@@ -55,18 +55,12 @@ def toml_value(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return f'"{"".join(map(_escaped, value))}"'
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
     if isinstance(value, dict):
         return f"{{{', '.join(f'{toml_key(key)} = {toml_value(item)}' for key, item in value.items())}}}"
     return repr(value) if isinstance(value, int | float) else str(value)
-
-
-def _escaped(character: str) -> str:
-    if character in _ESCAPES:
-        return _ESCAPES[character]
-    return f"\\u{ord(character):04X}" if ord(character) < 0x20 or ord(character) == 0x7F else character
 
 
 def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
@@ -76,9 +70,7 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
         SceneError: the file cannot be read, or is not TOML.
     """
     try:
-        text = regular_file(path, MAX_BYTES).read_text(
-            encoding="utf-8-sig"
-        )  # some editors begin with a byte order mark
+        text = regular_file(path, MAX_BYTES).read_text("utf-8-sig")  # some editors begin with a byte order mark
     except OSError as error:
         hint = else_what if isinstance(error, FileNotFoundError) else ""
         raise SceneError([f"{file}: cannot be read: {error.strerror}{hint}"]) from error

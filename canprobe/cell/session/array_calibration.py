@@ -276,8 +276,8 @@ def _scene(request: CalibrationRequest) -> Scene:
 def _under_probe(scene: Scene) -> Vec3:
     """The point under the probe in the start posture, mm."""
     setup = resolve(scene)
-    assert setup.arm is not None
-    centre = (forward(setup.arm.model.chain, setup.arm.q_start) @ setup.probe.T_flange_probe)[:3, 3]
+    arm = setup.needed_arm()
+    centre = (forward(arm.model.chain, arm.q_start) @ setup.probe.T_flange_probe)[:3, 3]
     x, y, z = (1e3 * (centre - (0.0, 0.0, setup.probe.radius + POINT_BELOW_PROBE_M))).round(1).tolist()
     return x, y, z
 
@@ -291,8 +291,8 @@ def _plan(scene: Scene, visit: Visit) -> Plan:
     where = f"{visit.known.name} at ({', '.join(f'{value:g}' for value in scene.task.start_mm)}) mm"
     try:
         plan = make_plan(resolve(scene))
-        arm, task = plan.setup.arm, plan.setup.task
-        assert arm is not None and isinstance(task, Touch)
+        arm, task = plan.setup.needed_arm(), plan.setup.task
+        assert isinstance(task, Touch)
         x = (forward(arm.model.chain, arm.q_start) @ task.probe.T_flange_probe)[:3, 0]
         poses = _roll_task(plan, visit).poses(x)
         if problems := reach_problems(plan.setup, task, [(pose.centre, -pose.pole) for pose in poses]):
@@ -305,9 +305,7 @@ def _plan(scene: Scene, visit: Visit) -> Plan:
 
 def _turned(scene: Scene) -> Scene | None:
     """The scene with the last joint half a turn further; None where it cannot go there."""
-    setup = resolve(scene)
-    assert setup.arm is not None
-    last = setup.arm.model.joints[-1]
+    last = resolve(scene).needed_arm().model.joints[-1]
     name, joint = list(scene.joints.items())[-1]
     for turn in (180.0, -180.0):
         q = math.radians(joint.start_deg + turn)
@@ -368,8 +366,7 @@ def _read(ask: Ask | None, force: float) -> float:
 
 def _along_rod(plan: Plan, known: KnownObject) -> float:
     """Heading of a rod's axis on the pad, rad."""
-    arm, probe = plan.setup.arm, plan.setup.probe
-    assert arm is not None
+    arm, probe = plan.setup.needed_arm(), plan.setup.probe
     x, y = (forward(arm.model.chain, arm.q_start) @ probe.T_flange_probe)[:2, 0].tolist()
     # seen from outside the pad looks down: its v axis is on the other side
     return math.atan2(y, x) - known.angle

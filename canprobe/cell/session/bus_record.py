@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.planning.measured import TrafficMeter
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.wire_time import unstuffed_frame_bits
+from canprobe.cell.scene.hardware import BusSettings
 from canprobe.cell.session.folder import prepare_folder
 from canprobe.cell.session.target import LOCKSTEP
 from canprobe.fieldbus.bus.candump import CandumpWriter
 from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.bus.port import TimedFrame, is_bus_error
-from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits
 
 Write = Callable[[int, bytes, int], None]
 
@@ -26,15 +26,15 @@ class TrafficCounter:
     """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
 
     Args:
-        speed_up: data bit rate of CAN FD over the nominal one.
+        bus: bit rates of the bus.
 
     Attributes:
         error_frames: number of bus errors; whoever receives one counts it here.
     """
 
-    def __init__(self, speed_up: float) -> None:
+    def __init__(self, bus: BusSettings) -> None:
         self._by_length = [0] * 65
-        self._speed_up = speed_up
+        self._bus = bus
         self.error_frames = 0
 
     @property
@@ -45,9 +45,8 @@ class TrafficCounter:
     @property
     def bits(self) -> int:
         """Number of bits so far, those of a data phase in bits of the nominal rate."""
-        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
-        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
-        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
+        counted = enumerate(self._by_length)
+        return sum(count * unstuffed_frame_bits(n, self._bus) for n, count in counted if count)
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame."""
@@ -89,9 +88,7 @@ class BusRecord:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def writer(self, channel: str) -> Write:
@@ -105,7 +102,7 @@ class BusRecord:
         if bus.interface == LOCKSTEP:
             self.traffic[channel] = self.meters[channel] = TrafficMeter(self._plan, channel, exact=False)
         else:
-            self.traffic[channel] = TrafficCounter(bus.data_bitrate / bus.bitrate)
+            self.traffic[channel] = TrafficCounter(bus)
         write: Write = self.traffic[channel].write
         if self._out is not None:
             if self._candump is None:

@@ -161,7 +161,7 @@ class RealBuses(SessionBuses):
     def __init__(self, plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitStack) -> None:
         super().__init__(plan, options, files, stack)
         self._open_ports = stack.enter_context(ExitStack())  # left last, also those that were opened again
-        self._record: BusRecord | None = None
+        self._record: BusRecord  # once opened
 
     def open(self, record: BusRecord) -> Port:
         bus = self._plan.scene.bus
@@ -176,7 +176,6 @@ class RealBuses(SessionBuses):
         return self._open(record, clock)
 
     def reopen(self, port: Port) -> Port:
-        assert self._record is not None
         check_links(self._plan.scene.bus.interface, expected_of(self._plan), quiet)
         return self._open(self._record, port.clock)
 
@@ -195,7 +194,6 @@ class RealBuses(SessionBuses):
         """Start the process of the emulated nodes, if there are any."""
         if not self._plan.setup.emulates:
             return
-        assert self._record is not None
         self._options.say("start the emulated nodes")
         channels, truth = list(self._plan.emulated_channels), self._options.rows_kept is None
         child = EmulatorChild(self._plan, self._options.out, channels, truth=truth, origin_ns=self._record.origin_ns)

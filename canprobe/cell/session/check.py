@@ -12,21 +12,14 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.first_second import link_limits
 from canprobe.cell.session.links import SOCKETCAN
-from canprobe.cell.session.session import Session
+from canprobe.cell.session.session import Session, link_limits
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.fieldbus.bus.port import ControllerState, Port
 from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.fieldbus.tools.link import (
-    Fitness,
-    LinkFigures,
-    LinkMeter,
-    LinkVerdict,
-    judge_link,
-)
+from canprobe.fieldbus.tools.link import Fitness, LinkFigures, LinkMeter, LinkVerdict, judge_link
 from canprobe.fieldbus.tools.link.figures import IDLE_FAST_NS, quantile, us
 from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, wake_lateness
 
@@ -215,11 +208,10 @@ def _controller(plan: Plan) -> str:
 
 def _traffic(plan: Plan) -> dict[str, Any]:
     """What a meter has to know of a plan."""
-    arm = plan.setup.arm.node_ids if plan.setup.arm is not None else ()
     answers = {
         pdo.cob_id: pdo.node_id
-        for node_id in arm
-        for pdo in plan.pdos_of(node_id, "tpdo")
+        for drive in plan.setup.drives
+        for pdo in plan.pdos_of(drive.node_id, "tpdo")
         if pdo.transmission_type == 1
     }
     bases = (EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE)

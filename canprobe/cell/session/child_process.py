@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, NoReturn
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,7 +177,9 @@ class EmulatorChild(ChildProcess):
             now = clock.now_ns()
             self.raise_ended()
             if now >= deadline:
-                self._raise_late(min(waiting, default=0))
+                allowed = f"within {self._scene.bring_up.emulated_s:g} s, and its process still runs"
+                why = f"the emulated node did not boot {allowed}: a busier machine needs a larger [bring_up] emulated_s"
+                raise NodeError(min(waiting, default=0), why)
             if now >= report:
                 say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
                 report += round(REPORT_EVERY_S * 1e9)
@@ -201,13 +203,6 @@ class EmulatorChild(ChildProcess):
         if self._scene.sensor is None or self._scene.array_is_node or not self._scene.sensor.emulated:
             return True
         return SERVING_WORD.encode() in (self.folder / ERRORS).read_bytes()  # leaves the child's place in it
-
-    def _raise_late(self, node_id: int) -> NoReturn:
-        raise NodeError(
-            node_id,
-            f"the emulated node did not boot within {self._scene.bring_up.emulated_s:g} s, and its process still runs:"
-            " a busier machine needs a larger [bring_up] emulated_s",
-        )
 
     def end(self) -> dict[str, NDArray[np.float64]]:
         """Stop the process, by stronger signals where it does not end; the plant's truth where it left any."""

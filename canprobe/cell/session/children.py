@@ -9,7 +9,6 @@ import importlib
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from canprobe.cell.master.controller import Controller
@@ -63,9 +62,7 @@ class Bridges:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end(None)
 
     def open_to_requests(self, task: Controller | None, make: Callable[[], Controller] | None = None) -> Controller:

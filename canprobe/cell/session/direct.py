@@ -10,7 +10,7 @@ Heartbeats and emergencies, which a node sends by itself, are handed over unchan
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,13 +21,12 @@ from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.emulated.world import World
 from canprobe.cell.master.array import TactileReceiver
 from canprobe.cell.master.cycle import Cycle
-from canprobe.cell.master.drives import DriveCommand, DriveGroup
+from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
-from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
 from canprobe.fieldbus.drive.drive import DriveApplication
@@ -40,97 +39,6 @@ from canprobe.fieldbus.protocol.sdo import SdoAbort
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 
 HEARTBEAT_CONSUMER = 0x1016
-Hear = Callable[[int, bytes, int], object]
-"""Called with (can_id, data, t_ns)."""
-
-
-class DirectNodes:
-    """The emulated nodes of a world, reached without a bus.
-
-    Args:
-        world: the world with all nodes of the plan.
-        plan: the plan, which has their configuration.
-        hear: takes the frames that a node sends by itself.
-        see: takes the array's frames.
-    """
-
-    def __init__(self, world: World, plan: Plan, hear: Hear, see: Callable[[TactileFrame], None]) -> None:
-        self._nodes = world.nodes
-        self._recorder = world.recorder
-        self._setups = {setup.node_id: setup for setup in plan.configurations}
-        self._hear = hear
-        self._see = see
-        self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
-        self._drives = plan.setup.arm.node_ids if plan.setup.arm is not None else ()
-        self._stations = [(node.core, node.pdos.exchange, node.node_id in self._drives) for node in world.nodes]
-        self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
-        self._plan = plan
-
-    def start(self, t_ns: int) -> None:
-        """Power on, configure and start all nodes, so that they are operational at `t_ns`.
-
-        Raises:
-            NodeError: when a node refuses a required write.
-        """
-        power_on_ns = t_ns - max(node.core.quirks.boot_ns for node in self._nodes)
-        for node in self._nodes:
-            node.start(power_on_ns)
-            node.advance(t_ns)
-            configure(node, self._setups[node.node_id])
-            if isinstance(node.application, TactileApplication):
-                node.application.publish = partial(self._publish, node)
-        for node in self._nodes:
-            self._pass_on(node.receive(*pack_nmt(NmtCommand.START, node.node_id), t_ns), t_ns)
-        by_id = {node.node_id: node for node in self._nodes}
-        for node_id in self._drives:
-            for pdo in self._plan.pdos_of(node_id, "rpdo"):
-                rpdo = by_id[node_id].pdos.rpdo(pdo.cob_id)
-                self._rpdos.setdefault(pdo.cob_id, []).append((by_id[node_id].core, rpdo))
-
-    def advance(self, t_ns: int) -> None:
-        """Let every node do what is due up to and at `t_ns`, in the order of time."""
-        nodes = self._nodes
-        while True:
-            first = min([due for node in nodes if (due := node.next_deadline_ns) is not None], default=t_ns + 1)
-            if first > t_ns:
-                return
-            for node in nodes:
-                if node.next_deadline_ns == first:
-                    self._pass_on(node.advance(first), first)
-
-    def sync(self, t_ns: int, counter: int, take: Callable[[int, tuple[int, ...], int], None]) -> None:
-        """A SYNC: every node latches its targets and samples.
-
-        Args:
-            t_ns: time of the SYNC.
-            counter: counter of the SYNC; 0 where it has none.
-            take: called with the COB-ID of each TPDO of a drive, its values, and the time.
-        """
-        for core, exchange, of_drive in self._stations:
-            core.now_ns = t_ns
-            filled = exchange(t_ns, counter)
-            if of_drive:
-                for cob_id, values in filled:
-                    take(cob_id, values, t_ns)
-            if core.out:
-                frames, core.out = core.out, []
-                self._pass_on(frames, t_ns)
-        if self._recorder is not None:
-            self._recorder.receive(SYNC_ID, bytes((counter,)), t_ns)
-
-    def command(self, commands: Sequence[DriveCommand], t_ns: int) -> None:
-        """Give the RPDOs to the drives; each part of one is for one drive."""
-        for cob_id, _, parts in commands:
-            for (core, rpdo), values in zip(self._rpdos[cob_id], parts, strict=True):
-                core.now_ns = t_ns
-                rpdo.take(values)
-
-    def _pass_on(self, frames: Sequence[Frame], t_ns: int) -> None:
-        for can_id, data in frames:
-            self._hear(can_id, data, t_ns)
-
-    def _publish(self, node: SlaveNode, header: TactileHeader, content: NDArray[np.uint8] | Features) -> None:
-        self._see(tactile_frame(header, content, self._shape, node.core.now_ns))
 
 
 def tactile_frame(
@@ -167,7 +75,7 @@ def configure(node: SlaveNode, setup: NodeConfiguration) -> None:
         else:
             taken = write is not times[0][0] or any(all(_takes(node.dictionary, w) for w in time) for time in times)
         if not taken:
-            raise NodeError(node.node_id, f"({setup.name}) refuses {write.place} = {write.value:#x} ({write.purpose})")
+            raise setup.error(f"refuses {write.place} = {write.value:#x} ({write.purpose})")
     if isinstance(node.application, DriveApplication):
         node.application.parts.parameters.patience_ns = 0
 
@@ -187,10 +95,13 @@ def _takes(dictionary: Dictionary, write: Write) -> bool:
 
 
 class DirectCycle(Cycle):
-    """A cycle whose SYNC, TPDOs and RPDOs are calls; for its arguments see `Cycle`.
+    """A cycle whose SYNC, TPDOs and RPDOs are calls of emulated nodes; for its other arguments see `Cycle`.
 
     Args:
-        world: the emulated nodes; they become operational here.
+        world: the world with all nodes of the plan; they become operational here.
+
+    Raises:
+        NodeError: a node refuses a required write.
     """
 
     def __init__(
@@ -210,19 +121,75 @@ class DirectCycle(Cycle):
         self._counter = 0
         self._commands = drives.commands if drives is not None else tuple
         self._take = drives.take if drives is not None else nothing
-        self._nodes = DirectNodes(world, plan, watch.push, tactile.put if tactile is not None else nothing)
-        self._nodes.start(self._clock.now_ns())
+        self._see = tactile.put if tactile is not None else nothing
+        self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
+        self._nodes, self._recorder = world.nodes, world.recorder
+        self._start({setup.node_id: setup for setup in plan.configurations}, port.clock.now_ns())
+        by_id, of_drives = {node.node_id: node for node in self._nodes}, [drive.node_id for drive in plan.setup.drives]
+        self._stations = [(node.core, node.pdos.exchange, node.node_id in of_drives) for node in self._nodes]
+        self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
+        for node_id in of_drives:
+            for pdo in plan.pdos_of(node_id, "rpdo"):
+                rpdo = by_id[node_id].pdos.rpdo(pdo.cob_id)
+                self._rpdos.setdefault(pdo.cob_id, []).append((by_id[node_id].core, rpdo))
+
+    def _start(self, setups: Mapping[int, NodeConfiguration], t_ns: int) -> None:
+        """Power on, configure and start all nodes, so that they are operational at `t_ns`."""
+        power_on_ns = t_ns - max(node.core.quirks.boot_ns for node in self._nodes)
+        for node in self._nodes:
+            node.start(power_on_ns)
+            node.advance(t_ns)
+            configure(node, setups[node.node_id])
+            if isinstance(node.application, TactileApplication):
+                node.application.publish = partial(self._publish, node)
+        for node in self._nodes:
+            self._pass_on(node.receive(*pack_nmt(NmtCommand.START, node.node_id), t_ns), t_ns)
 
     def send_sync(self, counter: int | None) -> None:
         self.sync_ns = self._clock.now_ns()
-        self._nodes.advance(self.sync_ns)
+        self._advance(self.sync_ns)
         self._counter = counter or 0
 
     def collect(self) -> None:
-        self._nodes.sync(self.sync_ns, self._counter, self._take)
-        look_ns = self.sync_ns + self._first_look_ns
+        """Every node latches its targets and samples, and the drives send their TPDOs."""
+        t_ns, counter, take = self.sync_ns, self._counter, self._take
+        for core, exchange, of_drive in self._stations:
+            core.now_ns = t_ns
+            filled = exchange(t_ns, counter)
+            if of_drive:
+                for cob_id, values in filled:
+                    take(cob_id, values, t_ns)
+            if core.out:
+                frames, core.out = core.out, []
+                self._pass_on(frames, t_ns)
+        if self._recorder is not None:
+            self._recorder.receive(SYNC_ID, bytes((counter,)), t_ns)
+        look_ns = t_ns + self._first_look_ns
         self._clock.sleep_until_ns(look_ns)
-        self._nodes.advance(look_ns)
+        self._advance(look_ns)
 
     def send_commands(self) -> None:
-        self._nodes.command(self._commands(), self.sync_ns + self._first_look_ns)
+        """Give the RPDOs to the drives; each part of one is for one drive."""
+        t_ns = self.sync_ns + self._first_look_ns
+        for cob_id, _, parts in self._commands():
+            for (core, rpdo), values in zip(self._rpdos[cob_id], parts, strict=True):
+                core.now_ns = t_ns
+                rpdo.take(values)
+
+    def _advance(self, t_ns: int) -> None:
+        """Let every node do what is due up to and at `t_ns`, in the order of time."""
+        nodes = self._nodes
+        while True:
+            first = min([due for node in nodes if (due := node.next_deadline_ns) is not None], default=t_ns + 1)
+            if first > t_ns:
+                return
+            for node in nodes:
+                if node.next_deadline_ns == first:
+                    self._pass_on(node.advance(first), first)
+
+    def _pass_on(self, frames: Sequence[Frame], t_ns: int) -> None:
+        for can_id, data in frames:
+            self._watch.push(can_id, data, t_ns)
+
+    def _publish(self, node: SlaveNode, header: TactileHeader, content: NDArray[np.uint8] | Features) -> None:
+        self._see(tactile_frame(header, content, self._shape, node.core.now_ns))

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.npz import write_npz
@@ -29,14 +29,11 @@ from canprobe.fieldbus.bus.presence import answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import check_eds
+from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
-
-if TYPE_CHECKING:
-    from canprobe.fieldbus.bus.virtual.lockstep import Participant
-    from canprobe.fieldbus.node.slave_node import SlaveNode
-
 
 ALL_CYCLES_PERCENT = 100
 """`limits.late_cycles_max_percent` with which late cycles stop nothing."""
@@ -318,11 +315,6 @@ def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
 
     if folder is not None:
         for node in nodes:
-            keep_in_file(node, folder / _file_name(node))
-
-
-def _file_name(node: SlaveNode) -> str:
-    """File of a node: named by its id, or by its serial number where it has no id yet."""
-    if node.node_id != UNCONFIGURED_ID:
-        return f"node{node.node_id:03}.json"
-    return f"serial{node.dictionary.number(0x1018, 4):08x}.json"
+            unnamed = node.node_id == UNCONFIGURED_ID  # it has no id yet, and its serial number names its file
+            name = f"serial{node.dictionary.number(0x1018, 4):08x}" if unnamed else f"node{node.node_id:03}"
+            keep_in_file(node, folder / f"{name}.json")

@@ -10,16 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.folder import record_file
+from canprobe.cell.tasks.joint_finding import JointFinding
 from canprobe.errors import UsageError
-
-if TYPE_CHECKING:
-    from canprobe.cell.master.bringup import BringUp
-    from canprobe.cell.tasks.joint_finding import JointFinding
 
 WHAT_CHANGED = {
     "joint": "node id",
@@ -47,7 +45,7 @@ class JointRecord:
     def __init__(self, plan: Plan) -> None:
         arm = plan.setup.arm
         self._plan = plan
-        self._axes = {} if arm is None else {d.node_id: axis for axis, d in enumerate(arm.drives) if not d.emulated}
+        self._axes = {drive.node_id: axis for axis, drive in enumerate(plan.setup.drives) if not drive.emulated}
         self.node_ids = tuple(self._axes)
         self.path = record_file("joints", arm) if arm is not None and self._axes else None
         self._record = NodeRecord(self.path, "check the joints again")
@@ -89,8 +87,7 @@ class JointRecord:
 
     def _settings(self, axis: int, serial: int | None) -> dict[str, Any]:
         """The values with which what was seen is valid, as JSON gives them back; None where one is not known."""
-        arm = self._plan.setup.arm
-        assert arm is not None
+        arm = self._plan.setup.needed_arm()
         drive, model = arm.drives[axis], arm.model
         identity = next(node.identity for node in self._plan.nodes if node.node_id == drive.node_id)
         return {

@@ -76,10 +76,7 @@ def expected_of(plan: Plan) -> dict[str, ExpectedLink]:
 
 def check_link(link: LinkState, expected: ExpectedLink) -> list[Remark]:
     """All findings about an interface; none for a virtual one."""
-    if link.kind in VIRTUAL_KINDS:
-        return []
-    checks = (_rates, _modes, _state, _sample_point, _restart, _queue)
-    return [remark for check in checks for remark in check(link, expected)]
+    return [] if link.kind in VIRTUAL_KINDS else [*_remarks(link, expected)]
 
 
 def controller_trouble(link: LinkState, *, typed: bool = True) -> str | None:
@@ -106,31 +103,36 @@ def _restart_line(link: LinkState) -> str:
     return f"then type: {ip_line(f'{link.name} type can restart')}"
 
 
-def _rates(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
+def _remarks(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
+    name, line = link.name, setting_line(link.name, expected.bitrate, expected.data_bitrate)
     pairs = [("bit rate", link.bitrate, expected.bitrate)]
     if expected.data_bitrate is not None:
         pairs.append(("data bit rate", link.data_bitrate, expected.data_bitrate))
     for what, have, want in pairs:
         if have is not None and abs(have - want) > RATE_TOLERANCE * want:
             whose = "the scene's" if expected.of_scene else "the one asked for"
-            yield Remark(True, f"its {what} is {have} bit/s, {whose} {want}; type: {_line(link, expected)}")
-
-
-def _line(link: LinkState, expected: ExpectedLink) -> str:
-    return setting_line(link.name, expected.bitrate, expected.data_bitrate)
-
-
-def _modes(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
-    name = link.name
+            yield Remark(True, f"its {what} is {have} bit/s, {whose} {want}; type: {line}")
     for mode, what in (("LISTEN-ONLY", "cannot send"), ("LOOPBACK", "hears only itself")):
         if mode in link.modes and expected.frames_at_once:
             off = ip_line(f"{name} down", f"{name} type can {mode.lower()} off", f"{name} up")
             yield Remark(True, f"it is in {mode.lower()} mode and {what}; type: {off}")
     if "ONE-SHOT" in link.modes:
         yield Remark(False, "it is in one-shot mode: a frame that loses the arbitration is not sent again")
+    yield from _state(link)
+    low, best, high = SLOW_SAMPLE_POINTS if expected.bitrate <= MAX_SLOW_BITRATE else FAST_SAMPLE_POINTS
+    point = link.sample_point
+    if point is not None and not low - 1e-3 <= point <= high + 1e-3:
+        at = f"{100 * point:.1f} % of the bit, {100 * best:g} % is recommended at {expected.bitrate} bit/s"
+        yield Remark(False, f"it samples at {at}; type: {line}")
+    if link.restart_ms == 0 and expected.frames_at_once:
+        stays = "after a bus-off it stays off until somebody restarts it"
+        yield Remark(False, f"restart-ms is 0: {stays}; type: {line}")
+    if link.tx_queue is not None and link.tx_queue < expected.frames_at_once:
+        holds = f"its queue holds {link.tx_queue} frames, and {expected.frames_at_once} may be sent at once"
+        yield Remark(False, f"{holds}; type: {ip_line(f'{name} txqueuelen {TX_QUEUE_FRAMES}')}")
 
 
-def _state(link: LinkState, _: ExpectedLink) -> Iterator[Remark]:
+def _state(link: LinkState) -> Iterator[Remark]:
     if (trouble := controller_trouble(link)) is not None:
         yield Remark(link.state == "BUS-OFF", f"it is {trouble}")
     elif link.state == "ERROR-WARNING":
@@ -149,34 +151,6 @@ def _symptom(link: LinkState) -> str:
     if sent == heard:
         return f"{unheard}; or {broken}"
     return unheard if sent > heard else broken
-
-
-def _sample_point(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
-    low, best, high = SLOW_SAMPLE_POINTS if expected.bitrate <= MAX_SLOW_BITRATE else FAST_SAMPLE_POINTS
-    point = link.sample_point
-    if point is not None and not low - 1e-3 <= point <= high + 1e-3:
-        yield Remark(
-            False,
-            f"it samples at {100 * point:.1f} % of the bit, {100 * best:g} % is recommended at"
-            f" {expected.bitrate} bit/s; type: {_line(link, expected)}",
-        )
-
-
-def _restart(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
-    if link.restart_ms == 0 and expected.frames_at_once:
-        yield Remark(
-            False,
-            f"restart-ms is 0: after a bus-off it stays off until somebody restarts it; type: {_line(link, expected)}",
-        )
-
-
-def _queue(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
-    if link.tx_queue is not None and link.tx_queue < expected.frames_at_once:
-        yield Remark(
-            False,
-            f"its queue holds {link.tx_queue} frames, and {expected.frames_at_once} may be sent at once;"
-            f" type: {ip_line(f'{link.name} txqueuelen {TX_QUEUE_FRAMES}')}",
-        )
 
 
 SOCKETCAN = "socketcan"

@@ -206,11 +206,8 @@ class Recovery:
                 cell.stop()
                 self._doubted |= cell.bring_up.booted_again()
                 self._released |= cell.bring_up.released
-                if (
-                    isinstance(error, UnhomedError)
-                    or not isinstance(error, BusError)
-                    or self._tries == BRING_UP_ATTEMPTS
-                ):
+                passes = isinstance(error, BusError) and not isinstance(error, UnhomedError)
+                if not passes or self._tries == BRING_UP_ATTEMPTS:
                     raise
                 self._say(f"not back yet: {error}")
                 if isinstance(error, InterfaceError):

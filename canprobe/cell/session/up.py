@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
 
+from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
@@ -20,12 +21,8 @@ from canprobe.cell.tasks.joint_check import JointCheck
 from canprobe.cell.tasks.joint_finding import Answer, JointFinding, Operator, SeenWay
 from canprobe.errors import NodeError, ResultsError, UsageError
 from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.cell.master.cell import Cell
-    from canprobe.cell.planning.model import Plan
-    from canprobe.mechanics.robot.model import ArmModel
 
 ROWS_OF_UP = 4000
 """Number of cycles whose rows are kept: `up` runs for days."""
@@ -122,8 +119,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
     plan = make_plan(resolve(scene))
-    assert plan.setup.arm is not None
-    arm, check, record = plan.setup.arm, JointCheck(plan, operator), JointRecord(plan)
+    arm, check, record = plan.setup.needed_arm(), JointCheck(plan, operator), JointRecord(plan)
     serials: dict[int, int] = {}
     try:
         with Session(plan, RunOptions(say=say, rows_kept=ROWS_OF_UP)) as session:
@@ -198,8 +194,7 @@ def homed_of(plan: Plan, joints: Sequence[int] | None) -> list[int]:
     Raises:
         UsageError: one of them, or all where none is given, has an absolute encoder or does not exist.
     """
-    arm = plan.setup.arm
-    homed = [i for i, drive in enumerate(arm.drives) if drive.zero] if arm is not None else []
+    homed = [i for i, drive in enumerate(plan.setup.drives) if drive.zero]
     wanted = homed if joints is None else [joint - 1 for joint in joints]
     if not wanted or (others := set(wanted) - set(homed)):
         which = "no joint" if joints is None else f"joint {min(others) + 1}"

@@ -45,6 +45,7 @@ class CalibrateTask(ProbingTask):
 
     def __init__(self, plan: Plan, task: Calibrate, sensing: ContactSensing) -> None:
         super().__init__(plan, task.lag_s, sensing, holds=True)
+        self._phases |= {Phase.APPROACH: self._approach, Phase.SETTLE: self._settle, Phase.SCAN: self._scan}
         sensing.set_kappa(np.full(2, 1.0 / task.ball_radius))
         radii = sensing.radius + task.ball_radius
         self._ball = BallModel(sensing.flange_probe[:3, 3], task.ball_centre, radii, sigma_c=task.ball_sigma)
@@ -57,16 +58,10 @@ class CalibrateTask(ProbingTask):
         self._push = PushFit()
         self._depths: list[tuple[float, float]] = []
 
-    def retreat(self, reason: str) -> None:
-        if self.reason is None and self.phase is not Phase.DONE and self._motion is not None:
-            self.reason = reason
-            self._let_go()
-
     def stop(self) -> None:
         """Let go, and estimate from the touches so far."""
         self._number = len(self._task.approaches)
-        if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
-            self._let_go()
+        super().stop()
 
     def record(self) -> TaskRecord:
         return replace(super().record(), tool=self.estimate)
@@ -102,7 +97,7 @@ class CalibrateTask(ProbingTask):
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:
-        self._begin(self._stay())
+        self._begin(self._motion.pose)
 
     def _approach(self) -> ProbePose:
         self._gone = self._task.approach.speed * self._t - self._task.approach.clearance
@@ -164,5 +159,5 @@ class CalibrateTask(ProbingTask):
         return [replace(touch, depth=touch.depth * float(pushed / felt)) for touch in self.touches]
 
     def _let_go(self) -> None:
-        n = self._stay().centre - self._ball.c_base
+        n = self._motion.pose.centre - self._ball.c_base
         self._draw_back(n / np.linalg.norm(n) * (self._task.approach.clearance + EXTRA_CLEARANCE_M))

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.tasks.probing import Phase
-from canprobe.cell.tasks.regain import SEARCH_SPEED, Search
-from canprobe.cell.tasks.task import Exploration, TaskRecord
-from canprobe.cell.tasks.touch import RAMP_S, TouchTask
+from canprobe.cell.tasks.task import TaskRecord
+from canprobe.cell.tasks.touch import RAMP_S, SEARCH_SPEED, Search, TouchTask
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
 from canprobe.mechanics.touch.explore.ground import UNKNOWN_M, GroundCells
@@ -53,7 +53,7 @@ class ExploreTask(TouchTask):
         explorer: what leads the contact; None before the touch.
     """
 
-    explorer: Explorer | None = None
+    explorer: Explorer  # from the first touch on
     _brake_from: float | None = None
     _near_rim = False
     _ends = False
@@ -90,59 +90,49 @@ class ExploreTask(TouchTask):
         return self.explorer, self._task.approach.start
 
     def record(self) -> TaskRecord:
-        explored = None if self.explorer is None else end_of(self.explorer, self._scan_t, over=not self._ends)
+        explored = end_of(self.explorer, self._scan_t, over=not self._ends) if self._touched else None
         return replace(super().record(), explored=explored)
 
     def update(self) -> None:
         """The work of estimator and map, and one share of the exploration's."""
         due = not self._updated
         super().update()
-        if due and self.phase is Phase.SCAN and self.explorer is not None:
+        if due and self.phase is Phase.SCAN:
             self.explorer.work()
 
     def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         contact = super()._feel(sample, patch)
-        if self.phase is Phase.SCAN and contact is not None and self.explorer is not None:
+        if self.phase is Phase.SCAN and contact is not None:
             from_edge = self._task.array.pad.reach_m - max(abs(patch.u), abs(patch.v))
             self._near_rim = from_edge < self._rim
             self.explorer.walk(contact.p_base, contact.n_base, contact.force_n / self.targets["target_force_n"])
+            places = self.explorer.ground.in_base(self.explorer.ahead(AHEAD)).tolist()
+            ahead = [self._servo.surface.foot(place)[0] for place in places]
             self._columns = self._columns | {
                 "explored_mm": 1e3 * self.explorer.path,
                 "explored_sigma_um": 1e6 * self.explorer.ground.largest,
                 "explored_within": float(np.mean(self.explorer.ground.sigma <= self.explorer.ground.target)),
-                "explored_ahead_mm": 1e3 * self._ahead(self.explorer),
+                "explored_ahead_mm": 1e3 * np.array(ahead),
             }
         return contact
 
-    def _ahead(self, explorer: Explorer) -> Floats:
-        """(AHEAD, 3) points of the path ahead on the servo's local surface, base frame, m."""
-        assert self._servo is not None
-        places = explorer.ground.in_base(explorer.ahead(AHEAD))
-        return np.array([self._servo.surface.foot(place)[0] for place in places.tolist()])
-
     def _watch(self) -> None:
-        if self.phase is Phase.SCAN and self.explorer is not None:
+        if self.phase is Phase.SCAN:
             if self.explorer.astray and self._touch.limits.regain > 0.0:
                 self._look_for_contact()
-            elif self._ground_ends(self.explorer):
-                self._brake()
+            elif self.explorer.at_edge or self._near_rim or self._motion.near_limit(LIMIT_S):
+                self._brake()  # the probe turns round an edge, or the array or a joint ends
         super()._watch()
-
-    def _ground_ends(self, explorer: Explorer) -> bool:
-        """Whether the probe turns round an edge, the contact comes to the array's edge, or a joint to its limit."""
-        assert self._motion is not None
-        return explorer.at_edge or self._near_rim or self._motion.near_limit(LIMIT_S)
 
     def _at_hollow(self, radius: float) -> None:
         self._brake()
 
     def _brake(self) -> None:
         """Begin to turn back, unless the contact goes back already."""
-        if self._brake_from is None and self.explorer is not None and not self.explorer.going_back:
+        if self._brake_from is None and not self.explorer.going_back:
             self._brake_from = self._scan_t
 
     def _pace(self, left: float) -> float:
-        assert self.explorer is not None
         if not self._ends and not self.explorer.ground.wanting.any():
             self._ends = True
             self._task = replace(self._task, duration_s=self._scan_t + RAMP_S)
@@ -157,7 +147,6 @@ class ExploreTask(TouchTask):
         return 0.0
 
     def _scan(self) -> ProbePose:
-        assert self.explorer is not None
         pose = super()._scan()
         if not self._gone or np.linalg.norm(pose.centre - self._gone[-1].centre) > STEP_M:
             self._gone.append(pose)
@@ -166,7 +155,6 @@ class ExploreTask(TouchTask):
     def _look_for_contact(self) -> None:
         """Return to where the contact was, in the air over the path."""
         super()._look_for_contact()
-        assert self.explorer is not None and self._motion is not None
         self._brake_from = None
         self.explorer.turn_back(without=BACK_M)
         self._search = Return([self._motion.pose, *reversed(self._gone)])
@@ -200,8 +188,18 @@ class Return(Search):
         return max(0.0, SEARCH_SPEED * (t - float(self._times[-1])) - LIFT_M)
 
 
-def end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
-    """The end of an exploration of a duration, s, whose time was over or which had nothing more to gain."""
+def end_of(explorer: Explorer, seconds: float, *, over: bool) -> dict[str, Any]:
+    """The section ``explore`` of ``summary.json``.
+
+    Args:
+        explorer: at the end of its way.
+        seconds: time of the scan, s.
+        over: its time was over; else it had nothing more to gain.
+
+    Returns:
+        The largest stated deviation is None where a cell was not touched. The shares of the rectangle are those within
+        the target, beyond where the contact turned back, and where contacts contradict every smooth surface.
+    """
     ground = explorer.ground
     target, sigma, is_open = ground.target, ground.sigma, ~ground.closed
     within = is_open & (sigma <= target)
@@ -224,15 +222,17 @@ def end_of(explorer: Explorer, seconds: float, *, over: bool) -> Exploration:
         )
     if over and ground.wanting.any():
         causes.append(f"the time was over with {100 * ground.wanting.mean():.0f} % still above what can be reached")
-    return Exploration(
-        target=target,
-        sigma_max=ground.largest if ground.largest < UNKNOWN_M else None,
-        common=ground.common,
-        path=explorer.path,
-        seconds=seconds,
-        done=float(within.mean()),
-        closed=float(ground.closed.mean()),
-        rough=float(rough.mean()),
-        reached=bool(within.all()),
-        why=None if within.all() else "; ".join(causes) or "the last cells are within a tenth of what can be reached",
-    )
+    reached = bool(within.all())
+    why = None if reached else "; ".join(causes) or "the last cells are within a tenth of what can be reached"
+    return {
+        "target_sigma_um": 1e6 * target,
+        "sigma_max_um": 1e6 * ground.largest if ground.largest < UNKNOWN_M else None,
+        "reached": reached,
+        "why_not": why,
+        "path_mm": 1e3 * explorer.path,
+        "time_s": seconds,
+        "done_fraction": float(within.mean()),
+        "closed_fraction": float(ground.closed.mean()),
+        "rough_fraction": float(rough.mean()),
+        "common_sigma_um": 1e6 * ground.common,
+    }

@@ -57,15 +57,11 @@ class ListenTask(Task):
     resumable = True
 
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
-        self._reader = PatchReader(calibration)
+        self.reader: PatchReader = PatchReader(calibration)
         self._left = duration_s
         self._period = period_s
         self.taxels: NDArray[np.uint8] | None = None
         self._columns: dict[str, float | Floats] = {}
-
-    @property
-    def reader(self) -> PatchReader:
-        return self._reader
 
     def record(self) -> TaskRecord:
         return TaskRecord(taxels=self.taxels)
@@ -74,7 +70,7 @@ class ListenTask(Task):
         self._left -= self._period
         if measurement.tactile is not None:
             self.taxels = measurement.tactile.frame.taxels
-            patch = self._reader.read(measurement.tactile)
+            patch = self.reader.read(measurement.tactile)
             self._columns = {
                 "sample_cycle": float(measurement.tactile.cycle),
                 **force_columns(patch),

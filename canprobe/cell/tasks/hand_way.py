@@ -1,25 +1,33 @@
-"""The way of a motion that a person asks for: where it goes, how fast it may be, and why it may not be gone.
+"""A motion that a person asks for: its way, why it may not be gone, and the controller that follows it.
 
 A way is known as a whole before it begins: joint positions along it, close to each other. So limits, keep-out places
-and the speed of each joint are looked at before anything moves; what happens on it is `cell.tasks.hand_motion`.
+and the speed of each joint are looked at before anything moves. The motion brakes when nobody wants it. What the array
+feels on the way ends it, and the probe goes back the way that it came, which was free; joints that do not follow are
+seen by the supervision.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
+from canprobe.cell.master.array import make_patch_reader
+from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.first_touch import blind_s, depth_at
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import lag_s
+from canprobe.cell.tasks.task import MotionTime
 from canprobe.errors import PlanError, UsageError, did_you_mean
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.motion_profile import MotionProfile
 from canprobe.mechanics.touch.linear_algebra import checked
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 JERK_S = 0.05
@@ -66,37 +74,32 @@ class HandWay:
         return MotionProfile(1.0, self.speed, self.acceleration, self.jerk)
 
 
-def goal_of(plan: Plan, to: str | npt.ArrayLike) -> Floats:
-    """Joint positions (n,), rad or m, of a posture's name, or as they are.
-
-    Raises:
-        UsageError: no arm, no such posture, or no n numbers.
-    """
-    arm = plan.setup.arm
-    if arm is None:
-        raise UsageError(f"{plan.setup.name}: expected a scene with an arm; got one without")
-    if not isinstance(to, str):
-        return checked("posture", to, (arm.model.n,))
-    if (q := arm.postures.get(to)) is None:
-        known = ", ".join(arm.postures)
-        raise UsageError(f"posture {to}: the cell has {known}{did_you_mean(to, arm.postures)}; [postures] names others")
-    return q
-
-
-def joint_way(plan: Plan, start: Floats, goal: Floats, speed: float = USUAL_SPEED, *, bounded: bool = False) -> HandWay:
+def joint_way(
+    plan: Plan, start: Floats, to: str | npt.ArrayLike, speed: float = USUAL_SPEED, *, bounded: bool = False
+) -> HandWay:
     """The way from one posture to another, straight in joints: all joints begin and end together.
 
     Args:
         plan: plan of a cell with an arm.
-        start, goal: joint positions (n,), rad or m.
-        speed: share of the speed limits of the joints.
+        start: joint positions (n,), rad or m.
+        to: the same, or the name of a posture.
+        speed: share of the speed limits of the joints, above 0 and up to 1.
         bounded: it is so slow that it can stop at what it touches, see `touch_speed`.
+
+    Raises:
+        UsageError: there is no arm, no such posture or no such speed.
     """
-    arm = plan.setup.arm
-    assert arm is not None
+    arm = plan.setup.needed_arm()
+    if isinstance(to, str) and to not in arm.postures:
+        known = ", ".join(arm.postures)
+        raise UsageError(f"posture {to}: the cell has {known}{did_you_mean(to, arm.postures)}; [postures] names others")
+    goal = arm.postures[to] if isinstance(to, str) else checked("posture", to, (arm.model.n,))
+    if not 0.0 < float(checked("speed", speed, ())) <= 1.0:
+        raise UsageError(f"speed: expected a share of the joints' limits, above 0 and up to 1, got {speed:g}")
     steps = np.abs(goal - start) / (arm.model.radian * STEP_RAD)
     count = max(1, math.ceil(float(steps.max())))
-    return _limited(plan, start + np.linspace(0.0, 1.0, count + 1)[:, None] * (goal - start), speed, bounded=bounded)
+    joints = start + np.linspace(0.0, 1.0, count + 1)[:, None] * (goal - start)
+    return _limited(plan, joints, float(speed), bounded=bounded)
 
 
 def probe_way(plan: Plan, start: Floats, way: Floats, turn: Floats, speed: float = USUAL_SPEED) -> HandWay:
@@ -112,15 +115,14 @@ def probe_way(plan: Plan, start: Floats, way: Floats, turn: Floats, speed: float
     Raises:
         UsageError: the arm cannot go there, as at the end of its reach.
     """
-    arm = plan.setup.arm
-    assert arm is not None
+    arm = plan.setup.needed_arm()
     length, angle = float(np.linalg.norm(way)), float(np.linalg.norm(turn))
     count = max(1, math.ceil(max(length / STEP_M, angle / STEP_RAD)))
     guard, rows = JointGuard(plan), [start]
     T = guard.T_base_tip(start)
     for share in np.linspace(0.0, 1.0, count + 1)[1:]:
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = _rotation(share * turn) @ T[:3, :3], T[:3, 3] + share * way
+        pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(share * turn).as_matrix() @ T[:3, :3], T[:3, 3] + share * way
         try:
             rows.append(inverse_near(arm.model, pose, guard.T_flange_tip, rows[-1], max_move_rad=MAX_MOVE_RAD))
         except PlanError as error:
@@ -147,8 +149,7 @@ def jog_way(
     Raises:
         UsageError: not one of joint, along and about; no such joint; no speed; or the probe cannot go there.
     """
-    arm = plan.setup.arm
-    assert arm is not None
+    arm = plan.setup.needed_arm()
     if [joint, along, about].count(None) != 2:
         raise UsageError("jog: expected one of joint, along and about")
     length = float(checked("jog: velocity", velocity, ())) * float(checked("jog: for_s", for_s, ()))
@@ -175,17 +176,6 @@ def jog_way(
     return probe_way(plan, start, way, turn, min(1.0, abs(velocity) / most))
 
 
-def share_of_speed(speed: float) -> float:
-    """A share of the speed limits, above 0 and up to 1.
-
-    Raises:
-        UsageError: it is none.
-    """
-    if not 0.0 < float(checked("speed", speed, ())) <= 1.0:
-        raise UsageError(f"speed: expected a share of the joints' limits, above 0 and up to 1, got {speed:g}")
-    return float(speed)
-
-
 def refuse(plan: Plan, way: HandWay) -> None:
     """Refuse a way that may not be gone, with place and time.
 
@@ -195,8 +185,7 @@ def refuse(plan: Plan, way: HandWay) -> None:
         UsageError: a joint would leave its range, the probe its workspace, or the arm would come near what it keeps
             out of.
     """
-    arm, limits, guard = plan.setup.arm, plan.setup.limits, JointGuard(plan)
-    assert arm is not None
+    arm, limits, guard = plan.setup.needed_arm(), plan.setup.limits, JointGuard(plan)
     low, high = np.minimum(guard.low, way.q[0]), np.maximum(guard.high, way.q[0])
     for k, q in enumerate(way.q):
         why = None
@@ -227,8 +216,7 @@ def _time_at(way: HandWay, share: float) -> float:
 
 def _limited(plan: Plan, q: Floats, speed: float, most: float = math.inf, *, bounded: bool) -> HandWay:
     """A way with the limits of the joints, no faster than `most`, and slow enough for what it may touch."""
-    arm, guard = plan.setup.arm, JointGuard(plan)
-    assert arm is not None
+    arm, guard = plan.setup.needed_arm(), JointGuard(plan)
     rates = np.abs(np.diff(q, axis=0)).max(axis=0) * (len(q) - 1)  # of each joint, per way
     moves = rates > 0.0
     if not moves.any():
@@ -258,12 +246,97 @@ def _tips(guard: JointGuard, q: Floats) -> Floats:
     return np.array([guard.T_base_tip(one)[:3, 3] for one in q])
 
 
-def _rotation(turn: Floats) -> Floats:
-    """(3, 3) rotation of a rotation vector (3,), rad (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = turn / angle
-    K = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    rotation: Floats = np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * K @ K
-    return rotation
+ELSEWHERE_RAD = 0.002
+"""Distance from the way's start, rad, by which an arm has been moved since; of a sliding joint by `ArmModel.radian`."""
+ARRIVAL_S = 0.5
+"""Longest time from the end of the way until the joints have arrived, s."""
+BACK_M = 5e-3
+"""Way of the probe back from what it has touched, m."""
+
+
+class HandMotion(Controller):
+    """Follows a way once.
+
+    Args:
+        plan: plan of a cell with an arm.
+        way: the way, from where the arm stands.
+        renewed: asked in each cycle whether the motion is still wanted; where it is not, it brakes.
+
+    Attributes:
+        share: share of the way that is gone.
+        ended_by: why the motion ended before its end; None where it did not.
+    """
+
+    def __init__(self, plan: Plan, way: HandWay, renewed: Callable[[], bool] = lambda: True) -> None:
+        arm = plan.setup.needed_arm()
+        self._model, self._way, self._renewed = arm.model, way, renewed
+        self._jog_force = plan.setup.limits.jog_force
+        self._count = np.abs(arm.model.q_per_unit).sum(axis=1)
+        self.reader = make_patch_reader(plan.setup)
+        self._time = MotionTime(plan.sync.period_ns)
+        self._motion = way.profile()
+        self._back: MotionProfile | None = None
+        self._t = self._touched_at = self.share = 0.0
+        self._late_ns = 0
+        self._interrupt: KeyboardInterrupt | None = None
+        self.ended_by: str | None = None
+
+    def inspect(self, q: Floats) -> str | None:
+        away = np.abs(q - self._way.q[0]) / self._model.radian
+        if away.max() <= ELSEWHERE_RAD:
+            return None
+        joint = int(away.argmax())
+        its = self._model.joints[joint]
+        stands, was = its.text(q[joint], ".2f"), its.text(self._way.q[0][joint], ".2f")
+        return f"joint {joint + 1} stands at {stands}, and was at {was} when the way was planned: plan it again"
+
+    def brake(self, interrupt: KeyboardInterrupt) -> bool:
+        self._end("interrupted")
+        self._interrupt = interrupt
+        return True
+
+    def step(self, measurement: Measurement) -> Command:
+        self._t += 1e-9 * self._time.step(measurement.t_ns)
+        self._feel(measurement)
+        if self.ended_by is None and not self._renewed():
+            self._end("no longer asked for")
+        motion = self._motion if self._back is None else self._back
+        gone = motion.at(self._t)[0]
+        self.share = gone if self._back is None else self._touched_at - gone
+        q = self._way.at(self.share)
+        if self._t < motion.duration_s:
+            return Command(q)
+        self._late_ns = self._late_ns or measurement.t_ns + round(1e9 * ARRIVAL_S)
+        assert measurement.q is not None
+        if measurement.t_ns < self._late_ns and (np.abs(measurement.q - q) > self._count).any():
+            return Command(q)
+        if self._interrupt is not None:
+            raise self._interrupt
+        return Command(q, done=True, stop_reason=self.ended_by if self._back is not None else None)
+
+    def _end(self, why: str) -> None:
+        """Brake, once."""
+        self.ended_by = why
+        self._motion.brake(self._t)
+
+    def _feel(self, measurement: Measurement) -> None:
+        """Begin the way back where the array shows the force of a jog."""
+        sample = measurement.tactile
+        if self.reader is None or sample is None or self._back is not None:
+            return
+        force = self.reader.read(sample).force
+        if force < max(self._jog_force, TOUCH_FORCE):
+            return
+        self._touched_at = self._motion.at(self._t)[0]
+        self.ended_by = (
+            f"the array showed {force:.2f} N (limits.jog_force_n = {self._jog_force:g}) after"
+            f" {100.0 * self._touched_at:.0f} % of the way: the probe went back the way that it came"
+        )
+        way = self._way
+        length = min(self._touched_at, self._share_of_back())
+        self._back, self._t = MotionProfile(length, way.speed, way.acceleration, way.jerk), 0.0
+
+    def _share_of_back(self) -> float:
+        """Share of the way on which the probe goes `BACK_M`."""
+        steps = np.linalg.norm(np.diff(self._way.tip, axis=0), axis=1)
+        return BACK_M / max(float(steps.sum()), 1e-9)

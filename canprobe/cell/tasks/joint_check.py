@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.cell.master.array import PatchReader, make_patch_reader
+from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.position_track import rest_counts
 from canprobe.cell.master.supervisor import JointGuard
@@ -68,11 +68,10 @@ class JointCheck(Controller):
     compares_motion = True
 
     def __init__(self, plan: Plan, operator: Operator | None) -> None:
-        assert plan.setup.arm is not None
-        self._guard, self._model = JointGuard(plan), plan.setup.arm.model
+        self._guard, self._model = JointGuard(plan), plan.setup.needed_arm().model
         self._highest = plan.setup.limits.speed_share * self._model.qd_max / self._model.radian
         self._period_s, self._operator = plan.sync.period_ns * 1e-9, operator
-        self._reader = make_patch_reader(plan.setup)
+        self.reader = make_patch_reader(plan.setup)
         self.findings: list[JointFinding] = []
         self.start: Floats | None = None
         self._quits = False
@@ -80,10 +79,6 @@ class JointCheck(Controller):
         self._pressed: str | None = None
         self._script: Generator[Command, Measurement, None] = self._all_joints()
         next(self._script)
-
-    @property
-    def reader(self) -> PatchReader | None:
-        return self._reader
 
     def step(self, measurement: Measurement) -> Command:
         try:
@@ -255,9 +250,9 @@ class JointCheck(Controller):
     def _presses(self, joint: int, measurement: Measurement) -> bool:
         """Whether something presses on the array while a joint moves."""
         sample = measurement.tactile
-        if self._reader is None or sample is None:
+        if self.reader is None or sample is None:
             return False
-        force = self._reader.read(sample).force
+        force = self.reader.read(sample).force
         self._force = max(force, self._force or 0.0)
         if force > TOUCH_FORCE:
             self._pressed = (

@@ -97,6 +97,3 @@ class PausedController(WrappingController):
     def trail(self) -> TakenWay | None:
         """The way by which the controller's probe has come; after a hold it is not known."""
         return None if self.held else self.inner.trail
-
-    def retreat(self, reason: str) -> None:
-        self.inner.retreat(reason)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import PatchReader, force_columns
+from canprobe.cell.master.array import force_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import Finding, TouchState, limits_of
@@ -50,6 +50,7 @@ COMING = (Phase.MOVE, Phase.APPROACH, Phase.SETTLE)
 """Phases in which the probe comes from free space: the way that it has taken leads off what it touches."""
 
 
+LEAVING = (Phase.RETREAT, Phase.DONE)
 _IN_CONTACT = (Phase.SETTLE, Phase.SCAN, Phase.REGAIN)
 
 
@@ -74,7 +75,7 @@ class ProbingTask(Task):
 
     def __init__(self, plan: Plan, lag_s: float, sensing: ContactSensing, *, holds: bool = False) -> None:
         self.phase = Phase.MOVE
-        self.sensing = sensing
+        self.sensing, self.reader = sensing, sensing.reader
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
         self._setup = plan.setup
@@ -85,11 +86,12 @@ class ProbingTask(Task):
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
         self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
-        self._motion: ProbeMotion | None = None
-        self._line: LineMotion | ArcMotion | None = None
-        self._way_here: TakenWay | None = None
+        self._begun = False
+        self._motion: ProbeMotion  # from the first cycle on
+        self._line: LineMotion | ArcMotion
+        self._way_here = TakenWay(plan.setup.needed_arm().model, plan.setup.probe.T_flange_probe)
         self._retrace: Retrace | None = None
-        self._growing: GrowingForce | None = None
+        self._growing: GrowingForce  # on the way back
         self._measured: Floats | None = None
         self._cycle = 0
         self._t = 0.0
@@ -98,20 +100,12 @@ class ProbingTask(Task):
         self._estimate: SurfaceEstimate | None = None
         self._phases: dict[Phase, Callable[[], ProbePose]] = {
             Phase.MOVE: self._move,
-            Phase.APPROACH: self._approach,
-            Phase.SETTLE: self._settle,
-            Phase.SCAN: self._scan,
             Phase.RETREAT: self._retreat,
-            Phase.DONE: self._stay,
-            Phase.REGAIN: self._regain,
+            Phase.DONE: lambda: self._motion.pose,
         }
 
-    @property
-    def reader(self) -> PatchReader:
-        return self.sensing.reader
-
     def record(self) -> TaskRecord:
-        slowed = self._motion.slowed if self._motion is not None else 0
+        slowed = self._motion.slowed if self._begun else 0
         contacts = self.depth.watched + self.depth.silent
         watched = self.depth.watched / contacts if contacts else None
         return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed, depth_watched=watched)
@@ -124,14 +118,14 @@ class ProbingTask(Task):
     def step(self, measurement: Measurement) -> Command:
         self._cycle = measurement.cycle
         self._dt = self._time.step(measurement.t_ns) * 1e-9
-        if self._motion is None:
+        if not self._begun:
             setup = self._setup
-            assert measurement.q is not None and setup.arm is not None
-            self._motion = ProbeMotion(setup.arm, setup.probe, setup.limits, self._period_s, measurement.q)
-            self._way_here = TakenWay(setup.arm.model, setup.probe.T_flange_probe)
+            assert measurement.q is not None
+            self._motion = ProbeMotion(setup.needed_arm(), setup.probe, setup.limits, self._period_s, measurement.q)
+            self._begun = True
             self._begin(self._motion.pose)
         self._measured = measurement.q
-        if self._way_here is not None and self.phase in COMING:
+        if self.phase in COMING:
             self._way_here.add(measurement.q, measurement.q_age)
         patch = self.sensing.step(measurement)
         if patch is not None and measurement.tactile is not None:
@@ -143,10 +137,17 @@ class ProbingTask(Task):
         return self._command(pose)
 
     def retreat(self, reason: str) -> None:
-        raise NotImplementedError
+        if self._begun and self.reason is None and self.phase is not Phase.DONE:
+            self.reason = reason
+            self._let_go()
 
     def stop(self) -> None:
         """Let go and be done, from whatever phase."""
+        if self._begun and self.phase not in LEAVING:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Begin the way off the object."""
         raise NotImplementedError
 
     def _begin(self, pose: ProbePose) -> None:
@@ -188,7 +189,6 @@ class ProbingTask(Task):
 
         On its trail the probe goes back by joints that were measured, whatever the pose is.
         """
-        assert self._motion is not None
         if self._retrace is not None:
             target = self._retrace.q
         else:
@@ -224,19 +224,15 @@ class ProbingTask(Task):
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
         self._t = 0.0
-        if phase is Phase.MOVE and self._way_here is not None:
+        if phase is Phase.MOVE:
             self._way_here.forget()
 
     def _move(self) -> ProbePose:
-        assert self._line is not None
         pose = self._line.at(self._t)
         if self._t >= self._line.duration + self._lead_s + 0.1:
             self._floor = self._touch.force  # an array that was pressed for long shows some of it for a while
             self._enter(Phase.APPROACH)
         return pose
-
-    def _approach(self) -> ProbePose:
-        raise NotImplementedError
 
     def _search_way(self, approach: Approach) -> float:
         """Way beyond the expected place up to which an approach goes, m: a blind array ends none."""
@@ -252,52 +248,32 @@ class ProbingTask(Task):
             " finger (`canprobe run listen` shows what it measures), then try again; task.search_mm widens the search"
         )
 
-    def _settle(self) -> ProbePose:
-        raise NotImplementedError
-
-    def _scan(self) -> ProbePose:
-        raise NotImplementedError
-
-    def _regain(self) -> ProbePose:
-        raise NotImplementedError
-
     def _draw_back(self, way: Floats) -> None:
         """Begin the retreat: back on the way that the probe has come, or where it has moved over the object, by a way.
 
         Args:
             way: (3,) m, off the object.
         """
-        assert self._motion is not None
-        if self._way_here is not None and self._measured is not None and self.phase in COMING:
+        if self._measured is not None and self.phase in COMING:
             self._retrace = self._way_here.back(self._measured, self._motion.step_max)
         pose = self._motion.pose
         self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED_M_S, at_once=True)
-        self._growing = None
+        self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
         self._enter(Phase.RETREAT)
 
     def _retreat(self) -> ProbePose:
-        assert self._line is not None
-        if self._witness_grows():
-            grows = f"the force grows on the way back, to {self._touch.force:.2f} N: the probe was stopped there"
+        touch = self._touch
+        if self._growing.grows(self._cycle, touch.force, a_part=math.isinf(touch.force_sigma)):
+            grows = f"the force grows on the way back, to {touch.force:.2f} N: the probe was stopped there"
             self.reason = grows if self.reason is None else f"{self.reason}; {grows}"
             self._enter(Phase.DONE)
-            return self._stay()
+            return self._motion.pose
         pose = self._line.at(self._t)
         over = self._t >= self._line.duration + self._lead_s
         if over if self._retrace is None else self._retrace.step(self._dt) is None:
             self._off()
         return pose
 
-    def _witness_grows(self) -> bool:
-        """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
-        if self._growing is None:
-            self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
-        return self._growing.grows(self._cycle, self._touch.force, a_part=math.isinf(self._touch.force_sigma))
-
     def _off(self) -> None:
         """The probe is off the object."""
         self._enter(Phase.DONE)
-
-    def _stay(self) -> ProbePose:
-        assert self._motion is not None
-        return self._motion.pose

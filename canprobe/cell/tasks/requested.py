@@ -153,16 +153,8 @@ class RequestedTask(WrappingController):
             self.inner.go_on(measurement)
 
     @property
-    def retreats_itself(self) -> bool:  # type: ignore[override]
-        return self.inner is not None and self.inner.retreats_itself
-
-    @property
     def trail(self) -> TakenWay | None:
         return None if self.inner is None else self.inner.trail
-
-    def retreat(self, reason: str) -> None:
-        if self.inner is not None:
-            self.inner.retreat(reason)
 
     def _take(self, request: Request) -> None:
         if request.kind == "stop":

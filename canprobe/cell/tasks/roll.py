@@ -105,6 +105,7 @@ class RollTask(ProbingTask):
         self, plan: Plan, task: Touch, sensing: ContactSensing, presses: Sequence[Press], radius: float, rest_s: float
     ) -> None:
         super().__init__(plan, task.lag_s, sensing)
+        self._phases |= {Phase.APPROACH: self._approach, Phase.SETTLE: self._settle, Phase.SCAN: self._scan}
         self._follows_depth = False  # what is calibrated here is the very force that a depth would contradict
         self.pressed: list[RollRecord] = []
         self.unloaded: list[NDArray[np.uint8]] = []
@@ -115,15 +116,9 @@ class RollTask(ProbingTask):
         self._axes = np.eye(3)
         sensing.set_kappa(np.full(2, 0.0 if math.isinf(radius) else 1.0 / radius))
 
-    def retreat(self, reason: str) -> None:
-        if self.reason is None and self.phase is not Phase.DONE and self._motion is not None:
-            self.reason = reason
-            self._let_go()
-
     def stop(self) -> None:
         self._number = len(self.presses)
-        if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
-            self._let_go()
+        super().stop()
 
     def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         self._touch.update_force(patch, sample.t_sample_ns)
@@ -185,7 +180,6 @@ class RollTask(ProbingTask):
 
     def _begin(self, pose: ProbePose) -> None:
         """Go to the next touch, or end."""
-        assert self._motion is not None
         if self._number == 0:
             self._set_axes(self._motion.pose_matrix[:3, 0])
         if self.reason is not None or self._number >= len(self.presses):
@@ -195,11 +189,10 @@ class RollTask(ProbingTask):
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:
-        self._begin(self._stay())
+        self._begin(self._motion.pose)
 
     def _move(self) -> ProbePose:
         if self._number == 0 and self._t < self._rest_s:
-            assert self._line is not None
             return self._line.at(0.0)
         if self._number == 0 and self._rest_s > 0.0:
             self._rest_s, self._t = 0.0, 0.0

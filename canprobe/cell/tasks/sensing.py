@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -65,14 +66,11 @@ class JointHistory:
         """Joint positions (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
         if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
             return None
-        for i in range(len(self._times) - 1, -1, -1):
-            t = self._times[i]
-            if t <= t_ns:
-                if t == t_ns:
-                    return self._joints[i]
-                share = (t_ns - t) / (self._times[i + 1] - t)
-                return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
-        return None
+        i = bisect_right(self._times, t_ns) - 1
+        if self._times[i] == t_ns:
+            return self._joints[i]
+        share = (t_ns - self._times[i]) / (self._times[i + 1] - self._times[i])
+        return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
 
 
 def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
@@ -97,6 +95,9 @@ class ContactSensing:
         moment_image: gives the contacts the second moments of their images; None leaves them out.
         noise: noise of the contacts; None: they do not state any.
         lag: lag of the array's centroids behind the contact; None: no lag.
+
+    Attributes:
+        slope: slope that the last touch showed; None before.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class ContactSensing:
         self._chain = ending_in(model.chain, flange_probe)
         self.radius = radius
         self.stiffness = stiffness
-        self._slope: Slope | None = None
+        self.slope: Slope | None = None
         self._settled = True
         self.set_kappa(np.zeros(2))
         self.patch: Patch | None = None
@@ -155,8 +156,8 @@ class ContactSensing:
         possible = np.maximum(kappa, -HOLLOW_LIMIT_SHARE / self.radius)
         if stiffness is not None:
             self.stiffness = stiffness
-        elif self._slope is not None and not self._settled:
-            self.stiffness = stiffness_from_slope(self._slope.value, self.radius, possible)
+        elif self.slope is not None and not self._settled:
+            self.stiffness = stiffness_from_slope(self.slope.value, self.radius, possible)
         self._settled = True
         self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
 
@@ -164,19 +165,12 @@ class ContactSensing:
         """Place contacts as another sensing did that had this depth at 1 N, m."""
         self._depth_at_1_n = depth
 
-    @property
-    def slope(self) -> Slope | None:
-        """Slope that the last touch showed; None before."""
-        return self._slope
-
     def set_slope(self, slope: Slope) -> None:
         """Take the slope that a touch showed; depths follow from it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
-        self._slope = slope._replace(
-            value=min(max(slope.value, flat / MAX_STIFFNESS_RATIO), flat * MAX_STIFFNESS_RATIO)
-        )
+        self.slope = slope._replace(value=min(max(slope.value, flat / MAX_STIFFNESS_RATIO), flat * MAX_STIFFNESS_RATIO))
         self._settled = False
-        self._depth_at_1_n = 1.0 / self._slope.value
+        self._depth_at_1_n = 1.0 / self.slope.value
 
     def depth(self, force: float) -> float:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
@@ -214,7 +208,7 @@ class ContactSensing:
             sigma_point=None if self._noise is None else self._noise.lateral(lightness),
             moments=self._moments(patch),
             doubts=patch.doubts,
-            slope=self._slope,
+            slope=self.slope,
             sigma_height=None if self._noise is None else self._noise.height,
             sigma_slow=0.0 if self._noise is None else self._noise.slow,
         )

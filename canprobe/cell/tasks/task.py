@@ -61,48 +61,11 @@ class Loss:
     searched: float = 0.0
     regained_s: float | None = None
 
-
-@dataclass(frozen=True, slots=True)
-class Exploration:
-    """The end of an exploration, in m.
-
-    Attributes:
-        target: deviation of the height that was wanted.
-        sigma_max: largest stated deviation in the cells that can be touched; None if one was not touched.
-        common: deviation that the whole scan has in common.
-        path: path that was walked.
-        seconds: time of the scan, s.
-        done, closed, rough: shares of the rectangle: within the target, beyond where the contact turned back, and where
-            contacts contradict every smooth surface.
-        reached: whether all of the rectangle is within the target.
-        why: why it is not, in words; None where it is.
-    """
-
-    target: float
-    sigma_max: float | None
-    common: float
-    path: float
-    seconds: float
-    done: float
-    closed: float
-    rough: float
-    reached: bool
-    why: str | None
-
-    def summarised(self) -> dict[str, Any]:
-        """The section ``explore`` of ``summary.json``."""
-        return {
-            "target_sigma_um": 1e6 * self.target,
-            "sigma_max_um": None if self.sigma_max is None else 1e6 * self.sigma_max,
-            "reached": self.reached,
-            "why_not": self.why,
-            "path_mm": 1e3 * self.path,
-            "time_s": self.seconds,
-            "done_fraction": self.done,
-            "closed_fraction": self.closed,
-            "rough_fraction": self.rough,
-            "common_sigma_um": 1e6 * self.common,
-        }
+    @property
+    def summarised(self) -> dict[str, float | None]:
+        """The loss in ``summary.json``: `regained_after_ms` is None where the contact was not regained."""
+        after_ms = None if self.regained_s is None else 1e3 * self.regained_s
+        return {"searched_mm": 1e3 * self.searched, "regained_after_ms": after_ms}
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +80,7 @@ class TaskRecord:
         scan_cycles: first cycle of the scan or hold, and the one after its last; None before.
         unplaced: contacts that were not used because the joints of their instant are unknown.
         slowed: cycles in which a joint could not keep up with the probe's path.
-        explored: end of an exploration; None where nothing was explored.
+        explored: the section ``explore`` of ``summary.json``; None where nothing was explored.
         depth_watched: share of the contacts at which the depth said something of the force; None without contacts.
     """
 
@@ -128,7 +91,7 @@ class TaskRecord:
     scan_cycles: tuple[int, int] | None = None
     unplaced: int = 0
     slowed: int = 0
-    explored: Exploration | None = None
+    explored: dict[str, Any] | None = None
     depth_watched: float | None = None
 
 

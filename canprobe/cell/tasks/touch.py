@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +14,7 @@ from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.cell.tasks.contact_learning import ContactLearning
-from canprobe.cell.tasks.probing import Phase, ProbingTask
-from canprobe.cell.tasks.regain import REST_S, Search
+from canprobe.cell.tasks.probing import LEAVING, Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
@@ -25,10 +24,6 @@ from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
 from canprobe.mechanics.touch.strategies import PathFollower, Rectangle
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    pass
-
 
 LONGEST_GAP_S = 0.02
 """Longest gap between two contacts for the servo's surface: after a longer gap it does not rest on one sample alone."""
@@ -40,7 +35,34 @@ RETREAT_WAY = 6e-3
 """Way off the object, m."""
 RAMP_S = 0.05
 """Time to reach the scan's speed, at its begin and where its path has turned back."""
-_LEAVING = (Phase.RETREAT, Phase.DONE)
+SEARCH_SPEED = 2e-3
+"""Speed of the search, m/s: until the first sample of the new touch takes effect, 27 ms, the layer sinks in 0.05 mm."""
+BRAKE_S = 0.02
+"""Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
+REST_S = 0.25
+"""Time at rest on the surface that was found, until the wanted force is reached and the scan goes on."""
+
+
+class Search:
+    """The probe's motion from a lost contact to the object, along its pole.
+
+    Args:
+        pose: pose of the probe where the contact was lost.
+        velocity: velocity of its centre then (3,), m/s; its part along the path fades out.
+    """
+
+    def __init__(self, pose: ProbePose, velocity: Floats) -> None:
+        self._start = pose
+        self._sideways = velocity - pose.pole * float(velocity @ pose.pole)
+
+    def pose(self, t: float) -> ProbePose:
+        """Pose ``t`` seconds after the loss."""
+        sideways = self._sideways * (BRAKE_S * (1.0 - math.exp(-t / BRAKE_S)))
+        return ProbePose(self._start.centre + sideways + self._start.pole * (SEARCH_SPEED * t), self._start.pole)
+
+    def searched(self, t: float) -> float:
+        """Distance towards the object that was searched by then, m."""
+        return SEARCH_SPEED * t
 
 
 class Sinking:
@@ -103,6 +125,8 @@ class TouchTask(ProbingTask):
         check: CalibrationCheck | None = None,
     ) -> None:
         super().__init__(plan, task.lag_s, sensing, holds=task.scan is None)
+        self._phases |= {Phase.APPROACH: self._approach, Phase.SETTLE: self._settle, Phase.SCAN: self._scan}
+        self._phases[Phase.REGAIN] = self._regain
         self.shape = shape
         self.learned = ContactLearning(sensing, shape, check)
         self.remarks = self.learned.remarks
@@ -110,7 +134,9 @@ class TouchTask(ProbingTask):
         self._scan_end: int | None = None
         self._task = task
         self.targets = {"target_force_n": task.force, "speed_m_s": task.scan.speed if task.scan is not None else 0.0}
-        self._servo: TactileServo | None = None
+        self._touched = False
+        self._servo: TactileServo  # from the first touch on, as the next
+        self._sinking: Sinking
         self._sample_t: float | None = None
         self.losses: list[Loss] = []
         self._search: Search | None = None
@@ -118,12 +144,11 @@ class TouchTask(ProbingTask):
         self._velocity: Floats = np.zeros(3)
         self._scan_t = self._searched_before = 0.0
         self._contact: ContactSample | None = None
-        self._sinking: Sinking | None = None
         self._at_rest = AtRest()
         self._updated = True
 
     @property
-    def restarts(self) -> int:
+    def restarts(self) -> int:  # type: ignore[override]
         """How often its estimator diverged and started afresh."""
         return self.shape.restarts if self.shape is not None else 0
 
@@ -147,14 +172,14 @@ class TouchTask(ProbingTask):
         if self._updated:
             return
         self._updated = True
-        learned, contact, servo = self.learned, self._contact, self._servo
+        learned, contact = self.learned, self._contact
         if self.shape is not None and (estimate := self.shape.work()) is not None:
             if learned.check is not None:
                 learned.check.take(estimate, self.sensing.slope)
-            if contact is not None and servo is not None:
-                all_observed = learned.follow(estimate, contact, servo.surface)
+            if contact is not None and self._touched:
+                all_observed = learned.follow(estimate, contact, self._servo.surface)
                 self._columns = self._columns | learned.columns
-                if all_observed and self.phase not in _LEAVING and is_too_hollow(estimate, self.sensing.radius):
+                if all_observed and self.phase not in LEAVING and is_too_hollow(estimate, self.sensing.radius):
                     self._at_hollow(-1.0 / float(estimate.kappa[1]))
         learned.doubt()
 
@@ -170,12 +195,11 @@ class TouchTask(ProbingTask):
             self.sensing.dropped += 1  # it says that it is older than the one before
             contact = None
         self._contact = contact
-        if contact is not None and self._servo is not None:
+        if contact is not None and self._touched:
             elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._period_s
             self._servo.surface.correct(contact.p_base, contact.n_base, min(elapsed, LONGEST_GAP_S))
             self._sample_t = contact.t_s
             if self.phase is Phase.SETTLE:
-                assert self._sinking is not None
                 self._sinking.depth += self.learned.push(contact, self._servo.surface)
                 if self._t > REST_SHARE * SETTLE_S:
                     self._at_rest.add(contact.force_n, patch.saturated)
@@ -192,7 +216,7 @@ class TouchTask(ProbingTask):
         self.retreat(f"a hollow of radius {1e3 * radius:.0f} mm: as tight as the probe, no contact in one place")
 
     def _watch(self) -> None:
-        if self.phase in _LEAVING:
+        if self.phase in LEAVING:
             return
         touch = self._touch
         least_force = 0.0  # below it the contact is lost; an array that has let go shows a tenth of it for a while
@@ -214,7 +238,7 @@ class TouchTask(ProbingTask):
 
     def retreat(self, reason: str | None) -> None:
         """Let go, for a reason or because the work is done; nothing changes where the task is letting go already."""
-        if self._motion is None or self.phase in _LEAVING:
+        if not self._begun or self.phase in LEAVING:
             return
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
@@ -252,6 +276,7 @@ class TouchTask(ProbingTask):
         )
         self.depth.restart()
         self._sinking = Sinking(contact, pose, self.sensing.radius)
+        self._touched = True
         self._enter(Phase.SETTLE)
 
     def _leader(self, contact: ContactSample) -> tuple[PathFollower | None, Floats]:
@@ -265,7 +290,6 @@ class TouchTask(ProbingTask):
         return self.sensing.depth(self.targets["target_force_n"])
 
     def _settle(self) -> ProbePose:
-        assert self._servo is not None and self._sinking is not None
         depth = self._target_depth()
         share = self._sinking.share(self._t, depth, self._task.approach.speed)
         pose = self._sinking.pose(self._servo, share, depth, self._dt)
@@ -278,7 +302,6 @@ class TouchTask(ProbingTask):
         return pose
 
     def _scan(self) -> ProbePose:
-        assert self._servo is not None
         left = self._task.duration_s - self._scan_t
         pose = self._servo.step(self.targets["speed_m_s"] * self._pace(left), self._target_depth(), self._dt)
         if self._asked is not None:
@@ -294,7 +317,6 @@ class TouchTask(ProbingTask):
 
     def _look_for_contact(self) -> None:
         """Leave the path for where the object should be."""
-        assert self._motion is not None
         if self.phase is Phase.SCAN:
             self.losses.append(Loss(self._cycle))
         self._search = Search(self._motion.pose, self._velocity)
@@ -305,7 +327,6 @@ class TouchTask(ProbingTask):
         self._enter(Phase.REGAIN)
 
     def _regain(self) -> ProbePose:
-        assert self._servo is not None and self._sinking is not None
         if self._scan_t >= self._task.duration_s:
             self.retreat(None)
         if self._search is None:

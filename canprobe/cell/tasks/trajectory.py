@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.supervisor import JointGuard
@@ -56,9 +58,7 @@ class Trajectory(Controller):
         *,
         hold_s: float = 0.5,
     ) -> None:
-        arm = instance("trajectory: plan", plan, Plan).setup.arm
-        if arm is None:
-            raise UsageError("trajectory: expected a scene with an arm; got one without")
+        arm = instance("trajectory: plan", plan, Plan).setup.needed_arm("trajectory")
         self._model: ArmModel = arm.model
         self._limits: SafetyLimits = plan.setup.limits
         self._guard = JointGuard(plan)
@@ -69,7 +69,7 @@ class Trajectory(Controller):
         self._hold_s = float(checked("trajectory: hold_s", hold_s, ()))
         self._time = MotionTime(plan.sync.period_ns)
         self._gone_ns: int | None = None
-        self._qd = np.empty(0)
+        self._way: CubicHermiteSpline | None = None
         if reason := self._outside_range():
             raise UsageError(f"trajectory: {reason}")
 
@@ -107,8 +107,11 @@ class Trajectory(Controller):
                 self._given = np.vstack([np.zeros_like(q), self._given])
         if len(self._times) == 1:  # nothing but where it stands
             self._times, self._q, self._given = np.array([0.0, 1e-3]), np.vstack([q, q]), None
-        self._qd = _slopes(self._times, self._q) if self._given is None else self._given
-        self._qd[0], self._qd[-1] = (0.0 if qd is None else qd), 0.0
+        speeds = self._given
+        if speeds is None:
+            speeds = PchipInterpolator(self._times, self._q).derivative()(self._times)
+        speeds[0], speeds[-1] = (0.0 if qd is None else qd), 0.0
+        self._way = CubicHermiteSpline(self._times, self._q, speeds)
 
     @classmethod
     def braking(cls, plan: Plan, q: Floats, qd: Floats) -> Trajectory:
@@ -121,17 +124,15 @@ class Trajectory(Controller):
 
     def at(self, t_s: float) -> Floats:
         """Joint positions (n,), rad or m, at a time from the start, s; after the last point those at it."""
-        t = min(max(t_s, 0.0), self.duration_s)
-        k = min(int(np.searchsorted(self._times, t, side="right")) - 1, len(self._times) - 2)
-        h = self._times[k + 1] - self._times[k]
-        q, _ = _cubic((t - self._times[k]) / h, h, self._q[k : k + 2], self._qd[k : k + 2])
+        assert self._way is not None
+        q: Floats = self._way(min(max(t_s, 0.0), self.duration_s))
         return q
 
     def step(self, measurement: Measurement) -> Command:
         passed_ns = self._time.step(measurement.t_ns)
         if self._gone_ns is None:
             assert measurement.q is not None
-            if not self._qd.size and (reason := self.inspect(measurement.q)):
+            if self._way is None and (reason := self.inspect(measurement.q)):
                 raise UsageError(reason)
             passed_ns = self._gone_ns = 0
         self._gone_ns += passed_ns
@@ -150,10 +151,11 @@ class Trajectory(Controller):
     def _outside_way(self) -> str | None:
         """A message about a limit that is exceeded between two points, with the time that the speed limit allows."""
         highest = self._model.qd_max * self._limits.speed_share
-        s = np.linspace(0.0, 1.0, CHECKS_PER_SEGMENT)[:, None]
-        for k, h in enumerate(np.diff(self._times)):
-            q, qd = _cubic(s, h, self._q[k : k + 2], self._qd[k : k + 2])
-            where = f"at {self._times[k]:g} to {self._times[k + 1]:g} s: joint"
+        assert self._way is not None
+        for start_s, end_s in pairwise(self._times.tolist()):
+            t = np.linspace(start_s, end_s, CHECKS_PER_SEGMENT)
+            q, qd = self._way(t), self._way(t, 1)
+            where = f"at {start_s:g} to {end_s:g} s: joint"
             share = np.abs(qd).max(axis=0) / highest
             if share.max() > 1.0:
                 joint = int(share.argmax())
@@ -164,7 +166,7 @@ class Trajectory(Controller):
             if beyond.max() > 0.0:
                 return f"{where} {int(beyond.argmax()) + 1} leaves its range between the points"
             if self._limits.workspace is not None and (found := next(filter(None, map(self._guard.outside, q)), None)):
-                return f"at {self._times[k]:g} to {self._times[k + 1]:g} s: {found}"
+                return f"at {start_s:g} to {end_s:g} s: {found}"
         return None
 
 
@@ -190,23 +192,3 @@ def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Floats, F
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
         raise UsageError("trajectory: expected times from 0 on, each later than the one before")
     return times, q
-
-
-def _slopes(times: Floats, q: Floats) -> Floats:
-    """Speed (m, n) in each point: a weighted harmonic mean of the means beside it; 0 at the ends and in extremes."""
-    h = np.diff(times)[:, None]
-    mean = np.diff(q, axis=0) / h
-    before, after = mean[:-1], mean[1:]
-    a, b = h[:-1] + 2.0 * h[1:], 2.0 * h[:-1] + h[1:]
-    same = before * after > 0.0
-    slopes = np.zeros_like(q)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slopes[1:-1] = np.where(same, (a + b) / (a / before + b / after), 0.0)
-    return slopes
-
-
-def _cubic(s: Floats | float, h: float, q: Floats, qd: Floats) -> tuple[Floats, Floats]:
-    """Position and speed at the share s of a segment of h seconds, from those at its ends, (2, n) each."""
-    way = q[1] - q[0]
-    c2, c3 = 3.0 * way - h * (2.0 * qd[0] + qd[1]), -2.0 * way + h * (qd[0] + qd[1])
-    return q[0] + s * (h * qd[0] + s * (c2 + s * c3)), qd[0] + s * (2.0 * c2 + 3.0 * s * c3) / h

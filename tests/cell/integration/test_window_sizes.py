@@ -10,9 +10,9 @@ from undrawn import undrawn_run
 
 import canprobe
 import canprobe.fieldbus.eds.packaged
+from canprobe.cell.planning.array import patch_across_taxels, patch_radius_m, window_choices
 from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.planning.pdos import tactile_objects
-from canprobe.cell.planning.window import patch_across_taxels, patch_radius_m, window_choices
 from canprobe.cell.plant.elastic_contact import elastic_contact
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve

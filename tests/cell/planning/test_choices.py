@@ -9,18 +9,18 @@ import pytest
 from scenes import change, refused
 
 import canprobe
+from canprobe.cell.planning.array import (
+    cut_patch,
+    measured_share,
+    patch_radius_m,
+    true_force_n,
+)
 from canprobe.cell.planning.free_parameters import opened, second_channel
 from canprobe.cell.planning.identifiers import order_by_deadline
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.planning.report_json import plan_dict
 from canprobe.cell.planning.warnings import LOCAL_GROUP
-from canprobe.cell.planning.window import (
-    cut_patch,
-    measured_share,
-    patch_radius_m,
-    true_force_n,
-)
 from canprobe.cell.plant.elastic_contact import elastic_contact
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve

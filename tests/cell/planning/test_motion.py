@@ -9,8 +9,7 @@ import pytest
 from scenes import change, reasons, with_joints
 
 import canprobe
-from canprobe.cell.planning.surface_path import surface_path
-from canprobe.cell.planning.task_way import over_path
+from canprobe.cell.planning.surface_path import over_path, surface_path
 from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings

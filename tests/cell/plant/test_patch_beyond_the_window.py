@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.cell.emulated.image_processing import follow, middle
-from canprobe.cell.planning.window import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
+from canprobe.cell.planning.array import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.scene.setup import Probe

@@ -39,7 +39,7 @@ def test_millimetres_degrees_and_kilopascals_become_si():
     assert (task.approach.clearance, task.scan.speed) == pytest.approx((2.5e-3, 0.020))
     assert (task.shape.memory, task.shape.every_s) == pytest.approx((0.015, 0.05))
     assert setup.arm.q_start[0] == pytest.approx(math.pi / 2)
-    assert setup.array.full_scale == pytest.approx(300e3)
+    assert setup.array.pad.full_scale_pa == pytest.approx(300e3)
     np.testing.assert_allclose(setup.probe.T_flange_probe[:3, 3], (1e-3, -2e-3, 0.070))
     assert setup.limits.joint_margin == pytest.approx(math.radians(2.0))
     np.testing.assert_allclose(setup.limits.workspace, ((-0.2, -0.2, 0.3), (math.inf,) * 3))

@@ -106,7 +106,7 @@ def test_contacts_contradict_a_smooth_surface_where_they_scatter_more_than_the_s
         target=6e-6, sigma=floor, floor=floor, common=8e-6, closed=none, wanting=none, largest=floor[0]
     )
     explored = end_of(SimpleNamespace(ground=ground, path=0.1), 4.0, over=False)
-    assert explored.rough == rough and ("contradict" in explored.why) == (rough > 0.0)
+    assert explored["rough_fraction"] == rough and ("contradict" in explored["why_not"]) == (rough > 0.0)
 
 
 @pytest.mark.slow(reason="a whole exploration; the default has one that ends")
@@ -169,7 +169,7 @@ def test_it_turns_back_before_the_contact_runs_off_the_array():
     planned, met = (resolve(scene_with(keys, object=ball(radius))) for radius in (400.0, 45.0))
     plan = make_plan(planned)
     explored = explored_by(replace(plan, setup=replace(planned, truth=met.truth)))
-    assert 0.0 < explored.closed < 0.6
+    assert 0.0 < explored["closed_fraction"] < 0.6
 
 
 @pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
@@ -179,7 +179,7 @@ def test_it_turns_back_before_a_joint_comes_to_its_limit():
     margin = plan.setup.limits.joint_margin.copy()
     margin[0] = plan.setup.arm.model.q_max[0] - np.radians(84.0)
     limited = replace(plan, setup=replace(plan.setup, limits=replace(plan.setup.limits, joint_margin=margin)))
-    assert 0.0 < explored_by(limited).closed < 0.6
+    assert 0.0 < explored_by(limited)["closed_fraction"] < 0.6
 
 
 def test_the_probe_returns_in_the_air_and_searches_from_the_known_surface_on():

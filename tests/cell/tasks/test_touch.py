@@ -8,9 +8,9 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.results.text import losses_text
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.regain import losses_text, summarise_losses
 from canprobe.cell.tasks.requested import FORCE_RATE, Request, RequestedTask
 from canprobe.cell.tasks.task import Loss
 from canprobe.errors import UsageError
@@ -31,9 +31,8 @@ def test_each_loss_is_told(losses, text):
 
 
 def test_a_loss_is_summed_up_in_the_units_of_the_summary():
-    (found, gone) = summarise_losses([Loss(900, 0.93e-3, 0.465), Loss(1400, 2e-3)])
-    assert found == pytest.approx(FOUND)
-    assert gone == GONE
+    assert Loss(900, 0.93e-3, 0.465).summarised == pytest.approx(FOUND)
+    assert Loss(1400, 2e-3).summarised == GONE
 
 
 # A task under requests: it follows them without a step, and stops in its own orderly way.
