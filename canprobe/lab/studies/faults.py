@@ -20,7 +20,7 @@ import numpy as np
 from canprobe.cell.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, legend, log_scale, parts, picture
 from canprobe.lab.studies.fault_cases import CASES, KINDS, REPEATS, TASKS, FaultCase, WrongFile, wrong_files
 from canprobe.lab.studies.fault_runs import FORCE_SHARE, PRESSED_N, USUAL_SHARE, run_case, run_wrong_file
-from canprobe.lab.studies.result import Column, Row, Say, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 NUMBERS_A_CELL = 17
@@ -37,31 +37,10 @@ COLOURS = {
 }
 """Colour and hatch of each outcome; the others, `hang` and `crash`, are failures."""
 COLUMNS = (
-    Column("fault", "fault"),
-    Column("runs", "runs", "d"),
-    Column("force_max_n", "highest true force N", ".2f"),
-    Column("worst", "in"),
-    *(Column(f"{task}_n", f"{task} N", ".1f") for task in TASKS),
-    Column("above_ms", "longest above limit ms", ".0f"),
-    Column("noticed_ms", "detection ms, median", ".0f"),
-    Column("noticed_max_ms", "longest", ".0f"),
-    Column("unnoticed", "not noticed", "d"),
-    *(Column(outcome, outcome, "d") for outcome in COLOURS),
-    Column("pressing", "left pressing", "d"),
-    Column("left_n", "with N", ".1f"),
-    Column("named", "cause named %", ".0f"),
-    Column("failures", "failures", "d"),
-)
-FILE_COLUMNS = (
-    Column("file", "wrong file"),
-    Column("joint", "joint", "d"),
-    Column("plant", "plant"),
-    Column("force_max_n", "highest true force N", ".2f"),
-    Column("above_ms", "longest above limit ms", ".0f"),
-    Column("left_n", "left pressing with N", ".1f"),
-    Column("outcome", "outcome"),
-    Column("reason", "what notices it"),
-)
+    "fault", "runs", "force_max_n", "worst", *(f"{task}_n" for task in TASKS), "above_ms", "noticed_ms",
+    "noticed_max_ms", "unnoticed", *COLOURS, "pressing", "left_n", "named", "failures",
+)  # fmt: skip
+FILE_COLUMNS = ("file", "joint", "plant", "force_max_n", "above_ms", "left_n", "outcome", "reason")
 MOST_FAILURES = 20
 
 

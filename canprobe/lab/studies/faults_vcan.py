@@ -54,7 +54,7 @@ from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.faults import draw_forces
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
 from canprobe.lab.studies.recover_score import forces_of
-from canprobe.lab.studies.result import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
 
@@ -80,28 +80,10 @@ APART_S = 0.3
 """Time between two looks at the positions, s."""
 MOST_COUNTS = 8
 _TPDO1 = 0x181
-COLUMNS = (
-    Column("seed", "seed", "d"),
-    Column("fault", "fault"),
-    Column("after_s", "after s", ".2f"),
-    Column("status", "master's status"),
-    Column("ended_s", "ended within s", ".2f"),
-    Column("drives", "drives afterwards"),
-    Column("failures", "failures"),
-)
+COLUMNS = ("seed", "fault", "after_s", "status", "ended_s", "drives", "failures")
 
 
-THROWN_COLUMNS = (
-    Column("fault", "fault"),
-    Column("task", "task"),
-    Column("phase", "thrown in"),
-    Column("patient", "patient"),
-    Column("force_max_n", "highest true force N", ".2f"),
-    Column("above_ms", "longest above limit ms", ".0f"),
-    Column("left_n", "left pressing with N", ".1f"),
-    Column("reason", "reason"),
-    Column("failures", "failures"),
-)
+THROWN_COLUMNS = ("fault", "task", "phase", "patient", "force_max_n", "above_ms", "left_n", "reason", "failures")
 THROWN = (
     ("node 16: stuck-image", "press", Phase.APPROACH),
     ("node 16: stuck-image", "weave", Phase.SCAN),

@@ -29,7 +29,7 @@ from canprobe.fieldbus.tools.link.verdict import FIT_SHARE, UNFIT_SHARE, Fitness
 from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.link_setups import MACHINE_HZ, construct, draw_machine, draw_setup, scene_of
 from canprobe.lab.studies.realtime_cases import on_any_bitrate, patient
-from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 CHECK_S, MINUTE_S, QUICK_MINUTE_S = 10.0, 60.0, 10.0
@@ -44,28 +44,10 @@ MODEL = (
     *("cell/session/check.py", "lab/studies/realtime_link.py", "lab/studies/link_setups.py"),
 )
 COLUMNS = (
-    Column("seed", "seed"),
-    Column("kind", "what is wrong"),
-    Column("rate_hz", "Hz"),
-    Column("size", "size", ".3g"),
-    Column("verdict", "check"),
-    Column("truth", "minute"),
-    Column("cause", "cause"),
-    Column("overruns_percent", "overruns, check %", ".2f"),
-    Column("true_overruns_percent", "minute %", ".2f"),
-    Column("missed", "missed, check"),
-    Column("true_missed", "minute"),
-    Column("ended", "ended by"),
-)
-RATE_COLUMNS = (
-    Column("seed", "machine"),
-    Column("kind", "kind"),
-    Column("rate_hz", "Hz"),
-    Column("late", "late SYNCs, check", ".0f"),
-    Column("predicted_percent", "predicted %", ".2f"),
-    Column("seen_percent", "minute %", ".2f"),
-    Column("ratio", "ratio", ".2f"),
-)
+    "seed", "kind", "rate_hz", "size", "verdict", "truth", "cause", "overruns_percent", "true_overruns_percent",
+    "missed", "true_missed", "ended",
+)  # fmt: skip
+RATE_COLUMNS = ("seed", "kind", "rate_hz", "late", "predicted_percent", "seen_percent", "ratio")
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,23 +34,14 @@ from canprobe.lab.studies.recover_score import (
     draw_case,
     shrink,
 )
-from canprobe.lab.studies.result import Column, Row, Say, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS, QUICK_RUNS, SEEDS_A_CELL = 1000, 8, 20
 COLUMNS = (
-    Column("work", "while it"),
-    Column("runs", "runs", "d"),
-    Column("lost", "losses", "d"),
-    Column("back", "came back", "d"),
-    Column("refused", "somebody has to look", "d"),
-    Column("jump_counts", "largest jump, counts", "d"),
-    Column("force_max_n", "highest force N", ".2f"),
-    Column("force_calm_n", "but for the stop N", ".2f"),
-    Column("late_s", "longest from return to hold s", ".2f"),
-    Column("rows_lost", "cycles without a row", "d"),
-    Column("failures", "failures", "d"),
-)
+    "work", "runs", "lost", "back", "refused", "jump_counts", "force_max_n", "force_calm_n", "late_s", "rows_lost",
+    "failures",
+)  # fmt: skip
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:

@@ -35,7 +35,7 @@ from canprobe.errors import PlanError
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 from canprobe.lab.studies.random_scenes import CELLS
 from canprobe.lab.studies.region_scores import scores_of
-from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import CHI2_95_OF_3, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.stability_runs import delay, refused_row, run_touch
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.robot.chain import forward
@@ -52,17 +52,9 @@ MODEL = (
     "lab/studies/stability_extremes.py", "lab/studies/region_scores.py", "lab/studies/random_scenes.py",
 )  # fmt: skip
 COLUMNS = (
-    Column("extreme", "extreme"),
-    Column("value", "value"),
-    Column("task", "task"),
-    Column("ended", "ended"),
-    Column("force_max_n", "max N", ".3g"),
-    Column("error_percent", "force error %", ".0f"),
-    Column("curvature_per_m", "curvature error 1/m", ".2f"),
-    Column("stated_per_m", "stated 1/m", ".2f"),
-    Column("held", "regions hold", ".2f"),
-    Column("reason", "reason"),
-)
+    "extreme", "value", "task", "ended", "force_max_n", "error_percent", "curvature_per_m", "stated_per_m", "held",
+    "reason",
+)  # fmt: skip
 END_MARKS = {
     "right": (BLUE, "o", "right"),
     "stopped": (AMBER, "s", "stopped with the reason"),

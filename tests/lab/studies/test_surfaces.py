@@ -125,7 +125,7 @@ def test_exploration_is_compared_with_the_best_of_the_others():
 
 
 def test_the_map_is_compared_with_the_best_of_the_others_shape_by_shape():
-    scores = dict.fromkeys((column.key for column in COLUMNS[3:]), 1.0)
+    scores = dict.fromkeys(COLUMNS[3:], 1.0)
     names = [{"method": name, "setting": 4.0, "unit": "mm radius"} for name in ("map", "quadrics", "process")]
     each = [
         [
