@@ -171,7 +171,7 @@ def measure_machine(case: RateCase) -> list[Row]:
 
 def _patient_scene(rate_hz: float) -> Scene:
     changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "scene.figures": False}
-    return patient(on_any_bitrate(load_scene("free", changes), BITRATE))
+    return on_any_bitrate(patient(load_scene("free", changes)), BITRATE)
 
 
 def findings(rows: Sequence[Row]) -> list[str]:
