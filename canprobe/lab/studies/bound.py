@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -46,9 +45,7 @@ SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
 NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
 LEAST_SIZE = 50.0
 """Least ‖K‖ that counts, 1/m: a smaller one counts as this."""
-REGION: Mapping[str, float] = MappingProxyType(
-    {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
-)
+REGION: Mapping[str, float] = {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
 """Largest path over the radius, bound on an entry of K over its size, κσ_p (turn of the normal over the noise of a
 point, rad), error of the quadric without noise (its prior, and cubic terms of the surface) over the bound, and noise of
 a point over the spread of the points where that is narrowest: beyond, a path is not well excited.

@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from random import Random
-from types import MappingProxyType
 from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
@@ -34,20 +33,18 @@ SETTLED_S = 0.5
 """Time of the work after the last outage, and after motion was asked for: what is lost is noticed within 0.2 s."""
 SLACK_S = 1.0
 """Time that a cell may take from the boot-up of a node to the hold, besides the node's SDO times."""
-SCENES: Mapping[str, str] = MappingProxyType({"hold": "free", "free": "free", "press": "press", "scan": "plane"})
+SCENES: Mapping[str, str] = {"hold": "free", "free": "free", "press": "press", "scan": "plane"}
 """Scene of each kind of work."""
 STATUSWORD, POSITION, TARGET = 0x6041, 0x6064, 0x607A
-LOST: Mapping[str, str] = MappingProxyType(
-    {
-        "reboot": "reboot",
-        "bus-off": "bus-off",
-        "freeze": "freeze",
-        "sync-lost": "sync-lost",
-        "heartbeat-off": "heartbeat-off",
-        "nmt-reset": "nmt command=129",
-        "nmt-preop": "nmt command=128",
-    }
-)
+LOST: Mapping[str, str] = {
+    "reboot": "reboot",
+    "bus-off": "bus-off",
+    "freeze": "freeze",
+    "sync-lost": "sync-lost",
+    "heartbeat-off": "heartbeat-off",
+    "nmt-reset": "nmt command=129",
+    "nmt-preop": "nmt command=128",
+}
 """Faults of a node in the words of the registry, by name."""
 POWER, REPLUG, STALL = "power", "replug", "stall"
 """All nodes are without power; the interface of the master is down; the master itself stands still."""
