@@ -14,7 +14,6 @@ the cell.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -50,20 +49,12 @@ COLUMNS = (
 RATE_COLUMNS = ("seed", "kind", "rate_hz", "late", "predicted_percent", "seen_percent", "ratio")
 
 
-@dataclass(frozen=True, slots=True)
-class RateCase:
-    """One machine by its seed, and the length of the hold at each rate, s."""
-
-    seed: int
-    minute_s: float
-
-
 def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW) -> StudyResult:
     """Check the set-ups of a draw, and hold each for a minute; then the machines of a draw at each rate."""
     number = QUICK_SETUPS if quick else SETUPS
     rows: list[Row] = sweep.map(measure, [1000 * draw + i for i in range(number)], model=MODEL)
     machines, minute_s = (QUICK_MACHINES, QUICK_MINUTE_S) if quick else (MACHINES, MINUTE_S)
-    cases = [RateCase(900 * draw + i, minute_s) for i in range(machines)]
+    cases = [(900 * draw + i, minute_s) for i in range(machines)]
     rates: list[Row] = [row for some in sweep.map(measure_machine, cases, model=MODEL) for row in some]
     facts = measuring_facts(quick, number, MODEL)
     drawn = partial(
@@ -148,9 +139,10 @@ def measure(seed: int) -> dict[str, Any]:
     }
 
 
-def measure_machine(case: RateCase) -> list[Row]:
-    """Check a machine at one rate, and hold the cell at each rate."""
-    machine = draw_machine(case.seed)
+def measure_machine(case: tuple[int, float]) -> list[Row]:
+    """Check a machine, by its seed, at one rate, and hold the cell at each rate for a length, s."""
+    seed, minute_s = case
+    machine = draw_machine(seed)
     session = Session(_patient_scene(MACHINE_HZ), options_of_check())
     construct(session, machine, 0)
     report = measure_link(session, CHECK_S)
@@ -159,10 +151,10 @@ def measure_machine(case: RateCase) -> list[Row]:
     for rate_hz in RATES_HZ:
         session = Session(_patient_scene(rate_hz), RunOptions(rows_kept=100))
         construct(session, machine, rate_hz)
-        predicted, held = report.verdict.overruns[float(rate_hz)], hold(session, case.minute_s)
+        predicted, held = report.verdict.overruns[float(rate_hz)], hold(session, minute_s)
         if held.ended:
             raise CanprobeError(held.ended)
-        head = {"seed": case.seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
+        head = {"seed": seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
         percents = {"predicted_percent": 100.0 * predicted, "seen_percent": 100.0 * held.overruns}
         ratio = predicted / held.overruns if predicted and held.overruns else None
         rows.append({**head, **percents, "ratio": ratio})
