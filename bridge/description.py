@@ -6,14 +6,16 @@ the joint turns; `/tf_static` has it behind `link_i`. Any other arm is a drum al
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.geometry import T_flange_probe, transform
+from canprobe.cell.scene.hardware import ArmSettings
 from canprobe.errors import PlanError
 from canprobe.lab.bridge.sample import BASE, FLANGE, PROBE
 from canprobe.mechanics.robot import chain as serial
@@ -58,25 +60,35 @@ def axis_transforms(chain: Chain) -> list[tuple[str, str, Floats]]:
 
 
 def quaternion_of(R: Floats) -> tuple[float, float, float, float]:
-    """Unit quaternion x, y, z, w of a rotation (3, 3), w ≥ 0.
+    """Unit quaternion x, y, z, w of a rotation (3, 3), w ≥ 0."""
+    x, y, z, w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
+    return x, y, z, w
 
-    Source: Shepperd's choice of the largest of the four squares, which divides by no small number.
+
+def urdf_solids(arm: ArmSettings) -> list[Visual]:
+    """Solids of an arm's own URDF, each in the frame of its joint, those of the base where the arm is mounted.
+
+    Raises:
+        PlanError: the URDF cannot be read.
     """
-    m = R.tolist()
-    trace = m[0][0] + m[1][1] + m[2][2]
-    squares = (1 - trace + 2 * m[0][0], 1 - trace + 2 * m[1][1], 1 - trace + 2 * m[2][2], 1 + trace)
-    i = squares.index(max(squares))
-    big = math.sqrt(squares[i]) / 2
-    if i == 3:
-        q = [(m[2][1] - m[1][2]), (m[0][2] - m[2][0]), (m[1][0] - m[0][1]), 4 * big * big]
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q = [0.0] * 4
-        q[i] = 4 * big * big
-        q[j], q[k] = m[i][j] + m[j][i], m[i][k] + m[k][i]
-        q[3] = m[k][j] - m[j][k]
-    scale = math.copysign(1 / (4 * big), q[3])
-    return (q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale)
+    if arm.urdf is None:
+        return []
+    mount = transform(arm.mount_mm, arm.mount_deg)
+    solids = visuals_of(Path(arm.urdf), arm.base, arm.tip)
+    return [solid if solid.joint else replace(solid, T=mount @ solid.T) for solid in solids]
+
+
+def simple_solids(chain: Chain) -> list[Visual]:
+    """A drum along every axis, fixed to the link before it, and a bar to the next one, thinner towards the flange."""
+    solids = []
+    for i, (T, behind) in enumerate(zip(chain.fixed, (*chain.fixed[1:], chain.T_last_flange), strict=True)):
+        radius, way = DRUM_RADIUS_M * (1.0 - 0.5 * i / chain.n), behind[:3, 3]
+        solids.append(Visual(i, T, "cylinder", (radius, 2.0 * radius), "", DARK))
+        length = float(np.linalg.norm(way))
+        if length > radius:
+            bar = homogeneous(tangent_rotation(way / length), 0.5 * way)
+            solids.append(Visual(i + 1, bar, "cylinder", (0.7 * radius, length), "", WHITE))
+    return solids
 
 
 def robot_description(plan: Plan) -> str | None:
@@ -113,8 +125,10 @@ def robot_description(plan: Plan) -> str | None:
     if (probe := plan.scene.probe) is not None:  # not that of the setup, which is a large sphere with a flat array
         link = _fix(robot, PROBE, FLANGE, T_flange_probe(probe))
         _visual(link, np.eye(4), DARK, "sphere", radius=f"{probe.radius_mm * 1e-3:.12g}")
-    if not _shown_by_urdf(plan, frames, chain):
-        _plain(frames, chain)
+    assert plan.scene.arm is not None
+    if not _add_own_solids(plan.scene.arm, frames):
+        for solid in simple_solids(chain):
+            _visual(frames[solid.joint], solid.T, solid.colour or WHITE, solid.kind, **_sizes(solid))
     return Xml.tostring(robot, encoding="unicode")
 
 
@@ -136,46 +150,30 @@ def _fix(robot: Xml.Element, name: str, parent: str, T: Floats) -> Xml.Element:
     return link
 
 
-def _shown_by_urdf(plan: Plan, frames: dict[int, Xml.Element], chain: Chain) -> bool:
+def _add_own_solids(arm: ArmSettings, frames: dict[int, Xml.Element]) -> bool:
     """Add the solids of the arm's own URDF; False where it has none, or none is found."""
-    arm = plan.scene.arm
-    if arm is None or arm.urdf is None:
-        return False
     try:
-        visuals = visuals_of(Path(arm.urdf), arm.base, arm.tip)
+        solids = urdf_solids(arm)
     except PlanError:
         return False
-    mount, shown = transform(arm.mount_mm, arm.mount_deg), False
-    for visual in visuals:
-        attributes = _shape(Path(arm.urdf), visual)
-        if attributes is not None:
-            T = mount @ visual.T if visual.joint == 0 else visual.T
-            _visual(frames[visual.joint], T, visual.colour or WHITE, visual.kind, **attributes)
+    shown = False
+    for solid in solids:
+        attributes = _sizes(solid)
+        if solid.kind == "mesh":
+            path = find_mesh(Path(arm.urdf or ""), solid.mesh)
+            attributes = {} if path is None else {"filename": path.as_uri(), **attributes}
+        if attributes:
+            _visual(frames[solid.joint], solid.T, solid.colour or WHITE, solid.kind, **attributes)
             shown = True
     return shown
 
 
-def _shape(urdf: Path, visual: Visual) -> dict[str, str] | None:
-    size = [f"{value:.12g}" for value in visual.size]
-    if visual.kind == "mesh":
-        path = find_mesh(urdf, visual.mesh)
-        return None if path is None else {"filename": path.as_uri(), "scale": " ".join(size)}
-    if visual.kind == "box":
-        return {"size": " ".join(size)}
-    if visual.kind == "cylinder":
-        return {"radius": size[0], "length": size[1]}
-    return {"radius": size[0]} if visual.kind == "sphere" else None
-
-
-def _plain(frames: dict[int, Xml.Element], chain: Chain) -> None:
-    """A drum along every axis, and a bar to the next one."""
-    for i, T in enumerate((*chain.fixed[1:], chain.T_last_flange), start=1):
-        radius, frame, way = DRUM_RADIUS_M * (1.0 - 0.5 * (i - 1) / chain.n), frames[i], T[:3, 3]
-        _visual(frame, np.eye(4), DARK, "cylinder", radius=f"{radius:.4g}", length=f"{2.0 * radius:.4g}")
-        length = float(np.linalg.norm(way))
-        if length > radius:
-            bar = homogeneous(tangent_rotation(way / length), 0.5 * way)
-            _visual(frame, bar, WHITE, "cylinder", radius=f"{0.7 * radius:.4g}", length=f"{length:.4g}")
+def _sizes(solid: Visual) -> dict[str, str]:
+    """Attributes of a solid in a URDF that state its size; none of what a URDF does not know."""
+    size = [f"{value:.12g}" for value in solid.size]
+    if solid.kind in ("mesh", "box"):
+        return {"scale" if solid.kind == "mesh" else "size": " ".join(size)}
+    return dict(zip(("radius", "length"), size, strict=False))
 
 
 def _visual(link: Xml.Element, T: Floats, colour: tuple[int, int, int], kind: str, **attributes: str) -> None:

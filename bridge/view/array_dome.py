@@ -1,13 +1,15 @@
-"""The tactile array on its dome: where each taxel lies, and its image as colours."""
+"""The probe: its holder and elastic dome, where each taxel of its array lies, and the image as colours."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.lab.bridge.view.colours import MAGMA, Colours, scale
+from canprobe.lab.bridge.view.meshes import arc, revolved
 from canprobe.mechanics.touch.contact import pad_to_direction
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
@@ -17,6 +19,20 @@ TAXEL_SHARE = 0.9
 """Side of a drawn taxel over the pitch."""
 TAXEL_LIFT_M = 2e-4
 """Height of the drawn taxels above the dome, m."""
+
+
+def probe_parts(radius: float, T_flange_probe: Floats) -> tuple[Any, Any]:
+    """The probe in its own frame (origin at the sphere's centre, z the pole): its holder, and its elastic dome.
+
+    Args:
+        radius: radius of the sphere, m.
+        T_flange_probe: (4, 4); the holder goes back along z to the flange.
+    """
+    back = float(T_flange_probe[2, 3])
+    r = radius
+    outline = [(0.0, -back), (0.014, -back), (0.014, -0.72 * r), (0.62 * r, -0.42 * r), (0.9 * r, -0.42 * r)]
+    holder = revolved([*outline, (0.9 * r, -0.34 * r), (0.0, -0.34 * r)])
+    return holder, revolved(arc(radius, math.radians(-20.0), math.pi / 2, 24))
 
 
 def taxel_poses(pad: Pad, radius: float) -> tuple[Floats, Floats]:

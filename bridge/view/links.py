@@ -1,30 +1,62 @@
-"""The links of an arm from its URDF: meshes that are found beside it, and plain solids.
+"""The links of an arm: the solids of its URDF, with the meshes that are found beside it, or simple ones.
 
 Meshes (STL, DAE, OBJ) are read by trimesh (extra `view`). Where a link has nothing to show, or one of its
-meshes is missing or cannot be read, the simple link of `canprobe.lab.bridge.view.bodies` is drawn, and a line says so.
+meshes is missing or cannot be read, its simple solids are drawn (`description`), and a line says so.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.hardware import ArmSettings
-from canprobe.errors import PlanError, needed_module
-from canprobe.lab.bridge.view.bodies import WHITE, Part, arm_parts
-from canprobe.lab.bridge.view.meshes import TriangleMesh
-from canprobe.mechanics.robot.chain import Chain
-from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
+from canprobe.errors import PlanError
+from canprobe.lab.bridge.description import WHITE, simple_solids, urdf_solids
+from canprobe.lab.bridge.view.meshes import SECTORS, trimesh
+from canprobe.mechanics.robot.chain import Chain, link_transforms
+from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh
 from canprobe.mechanics.types import Floats
 
 _NAMED = 3
 """Number of missing meshes that a line names."""
 _FORMATS = (".stl", ".dae", ".obj")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One solid of one colour, fixed to a link.
+
+    Attributes:
+        name: name, unique in the arm.
+        frame: 0 for the base, i for the frame behind joint i.
+        mesh: its triangles in that frame, m, a `trimesh.Trimesh`.
+        colour: RGB, 0–255.
+    """
+
+    name: str
+    frame: int
+    mesh: Any
+    colour: tuple[int, int, int]
+
+
+def link_frames(chain: Chain, q: ArrayLike) -> Floats:
+    """Frames of the base and of every link.
+
+    Args:
+        chain: the arm.
+        q: joint positions (n,), rad or m.
+
+    Returns:
+        Poses T_base_link (n + 1, 4, 4); the last is the flange.
+    """
+    return np.array([*accumulate(link_transforms(chain, q), np.matmul, initial=np.eye(4))])
 
 
 def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
@@ -34,29 +66,30 @@ def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
         arm: arm of the scene.
         chain: kinematic chain of that arm.
     """
-    plain = arm_parts(chain)
-    if arm.urdf is None:
-        return plain, []
-    urdf = Path(arm.urdf)
-    try:
-        visuals = visuals_of(urdf, arm.base, arm.tip)
-    except PlanError as error:
-        return plain, [f"{error}: simple links are drawn"]
     behind = (np.eye(4), *chain.fixed[1:], chain.T_last_flange)  # where a part's frame stands in that of its joint
-    mount = transform(arm.mount_mm, arm.mount_deg)
+
+    def placed(name: str, solid: Visual) -> Iterator[Part]:
+        T = np.linalg.inv(behind[solid.joint]) @ solid.T
+        for number, (mesh, colour) in enumerate(_meshes(arm, solid), start=1):
+            yield Part(f"{name}_{number}", solid.joint, mesh.apply_transform(T), solid.colour or colour)
+
+    try:
+        solids, lines = urdf_solids(arm), list[str]()
+    except PlanError as error:
+        solids, lines = [], [f"{error}: simple links are drawn"]
     parts: list[Part] = []
     lost: dict[str, list[Visual]] = {}
-    for visual in visuals:
-        T = (mount if visual.joint == 0 else np.linalg.inv(behind[visual.joint])) @ visual.T
+    for number, solid in enumerate(solids, start=1):
         try:
-            for mesh, colour in _solids(urdf, visual):
-                name = f"solid_{len(parts) + 1}"
-                parts.append(Part(name, visual.joint, mesh.moved(T), visual.colour or colour, flat=True))
+            parts += placed(f"solid_{number}", solid)
         except _LostError as error:
-            lost.setdefault(str(error), []).append(visual)
-    simple = {visual.joint for visuals in lost.values() for visual in visuals}
-    simple |= set(range(chain.n + 1)) - {part.frame for part in parts}
-    return [*(part for part in plain if part.frame in simple), *parts], list(_lines(urdf, lost))
+            lost.setdefault(str(error), []).append(solid)
+    bare = {solid.joint for some in lost.values() for solid in some}
+    bare |= set(range(chain.n + 1)) - {part.frame for part in parts}
+    for number, solid in enumerate(simple_solids(chain), start=1):
+        if solid.joint in bare:
+            parts += placed(f"simple_{number}", solid)
+    return parts, [*lines, *_lines(Path(arm.urdf or ""), lost)]
 
 
 def _lines(urdf: Path, lost: dict[str, list[Visual]]) -> Iterator[str]:
@@ -70,42 +103,32 @@ class _LostError(Exception):
     """Why a solid cannot be drawn."""
 
 
-def _solids(urdf: Path, visual: Visual) -> list[tuple[TriangleMesh, tuple[int, int, int]]]:
+def _meshes(arm: ArmSettings, solid: Visual) -> list[tuple[Any, tuple[int, int, int]]]:
     """Triangles and colours of one solid, in its own frame."""
-    trimesh = needed_module("trimesh", "view", "the view needs trimesh; type:")
-    size: Sequence[float] = visual.size
-    if visual.kind == "box":
-        return [(_mesh(trimesh.creation.box(size)), WHITE)]
-    if visual.kind == "cylinder":
-        return [(_mesh(trimesh.creation.cylinder(*size)), WHITE)]
-    if visual.kind == "sphere":
-        return [(_mesh(trimesh.creation.icosphere(radius=size[0])), WHITE)]
-    if visual.kind != "mesh":
+    creation = trimesh().creation
+    if solid.kind == "box":
+        return [(creation.box(solid.size), WHITE)]
+    if solid.kind == "cylinder":
+        return [(creation.cylinder(*solid.size, sections=SECTORS), WHITE)]
+    if solid.kind == "sphere":
+        return [(creation.icosphere(radius=solid.size[0]), WHITE)]
+    if solid.kind != "mesh":
         raise _LostError("not a solid of a URDF")
-    path = find_mesh(urdf, visual.mesh)
+    path = find_mesh(Path(arm.urdf or ""), solid.mesh)
     if path is None:
         raise _LostError("not found beside the URDF")
     if path.suffix.lower() not in _FORMATS:
         raise _LostError(f"expected {', '.join(_FORMATS)}")
     logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it logs tracebacks of what it does without
     try:
-        bodies = trimesh.load_scene(path).dump()
+        bodies = [body for body in trimesh().load_scene(path).dump() if len(getattr(body, "faces", ()))]
     except Exception as error:  # whatever a reader of foreign files raises, the view goes on
         raise _LostError(f"cannot be read: {error or type(error).__name__}") from error
-    solid = [body for body in bodies if len(getattr(body, "faces", ()))]
-    if not solid:  # of a damaged STL, trimesh makes a body of nothing
+    if not bodies:  # of a damaged STL, trimesh makes a body of nothing
         raise _LostError("cannot be read: it holds no facet")
-    return [(_scaled(_mesh(body), np.array(size)), _colour(body)) for body in solid]
-
-
-def _mesh(body: Any) -> TriangleMesh:
-    body.merge_vertices(merge_tex=True, merge_norm=True)
-    return TriangleMesh(np.array(body.vertices, np.float64), np.array(body.faces, np.int64))
-
-
-def _scaled(mesh: TriangleMesh, scale: Floats) -> TriangleMesh:
-    faces = mesh.faces if scale.prod() > 0.0 else mesh.faces[:, ::-1]  # mirrored, it would be inside out
-    return TriangleMesh(mesh.vertices * scale, faces)
+    for body in bodies:
+        body.merge_vertices(merge_tex=True, merge_norm=True)
+    return [(body.apply_scale(solid.size), _colour(body)) for body in bodies]
 
 
 def _colour(body: Any) -> tuple[int, int, int]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.lab.bridge.view.meshes import TriangleMesh, dome, grid, revolved
+from canprobe.lab.bridge.view.meshes import arc, revolved, sheet
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.objects import Cylinder, Sphere
 from canprobe.mechanics.touch.shapes import Bowl, PlacedShape, Torus, Wave
+from canprobe.mechanics.touch.tangent_frames import homogeneous
 from canprobe.mechanics.types import Floats
 
 REACH_M = 0.055
@@ -23,27 +25,38 @@ RELIEF = 161
 """Points along each side of a grid of heights."""
 
 
-def object_mesh(shape: PlacedShape) -> TriangleMesh:
-    """The surface of an object near its origin, base frame.
+def object_mesh(shape: PlacedShape) -> Any:
+    """The surface of an object near its origin, base frame, a `trimesh.Trimesh`.
 
     Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `REACH_M` to each side),
     heights within `REACH_M`, everything else over a square of twice `REACH_M`.
     """
-    radius = getattr(shape, "radius", math.inf)
-    if radius <= WHOLE_M and isinstance(shape, Sphere):
-        return _placed(shape, dome(radius, math.pi, rings=32), -radius)
-    if radius <= WHOLE_M and isinstance(shape, Cylinder):
-        return _placed(shape, _tube(radius, REACH_M), -radius)
-    if radius <= WHOLE_M and isinstance(shape, Bowl):
-        return _placed(shape, _hollow(radius), radius)
+    T, radius = shape.T_base_object, getattr(shape, "radius", math.inf)
     if isinstance(shape, Heights):
         points, exists = _relief(shape)
-        mesh = grid(points)
-        used, faces = np.unique(mesh.faces[exists.ravel()[mesh.faces].all(axis=1)], return_inverse=True)
-        return TriangleMesh(mesh.vertices[used], faces.reshape(-1, 3))
+        mesh = sheet(points)
+        mesh.update_faces(exists.ravel()[mesh.faces].all(axis=1))
+        mesh.remove_unreferenced_vertices()
+        return mesh
+    if isinstance(shape, Sphere) and radius <= WHOLE_M:
+        return revolved(arc(radius, -math.pi / 2, math.pi / 2, 32), T @ _at(z=-radius))
+    if isinstance(shape, Cylinder) and radius <= WHOLE_M:
+        sides = np.column_stack([np.full(9, radius), np.linspace(-REACH_M, REACH_M, 9)])
+        return revolved(sides, T @ _at(z=-radius) @ _ALONG_X)
+    if isinstance(shape, Bowl) and radius <= WHOLE_M:  # the inside of the lower half of a ball
+        return revolved(arc(radius, 0.0, -math.pi / 2, 24), T @ _at(z=radius))
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
-        return _ring(shape)
-    return grid(_sheet(shape, REACH_M))
+        ring = np.add(arc(radius, -math.pi, math.pi, 48), (shape.ring_radius, 0.0))
+        return revolved(ring, T @ _at(x=-shape.ring_radius, z=-radius))
+    return sheet(_sheet(shape, REACH_M))
+
+
+_ALONG_X = homogeneous(np.array(((0, 0, 1), (0, 1, 0), (-1, 0, 0))), (0.0, 0.0, 0.0))
+"""Carries a body along z to one along x."""
+
+
+def _at(x: float = 0.0, z: float = 0.0) -> Floats:
+    return homogeneous(np.eye(3), (x, 0.0, z))
 
 
 def object_lines(shape: PlacedShape) -> Floats:
@@ -53,14 +66,13 @@ def object_lines(shape: PlacedShape) -> Floats:
         points, exists = _relief(shape)
         lines = _lines(np.where(exists[..., None], points, np.nan))
         return lines[np.isfinite(lines).all(axis=(1, 2))]
-    sheet = _sheet(shape, min(REACH_M, 0.7 * radius))  # not over the edge of a body seen from above
-    return _lines(sheet)
+    return _lines(_sheet(shape, min(REACH_M, 0.7 * radius)))  # not over the edge of a body seen from above
 
 
-def _lines(sheet: Floats) -> Floats:
-    rows, columns = (np.linspace(0, n - 1, LINES).round().astype(int) for n in sheet.shape[:2])
-    along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in rows]
-    across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in columns]
+def _lines(points: Floats) -> Floats:
+    rows, columns = (np.linspace(0, n - 1, LINES).round().astype(int) for n in points.shape[:2])
+    along = [np.stack([points[i, :-1], points[i, 1:]], axis=1) for i in rows]
+    across = [np.stack([points[:-1, j], points[1:, j]], axis=1) for j in columns]
     return np.concatenate([*along, *across])
 
 
@@ -91,31 +103,3 @@ def _height(shape: PlacedShape, y: float) -> float:
     if isinstance(shape, Wave):
         return shape.amplitude * (math.cos(2.0 * math.pi * y / shape.wavelength) - 1.0)
     return 0.0
-
-
-def _ring(shape: Torus) -> TriangleMesh:
-    """A whole torus."""
-    angle = np.linspace(-math.pi, math.pi, 49)
-    profile = np.column_stack([shape.ring_radius + shape.radius * np.cos(angle), shape.radius * np.sin(angle)])
-    mesh = revolved(profile, 96)
-    return _placed(shape, TriangleMesh(mesh.vertices - (shape.ring_radius, 0.0, 0.0), mesh.faces), -shape.radius)
-
-
-def _placed(shape: PlacedShape, mesh: TriangleMesh, height_m: float) -> TriangleMesh:
-    T = np.array(shape.T_base_object)
-    T[:3, 3] += height_m * T[:3, 2]
-    return mesh.moved(T)
-
-
-def _tube(radius: float, half: float) -> TriangleMesh:
-    """A cylinder along x, open at its ends."""
-    angles = np.linspace(0.0, 2.0 * math.pi, 97)
-    y, z = radius * np.cos(angles), radius * np.sin(angles)
-    ends = [np.column_stack([np.full(len(angles), x), y, z]) for x in np.linspace(-half, half, 9)]
-    return grid(np.stack(ends, axis=1))
-
-
-def _hollow(radius: float) -> TriangleMesh:
-    """The inside of the lower half of a ball."""
-    half = dome(radius, math.pi / 2)
-    return TriangleMesh(half.vertices * (1.0, -1.0, -1.0), half.faces[:, ::-1])

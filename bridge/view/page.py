@@ -74,19 +74,18 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))
     errors = deviation_scale(run.setup.truth.object, run.setup.scan)
-    task = run.scene.task
-    sensor = run.scene.sensor
+    scene, task, sensor = run.setup.scene, run.setup.scene.task, run.setup.scene.sensor
     blank = np.zeros((1, 1) if sensor is None else (sensor.rows, sensor.columns), np.uint8)
     taxels = b"".join((blank if m.taxels is None else m.taxels).tobytes() for m in moments) if run.taxels else b""
     return {
         "title": run.title,
         "notes": notes,
-        "scene": run.scene.name,
+        "scene": scene.name,
         "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
         "phases": [m.phase for m in moments],
         "target": task.force_n if task.kind in ("scan", "press") else None,
         "truth": run.setup.truth.object is not None,
-        "shape": run.scene.shape is not None,
+        "shape": scene.shape is not None,
         "sensor": sensor is not None,
         "rows": blank.shape[0],
         "columns": blank.shape[1],
@@ -97,7 +96,7 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
             "colours": errors.colours(np.linspace(0, errors.high, 64)).tolist(),
         },
         "heat": taxel_colours(np.arange(256, dtype=np.uint8)).tolist(),
-        "legend": legend_of(run.scene),
+        "legend": legend_of(scene),
         "centre": place_of(run.setup).tolist(),
     }
 

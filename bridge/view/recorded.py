@@ -26,7 +26,6 @@ from canprobe.cell.results.run_files import (
 )
 from canprobe.cell.results.surface_file import SURFACE, load_surface_map
 from canprobe.cell.scene.load import SAVED_AS
-from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.probing import Phase
@@ -65,14 +64,9 @@ class RecordedRun:
     surface_map: SurfaceMap | None
 
     @property
-    def scene(self) -> Scene:
-        """The scene in the user's words."""
-        return self.setup.scene
-
-    @property
     def title(self) -> str:
         """Name of the scene."""
-        return self.scene.title or self.scene.name
+        return self.setup.scene.title or self.setup.scene.name
 
     @property
     def duration_s(self) -> float:
@@ -83,11 +77,6 @@ class RecordedRun:
     def _q(self) -> Floats | None:
         """Joint positions (rows, n), rad or m."""
         return joint_positions(self.log)
-
-    @property
-    def contact_rows(self) -> NDArray[np.intp]:
-        """Rows of the log at which the probe was on its path over the object."""
-        return _contact_rows(self.log)
 
     def times(self, step_s: float) -> Floats:
         """Instants at an even distance from the first cycle to the last, s."""
@@ -161,7 +150,7 @@ def _surface_map(file: Path, log: dict[str, Floats], setup: Setup) -> SurfaceMap
         with contextlib.suppress(UsageError):
             found = load_surface_map(file)
             return found if len(found) else None
-    rows = _contact_rows(log)
+    rows = contact_rows(log)
     if setup.shape is None or not len(rows):
         return None
     found = map_of_points(setup.probe.radius)
@@ -169,7 +158,7 @@ def _surface_map(file: Path, log: dict[str, Floats], setup: Setup) -> SurfaceMap
     return found
 
 
-def _contact_rows(log: dict[str, Floats]) -> NDArray[np.intp]:
+def contact_rows(log: dict[str, Floats]) -> NDArray[np.intp]:
     """Rows of a log at which the probe was on its path over the object."""
     if "contact_mm" not in log:
         return np.zeros(0, np.intp)

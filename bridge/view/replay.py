@@ -11,7 +11,7 @@ from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.lab.bridge.view.instants import Moment, curves_of, row_of
 from canprobe.lab.bridge.view.panel import Panel
 from canprobe.lab.bridge.view.path import LoadedPath, Trail, deviation_scale
-from canprobe.lab.bridge.view.recorded import RecordedRun
+from canprobe.lab.bridge.view.recorded import RecordedRun, contact_rows
 from canprobe.lab.bridge.view.server import open_server
 from canprobe.lab.bridge.view.stage import Stage
 from canprobe.lab.bridge.view.surface import LoadedSurface
@@ -105,7 +105,7 @@ class Player:
         self._play = gui.add_checkbox("play", True)
         self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
         self.notes = self._scene.stage.notes
-        self._panel = Panel(server, run.scene, self._scene.errors, self._scene.stage)
+        self._panel = Panel(server, run.setup.scene, self._scene.errors, self._scene.stage)
         times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
         self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
         self._shown = math.nan
@@ -126,7 +126,7 @@ class Player:
 
 def trail_of(run: RecordedRun) -> Trail:
     """The path of a run's contact."""
-    trail, rows = Trail(), run.contact_rows
+    trail, rows = Trail(), contact_rows(run.log)
     if len(rows):
         points = run.log["contact_mm"][rows] * 1e-3
         for t_s, point, normal in zip(run.log["t_s"][rows].tolist(), points, run.log["normal"][rows], strict=True):

@@ -13,12 +13,10 @@ from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.lab.bridge.description import quaternion_of
-from canprobe.lab.bridge.view.array_dome import taxel_colours, taxel_poses, tile
-from canprobe.lab.bridge.view.bodies import link_frames, probe_parts
+from canprobe.lab.bridge.view.array_dome import probe_parts, taxel_colours, taxel_poses, tile
 from canprobe.lab.bridge.view.colours import linear_light
 from canprobe.lab.bridge.view.instants import Moment
-from canprobe.lab.bridge.view.links import arm_links
-from canprobe.lab.bridge.view.meshes import TriangleMesh
+from canprobe.lab.bridge.view.links import arm_links, link_frames
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
 from canprobe.lab.bridge.view.path import AHEAD, PATH
 from canprobe.mechanics.robot.model import ArmModel
@@ -95,11 +93,9 @@ class Stage:
             parts, undrawn = arm_links(scene.arm, self._model.chain)
             self.notes += undrawn
             self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
+            opacity = ARM_OPACITY if self._shape is not None else None
             for part in parts:
-                opacity = ARM_OPACITY if self._shape is not None else None
-                self._add(
-                    f"/arm/{part.frame}/{part.name}", part.mesh, part.colour, flat_shading=part.flat, opacity=opacity
-                )
+                self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour, flat_shading=True, opacity=opacity)
         if scene.probe is not None:
             self._add_probe(scene.probe.radius_mm * 1e-3, array.pad if array is not None else None)
         self._add_contact()
@@ -107,7 +103,7 @@ class Stage:
 
     # building
 
-    def _add(self, name: str, mesh: TriangleMesh, colour: tuple[int, int, int], **settings: Any) -> Any:
+    def _add(self, name: str, mesh: Any, colour: tuple[int, int, int], **settings: Any) -> Any:
         return self._api.add_mesh_simple(
             name, mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), color=colour, **settings
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from dataclasses import replace
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from canprobe.lab.bridge.sample import ContactFrame
+from canprobe.lab.bridge.view.meshes import trimesh
 from canprobe.lab.bridge.view.path import DeviationScale, Parts, Trail
 from canprobe.mechanics.touch import PAD_NOISE, Mesh, SurfaceMap
 from canprobe.mechanics.touch.map.surface_map import REACH_M
@@ -99,9 +99,8 @@ def _first_touched(vertices: Floats, trail: Trail) -> Floats:
 
 
 def _add(api: Any, name: str, mesh: Mesh, triangles: Any, colours: Any, *, visible: bool = True) -> Any:
-    trimesh = importlib.import_module("trimesh")
     used, index = np.unique(triangles, return_inverse=True)
-    solid = trimesh.Trimesh(
+    solid = trimesh().Trimesh(
         mesh.vertices[used] + LIFT_M * mesh.normals[used], index.reshape(-1, 3), vertex_colors=colours[used],
         vertex_normals=mesh.normals[used], process=False,
     )  # fmt: skip

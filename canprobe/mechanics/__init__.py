@@ -43,22 +43,16 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.mechanics.touch import fit_surface as fit_surface
     from canprobe.mechanics.touch import make_object as make_object
 
-_MODULES = {
-    "ArmModel": "robot.model",
-    "Chain": "robot.chain",
-    "ContactSample": "touch",
-    "Joint": "robot.model",
-    "Prior": "touch",
-    "SurfaceEstimate": "touch",
-    "SurfaceMap": "touch",
-    "SurfaceMatrix": "touch",
-    "cramer_rao": "touch",
-    "fit_map": "touch",
-    "fit_surface": "touch",
-    "forward": "robot.chain",
-    "from_dh": "robot.denavit_hartenberg",
-    "make_object": "touch",
+_NAMES = {
+    "robot.chain": ("Chain", "forward"),
+    "robot.denavit_hartenberg": ("from_dh",),
+    "robot.model": ("ArmModel", "Joint"),
+    "touch": (
+        *("ContactSample", "Prior", "SurfaceEstimate", "SurfaceMap", "SurfaceMatrix"),
+        *("cramer_rao", "fit_map", "fit_surface", "make_object"),
+    ),
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
 
 

@@ -18,7 +18,7 @@ from canprobe.cli import main
 from canprobe.errors import ResultsError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.lab.studies.cell_store import CellStore
-from canprobe.lab.studies.result import Column, StudyResult, write_study
+from canprobe.lab.studies.result import StudyResult, write_study
 
 ROOM = 2000
 
@@ -78,7 +78,7 @@ def test_a_table_leaves_no_part_of_a_file(scan, tmp_path):
 
 def test_a_study_leaves_no_part_of_a_file(tmp_path):
     rows = [{"value": float(value)} for value in np.arange(1000)]
-    result = StudyResult("some", (Column("value", "value", ".1f"),), rows, (), {}, lambda path: path.write_text("x"))
+    result = StudyResult("some", ("value",), rows, (), {}, lambda path: path.write_text("x"))
     with room_for(ROOM), pytest.raises(ResultsError, match=r"some\.csv: cannot be written"):
         write_study(result, tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -34,7 +34,7 @@ from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
-from canprobe.lab.studies.result import Column, Row, StudyResult, as_document, measuring_facts, text_of
+from canprobe.lab.studies.result import Row, StudyResult, as_document, measuring_facts, text_of
 
 # What packages take on disk, with everything that they need and canprobe itself does not.
 
@@ -82,16 +82,9 @@ def _normal(name: str) -> str:
 
 SCENE, SECONDS, QUICK_SECONDS, WARM_UP = "cylinder", 20.0, 3.0, 400
 COLUMNS = (
-    Column("bridge", "bridge"),
-    Column("watched", "watched"),
-    Column("added_p50_us", "added µs p50", ".0f"),
-    Column("added_p99_us", "p99", ".0f"),
-    Column("added_max_us", "max", ".0f"),
-    Column("samples", "samples", "d"),
-    Column("dropped", "dropped", "d"),
-    Column("processor_percent", "its processor %", ".0f"),
-    Column("installed_mb", "extra MB", ".0f"),
-)
+    "bridge", "watched", "added_p50_us", "added_p99_us", "added_max_us", "samples", "dropped", "processor_percent",
+    "installed_mb",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,8 @@ import struct
 from collections import deque
 from collections.abc import Callable, Container, Sequence
 from itertools import count, takewhile
-from typing import Protocol
 
 import numpy as np
-from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.cell.emulated.image_processing import (
     Image,
@@ -27,13 +25,14 @@ from canprobe.cell.emulated.image_processing import (
     is_overloaded,
     middle,
 )
+from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Array
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import WINDOW_SIZE, WINDOW_SIZE_NAME
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value, key_of
-from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
+from canprobe.fieldbus.node.slave_node import Application, SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtState
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 from canprobe.fieldbus.protocol.tactile import (
@@ -54,19 +53,6 @@ _CONTENT = {TactileMode.FEATURES: FEATURES, TactileMode.WINDOW: WINDOW_ROWS, Tac
 _MAX_AGE_US = 0xFFFF
 
 
-class TactilePlant(Protocol):
-    """The functions of the plant that the sensor needs."""
-
-    def begin(self, t_ns: int) -> None:
-        """Time goes on from `t_ns`, unless it does already: the array is triggered."""
-
-    def advance(self, t_ns: int) -> None:
-        """Bring the plant to `t_ns`; idempotent."""
-
-    def sample_image(self, t_ns: int) -> Raw:
-        """Raw counts of the array at `t_ns`, (rows, columns), 255 at full scale."""
-
-
 class TactileApplication(Application):
     """The sensor function of one node. A tare command takes the mean of the next images as zero.
 
@@ -75,13 +61,7 @@ class TactileApplication(Application):
         publish: called with header and content of each frame; it puts them into the objects that the TPDOs carry.
     """
 
-    def __init__(
-        self,
-        plant: TactilePlant,
-        latency_frames: int = 1,
-        tare_images: int = 16,
-        pad: Pad | None = None,
-    ) -> None:
+    def __init__(self, plant: Plant, latency_frames: int = 1, tare_images: int = 16, pad: Pad | None = None) -> None:
         """Make the sensor.
 
         Args:
@@ -233,21 +213,6 @@ def _members(dictionary: Dictionary, index: int) -> tuple[int, ...]:
     return tuple(takewhile(dictionary.__contains__, (key_of(index, subindex) for subindex in count(1))))
 
 
-def make_tactile_node(
-    od: ObjectDictionary, node_id: int, plant: TactilePlant, od_of: OdOf | None = None, pad: Pad | None = None
-) -> SlaveNode:
-    """A tactile node on the plant.
-
-    Args:
-        od: object dictionary of `tactile_array.eds`, for this node id.
-        node_id: 1–127, or 255 for none.
-        plant: shared by all nodes.
-        od_of: the EDS for another node id, where LSS may give the node one.
-        pad: its taxels; None: 16×16 over one inch.
-    """
-    return SlaveNode(od, node_id, TactileApplication(plant, pad=pad), od_of=od_of)
-
-
 def _check_tare(subindex: int, value: Value) -> None:
     if value != TARE:
         raise SdoAbort(Abort.CANNOT_STORE)
@@ -270,7 +235,7 @@ class RawArray(Participant):
         running: whether it was started; a device without a start frame always runs.
     """
 
-    def __init__(self, array: Array, plant: TactilePlant, *, sync_ratio: int, seed: int) -> None:
+    def __init__(self, array: Array, plant: Plant, *, sync_ratio: int, seed: int) -> None:
         assert array.raw is not None
         self._wire = wire = array.raw
         self._plant = plant

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 
 import numpy as np
 
@@ -202,5 +201,5 @@ class HeaderCrc(ArrayEffect):
         return ((can_id, data[:_CRC_BYTE] + bytes((data[_CRC_BYTE] ^ 1,)) + data[_CRC_BYTE + 1 :]),)
 
 
-CELL_FAULTS: Mapping[str, FaultKind] = MappingProxyType({**BUS_FAULTS, **kinds_of(sys.modules[__name__])})
+CELL_FAULTS: Mapping[str, FaultKind] = {**BUS_FAULTS, **kinds_of(sys.modules[__name__])}
 """Kinds of faults of the nodes of a cell by name."""

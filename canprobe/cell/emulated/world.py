@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.emulated.array import RawArray, make_tactile_node
+from canprobe.cell.emulated.array import RawArray, TactileApplication
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.emulated.truth_columns import with_units
 from canprobe.cell.planning.model import Plan, PlannedNode
@@ -214,7 +214,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
         _set_turn_units(node, drive.turn_units)
     else:
         assert setup.array is not None
-        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of, pad=setup.array.pad)
+        node = SlaveNode(dictionary, node_id, TactileApplication(plant, pad=setup.array.pad), od_of=od_of)
         if has_full_scale(dictionary):
             node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.pad.full_scale_pa))
     serial = planned.identity.serial_number

@@ -16,8 +16,7 @@ from canprobe.cell.plant.equations import ArmEquations
 from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE
 from canprobe.cell.plant.integrators import STEPS
 from canprobe.cell.plant.ramps import Reference
-from canprobe.fieldbus.drive.profile import MotorDynamics
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units
 from canprobe.mechanics.robot.motors import units_per_motor
 from canprobe.mechanics.types import Floats
 
@@ -86,17 +85,6 @@ class DynamicArm:
         x, v, _ = self._state().reshape(3, -1)
         return tuple((x * self._scales + self.model.zero_units).tolist()), tuple((v * self._scales).tolist())
 
-    @property
-    def q(self) -> Floats:
-        """(n,) joint positions now, rad or m."""
-        return units_to_joints(self.model, self.motors()[0])
-
-    @property
-    def qd(self) -> Floats:
-        """(n,) joint rates now, rad/s or m/s."""
-        rates: Floats = self.model.q_per_unit @ np.array(self.motors()[1])
-        return rates
-
     def motor_counts(self, axis: int) -> float:
         """Position of one motor now, counts, continuous.
 
@@ -132,19 +120,6 @@ class DynamicArm:
             axis, abs(rated) * limit_permille, speed / self._scales[axis], rated * torque_permille
         )
         self._torques = None
-
-    def motor_dynamics(self, axis: int) -> MotorDynamics:
-        """How one motor would answer to torque alone: its own inertia and friction, without the links.
-
-        Args:
-            axis: number of the motor, from 0.
-        """
-        joint = self.model.joints[axis]
-        return MotorDynamics(
-            gain=1e-3 * joint.rated_torque * abs(float(self._scales[axis])) / joint.rotor_inertia,
-            coulomb=1000.0 * joint.coulomb / joint.rated_torque,
-            damping=joint.viscous / joint.rotor_inertia,
-        )
 
     def _state(self) -> Floats:
         """The state at the present time."""

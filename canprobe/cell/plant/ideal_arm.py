@@ -15,9 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.cell.plant.ramps import NEVER
-from canprobe.fieldbus.drive.profile import MotorDynamics
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
-from canprobe.mechanics.types import Floats
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units
 
 PEAK_PERMILLE = 2000
 """Peak torque of a drive, permille of its rated torque (assumed)."""
@@ -179,27 +177,6 @@ class IdealArm:
         positions, rates, _ = zip(*(self._evaluated or self._states()), strict=True)
         return positions, rates
 
-    @property
-    def counts(self) -> Floats:
-        """(n,) motor positions now, counts."""
-        return np.array(self.motors()[0])
-
-    @property
-    def count_rates(self) -> Floats:
-        """(n,) motor rates now, counts/s."""
-        return np.array(self.motors()[1])
-
-    @property
-    def q(self) -> Floats:
-        """(n,) joint positions now, rad or m."""
-        return units_to_joints(self.model, self.counts)
-
-    @property
-    def qd(self) -> Floats:
-        """(n,) joint rates now, rad/s or m/s."""
-        rates: Floats = self.model.q_per_unit @ self.count_rates
-        return rates
-
     def motor_counts(self, axis: int) -> float:
         """Position of one motor now, counts, continuous.
 
@@ -242,21 +219,6 @@ class IdealArm:
             axis: number of the motor, from 0.
             limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
         """
-
-    def motor_dynamics(self, axis: int) -> MotorDynamics:
-        """How one motor would answer to torque: inertia, viscous and Coulomb friction of its own joint alone.
-
-        The wrist's coupling is left out here: it acts on positions only.
-
-        Args:
-            axis: number of the motor, from 0.
-        """
-        joint, units = self.model.joints[axis], abs(float(self.model.units_per_q[axis, axis]))
-        return MotorDynamics(
-            gain=1e-3 * joint.rated_torque * units / joint.rotor_inertia,
-            coulomb=1000.0 * joint.coulomb / joint.rated_torque,
-            damping=joint.viscous / joint.rotor_inertia,
-        )
 
     def _states(self) -> list[State]:
         if self._evaluated is None:

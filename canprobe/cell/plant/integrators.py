@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from math import sqrt
-from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -139,14 +138,12 @@ def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1
     raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MAX_PARTS} parts")
 
 
-STEPS: Mapping[str, Step] = MappingProxyType(
-    {
-        "semi-implicit": semi_implicit_euler,
-        "rk4": runge_kutta_4,
-        "implicit": implicit_euler,
-        "rosenbrock": rosenbrock2,
-        "exponential": exponential,
-        "adaptive": adaptive,
-    }
-)
+STEPS: Mapping[str, Step] = {
+    "semi-implicit": semi_implicit_euler,
+    "rk4": runge_kutta_4,
+    "implicit": implicit_euler,
+    "rosenbrock": rosenbrock2,
+    "exponential": exponential,
+    "adaptive": adaptive,
+}
 """Name in a scene -> step."""

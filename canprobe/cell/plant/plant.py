@@ -156,7 +156,9 @@ class Plant:
             self.arm.set_loop(axis, limit_permille, speed, torque_permille)
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
-        """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
+        """How one motor would answer to torque: inertia, viscous and Coulomb friction of its own joint alone.
+
+        Links and the wrist's coupling are left out.
 
         Args:
             axis: number of the drive, from 0.
@@ -164,7 +166,13 @@ class Plant:
         Raises:
             RuntimeError: without an arm.
         """
-        return self._need_arm().motor_dynamics(axis)
+        model = self._need_arm().model
+        joint, units = model.joints[axis], abs(float(model.units_per_q[axis, axis]))
+        return MotorDynamics(
+            gain=1e-3 * joint.rated_torque * units / joint.rotor_inertia,
+            coulomb=1000.0 * joint.coulomb / joint.rated_torque,
+            damping=joint.viscous / joint.rotor_inertia,
+        )
 
     def limit_switches(self, axis: int) -> tuple[float, float]:
         """Positions of one motor (counts) at and beyond which its joint's limit switches are active, lower first.
@@ -178,7 +186,8 @@ class Plant:
         arm = self.arm
         if arm is None:
             return -inf, inf
-        model, q, here = arm.model, float(arm.q[axis]), arm.motor_counts(axis)
+        model, here = arm.model, arm.motor_counts(axis)
+        q = float(units_to_joints(model, arm.motors()[0])[axis])
         beyond = SWITCH_DISTANCE_SHARE * (model.q_max[axis] - model.q_min[axis])
         per_count = float(model.q_per_unit[axis, axis])
         ends = [here + (end - q) / per_count for end in (model.q_min[axis] - beyond, model.q_max[axis] + beyond)]

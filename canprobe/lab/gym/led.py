@@ -103,11 +103,6 @@ class LedTask(TouchTask):
         """Last measured force, N."""
         return self._touch.force
 
-    @property
-    def force_set_point(self) -> float:
-        """Wanted force of the servo, N."""
-        return self.targets["target_force_n"]
-
     def frame(self, normal: Floats) -> Floats:
         """Rows x, y, z (3, 3) of the contact frame in base, for an outward unit normal (3,)."""
         x = self.axes[0] - (normal @ self.axes[0]) * normal

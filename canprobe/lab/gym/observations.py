@@ -91,7 +91,7 @@ class Observations:
         along, across, up = (task.axes @ (contact.p_base - origin)).tolist()
         values: list[float] = [
             task.wanted_force,
-            task.force_set_point,
+            task.targets["target_force_n"],
             float(np.mean(forces)),
             float(np.std(forces)),
             *(1e3 * uv for uv in task.pad_uv),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -76,7 +75,7 @@ _HELD_OUT = (
     {"kind": "torus", "ring_radius_mm": Uniform(100.0, 140.0), "radius_mm": Uniform(40.0, 60.0), **_TURNED},
     {"kind": "fillet", "radius_mm": Uniform(30.0, 50.0), "angle_deg": Uniform(20.0, 30.0), **_TURNED},
 )
-OBJECTS: Mapping[str, OneOf] = MappingProxyType({"train": OneOf(_TRAIN), "held_out": OneOf(_HELD_OUT)})
+OBJECTS: Mapping[str, OneOf] = {"train": OneOf(_TRAIN), "held_out": OneOf(_HELD_OUT)}
 """Sets of objects by name: the section `[object]` of an episode's scene, round the start point of the default scene."""
 
 

@@ -34,7 +34,7 @@ from canprobe.lab.studies.random_scenes import FOREIGN, KINDS, SceneSeed, own_ar
 from canprobe.lab.studies.region_scores import ScoredScan, held_share
 from canprobe.lab.studies.region_scores import measure as measure_scan
 from canprobe.lab.studies.regions import MODEL as SCAN_MODEL
-from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.array_calibration.parameter_fit import curvature_errors, moment_errors
 from canprobe.mechanics.touch.array_calibration.touches import Dwell, what_is_shown
@@ -64,37 +64,14 @@ SCAN_GROUPS = ("own", "foreign, alike", "foreign, unlike")
 GOALS = {"force_percent": 2.0, "stiffness_percent": 3.0, "curvature_percent": 5.0}
 MODEL = ("mechanics/touch", "cell/plant", "lab/studies/calibration.py", "lab/studies/array_presses.py")
 COLUMNS = (
-    Column("array", "array"),
-    Column("full_scale_kpa", "kPa", ".0f"),
-    Column("stiffness_n_m3", "K/h N/m³", ".3g"),
-    Column("blur", "blur pitches", ".2f"),
-    Column("crosstalk", "crosstalk", ".3f"),
-    Column("left_out", "left out"),
-    Column("force_percent", "force %", ".1f"),
-    Column("stiffness_percent", "stiffness %", ".1f"),
-    Column("by_depth_percent", "by depth %", ".1f"),
-    Column("moments_percent", "moments %", ".1f"),
-    Column("curvature_percent", "curvature %", ".1f"),
-)
+    "array", "full_scale_kpa", "stiffness_n_m3", "blur", "crosstalk", "left_out", "force_percent", "stiffness_percent",
+    "by_depth_percent", "moments_percent", "curvature_percent",
+)  # fmt: skip
 FORCE_COLUMNS = (
-    Column("array", "array"),
-    Column("calibration", "calibration"),
-    Column("creep_percent", "creep % a decade", ".1f"),
-    Column("creep_found_percent", "found", ".1f"),
-    Column("seconds", "seconds"),
-    Column("uncorrected_percent", "error with creep %", ".2f"),
-    Column("error_percent", "error %", ".2f"),
-    Column("stated_percent", "stated σ %", ".2f"),
-    Column("within_percent", "within 2σ %", ".1f"),
-    Column("bound_percent", "lower bound only %", ".1f"),
-)
-SCAN_COLUMNS = (
-    Column("calibration", "calibration"),
-    Column("scans", "scans"),
-    Column("noticed", "noticed"),
-    Column("coverage", "regions that hold the truth", ".3f"),
-    Column("coverage_noticed", "where noticed", ".3f"),
-)
+    "array", "calibration", "creep_percent", "creep_found_percent", "seconds", "uncorrected_percent", "error_percent",
+    "stated_percent", "within_percent", "bound_percent",
+)  # fmt: skip
+SCAN_COLUMNS = ("calibration", "scans", "noticed", "coverage", "coverage_noticed")
 
 
 def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:

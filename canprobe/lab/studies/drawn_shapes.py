@@ -6,7 +6,6 @@ rectangle (`TrueGround`).
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from canprobe.cell.results.scores import curvature_tensor
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
+from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import LAYER_STIFFNESS
 from canprobe.cell.scene.setup import Approach
 from canprobe.lab.studies.surface_methods import FoundSurface
@@ -71,26 +70,18 @@ def scene_of(shape: DrawnShape, folder: Path, seconds: float) -> Scene:
         seconds: duration of the scan.
     """
     rng = np.random.default_rng([261, 1000 + shape.number])
-    base = load_scene("cylinder")
-    assert base.shape is not None
     heading = float(rng.integers(0, 360))
     softer = float(np.exp(rng.uniform(-0.4, 0.4))) if shape.number % 2 else 1.0
-    task = replace(
-        base.task, strategy="explore", length_mm=LENGTH_MM, width_mm=WIDTH_MM, target_sigma_um=TARGET_UM,
-        duration_s=seconds, start_mm=PLACE_MM, clearance_mm=1.0, heading_deg=heading,
-    )  # fmt: skip
-    return replace(
-        base,
-        scene=replace(base.scene, name=shape.name, seed=FIRST_SEED + shape.number, figures=False),
-        bus=replace(base.bus, interface="direct"),
-        object=object_of(shape, folder),
-        task=task,
-        shape=replace(base.shape, also=()),
-        plant=PlantSettings(stiffness_n_m3=LAYER_STIFFNESS * softer),
-    )
+    return load_scene("cylinder", {
+        "scene.name": shape.name, "scene.seed": FIRST_SEED + shape.number, "scene.figures": False,
+        "bus.interface": "direct", "object": object_of(shape, folder), "shape.also": (),
+        "task.strategy": "explore", "task.length_mm": LENGTH_MM, "task.width_mm": WIDTH_MM,
+        "task.target_sigma_um": TARGET_UM, "task.duration_s": seconds, "task.start_mm": PLACE_MM,
+        "task.clearance_mm": 1.0, "task.heading_deg": heading, "plant": {"stiffness_n_m3": LAYER_STIFFNESS * softer},
+    })  # fmt: skip
 
 
-def object_of(shape: DrawnShape, folder: Path) -> ObjectSettings:
+def object_of(shape: DrawnShape, folder: Path) -> dict[str, Any]:
     """`[object]` of a shape; its heights are written into a folder."""
     rng = np.random.default_rng([262, *shape])
 
@@ -111,7 +102,7 @@ def object_of(shape: DrawnShape, folder: Path) -> ObjectSettings:
     formula = shape.kind < len(forms)
     keys = forms[shape.kind] if formula else heights_file(folder, form_heights_mm(shape.name, seed))
     turn = 37.0 * (1000 + shape.number) % 180
-    return ObjectSettings(position_mm=PLACE_MM, rotation_deg=(0.0, 0.0, turn), **keys)
+    return {"position_mm": PLACE_MM, "rotation_deg": (0.0, 0.0, turn), **keys}
 
 
 def form_heights_mm(form: str, seed: int) -> Floats:

@@ -25,8 +25,6 @@ from canprobe.lab.studies.bound import run_bound
 from canprobe.lab.studies.ground import Ground, make_ground
 from canprobe.lab.studies.result import (
     FROBENIUS,
-    SIGMA_COLUMNS,
-    Column,
     Row,
     StudyResult,
     mean_and_interval,
@@ -51,22 +49,10 @@ Place = tuple[str, float]
 REFERENCE = ("chen1996", 160, 10)
 MODEL = ("mechanics/touch", "lab/studies/estimators.py", "lab/studies/ground.py")
 COLUMNS = (
-    Column("surface", "surface"),
-    Column("method", "method"),
-    Column("window_samples", "window"),
-    Column("lag_samples", "lag"),
-    *SIGMA_COLUMNS,
-    Column("error_percent", "error %", ".2f"),
-    Column("error_low_percent", "from", ".2f"),
-    Column("error_high_percent", "to", ".2f"),
-    Column("bound_percent", "bound %", ".2f"),
-    Column("observed", "observed", ".2f"),
-    Column("add_us", "add µs", ".0f"),
-    Column("answer_us", "answer µs", ".0f"),
-    Column("sample_us", "add + ⅛ answer µs", ".0f"),
-    Column("ratio_to_chen1996", "× chen1996", ".3f"),
-    Column("in_budget", "frame in 5 ms"),
-)
+    "surface", "method", "window_samples", "lag_samples", "sigma_point_um", "sigma_normal_mrad", "error_percent",
+    "error_low_percent", "error_high_percent", "bound_percent", "observed", "add_us", "answer_us", "sample_us",
+    "ratio_to_chen1996", "in_budget",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

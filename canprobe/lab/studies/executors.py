@@ -36,12 +36,11 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
     pool = ProcessPoolExecutor(
         workers or system.processors(),
         multiprocessing.get_context("spawn"),
-        initializer=system.end_with_parent,
-        initargs=(os.getpid(), system.KILL),  # nothing in a worker moves, and whatever it does cannot ignore that
+        initializer=_begin,
+        initargs=(os.getpid(),),
     )
     try:
-        with _one_blas_thread():  # workers start when cells are submitted
-            yield _Deaf(pool)
+        yield _Deaf(pool)
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         _end(set(multiprocessing.active_children()) - before)
@@ -106,16 +105,10 @@ def _end(workers: Collection[BaseProcess]) -> None:
         worker.join()
 
 
-@contextlib.contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    before = {name: os.environ[name] for name in BLAS_THREADS if name in os.environ}
-    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name in BLAS_THREADS:
-            del os.environ[name]
-        os.environ.update(before)
+def _begin(parent: int) -> None:
+    """Begin a worker. Nothing in it moves, and whatever it does cannot ignore the signal."""
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))  # before numpy is loaded
+    system.end_with_parent(parent, system.KILL)
 
 
 Opener = Callable[[], AbstractContextManager[Executor]]

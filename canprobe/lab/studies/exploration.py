@@ -14,7 +14,7 @@ import numpy as np
 
 from canprobe.cell.results.picture import BLUE, GREEN, GREY, INK, ORANGE, PINK, SKY, legend, log_scale, picture
 from canprobe.lab.studies.drawn_shapes import LENGTH_MM, WIDTH_MM, TrueGround
-from canprobe.lab.studies.result import Column, Row, drawn_anew, interval_of
+from canprobe.lab.studies.result import Row, drawn_anew, interval_of
 from canprobe.lab.studies.surface_methods import evaluate_map
 from canprobe.mechanics.touch import ContactSample, SurfaceMap
 from canprobe.mechanics.touch.estimate.path_length import PathLength
@@ -29,16 +29,8 @@ LIMITS = {"height": 20e-6, "normal": 3e-3, "curvature": 2.0}
 STRATEGIES = ("explore", "weave 12 mm", "weave 9 mm", "raster 10 mm", "raster 8 mm", "raster 6 mm", "circle")
 COLOURS = dict(zip(STRATEGIES, (ORANGE, BLUE, SKY, INK, GREEN, PINK, GREY), strict=True))
 COLUMNS = (
-    Column("strategy", "strategy"),
-    Column("height_mm", "path to 20 µm, mm", ".0f"),
-    Column("normal_mm", "path to 3 mrad, mm", ".0f"),
-    Column("curvature_mm", "path to 2 1/m, mm", ".0f"),
-    Column("reached", "reached"),
-    Column("height_s", "time to 20 µm, s", ".1f"),
-    Column("force_percent", "force %", ".1f"),
-    Column("contact", "contact", ".1%"),
-    Column("stopped", "stopped", "d"),
-)
+    "strategy", "height_mm", "normal_mm", "curvature_mm", "reached", "height_s", "force_percent", "contact", "stopped",
+)  # fmt: skip
 
 
 class Lines:

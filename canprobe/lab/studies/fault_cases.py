@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from random import Random
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -32,18 +31,16 @@ KINDS = tuple(CELL_FAULTS.values())
 PHASES = ("start", "approach", "contact", "lift-off")
 PLANTS = ("ideal", "dynamic")
 REPEATS = 5
-TASKS: Mapping[str, tuple[str, Mapping[str, Any]]] = MappingProxyType(
-    {
-        "press": ("press", {"task.force_n": 3.0, "task.duration_s": 0.6}),
-        "weave": ("cylinder", {"task.duration_s": 4.0, "shape.also": ()}),
-        "straight": (
-            "cylinder",
-            {"task.strategy": "straight", "task.width_mm": None, "task.duration_s": 4.0, "shape.also": ()},
-        ),
-        "explore": ("explore", {"task.duration_s": 4.0}),
-        "calibrate": ("calibrate", {"task.touches": 2, "task.clearance_mm": 2.0}),
-    }
-)
+TASKS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "press": ("press", {"task.force_n": 3.0, "task.duration_s": 0.6}),
+    "weave": ("cylinder", {"task.duration_s": 4.0, "shape.also": ()}),
+    "straight": (
+        "cylinder",
+        {"task.strategy": "straight", "task.width_mm": None, "task.duration_s": 4.0, "shape.also": ()},
+    ),
+    "explore": ("explore", {"task.duration_s": 4.0}),
+    "calibrate": ("calibrate", {"task.touches": 2, "task.clearance_mm": 2.0}),
+}
 """Packaged scene of each task, and what makes it as short as it can be: a scan behind an image that no longer changes
 leaves the surface within three seconds."""
 CLEARANCE_MM = 1.0
@@ -58,21 +55,19 @@ Windows = Mapping[str, tuple[int, int]]
 _BOTH_WAYS = ("drop", "delay", "duplicate", "corrupt")
 """A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; a frame that is corrupted here stands
 for errors behind it: in a controller's memory, a driver, a gateway."""
-_DRAWN: Mapping[str, Callable[[Random], float]] = MappingProxyType(
-    {
-        "ms": lambda rng: round(10 ** rng.uniform(-1.0, 1.5), 3),
-        "gap_ms": lambda rng: round(rng.uniform(0.2, 2.0), 3),
-        "counts": lambda rng: rng.choice((-1, 1)) * round(10 ** rng.uniform(1.0, 4.3)),
-        "command": lambda rng: rng.choice((2, 128, 129)),
-        "state": lambda rng: rng.choice((4, 127)),
-        "gain": lambda rng: round(rng.uniform(0.1, 0.9), 2),
-        "images": lambda rng: rng.choice((1, 20)),
-        "first": lambda rng: rng.randrange(4, 9),
-        "rows": lambda rng: rng.randrange(1, 5),
-        "counts_s": lambda rng: round(10 ** rng.uniform(0.0, 2.0), 1),
-        "permille": lambda rng: rng.choice((10, 100, 500)),
-    }
-)
+_DRAWN: Mapping[str, Callable[[Random], float]] = {
+    "ms": lambda rng: round(10 ** rng.uniform(-1.0, 1.5), 3),
+    "gap_ms": lambda rng: round(rng.uniform(0.2, 2.0), 3),
+    "counts": lambda rng: rng.choice((-1, 1)) * round(10 ** rng.uniform(1.0, 4.3)),
+    "command": lambda rng: rng.choice((2, 128, 129)),
+    "state": lambda rng: rng.choice((4, 127)),
+    "gain": lambda rng: round(rng.uniform(0.1, 0.9), 2),
+    "images": lambda rng: rng.choice((1, 20)),
+    "first": lambda rng: rng.randrange(4, 9),
+    "rows": lambda rng: rng.randrange(1, 5),
+    "counts_s": lambda rng: round(10 ** rng.uniform(0.0, 2.0), 1),
+    "permille": lambda rng: rng.choice((10, 100, 500)),
+}
 """How values of parameters are drawn; the others have their defaults."""
 
 
@@ -171,24 +166,20 @@ def _zero_off(setup: Setup, arm: Arm, axis: int) -> ArmModel:
     return replace(arm.model, chain=replace(arm.model.chain, fixed=fixed))
 
 
-ARM_FILES: Mapping[str, TrueArm] = MappingProxyType(
-    {
-        "true gear × ½": _geared(0.5),
-        "true gear × 2": _geared(2.0),
-        "other sign": _geared(-1.0),
-        "zero off by 5°": _zero_off,
-    }
-)
+ARM_FILES: Mapping[str, TrueArm] = {
+    "true gear × ½": _geared(0.5),
+    "true gear × 2": _geared(2.0),
+    "other sign": _geared(-1.0),
+    "zero off by 5°": _zero_off,
+}
 """Wrong numbers of one joint."""
-OTHER_FILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        "tool 20 mm longer than its file": {"plant.tool_error_mm": (0, 0, 20), "task.clearance_mm": DEEP_MM},
-        "tool 20 mm shorter than its file": {"plant.tool_error_mm": (0, 0, -20), "task.clearance_mm": DEEP_MM},
-        "stiffness of the file × ¼": {"probe.stiffness_n_m3": 1.27e8 / 4, "plant.stiffness_n_m3": 1.27e8},
-        "stiffness of the file × 10": {"probe.stiffness_n_m3": 1.27e9, "plant.stiffness_n_m3": 1.27e8},
-        "calibration of an array that reads × 0.7": {},
-    }
-)
+OTHER_FILES: Mapping[str, Mapping[str, Any]] = {
+    "tool 20 mm longer than its file": {"plant.tool_error_mm": (0, 0, 20), "task.clearance_mm": DEEP_MM},
+    "tool 20 mm shorter than its file": {"plant.tool_error_mm": (0, 0, -20), "task.clearance_mm": DEEP_MM},
+    "stiffness of the file × ¼": {"probe.stiffness_n_m3": 1.27e8 / 4, "plant.stiffness_n_m3": 1.27e8},
+    "stiffness of the file × 10": {"probe.stiffness_n_m3": 1.27e9, "plant.stiffness_n_m3": 1.27e8},
+    "calibration of an array that reads × 0.7": {},
+}
 """Wrong numbers that are of no joint, as changes of the scene."""
 FOREIGN = tuple(OTHER_FILES)[-1]
 

@@ -20,7 +20,8 @@ import numpy as np
 from canprobe.cell.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, legend, log_scale, parts, picture
 from canprobe.lab.studies.fault_cases import CASES, KINDS, REPEATS, TASKS, FaultCase, WrongFile, wrong_files
 from canprobe.lab.studies.fault_runs import FORCE_SHARE, PRESSED_N, USUAL_SHARE, run_case, run_wrong_file
-from canprobe.lab.studies.result import Column, Row, Say, StudyResult, measuring_facts
+from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
+from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 NUMBERS_A_CELL = 17
@@ -37,31 +38,10 @@ COLOURS = {
 }
 """Colour and hatch of each outcome; the others, `hang` and `crash`, are failures."""
 COLUMNS = (
-    Column("fault", "fault"),
-    Column("runs", "runs", "d"),
-    Column("force_max_n", "highest true force N", ".2f"),
-    Column("worst", "in"),
-    *(Column(f"{task}_n", f"{task} N", ".1f") for task in TASKS),
-    Column("above_ms", "longest above limit ms", ".0f"),
-    Column("noticed_ms", "detection ms, median", ".0f"),
-    Column("noticed_max_ms", "longest", ".0f"),
-    Column("unnoticed", "not noticed", "d"),
-    *(Column(outcome, outcome, "d") for outcome in COLOURS),
-    Column("pressing", "left pressing", "d"),
-    Column("left_n", "with N", ".1f"),
-    Column("named", "cause named %", ".0f"),
-    Column("failures", "failures", "d"),
-)
-FILE_COLUMNS = (
-    Column("file", "wrong file"),
-    Column("joint", "joint", "d"),
-    Column("plant", "plant"),
-    Column("force_max_n", "highest true force N", ".2f"),
-    Column("above_ms", "longest above limit ms", ".0f"),
-    Column("left_n", "left pressing with N", ".1f"),
-    Column("outcome", "outcome"),
-    Column("reason", "what notices it"),
-)
+    "fault", "runs", "force_max_n", "worst", *(f"{task}_n" for task in TASKS), "above_ms", "noticed_ms",
+    "noticed_max_ms", "unnoticed", *COLOURS, "pressing", "left_n", "named", "failures",
+)  # fmt: skip
+FILE_COLUMNS = ("file", "joint", "plant", "force_max_n", "above_ms", "left_n", "outcome", "reason")
 MOST_FAILURES = 20
 
 
@@ -86,7 +66,8 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     runs = [one for answer in sweep.map(measure, cells) for one in answer]
     touches = sweep.map(run_wrong_file, QUICK_FILES if quick else wrong_files(JOINTS))
     facts = measuring_facts(quick, len(numbers))
-    drawn = partial(draw_forces, touches, "file", "plant", "Highest true force of a first touch with a wrong file")
+    title = "Highest true force of a first touch with a wrong file"
+    drawn = partial(draw_by_name, touches, "file", FORCE_AXIS, title=title, by="plant")
     files = StudyResult("faults_files", FILE_COLUMNS, touches, file_findings(touches), facts, drawn)
     return StudyResult("faults", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw, runs), (files,))
 
@@ -196,23 +177,6 @@ def draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes.grid(visible=False, axis="y")
         for part in sides:
             legend(part)
-
-
-def draw_forces(rows: Sequence[Mapping[str, Any]], what: str, by: str, title: str, path: Path) -> None:
-    """Draw the highest true force of each row by its column `what`; the values of the column `by` have marks."""
-    names, sorts = (list(dict.fromkeys(row[key] for row in rows)) for key in (what, by))
-    with picture(path, title, 1.8 + 0.25 * len(names)) as figure:
-        axes = figure.subplots()
-        for sort, colour, mark in zip(sorts, (BLUE, ORANGE), "ox", strict=False):
-            some = [row for row in rows if row[by] == sort]
-            places = [names.index(row[what]) for row in some]
-            axes.plot(
-                [max(row["force_max_n"], 0.01) for row in some], places, mark, color=colour, label=f"{by}: {sort}"
-            )
-        log_scale(axes, "x")
-        axes.set_yticks(range(len(names)), names)
-        axes.set(xlabel="highest true force (N)", ylim=(len(names) - 0.5, -0.5))
-        legend(figure)
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:

@@ -30,7 +30,6 @@ from canopen.sdo.exceptions import SdoCommunicationError
 
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.results.picture import BLUE, ORANGE, legend, picture
 from canprobe.cell.scene.load import dump_scene, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
@@ -51,10 +50,10 @@ from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
-from canprobe.lab.studies.faults import draw_forces
+from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
 from canprobe.lab.studies.recover_score import forces_of
-from canprobe.lab.studies.result import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
 
@@ -80,28 +79,10 @@ APART_S = 0.3
 """Time between two looks at the positions, s."""
 MOST_COUNTS = 8
 _TPDO1 = 0x181
-COLUMNS = (
-    Column("seed", "seed", "d"),
-    Column("fault", "fault"),
-    Column("after_s", "after s", ".2f"),
-    Column("status", "master's status"),
-    Column("ended_s", "ended within s", ".2f"),
-    Column("drives", "drives afterwards"),
-    Column("failures", "failures"),
-)
+COLUMNS = ("seed", "fault", "after_s", "status", "ended_s", "drives", "failures")
 
 
-THROWN_COLUMNS = (
-    Column("fault", "fault"),
-    Column("task", "task"),
-    Column("phase", "thrown in"),
-    Column("patient", "patient"),
-    Column("force_max_n", "highest true force N", ".2f"),
-    Column("above_ms", "longest above limit ms", ".0f"),
-    Column("left_n", "left pressing with N", ".1f"),
-    Column("reason", "reason"),
-    Column("failures", "failures"),
-)
+THROWN_COLUMNS = ("fault", "task", "phase", "patient", "force_max_n", "above_ms", "left_n", "reason", "failures")
 THROWN = (
     ("node 16: stuck-image", "press", Phase.APPROACH),
     ("node 16: stuck-image", "weave", Phase.SCAN),
@@ -162,7 +143,13 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
     facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
     thrown = _throw_all(quick)
-    return StudyResult("faults_vcan", COLUMNS, rows, findings(rows), facts, partial(draw_ends, rows), (thrown,))
+    drawn = partial(
+        draw_by_name, [row | {"failed": bool(row["failures"])} for row in rows], "fault",
+        ("ended_s", "from the fault to the end of the master (s)"), by="failed", log=False,
+        title="How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"
+        "failed: it hung, or nodes moved or were enabled afterwards",
+    )  # fmt: skip
+    return StudyResult("faults_vcan", COLUMNS, rows, findings(rows), facts, drawn, (thrown,))
 
 
 def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
@@ -191,7 +178,8 @@ def _throw_all(quick: bool) -> StudyResult:
     highest = max(row["force_max_n"] for row in rows)
     told = [f"{len(rows)} faults thrown on {CHANNEL}: highest true force {highest:.2f} N; {len(failed)} failed."]
     told += [f"{row['fault']}, {row['task']}, patient {row['patient']}: {row['failures']}" for row in failed]
-    drawn = partial(draw_forces, rows, "fault", "patient", f"Highest true force with a fault thrown on {CHANNEL}")
+    title = f"Highest true force with a fault thrown on {CHANNEL}"
+    drawn = partial(draw_by_name, rows, "fault", FORCE_AXIS, title=title, by="patient")
     return StudyResult("faults_thrown", THROWN_COLUMNS, rows, told, measuring_facts(quick, len(rows)), drawn)
 
 
@@ -250,24 +238,6 @@ def row_of(case: ProcessCase) -> Row:
         "drives": drives,
         "failures": "; ".join(run.failures),
     }
-
-
-def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the time that the master took to end, by the fault on vcan0."""
-    kinds = list(dict.fromkeys(row["fault"] for row in rows))
-    title = (
-        "How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"
-        "failed: it hung, or nodes moved or were enabled afterwards"
-    )
-    with picture(path, title, 1.8 + 0.25 * len(kinds)) as figure:
-        axes = figure.subplots()
-        for colour, mark, label, failed in ((BLUE, "o", "no failure", False), (ORANGE, "X", "failed", True)):
-            some = [row for row in rows if bool(row["failures"]) == failed]
-            places = [kinds.index(row["fault"]) for row in some]
-            axes.plot([row["ended_s"] for row in some], places, mark, color=colour, label=label)
-        axes.set_yticks(range(len(kinds)), kinds)
-        axes.set(xlabel="from the fault to the end of the master (s)", xlim=(0, None), ylim=(len(kinds) - 0.5, -0.5))
-        legend(figure)
 
 
 class _ServedRun:

@@ -30,7 +30,7 @@ from canprobe.lab.studies.realtime_cases import (
     measure_hold,
     measure_scan,
 )
-from canprobe.lab.studies.result import CHANNEL, Column, Row, Say, StudyResult, measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
@@ -38,26 +38,10 @@ MODES: tuple[TactileModeName, ...] = ("features", "window", "image")
 HELD_PER_10000 = 1.0
 """Most overruns of a rate that counts as held."""
 COLUMNS = (
-    Column("case", "case"),
-    Column("sensor", "sensor"),
-    Column("rate_hz", "asked Hz", ".0f"),
-    Column("held_hz", "held Hz", ".1f"),
-    Column("cycles", "cycles", ".0f"),
-    Column("overruns_per_10000", "overruns/10⁴", ".1f"),
-    Column("missed_pdos", "missed", ".0f"),
-    Column("lateness_p50_us", "late p50 µs", ".0f"),
-    Column("lateness_p99_us", "p99", ".0f"),
-    Column("lateness_max_us", "max", ".0f"),
-    Column("response_p50_us", "response p50 µs", ".0f"),
-    Column("response_p99_us", "p99", ".0f"),
-    Column("compute_p50_us", "compute p50 µs", ".0f"),
-    Column("compute_p99_us", "p99", ".0f"),
-    Column("latency_p50_us", "SYNC→last TPDO p50 µs", ".0f"),
-    Column("latency_p99_us", "p99", ".0f"),
-    Column("processor_percent", "processor %", ".1f"),
-    Column("verdict", "link"),
-    Column("ended", "ended"),
-)
+    "case", "sensor", "rate_hz", "held_hz", "cycles", "overruns_per_10000", "missed_pdos", "lateness_p50_us",
+    "lateness_p99_us", "lateness_max_us", "response_p50_us", "response_p99_us", "compute_p50_us", "compute_p99_us",
+    "latency_p50_us", "latency_p99_us", "processor_percent", "verdict", "ended",
+)  # fmt: skip
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:

@@ -174,17 +174,15 @@ def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measu
 
 def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
     """Six drives and the sensor at half their rate; the session starts none of them."""
-    scene = on_any_bitrate(_scene(), WIRE_BITRATE)
-    real = with_real_nodes(replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz)))
-    assert real.sensor is not None
-    return replace(real, sensor=replace(real.sensor, mode=mode, rate_hz=rate_hz / 2))
+    scene = on_any_bitrate(with_real_nodes(_scene()), WIRE_BITRATE)
+    assert scene.sensor is not None
+    sensor = replace(scene.sensor, mode=mode, rate_hz=rate_hz / 2)
+    return replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz), sensor=sensor)
 
 
 def with_real_nodes(scene: Scene) -> Scene:
     """The scene whose arm and array are served by another process."""
-    assert scene.arm is not None and scene.sensor is not None
-    arm, sensor = replace(scene.arm, emulated=False), replace(scene.sensor, emulated=False)
-    return replace(scene, arm=arm, sensor=sensor)
+    return load_scene(scene, {"arm.emulated": False, "sensor.emulated": False})
 
 
 def _scene(seconds: float | None = None) -> Scene:
@@ -195,9 +193,7 @@ def _scene(seconds: float | None = None) -> Scene:
 
 def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:
     """The scene with drives that tolerate missed SYNCs, and a master that no late cycles stop."""
-    assert scene.arm is not None
-    limits = replace(scene.limits, late_cycles_max_percent=LATE_PERCENT)
-    return replace(scene, arm=replace(scene.arm, missed_syncs=missed_syncs), limits=limits)
+    return load_scene(scene, {"arm.missed_syncs": missed_syncs, "limits.late_cycles_max_percent": float(LATE_PERCENT)})
 
 
 class Hold(Controller):

@@ -14,7 +14,6 @@ the cell.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -29,7 +28,7 @@ from canprobe.fieldbus.tools.link.verdict import FIT_SHARE, UNFIT_SHARE, Fitness
 from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.link_setups import MACHINE_HZ, construct, draw_machine, draw_setup, scene_of
 from canprobe.lab.studies.realtime_cases import on_any_bitrate, patient
-from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 CHECK_S, MINUTE_S, QUICK_MINUTE_S = 10.0, 60.0, 10.0
@@ -44,36 +43,10 @@ MODEL = (
     *("cell/session/check.py", "lab/studies/realtime_link.py", "lab/studies/link_setups.py"),
 )
 COLUMNS = (
-    Column("seed", "seed"),
-    Column("kind", "what is wrong"),
-    Column("rate_hz", "Hz"),
-    Column("size", "size", ".3g"),
-    Column("verdict", "check"),
-    Column("truth", "minute"),
-    Column("cause", "cause"),
-    Column("overruns_percent", "overruns, check %", ".2f"),
-    Column("true_overruns_percent", "minute %", ".2f"),
-    Column("missed", "missed, check"),
-    Column("true_missed", "minute"),
-    Column("ended", "ended by"),
-)
-RATE_COLUMNS = (
-    Column("seed", "machine"),
-    Column("kind", "kind"),
-    Column("rate_hz", "Hz"),
-    Column("late", "late SYNCs, check", ".0f"),
-    Column("predicted_percent", "predicted %", ".2f"),
-    Column("seen_percent", "minute %", ".2f"),
-    Column("ratio", "ratio", ".2f"),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class RateCase:
-    """One machine by its seed, and the length of the hold at each rate, s."""
-
-    seed: int
-    minute_s: float
+    "seed", "kind", "rate_hz", "size", "verdict", "truth", "cause", "overruns_percent", "true_overruns_percent",
+    "missed", "true_missed", "ended",
+)  # fmt: skip
+RATE_COLUMNS = ("seed", "kind", "rate_hz", "late", "predicted_percent", "seen_percent", "ratio")
 
 
 def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW) -> StudyResult:
@@ -81,7 +54,7 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW) -> StudyResult:
     number = QUICK_SETUPS if quick else SETUPS
     rows: list[Row] = sweep.map(measure, [1000 * draw + i for i in range(number)], model=MODEL)
     machines, minute_s = (QUICK_MACHINES, QUICK_MINUTE_S) if quick else (MACHINES, MINUTE_S)
-    cases = [RateCase(900 * draw + i, minute_s) for i in range(machines)]
+    cases = [(900 * draw + i, minute_s) for i in range(machines)]
     rates: list[Row] = [row for some in sweep.map(measure_machine, cases, model=MODEL) for row in some]
     facts = measuring_facts(quick, number, MODEL)
     drawn = partial(
@@ -166,9 +139,10 @@ def measure(seed: int) -> dict[str, Any]:
     }
 
 
-def measure_machine(case: RateCase) -> list[Row]:
-    """Check a machine at one rate, and hold the cell at each rate."""
-    machine = draw_machine(case.seed)
+def measure_machine(case: tuple[int, float]) -> list[Row]:
+    """Check a machine, by its seed, at one rate, and hold the cell at each rate for a length, s."""
+    seed, minute_s = case
+    machine = draw_machine(seed)
     session = Session(_patient_scene(MACHINE_HZ), options_of_check())
     construct(session, machine, 0)
     report = measure_link(session, CHECK_S)
@@ -177,10 +151,10 @@ def measure_machine(case: RateCase) -> list[Row]:
     for rate_hz in RATES_HZ:
         session = Session(_patient_scene(rate_hz), RunOptions(rows_kept=100))
         construct(session, machine, rate_hz)
-        predicted, held = report.verdict.overruns[float(rate_hz)], hold(session, case.minute_s)
+        predicted, held = report.verdict.overruns[float(rate_hz)], hold(session, minute_s)
         if held.ended:
             raise CanprobeError(held.ended)
-        head = {"seed": case.seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
+        head = {"seed": seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
         percents = {"predicted_percent": 100.0 * predicted, "seen_percent": 100.0 * held.overruns}
         ratio = predicted / held.overruns if predicted and held.overruns else None
         rows.append({**head, **percents, "ratio": ratio})
@@ -189,7 +163,7 @@ def measure_machine(case: RateCase) -> list[Row]:
 
 def _patient_scene(rate_hz: float) -> Scene:
     changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "scene.figures": False}
-    return patient(on_any_bitrate(load_scene("free", changes), BITRATE))
+    return on_any_bitrate(patient(load_scene("free", changes)), BITRATE)
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

@@ -31,7 +31,7 @@ from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.lab.studies.realtime_cases import PATIENCE, Hold, patient, served, with_real_nodes
-from canprobe.lab.studies.result import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 SOAK_S = 1800.0
@@ -39,18 +39,9 @@ SAMPLES = 60
 SETTLED = 0.25
 """Share of the run after which memory should be constant."""
 COLUMNS = (
-    Column("t_s", "t s", ".0f"),
-    Column("master_mib", "master MiB", ".2f"),
-    Column("nodes_mib", "nodes MiB", ".2f"),
-    Column("monitor_mib", "monitor MiB", ".2f"),
-    Column("cycles", "cycles", ".0f"),
-    Column("overruns", "overruns", ".0f"),
-    Column("missed_pdos", "missed", ".0f"),
-    Column("dropped_frames", "dropped", ".0f"),
-    Column("latency_us", "SYNC→last TPDO µs", ".0f"),
-    Column("frames_counted", "frames counted", ".0f"),
-    Column("frames_on_bus", "on the bus", ".0f"),
-)
+    "t_s", "master_mib", "nodes_mib", "monitor_mib", "cycles", "overruns", "missed_pdos", "dropped_frames",
+    "latency_us", "frames_counted", "frames_on_bus",
+)  # fmt: skip
 
 
 class Soaker(Hold):

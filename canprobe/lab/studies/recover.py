@@ -20,44 +20,28 @@ from typing import Any
 
 import canprobe
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.model import MASTER_NODE_ID
 from canprobe.cell.results.picture import BLUE, picture
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
-from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID, Frame
 from canprobe.lab.studies.recover_score import (
     END_S,
-    FIRST_SYNCS,
     REPLUG,
     SCENES,
     STALL,
     RecoverCase,
     RecoverScore,
     draw_case,
-    forces_of,
     shrink,
 )
-from canprobe.lab.studies.result import Column, Row, Say, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS, QUICK_RUNS, SEEDS_A_CELL = 1000, 8, 20
 COLUMNS = (
-    Column("work", "while it"),
-    Column("runs", "runs", "d"),
-    Column("lost", "losses", "d"),
-    Column("back", "came back", "d"),
-    Column("refused", "somebody has to look", "d"),
-    Column("jump_counts", "largest jump, counts", "d"),
-    Column("force_max_n", "highest force N", ".2f"),
-    Column("force_calm_n", "but for the stop N", ".2f"),
-    Column("late_s", "longest from return to hold s", ".2f"),
-    Column("rows_lost", "cycles without a row", "d"),
-    Column("failures", "failures", "d"),
-)
+    "work", "runs", "lost", "back", "refused", "jump_counts", "force_max_n", "force_calm_n", "late_s", "rows_lost",
+    "failures",
+)  # fmt: skip
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
@@ -83,8 +67,7 @@ def replay(seed: int, say: Say) -> dict[str, Any]:
     """Carry out the run of one seed again, and report what happens in it; a failure is shrunk."""
     case = draw_case(seed)
     say(f"seed {seed}: {case}")
-    with tempfile.TemporaryDirectory(prefix="canprobe-recover-") as folder:
-        outcome = run_case(case, say, Path(folder))
+    outcome = run_case(case, say)
     for failure in outcome["failures"]:
         say(f"FAILURE: {failure}")
     if outcome["failures"]:
@@ -134,72 +117,31 @@ def draw_runs(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
         axes.set_ylabel("runs")
 
 
-class WatchedDrives(Participant):
-    """Looks at the drives after each SYNC: distance of target and position in the first SYNCs after each enabling.
-
-    Args:
-        nodes: all emulated nodes.
-
-    Attributes:
-        jump_counts: largest distance in those SYNCs, from the second enabling of a drive on.
-        lifting: the cell takes the probe off, which is no jump.
-        syncs: number of SYNCs.
-        boot_ups: time of each boot-up, ns, by node.
-    """
-
-    name = "watcher of the drives"
-    hears_every_sync = True
-    listens = frozenset((SYNC_ID, *range(HEARTBEAT_BASE + 1, HEARTBEAT_BASE + MASTER_NODE_ID)))
-
-    def __init__(self, nodes: Sequence[SlaveNode]) -> None:
-        self._ages = {
-            node.node_id: (-1, 0, node) for node in nodes if node.dictionary.entries.get(0x604100) is not None
-        }
-        self.boot_ups: dict[int, list[int]] = {node.node_id: [] for node in nodes}
-        self.jump_counts = self.syncs = 0
-        self.lifting = False
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """Look at each drive."""
-        if can_id != SYNC_ID:
-            if data == b"\0":
-                self.boot_ups[can_id - HEARTBEAT_BASE].append(t_ns)
-            return []
-        self.syncs += 1
-        for node_id, (age, before, node) in self._ages.items():
-            number = node.dictionary.number
-            if known_state(number(0x6041)) is not DriveState.OPERATION_ENABLED:
-                self._ages[node_id] = (-1, before, node)
-                continue
-            times = before + (age < 0)
-            self._ages[node_id] = (age + 1, times, node)
-            if times > 1 and age + 1 < FIRST_SYNCS and not self.lifting:
-                self.jump_counts = max(self.jump_counts, abs(number(0x607A) - number(0x6064)))
-        return []
-
-
 class RecoverRun:
     """One run of the study.
 
     Args:
         case: what happens.
         say: called with each step.
-        out: folder of the run's files; None keeps none.
+        out: folder of the run's files.
+
+    Attributes:
+        outcome: what came of it, and what failed; with the hash of the bus log.
     """
 
-    def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path | None) -> None:
+    def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path) -> None:
         self._case = case
         changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
         plan = canprobe.plan(SCENES[case.work], changes)
         self._score = RecoverScore(case, plan, say)
         self._session = session = Session(plan, RunOptions(out, self._say, recover=True))
         self._faulty = session.buses.world.make_faulty()
-        self._drives = WatchedDrives(session.buses.world.nodes)
-        session.buses.world.participants.append(self._drives)
         session.around = self._disturbed
         self._away: list[tuple[int, int, bool]] = []
         with session:
             self._score.carry_out(session, self._begin, lambda: self._now_ns * 1e-9)
+        log = hashlib.sha256((out / "bus.log").read_bytes()).hexdigest()
+        self.outcome = {**self._score.outcome(session), "bus_log_sha256": log}
 
     @property
     def _now_ns(self) -> int:
@@ -208,8 +150,6 @@ class RecoverRun:
 
     def _say(self, text: str) -> None:
         self._score.say(self._now_ns * 1e-9 if self._session.buses.lockstep is not None else 0.0, text)
-        if text.startswith(("lift off", "enable the drives")):
-            self._drives.lifting = text.startswith("lift off")
 
     def _begin(self) -> None:
         """Throw the outages."""
@@ -241,17 +181,8 @@ class RecoverRun:
             setattr(port, name, around(name))
         return port
 
-    def outcome(self) -> dict[str, Any]:
-        """What came of it, and what failed; with files, the hash of the bus log too."""
-        session = self._session
-        boot_ups = {node_id: [t_ns * 1e-9 for t_ns in times] for node_id, times in self._drives.boot_ups.items()}
-        times_s = session.cell.log.arrays()["t_s"].tolist() if len(session.cell.log) else list[float]()
-        found = self._score.outcome(boot_ups, times_s, self._drives.syncs, forces_of(session), self._drives.jump_counts)
-        if session.options.out is not None:
-            found["bus_log_sha256"] = hashlib.sha256((session.options.out / "bus.log").read_bytes()).hexdigest()
-        return found
 
-
-def run_case(case: RecoverCase, say: Callable[[str], None] = lambda _: None, out: Path | None = None) -> dict[str, Any]:
+def run_case(case: RecoverCase, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Carry out a run, and score it."""
-    return RecoverRun(case, say, out).outcome()
+    with tempfile.TemporaryDirectory(prefix="canprobe-recover-") as folder:
+        return RecoverRun(case, say, Path(folder)).outcome

@@ -12,15 +12,18 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from random import Random
-from types import MappingProxyType
 from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
-from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.free_and_listen import HoldTask
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
+from canprobe.fieldbus.protocol.pdo import PdoLayout
 
 FIRST_SYNCS = 8
 """SYNCs after each enabling of a drive in which its target is compared with its position."""
@@ -30,19 +33,18 @@ SETTLED_S = 0.5
 """Time of the work after the last outage, and after motion was asked for: what is lost is noticed within 0.2 s."""
 SLACK_S = 1.0
 """Time that a cell may take from the boot-up of a node to the hold, besides the node's SDO times."""
-SCENES: Mapping[str, str] = MappingProxyType({"hold": "free", "free": "free", "press": "press", "scan": "plane"})
+SCENES: Mapping[str, str] = {"hold": "free", "free": "free", "press": "press", "scan": "plane"}
 """Scene of each kind of work."""
-LOST: Mapping[str, str] = MappingProxyType(
-    {
-        "reboot": "reboot",
-        "bus-off": "bus-off",
-        "freeze": "freeze",
-        "sync-lost": "sync-lost",
-        "heartbeat-off": "heartbeat-off",
-        "nmt-reset": "nmt command=129",
-        "nmt-preop": "nmt command=128",
-    }
-)
+STATUSWORD, POSITION, TARGET = 0x6041, 0x6064, 0x607A
+LOST: Mapping[str, str] = {
+    "reboot": "reboot",
+    "bus-off": "bus-off",
+    "freeze": "freeze",
+    "sync-lost": "sync-lost",
+    "heartbeat-off": "heartbeat-off",
+    "nmt-reset": "nmt command=129",
+    "nmt-preop": "nmt command=128",
+}
 """Faults of a node in the words of the registry, by name."""
 POWER, REPLUG, STALL = "power", "replug", "stall"
 """All nodes are without power; the interface of the master is down; the master itself stands still."""
@@ -213,23 +215,20 @@ class RecoverScore:
                 if self._said[-1][1].startswith("not back") or error.exit_status == 1:
                     break  # it ended for good, or somebody has to look
 
-    def outcome(
-        self,
-        boot_ups: Mapping[int, Sequence[float]],
-        times_s: Sequence[float],
-        syncs: int,
-        forces: Sequence[tuple[float, float]],
-        jump_counts: int,
-    ) -> dict[str, Any]:
-        """What came of it, and what failed.
-
-        Args:
-            boot_ups: times of all boot-ups, s, by node.
-            times_s: times of the log.
-            syncs: number of SYNCs on the bus.
-            forces: force of the plant: (time, s; force, N).
-            jump_counts: largest distance of target and position after an enabling, counts.
-        """
+    def outcome(self, session: Session) -> dict[str, Any]:
+        """What came of a finished session, and what failed: by its bus log, its log and the force of its plant."""
+        assert session.options.out is not None
+        boot_ups: dict[int, list[float]] = {node_id: [] for node_id in self.plan.node_ids}
+        targets, jump_counts, syncs = FirstTargets(self.plan), 0, 0
+        for t_ns, _, can_id, data in read_candump(session.options.out / "bus.log"):
+            syncs += can_id == SYNC_ID
+            if (jump := targets.push(can_id, data)) > jump_counts and not self._lifts(t_ns * 1e-9):
+                jump_counts = jump
+            if HEARTBEAT_BASE < can_id < HEARTBEAT_BASE + MASTER_NODE_ID and data == b"\0":
+                boot_ups[can_id - HEARTBEAT_BASE].append(t_ns * 1e-9)
+        log = session.cell.log
+        times_s = log.arrays()["t_s"].tolist() if len(log) else list[float]()
+        forces = forces_of(session)
         limit = self.plan.setup.limits.force_max
         lost = [time for time, text in self._said if text.startswith("lost: ")]
         back = [time for time, text in self._said if text.startswith("the cell is back")]
@@ -270,6 +269,11 @@ class RecoverScore:
             "failures": failures,
         }
 
+    def _lifts(self, time_s: float) -> bool:
+        """Whether the cell takes the probe off at a time, s: that is no jump."""
+        said = [text for time, text in self._said if time <= time_s and text.startswith(("lift off", "enable the"))]
+        return bool(said) and said[-1].startswith("lift off")
+
     def _reacts(self, time_s: float, lost_s: Sequence[float]) -> bool:
         """Whether an outage has begun, and the cell has not stopped: how far the force rises then, `faults` judges."""
         begun = [(self.first_s or 0.0) + loss.after_s for loss in self.case.outages]
@@ -304,6 +308,40 @@ class RecoverScore:
             return end_s
         behind = [[time for time in boot_ups[i] if time >= end_s - 1e-6] for i in loss.nodes(self.plan.node_ids)]
         return max((times[0] for times in behind if times), default=end_s)
+
+
+class FirstTargets:
+    """Distance of target and position in the first cycles after each enabling of a drive, from a log.
+
+    Args:
+        plan: plan of the cell.
+
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        drives = [pdo for pdo in plan.pdos if pdo.kind == "drive"]
+        self._layouts: Mapping[int, tuple[int, PdoLayout]] = {p.cob_id: (p.node_id, p.layout) for p in drives}
+        self._values: dict[int, dict[int, int]] = {pdo.node_id: {} for pdo in drives}
+        self._ages: dict[int, tuple[int, int]] = dict.fromkeys(self._values, (-1, 0))
+
+    def push(self, can_id: int, data: bytes) -> int:
+        """Take a frame: distance of a target, counts, from the position that the drive reported before it.
+
+        It is 0 of other frames, of later targets, and before the second enabling of the drive.
+        """
+        node_id, layout = self._layouts.get(can_id, (0, None))
+        if layout is None or len(data) != layout.length:
+            return 0
+        values = self._values[node_id]
+        got = {entry.index: value for entry, value in zip(layout.signals, layout.unpack(data), strict=True)}
+        values.update(got)
+        age, times = self._ages[node_id]
+        if STATUSWORD in got:
+            enabled = known_state(got[STATUSWORD]) is DriveState.OPERATION_ENABLED
+            self._ages[node_id] = (age + 1, times + (age < 0)) if enabled else (-1, times)
+        elif TARGET in got and times > 1 and 0 <= age < FIRST_SYNCS and POSITION in values:
+            return abs(got[TARGET] - values[POSITION])
+        return 0
 
 
 def forces_of(session: Session) -> list[tuple[float, float]]:

@@ -33,11 +33,11 @@ from canprobe.lab.studies.random_scenes import FOREIGN, KINDS, SceneSeed
 from canprobe.lab.studies.region_scores import ScoredScan, held_share, measure
 from canprobe.lab.studies.result import (
     CHI2_95_OF_3,
-    Column,
     Row,
     Say,
     StudyResult,
     drawn_anew,
+    heading,
     interval_of,
     measuring_facts,
     shown,
@@ -62,30 +62,11 @@ MODEL = (
     "lab/studies/random_scenes.py", "lab/studies/region_scores.py",
 )  # fmt: skip
 COLUMNS = (
-    Column("group", "scenes by"),
-    Column("of", "of"),
-    Column("seeds", "seeds"),
-    Column("scenes", "scenes"),
-    Column("refused", "refused"),
-    Column("stopped", "stopped"),
-    Column("answers", "answers"),
-    Column("observed", "observed", ".3f"),
-    Column("coverage", "cover", ".3f"),
-    Column("coverage_low", "from", ".3f"),
-    Column("coverage_high", "to", ".3f"),
-    Column("below_80", "<80 %", ".3f"),
-    Column("below_40", "<40 %", ".3f"),
-    Column("error_per_m", "error 1/m", ".2f"),
-    Column("stated_over_error", "stated/error", ".2f"),
-    Column("stated_low", "from", ".2f"),
-    Column("stated_high", "to", ".2f"),
-    Column("log_score", "log score", ".2f"),
-    Column("worst", "worst seed: cover"),
-)
-COMPARED = (
-    ("refused", "refused", "d"), ("stopped", "stopped", "d"), ("observed", "observed", ".3f"),
-    ("coverage", "coverage", ".3f"), ("stated_over_error", "stated/error", ".2f"), ("log_score", "log score", ".2f"),
+    "group", "of", "seeds", "scenes", "refused", "stopped", "answers", "observed", "coverage", "coverage_low",
+    "coverage_high", "below_80", "below_40", "error_per_m", "stated_over_error", "stated_low", "stated_high",
+    "log_score", "worst",
 )  # fmt: skip
+COMPARED = ("refused", "stopped", "observed", "coverage", "stated_over_error", "log_score")
 """Figures that are shown beside those of an earlier run."""
 BY: Mapping[str, Callable[[ScoredScan], str]] = {
     "array": lambda scan: scan.array,
@@ -257,7 +238,7 @@ def compared(rows: Sequence[Row], earlier: Mapping[str, Row]) -> list[str]:
     said = ["Now / in the earlier run:"]
     for row in rows:
         if row["group"] == "kind" and (before := earlier.get(row["of"])) is not None:
-            pairs = [f"{words} {shown(row[key], form)} / {shown(before[key], form)}" for key, words, form in COMPARED]
+            pairs = [f"{heading(key)} {shown(row[key])} / {shown(before[key])}" for key in COMPARED]
             said.append(f"  {row['of']}: {', '.join(pairs)}")
     return said
 

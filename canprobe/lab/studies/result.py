@@ -32,19 +32,11 @@ FROBENIUS = np.array([1.0, 2.0, 1.0])
 """Weights of (K11², K12², K22²) in ‖K‖²."""
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
-    """A column of a study's table.
-
-    Attributes:
-        key: key of the rows, and heading in the CSV; it ends in the unit.
-        heading: heading in the printed table.
-        form: format of a value, as for `format`.
-    """
-
-    key: str
-    heading: str
-    form: str = ""
+UNITS = {
+    "n_m3": "N/m³", "n_m": "N/m", "per_m": "1/m", "n": "N", "us": "µs", "um": "µm", "hz": "Hz", "kpa": "kPa",
+    "mib": "MiB", "percent": "%",
+}  # fmt: skip
+"""Units at the end of a key that a table spells otherwise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +45,7 @@ class StudyResult:
 
     Attributes:
         name: name of the study.
-        columns: columns of the table.
+        columns: keys of the rows that the printed table has, each with its unit at the end; the CSV has all.
         rows: one row for each case; None where a value does not apply.
         findings: sentences with figures.
         facts: machine, versions and settings of the measurement.
@@ -62,7 +54,7 @@ class StudyResult:
     """
 
     name: str
-    columns: Sequence[Column]
+    columns: Sequence[str]
     rows: Sequence[Row]
     findings: Sequence[str]
     facts: Mapping[str, Any]
@@ -94,13 +86,6 @@ def mean_and_interval(key: str, values: Floats) -> Row:
     return {key: float(values.mean()) if known else math.nan, f"{key}_low": low, f"{key}_high": high}
 
 
-SIGMA_COLUMNS = (
-    Column("sigma_point_um", "σp µm", ".0f"),
-    Column("sigma_normal_mrad", "σn mrad", ".1f"),
-)
-"""Noise of a row, filled by `sigma_values`."""
-
-
 def measuring_facts(quick: bool, seeds: int, model: Sequence[str] = ()) -> dict[str, Any]:
     """Machine, versions and settings of a study; `model` as for `Sweep.map`."""
     commit = ""
@@ -129,22 +114,29 @@ def processor() -> str:
 
 
 def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
-    """The values of `SIGMA_COLUMNS`, from m and rad."""
+    """Noise of a row, from m and rad."""
     return {"sigma_point_um": sigma_point * 1e6, "sigma_normal_mrad": sigma_normal * 1e3}
 
 
 def table_lines(result: StudyResult) -> list[str]:
     """The table, a line for each row, numbers flush right."""
-    cells = [[c.heading for c in result.columns]]
-    cells += [[shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
+    cells = [[heading(key) for key in result.columns]]
+    cells += [[shown(row.get(key)) for key in result.columns] for row in result.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    words = [bool(result.rows) and isinstance(result.rows[0].get(c.key), str) for c in result.columns]
+    words = [bool(result.rows) and isinstance(result.rows[0].get(key), str) for key in result.columns]
     return [
         "  ".join(
             t.ljust(w) if is_word else t.rjust(w) for t, w, is_word in zip(line, widths, words, strict=True)
         ).rstrip()
         for line in cells
     ]
+
+
+def heading(key: str) -> str:
+    """Heading of a column: the words of its key, such as `force max N` of `force_max_n`."""
+    unit = next((unit for unit in UNITS if key.endswith(f"_{unit}")), "")
+    words = key.removesuffix(unit).replace("_", " ")
+    return f"{words}{UNITS[unit]}" if unit else words
 
 
 def text_of(result: StudyResult) -> str:
@@ -195,12 +187,14 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         csv.writer(file).writerows([keys, *lines])
 
 
-def shown(value: Any, form: str) -> str:
-    """A value as a table shows it; a dash for what does not apply."""
+def shown(value: Any) -> str:
+    """A value as a table shows it: four digits, all of those before the point; a dash for what does not apply."""
     value = _plain(value)
     if value is None:
         return "–"
-    return "yes" if value is True else "no" if value is False else format(value, form)
+    if isinstance(value, float):
+        return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 def _plain(value: Any) -> Any:

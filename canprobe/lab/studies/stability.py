@@ -25,7 +25,7 @@ from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, SKY, legend, log_scale, parts, picture
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
-from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.stability_extremes import end_marks, run_extremes
 from canprobe.lab.studies.stability_runs import FORCE_N, HUNTING_SPREAD, LoopCase, carry_out, loop_of
 from canprobe.lab.studies.sweep import Sweep
@@ -40,19 +40,9 @@ WIDE_PERCENT = 20.0
 SOUND_ENDS = ("stable", "stopped", "approach", "refused")
 MODEL = ("fieldbus", "mechanics", "cell", "lab/studies/stability_runs.py", "lab/studies/linear_loop.py")
 COLUMNS = (
-    Column("servo", "servo"),
-    Column("contact_n_m", "contact N/m", ".0e"),
-    Column("rate_hz", "servo Hz", ".0f"),
-    Column("late_ms", "late ms", ".0f"),
-    Column("height_hz", "gain Hz", ".0f"),
-    Column("eigenvalue", "|λ|", ".2f"),
-    Column("ended", "ended"),
-    Column("force_max_n", "max N", ".3g"),
-    Column("above_ms", "above ms", ".0f"),
-    Column("error_percent", "error %", ".0f"),
-    Column("spread_percent", "spread %", ".0f"),
-    Column("reason", "reason"),
-)
+    "servo", "contact_n_m", "rate_hz", "late_ms", "height_hz", "eigenvalue", "ended", "force_max_n", "above_ms",
+    "error_percent", "spread_percent", "reason",
+)  # fmt: skip
 
 
 def cases(quick: bool) -> list[LoopCase]:

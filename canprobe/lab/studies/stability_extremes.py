@@ -18,7 +18,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
@@ -26,7 +25,7 @@ from matplotlib.lines import Line2D
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, ORANGE, legend, picture
 from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import PlantSettings, ProbeSettings, Scene
+from canprobe.cell.scene.model import ProbeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -35,8 +34,8 @@ from canprobe.errors import PlanError
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 from canprobe.lab.studies.random_scenes import CELLS
 from canprobe.lab.studies.region_scores import scores_of
-from canprobe.lab.studies.result import CHI2_95_OF_3, Column, Row, StudyResult, measuring_facts
-from canprobe.lab.studies.stability_runs import delay, refused_row, run_touch
+from canprobe.lab.studies.result import CHI2_95_OF_3, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.stability_runs import changed, delay, refused_row, run_touch
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import inverse_near
@@ -52,17 +51,9 @@ MODEL = (
     "lab/studies/stability_extremes.py", "lab/studies/region_scores.py", "lab/studies/random_scenes.py",
 )  # fmt: skip
 COLUMNS = (
-    Column("extreme", "extreme"),
-    Column("value", "value"),
-    Column("task", "task"),
-    Column("ended", "ended"),
-    Column("force_max_n", "max N", ".3g"),
-    Column("error_percent", "force error %", ".0f"),
-    Column("curvature_per_m", "curvature error 1/m", ".2f"),
-    Column("stated_per_m", "stated 1/m", ".2f"),
-    Column("held", "regions hold", ".2f"),
-    Column("reason", "reason"),
-)
+    "extreme", "value", "task", "ended", "force_max_n", "error_percent", "curvature_per_m", "stated_per_m", "held",
+    "reason",
+)  # fmt: skip
 END_MARKS = {
     "right": (BLUE, "o", "right"),
     "stopped": (AMBER, "s", "stopped with the reason"),
@@ -101,40 +92,29 @@ def extreme_scene(case: ExtremeCase) -> Scene:
     name, seconds = ("cylinder", SCAN_S) if case.scan else ("press", HOLD_S)
     scene = load_scene(name, {"task.duration_s": seconds, "task.clearance_mm": 0.5, "bus.timed": False})
     if scene.shape is not None:
-        scene = replace(scene, shape=replace(scene.shape, also=()))
+        scene = changed(scene, "shape", also=())
     return EXTREMES[case.extreme][2](scene, case.value)
-
-
-def _with_plant(scene: Scene, **keys: Any) -> Scene:
-    return replace(scene, plant=replace(scene.plant or PlantSettings(), **keys))
 
 
 def _with_dead_rows(scene: Scene, rows: float) -> Scene:
     """Dead rows in the middle of the array, where it touches."""
     first = 8 - math.ceil(rows / 2)
-    return _with_plant(scene, dead_rows=tuple(range(first, first + int(rows))))
+    return changed(scene, "plant", dead_rows=tuple(range(first, first + int(rows))))
 
 
 def _with_rate(scene: Scene, rate_hz: float) -> Scene:
     """The rate of the images divides that of the servo."""
     assert scene.sensor is not None
-    sensor = replace(scene.sensor, rate_hz=SENSOR_HZ.get(rate_hz, min(scene.sensor.rate_hz, rate_hz)))
-    return replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz), sensor=sensor)
+    sensor_hz = SENSOR_HZ.get(rate_hz, min(scene.sensor.rate_hz, rate_hz))
+    return changed(changed(scene, "cycle", rate_hz=rate_hz), "sensor", rate_hz=sensor_hz)
 
 
 def _on_sphere(scene: Scene, radius_mm: float) -> Scene:
     """A sphere where the arm reaches in all directions; a path turns its normal by 24 deg to both sides at most."""
-    assert scene.object is not None
     length, width = min(scene.task.length_mm, 0.8 * radius_mm), min(scene.task.width_mm, 0.3 * radius_mm)
     place, _ = CELLS["puma260"]
-    task = replace(scene.task, length_mm=length, width_mm=width, start_mm=place)
-    sphere = replace(scene.object, kind="sphere", radius_mm=radius_mm, position_mm=place)
-    return replace(scene, task=task, object=sphere)
-
-
-def _with_probe(scene: Scene, radius_mm: float) -> Scene:
-    assert scene.probe is not None
-    return replace(scene, probe=replace(scene.probe, radius_mm=radius_mm))
+    scene = changed(scene, "task", length_mm=length, width_mm=width, start_mm=place)
+    return changed(scene, "object", kind="sphere", radius_mm=radius_mm, position_mm=place)
 
 
 def _at_reach(scene: Scene, reach_mm: float) -> Scene:
@@ -147,20 +127,18 @@ def _at_reach(scene: Scene, reach_mm: float) -> Scene:
 def _with_wrist(scene: Scene, wrist_deg: float) -> Scene:
     """A gently curved object in front of the arm, with the wrist bent by an angle at the touch."""
     at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
-    assert scene.object is not None
-    ball = replace(scene.object, kind="sphere", radius_mm=300.0, rotation_deg=upright(normal))
-    scene = _touched_at(replace(scene, object=ball), at_mm)
+    scene = changed(scene, "object", kind="sphere", radius_mm=300.0, rotation_deg=upright(normal))
+    scene = changed(_touched_at(scene, at_mm), "task", approach_normal=normal)
     joints = {
         name: replace(joint, start_deg=start)
         for (name, joint), start in zip(scene.joints.items(), posture_deg, strict=True)
     }
-    return replace(scene, task=replace(scene.task, approach_normal=normal), joints=joints)
+    return replace(scene, joints=joints)
 
 
 def _touched_at(scene: Scene, place: tuple[float, float, float]) -> Scene:
-    assert scene.object is not None
-    task, object_ = replace(scene.task, start_mm=place), replace(scene.object, position_mm=place)
-    return replace(scene, task=task, object=object_, limits=replace(scene.limits, joint_margin_deg=0.5))
+    scene = changed(changed(scene, "task", start_mm=place), "object", position_mm=place)
+    return changed(scene, "limits", joint_margin_deg=0.5)
 
 
 def touch_in_posture(
@@ -205,17 +183,17 @@ def _with_coarser_encoders(scene: Scene, times: float) -> Scene:
 
 EXTREMES: Mapping[str, tuple[tuple[float, ...], str, Callable[[Scene, float], Scene]]] = {
     "dead rows": ((1, 2, 4, 8), "{:g}", _with_dead_rows),
-    "bits of a count": ((4, 6), "{:g}", lambda scene, bits: _with_plant(scene, adc_bits=int(bits))),
+    "bits of a count": ((4, 6), "{:g}", lambda scene, bits: changed(scene, "plant", adc_bits=int(bits))),
     "K/h": (
         tuple(10.0**n for n in range(4, 13)), "{:.0e} N/m³",
-        lambda scene, stiffness: _with_plant(scene, stiffness_n_m3=stiffness),
+        lambda scene, stiffness: changed(scene, "plant", stiffness_n_m3=stiffness),
     ),
     "servo": ((50, 100, 200, 500, 1000), "{:g} Hz", _with_rate),
-    "drives": ((3, 10, 100, 300), "{:g} Hz", lambda scene, hz: _with_plant(scene, drive_bandwidth_hz=hz)),
+    "drives": ((3, 10, 100, 300), "{:g} Hz", lambda scene, hz: changed(scene, "plant", drive_bandwidth_hz=hz)),
     "radius": ((5, 12, 100, 1000, 10_000), "{:g} mm", _on_sphere),
-    "probe": ((1, 5, 10_000), "{:g} mm", _with_probe),
+    "probe": ((1, 5, 10_000), "{:g} mm", lambda scene, radius: changed(scene, "probe", radius_mm=radius)),
     "coarser encoders": ((10, 100), "{:g} ×", _with_coarser_encoders),
-    "speed": ((50, 100, 250), "{:g} mm/s", lambda scene, v: replace(scene, task=replace(scene.task, speed_mm_s=v))),
+    "speed": ((50, 100, 250), "{:g} mm/s", lambda scene, v: changed(scene, "task", speed_mm_s=v)),
     "reach": ((120, 135, 350, 358, 400), "{:g} mm", _at_reach),
     "joint 5": ((0, 3), "{:g} deg", _with_wrist),
     "jitter of the period": ((5, 20, 50), "{:g} %", lambda scene, _: scene),

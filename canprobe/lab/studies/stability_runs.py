@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -82,19 +83,17 @@ def full_scale_kpa(contact_n_m: float) -> float:
 def scene_of(case: LoopCase) -> Scene:
     """The scene of a case; its layer may be harder than a scene file allows."""
     changes = {"task.duration_s": case.hold_s, "task.clearance_mm": 0.5, "bus.timed": False}
-    scene = load_scene("press", changes)
-    assert scene.sensor is not None
-    sensor = replace(
-        scene.sensor, rate_hz=min(SENSOR_HZ, case.rate_hz), mode="features",
-        full_scale_kpa=full_scale_kpa(case.contact_n_m),
-    )  # fmt: skip
-    return replace(
-        scene,
-        cycle=replace(scene.cycle, rate_hz=case.rate_hz),
-        sensor=sensor,
-        servo=replace(scene.servo or ServoSettings(), surface_height_hz=case.height_hz),
-        plant=replace(scene.plant or PlantSettings(), stiffness_n_m3=layer_stiffness(case.contact_n_m)),
-    )
+    scene = changed(load_scene("press", changes), "cycle", rate_hz=case.rate_hz)
+    full_scale, sensor_hz = full_scale_kpa(case.contact_n_m), min(SENSOR_HZ, case.rate_hz)
+    scene = changed(scene, "sensor", rate_hz=sensor_hz, mode="features", full_scale_kpa=full_scale)
+    scene = changed(scene, "servo", surface_height_hz=case.height_hz)
+    return changed(scene, "plant", stiffness_n_m3=layer_stiffness(case.contact_n_m))
+
+
+def changed(scene: Scene, section: str, **keys: Any) -> Scene:
+    """The scene with other values in a section, also beyond the limits of a scene file."""
+    own = getattr(scene, section) or {"plant": PlantSettings, "servo": ServoSettings}[section]()
+    return replace(scene, **{section: replace(own, **keys)})
 
 
 def loop_of(case: LoopCase) -> ForceLoop:

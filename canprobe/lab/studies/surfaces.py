@@ -39,7 +39,7 @@ from canprobe.cell.tasks.from_plan import make_surface_map, make_task
 from canprobe.errors import PlanError, SafetyStop, StudyError
 from canprobe.lab.studies import exploration
 from canprobe.lab.studies.drawn_shapes import DrawnShape, TrueGround, drawn, scene_of
-from canprobe.lab.studies.result import Column, Row, StudyResult, mean_and_interval, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, heading, mean_and_interval, measuring_facts
 from canprobe.lab.studies.surface_methods import METHODS, FoundSurface, evaluate_heights, evaluate_map, map_of
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.contact import ContactSample
@@ -54,17 +54,8 @@ MODEL = (
     *(f"lab/studies/{name}.py" for name in ("surfaces", "surface_methods", "exploration", "drawn_shapes")),
 )  # fmt: skip
 COLUMNS = (
-    Column("method", "method"),
-    Column("setting", "setting", "g"),
-    Column("unit", "of"),
-    Column("known", "ground known", ".1%"),
-    Column("height_um", "height µm", ".1f"),
-    Column("normal_mrad", "normal mrad", ".1f"),
-    Column("curvature_per_m", "K 1/m", ".2f"),
-    Column("nll", "NLL", ".2f"),
-    Column("coverage", "cover", ".2f"),
-    Column("cpu_s", "CPU s", ".2f"),
-)
+    "method", "setting", "unit", "known", "height_um", "normal_mrad", "curvature_per_m", "nll", "coverage", "cpu_s",
+)  # fmt: skip
 
 
 class SurfaceCase(NamedTuple):
@@ -180,7 +171,7 @@ def rows_of(each: Sequence[Sequence[Mapping[str, Any]]]) -> list[Row]:
     rows = []
     for k, first in enumerate(each[0]):
         row: Row = {name: first[name] for name in ("method", "setting", "unit")}
-        for key in (column.key for column in COLUMNS[3:]):
+        for key in COLUMNS[3:]:
             mine, maps = (np.array([math.nan if one[i][key] is None else one[i][key] for one in each]) for i in (k, 0))
             row |= mean_and_interval(key, mine) | mean_and_interval(f"{key}_over_map", mine - maps)
         rows.append(row)
@@ -213,11 +204,11 @@ def draw_surfaces(rows: Sequence[Row], path: Path) -> None:
     title = "Surfaces of the same contacts, over the processor time from contacts to answers; means over the shapes"
     with picture(path, title, 3.6) as figure:
         panels = figure.subplots(1, 4, sharex=True)
-        for axes, column in zip(panels, COLUMNS[4:8], strict=True):
+        for axes, score_key in zip(panels, COLUMNS[4:8], strict=True):
             for name, colour, marker in zip(("map", *METHODS), (INK, BLUE, GREEN, ORANGE), "*Dv^", strict=True):
                 mine = [row for row in rows if row["method"] == name]
-                times, values = ([row[key] for row in mine] for key in ("cpu_s", column.key))
+                times, values = ([row[key] for row in mine] for key in ("cpu_s", score_key))
                 axes.plot(times, values, marker=marker, color=colour, label=name)
-            log_scale(axes, "x" if column.key == "nll" else "xy")
-            axes.set(title=column.heading, xlabel="processor time (s)")
+            log_scale(axes, "x" if score_key == "nll" else "xy")
+            axes.set(title=heading(score_key), xlabel="processor time (s)")
         legend(figure)

@@ -37,7 +37,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from canprobe.cell.session.terminal import Progress
@@ -179,28 +178,24 @@ def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
     return text
 
 
-STUDIES: Mapping[str, str] = MappingProxyType(
-    {
-        "estimators": "error of the shape estimators against their run time, and over the Cramér–Rao bound",
-        "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
-        "calibration": "how well forty touches calibrate an array, and whether a foreign calibration is noticed",
-        "surfaces": "unknown shapes by the map, quadrics, splines and Gaussian processes; the path of exploration",
-        "workprec": "error of the dynamic plant against its run time, by an explicit and an implicit integrator",
-        "stability": "where the force loop settles, predicted and carried out, and how extreme cases end",
-        "faults": "the true force with every kind of fault, in each task and phase, and with files that are wrong",
-        "realtime": "how well the cycle keeps time on a real vcan0; needs that interface",
-    }
-)
+STUDIES: Mapping[str, str] = {
+    "estimators": "error of the shape estimators against their run time, and over the Cramér–Rao bound",
+    "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
+    "calibration": "how well forty touches calibrate an array, and whether a foreign calibration is noticed",
+    "surfaces": "unknown shapes by the map, quadrics, splines and Gaussian processes; the path of exploration",
+    "workprec": "error of the dynamic plant against its run time, by an explicit and an implicit integrator",
+    "stability": "where the force loop settles, predicted and carried out, and how extreme cases end",
+    "faults": "the true force with every kind of fault, in each task and phase, and with files that are wrong",
+    "realtime": "how well the cycle keeps time on a real vcan0; needs that interface",
+}
 """Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""
-FORMS: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "faults --vcan": ("faults_vcan", "on a real vcan0: processes are killed, the link is taken down"),
-        "faults --recover": ("recover", "whether a cell comes back from what it loses by chance: power, links, time"),
-        "faults --recover --vcan": ("recover_vcan", "the same on a real vcan0"),
-        "realtime --link": ("realtime_link", "whether a check of the link says what the next minute of the cell shows"),
-        "realtime --soak": ("realtime_soak", "memory, clocks and counters of a cell that is held for half an hour"),
-    }
-)
+FORMS: Mapping[str, tuple[str, str]] = {
+    "faults --vcan": ("faults_vcan", "on a real vcan0: processes are killed, the link is taken down"),
+    "faults --recover": ("recover", "whether a cell comes back from what it loses by chance: power, links, time"),
+    "faults --recover --vcan": ("recover_vcan", "the same on a real vcan0"),
+    "realtime --link": ("realtime_link", "whether a check of the link says what the next minute of the cell shows"),
+    "realtime --soak": ("realtime_soak", "memory, clocks and counters of a cell that is held for half an hour"),
+}
 """Other forms of a study, as they are typed: module, and measured quantity."""
 
 

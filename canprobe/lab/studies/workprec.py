@@ -33,7 +33,7 @@ from canprobe.cell.scene.arms import Bodies, arm_model
 from canprobe.cell.scene.load import read_cell
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import UsageError
-from canprobe.lab.studies.result import Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.dynamics import dynamics_problem
@@ -65,17 +65,9 @@ ENOUGH = {"force_percent": 1.0, "position_um": 2.9, "taxel_counts": 0.29}
 """Small enough errors: 1 % of the force, and the rounding of encoders (10 µm) and ADC, RMS."""
 MODEL = ("mechanics", "cell/plant", "lab/studies/workprec.py")
 COLUMNS = (
-    Column("stiffness_n_m3", "K/h N/m³", ".3g"),
-    Column("held", "held"),
-    Column("method", "method"),
-    Column("step_us", "step µs", ".0f"),
-    Column("cost_us", "µs a cycle", ".0f"),
-    Column("force_percent", "force %", ".2g"),
-    Column("position_um", "position µm", ".2g"),
-    Column("taxel_counts", "taxel counts", ".2g"),
-    Column("stands", "stands"),
-    Column("verdict", "verdict"),
-)
+    "stiffness_n_m3", "held", "method", "step_us", "cost_us", "force_percent", "position_um", "taxel_counts", "stands",
+    "verdict",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,26 +119,20 @@ class ScanStiffness:
     Args:
         stated: stiffness K/h that is stated, N/m³.
         sigma: standard deviation of its logarithm.
+
+    Attributes:
+        log: logarithm of `value`.
+        information: inverse variance of `log`.
     """
 
     def __init__(self, stated: float, sigma: float) -> None:
-        self._log = math.log(positive("stated", stated))
-        self._information = positive("sigma", sigma) ** -2
+        self.log = math.log(positive("stated", stated))
+        self.information = positive("sigma", sigma) ** -2
 
     @property
     def value(self) -> float:
         """Stiffness K/h, N/m³."""
-        return math.exp(self._log)
-
-    @property
-    def log(self) -> float:
-        """Logarithm of `value`."""
-        return self._log
-
-    @property
-    def information(self) -> float:
-        """Inverse variance of `log`."""
-        return self._information
+        return math.exp(self.log)
 
     def take(self, log: float, information: float, share: float = 1.0) -> None:
         """Take ln k of an answer that used this state as its prior.
@@ -148,6 +142,6 @@ class ScanStiffness:
             information: its inverse variance, that of this state included.
             share: share of the answer's contacts that no earlier answer had.
         """
-        kept = self._information + share * max(information - self._information, 0.0)
-        self._log += share * information / kept * (log - self._log)
-        self._information = max(min(kept, COMMON_SIGMA**-2), self._information)
+        kept = self.information + share * max(information - self.information, 0.0)
+        self.log += share * information / kept * (log - self.log)
+        self.information = max(min(kept, COMMON_SIGMA**-2), self.information)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from math import atan2, cos, hypot, inf, pi, sin, sqrt
-from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -215,24 +214,22 @@ class Ellipsoid(Quadric):
         return inf
 
 
-_KINDS: Mapping[str, tuple[Callable[..., PlacedShape], tuple[str, ...]]] = MappingProxyType(
-    {
-        "plane": (Plane, ()),
-        "sphere": (Sphere, ("radius",)),
-        "cylinder": (Cylinder, ("radius",)),
-        "saddle": (Saddle, ("radius_x", "radius_y")),
-        "bowl": (Bowl, ("radius",)),
-        "ellipsoid": (Ellipsoid, ("radius_x", "radius_y", "radius_z")),
-        "torus": (Torus, ("ring_radius", "radius")),
-        "wave": (Wave, ("amplitude", "wavelength")),
-        "fillet": (Fillet, ("radius", "angle")),
-        "quadric": (Quadric, ("matrix",)),
-        "heights": (Heights, ("heights", "spacing", "origin")),
-        "mesh": (MeshHeights.of, ("vertices", "faces", "spacing", "origin")),
-    }
-)
+_KINDS: Mapping[str, tuple[Callable[..., PlacedShape], tuple[str, ...]]] = {
+    "plane": (Plane, ()),
+    "sphere": (Sphere, ("radius",)),
+    "cylinder": (Cylinder, ("radius",)),
+    "saddle": (Saddle, ("radius_x", "radius_y")),
+    "bowl": (Bowl, ("radius",)),
+    "ellipsoid": (Ellipsoid, ("radius_x", "radius_y", "radius_z")),
+    "torus": (Torus, ("ring_radius", "radius")),
+    "wave": (Wave, ("amplitude", "wavelength")),
+    "fillet": (Fillet, ("radius", "angle")),
+    "quadric": (Quadric, ("matrix",)),
+    "heights": (Heights, ("heights", "spacing", "origin")),
+    "mesh": (MeshHeights.of, ("vertices", "faces", "spacing", "origin")),
+}
 
-OBJECT_PARAMETERS: Mapping[str, tuple[str, ...]] = MappingProxyType({k: names for k, (_, names) in _KINDS.items()})
+OBJECT_PARAMETERS: Mapping[str, tuple[str, ...]] = {k: names for k, (_, names) in _KINDS.items()}
 """Kind of object -> names of its parameters (lengths in m, angles in rad), for loaders and messages."""
 
 

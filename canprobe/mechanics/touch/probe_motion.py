@@ -19,6 +19,7 @@ from canprobe.mechanics.robot.inverse import in_rows, task_rows
 from canprobe.mechanics.robot.inverse_step import damped_step
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.tangent_frames import transported
 from canprobe.mechanics.types import Floats, Vec
 
 MOVE_SPEED_M_S, ROUND_SPEED_M_S, RETREAT_SPEED_M_S = 30e-3, 40e-3, 20e-3
@@ -105,12 +106,7 @@ def _pose_error(at: Posture, centre: list[float], pole: list[float], x_reference
     # Plain floats are used, as numpy costs ten times as much on 3-vectors
     (r00, r10, r20), (r01, r11, r21), (r02, r12, r22), (t0, t1, t2) = at.x, at.y, at.z, at.flange
     p0, p1, p2 = pole
-    x0, x1, x2 = x_reference
-    along = x0 * p0 + x1 * p1 + x2 * p2
-    x0, x1, x2 = x0 - along * p0, x1 - along * p1, x2 - along * p2
-    size = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
-    x0, x1, x2 = x0 / size, x1 / size, x2 / size
-    y0, y1, y2 = p1 * x2 - p2 * x1, p2 * x0 - p0 * x2, p0 * x1 - p1 * x0
+    (x0, x1, x2), (y0, y1, y2) = transported(x_reference, (p0, p1, p2))
     return (
         centre[0] - t0,
         centre[1] - t1,

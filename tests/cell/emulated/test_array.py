@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from node_fuzz import Watched, rage
 
-from canprobe.cell.emulated.array import TactileApplication, make_tactile_node
+from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.master.tactile_frame import decode
 from canprobe.fieldbus.eds.packaged import load_eds
@@ -294,8 +294,8 @@ def test_sensor_is_silent_out_of_operational_and_starts_afresh(make, plant):
     assert (frame.taxels[2, 2], frame.taxels[1, 1]) == (100, 0)
 
 
-def test_make_tactile_node(plant):
-    node = make_tactile_node(load_eds("tactile_array", 16), 16, plant)
+def test_a_tactile_node_boots(plant):
+    node = SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant))
     assert node.start(0) == [(0x710, b"\0")]
 
 
@@ -360,7 +360,7 @@ def test_the_window_holds_the_contact_wherever_it_is(sensor, plant, side, spot):
 
 
 def test_random_and_mutated_frames(plant):
-    rage(Watched(make_tactile_node(load_eds("tactile_array", 5), 5, plant)), 30_000, seed=20260)
+    rage(Watched(SlaveNode(load_eds("tactile_array", 5), 5, TactileApplication(plant))), 30_000, seed=20260)
 
 
 SAVE = 0x65766173

@@ -9,7 +9,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.emulated import world as build
-from canprobe.cell.emulated.array import make_tactile_node
+from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.emulated.world import TruthRecorder
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.setup import HomingParameters
@@ -21,6 +21,7 @@ from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.serve import Exchange, serve
+from canprobe.fieldbus.node.slave_node import SlaveNode
 
 MS = 1_000_000
 CYCLE = 2_500_000
@@ -279,7 +280,7 @@ def test_truth_recorder_columns(plant):
 
 def make_world(plant):
     nodes = [make_drive_node(load_eds("puma260_joint", i), i, i - 1, plant) for i in range(1, 7)]
-    nodes.append(make_tactile_node(load_eds("tactile_array", 16), 16, plant))
+    nodes.append(SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant)))
     exchange = Exchange(nodes)
     exchange.start(0)
     for node_id in (1, 2, 3, 4, 5, 6, 16):

@@ -15,7 +15,7 @@ from canprobe.mechanics.touch.image.beyond_window import Continuation
 from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
 
 EXACT = PatchCalibration()
-PITCH = EXACT.pitch_m
+PITCH = EXACT.pad.pitch_m
 FULL_PA = 100e3
 SOFT = 2.3e7  # N/m³: 4 kN/m at 2 N on the cylinder
 SHAPES = {"plane": (0.0, 0.0), "cylinder": (1 / 0.036, 0.0), "sphere": (20.0, 20.0)}
@@ -80,7 +80,7 @@ def test_a_patch_that_the_window_holds_is_the_same_with_and_without_it():
 def test_force_and_centroid_of_a_soft_contact(shape):
     """The emulated array, 2 N at 4 kN/m, its window as it follows the contact; the truth is the whole image's."""
     kappa = SHAPES[shape]
-    depth = depth_for_force(2.0, kappa, EXACT.radius_m, SOFT)
+    depth = depth_for_force(2.0, kappa, EXACT.pad.radius_m, SOFT)
     force, cut, off, cut_off = [], [], [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -112,9 +112,9 @@ def test_force_and_centroid_of_a_soft_contact(shape):
 )
 def test_what_the_plan_says_of_a_window_that_cuts(side, stiffness):
     """2 N on a plane, against the whole image: within the share that `cut_patch` tells."""
-    probe = Probe(np.eye(4), EXACT.radius_m, stiffness, 0.3)
+    probe = Probe(np.eye(4), EXACT.pad.radius_m, stiffness, 0.3)
     assert measured_share(2.0, probe, side, PITCH) >= CARRIED_SHARE and side >= CARRIED_SIDE
-    depth = depth_for_force(2.0, (0.0, 0.0), EXACT.radius_m, stiffness)
+    depth = depth_for_force(2.0, (0.0, 0.0), EXACT.pad.radius_m, stiffness)
     for seed in range(6):
         rng = np.random.default_rng(seed)
         array = TaxelArray(TaxelConfig(), rng, stiffness_n_m3=stiffness)

@@ -143,7 +143,7 @@ def test_errors_name_the_field(call, field):
 
 # Dead taxels in the patch: found, bridged, told.
 
-TAXEL_PITCH = PatchCalibration().pitch_m
+TAXEL_PITCH = PatchCalibration().pad.pitch_m
 
 
 def pressed(u, v, dead=(), kappa=(27.8, 0.0), seed=0):

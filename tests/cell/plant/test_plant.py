@@ -398,10 +398,10 @@ def test_the_drives_report_the_torque_against_the_resultant_of_several_places():
     pose = np.eye(4)
     pose[:3, 3] = POINT
     bowl = make_object("bowl", T_base_object=pose, radius=0.03)
-    T = forward(UPENN.chain, plant("plane").arm.q) @ TOOL
+    T = forward(UPENN.chain, plant("plane").truth()["q"]) @ TOOL
     T[:3, 3] = POINT + np.array((4e-4, 2e-4, 0.03 + math.sqrt((0.04 + LIP_M) ** 2 - (0.03 + LIP_M) ** 2) - 3e-4))
     p = Plant(PlantConfig(UPENN, posture_of(T), object=bowl))
-    truth, J = p.truth(), forward_jacobian(UPENN.chain, p.arm.q, TOOL)[1][:3]
+    truth, J = p.truth(), forward_jacobian(UPENN.chain, p.truth()["q"], TOOL)[1][:3]
     touches = bowl.touches(T[:3, 3], 0.04)
     force = total_force(touches, 0.04, p.config.stiffness_n_m3, np.zeros(len(touches.points)), 0.0)
     assert truth["force"] == pytest.approx(np.linalg.norm(force), rel=1e-6)

@@ -91,7 +91,7 @@ TERM = pytest.mark.slow(reason="the other signal")
 def test_a_run_is_served_until_it_is_told_to_end(served, number, status):
     process, address = served
     assert "<title>Viser</title>" in page_at(address)
-    messages(address, {"/arm/3/forearm", "/object/ghost", "/path/000", "GuiSliderMessage", "GuiUplotMessage"})
+    messages(address, {"/arm/3/simple_6_1", "/object/ghost", "/path/000", "GuiSliderMessage", "GuiUplotMessage"})
     process.send_signal(number)
     out, err = process.communicate(timeout=patience_s(30))
     assert (process.returncode, out, err) == (status, "", "")
@@ -110,7 +110,7 @@ def test_a_cell_is_shown_while_it_runs(recorded):
             bridge.observe(observation)
         assert "<title>Viser</title>" in page_at(address)
         last = recorded.observations[-1]
-        wanted = {"/arm/6/flange", "/path/0000", "/probe/taxels", "GuiUplotMessage"}
+        wanted = {"/arm/6", "/path/0000", "/probe/taxels", "GuiUplotMessage"}
         messages(address, wanted, lambda: bridge.observe(last))
         status = bridge.end("{}")
     finally:

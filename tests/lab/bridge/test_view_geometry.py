@@ -6,15 +6,16 @@ import math
 
 import numpy as np
 import pytest
+import trimesh
 from puma_arm import MODELS
 
 import canprobe
 from canprobe.cell.plant.pressure import pad_coordinates
-from canprobe.cell.scene.load import read_cell
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
 from canprobe.lab.bridge.sample import ContactFrame
 from canprobe.lab.bridge.view import array_dome as taxels
-from canprobe.lab.bridge.view import bodies as arm
-from canprobe.lab.bridge.view import colours, meshes
+from canprobe.lab.bridge.view import colours, links
 from canprobe.lab.bridge.view import object_sheet as objects
 from canprobe.lab.bridge.view.path import PathAhead, deviation_scale
 from canprobe.lab.bridge.view.surface import LIFT_M, GrowingSurface, drawn, map_of_points
@@ -43,50 +44,8 @@ def normals(mesh):
     return np.cross(b - a, c - a)
 
 
-def volume(mesh):
-    """Enclosed by a closed mesh; negative where it is inside out."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
-
-
 def face_middles(mesh):
     return mesh.vertices[mesh.faces].mean(axis=1)
-
-
-# meshes
-
-
-def test_volumes_are_those_of_the_solids():
-    polygon = 0.5 * meshes.SECTORS * 0.05**2 * math.sin(2 * math.pi / meshes.SECTORS)
-    assert volume(meshes.cylinder(0.05, (-0.1, 0.2))) == pytest.approx(0.3 * polygon, rel=1e-12)
-    stadium = math.pi * 0.02**2 + 0.04 * 0.1
-    link = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03))
-    assert volume(link) == pytest.approx(0.03 * stadium, rel=2e-3)
-    assert volume(meshes.dome(0.04, math.pi, rings=200)) == pytest.approx(4 / 3 * math.pi * 0.04**3, rel=4e-3)
-    rounded = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03), 4e-3)
-    assert 0.9 * volume(link) < volume(rounded) < volume(link)
-
-
-def test_a_link_between_unequal_circles_has_their_tangents():
-    outline = meshes.link_outline(((0.0, 0.0), 0.03), ((0.1, 0.0), 0.01), 400)
-    apart = np.minimum(np.hypot(*outline.T) - 0.03, np.hypot(outline[:, 0] - 0.1, outline[:, 1]) - 0.01)
-    assert np.abs(apart).max() < 1e-12
-    edges = np.roll(outline, -1, axis=0) - outline
-    assert (
-        edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0] > -1e-15
-    ).all()
-
-
-def test_a_circle_inside_the_other_leaves_the_larger():
-    outline = meshes.link_outline(((0.0, 0.0), 0.03), ((0.01, 0.0), 0.005))
-    assert np.hypot(*outline.T) == pytest.approx(0.03)
-
-
-def test_moving_keeps_faces_outside():
-    T = homogeneous(tangent_rotation(np.array([0.6, 0.0, 0.8])), np.array([0.1, 0.2, 0.3]))
-    mesh = meshes.cylinder(0.02, (0.0, 0.1), 2e-3)
-    assert volume(mesh.moved(T)) == pytest.approx(volume(mesh))
-    assert winding(mesh.moved(T), T[:3, 3] + 0.05 * T[:3, 2]) == pytest.approx(1.0)
 
 
 # the arm
@@ -95,7 +54,7 @@ def test_moving_keeps_faces_outside():
 @MODEL
 @pytest.mark.parametrize("q", QS[:6])
 def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
-    frames = arm.link_frames(model.chain, q)
+    frames = links.link_frames(model.chain, q)
     assert frames[6] == pytest.approx(forward(model.chain, q), abs=1e-14)
     c = posture(model.chain, q)
     wrist = c.origins[4]
@@ -104,57 +63,25 @@ def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
     assert frames[3][:3, 2] == pytest.approx(c.axes[3], abs=1e-14)
 
 
-@MODEL
-def test_every_link_is_a_closed_body_the_right_way_out(model):
-    parts = arm.arm_parts(model.chain)
-    assert len({part.name for part in parts}) == len(parts) and {part.frame for part in parts} == set(range(7))
-    assert all(volume(part.mesh) > 0 for part in parts)
-    for part in parts:
-        edges = np.sort(part.mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        places = np.unique(part.mesh.vertices.round(9), axis=0, return_inverse=True)[1].ravel()
-        at = np.sort(places[edges], axis=1)
-        at = at[at[:, 0] != at[:, 1]]  # triangles at a pole have an edge without length
-        _, uses = np.unique(at, axis=0, return_counts=True)
-        assert (uses % 2 == 0).all(), part.name
-
-
-@MODEL
-def test_joints_lie_in_the_bodies_that_they_join(model):
-    """Each joint's place by the closed form, looked for in the solids on both of its sides, in many postures."""
-    parts = {part.name: part for part in arm.arm_parts(model.chain)}
-    d = [1e-3 * joint.d_mm for joint in read_cell(model.name).joints.values()]
-
-    def inside(name, frames, point):
-        part = parts[name]
-        return winding(part.mesh.moved(frames[part.frame]), point) > 0.5
-
-    for q in QS:
-        frames, c = arm.link_frames(model.chain, q), posture(model.chain, q)
-        axis, offset = np.array(c.axes[1]), d[1] + d[2]
-        shoulder, wrist = np.array([0.0, 0.0, d[0]]), np.array(c.origins[4])
-        elbow = np.array(c.origins[2]) - d[1] * axis  # in the plane of joint 1's axis
-        side = math.copysign(1.0, offset)
-        beam = side * (abs(offset) - 0.5 * arm.FOREARM - 0.004 - 0.5 * arm.UPPER_ARM)
-        assert inside("shoulder", frames, shoulder)
-        assert inside("upper_arm", frames, shoulder + beam * axis)  # round joint 2
-        assert inside("upper_arm", frames, elbow + beam * axis)  # round joint 3
-        assert inside("forearm", frames, elbow + offset * axis)
-        assert inside("wrist", frames, wrist) and inside("hub", frames, wrist)
-        assert not inside("forearm", frames, wrist + 0.04 * np.array(c.axes[3]))
-
-
-def test_the_two_published_arms_differ_where_their_numbers_do():
-    upenn, unimate = ({p.name: p.mesh for p in arm.arm_parts(model.chain)} for model in MODELS.values())
-    length = lambda mesh: float(np.ptp(mesh.vertices[:, 0]))  # noqa: E731
-    assert length(upenn["upper_arm"]) - length(unimate["upper_arm"]) == pytest.approx(0.2 * 0.0254, abs=1e-6)
+@pytest.mark.parametrize("cell", ["puma260", "seven-axis", "gantry"])
+def test_every_link_has_a_closed_body_the_right_way_out_and_every_joint_lies_in_one(cell):
+    arm = resolve(load_scene("free", {"cell": cell})).arm.model
+    parts, lines = links.arm_links(load_scene("free", {"cell": cell}).arm, arm.chain)
+    assert not lines and len({part.name for part in parts}) == len(parts)
+    assert {part.frame for part in parts} >= set(range(arm.n)) and all(part.mesh.is_volume for part in parts)
+    q = 0.5 * (arm.q_min + arm.q_max)
+    frames, at = links.link_frames(arm.chain, q), posture(arm.chain, q)
+    bodies = [part.mesh.copy().apply_transform(frames[part.frame]) for part in parts]
+    for origin in np.array(at.origins):
+        assert max(winding(body, origin) for body in bodies) > 0.5
 
 
 def test_the_probe_is_a_ball_with_a_holder_from_the_flange():
     tool = tool_z_offset(80.0)
-    holder, elastic = arm.probe_parts(0.04, tool)
+    holder, elastic = taxels.probe_parts(0.04, tool)
     assert np.linalg.norm(elastic.vertices, axis=1) == pytest.approx(0.04)
     assert elastic.vertices[:, 2].max() == pytest.approx(0.04)
-    assert volume(holder) > 0 and holder.vertices[:, 2].min() == pytest.approx(-0.08)
+    assert holder.volume > 0 and holder.vertices[:, 2].min() == pytest.approx(-0.08)
     assert np.linalg.norm(holder.vertices[holder.vertices[:, 2] > -0.02], axis=1).max() < 0.04
     assert np.einsum("ij,ij->i", normals(elastic), face_middles(elastic)).min() > -1e-15
 
@@ -186,7 +113,7 @@ def test_the_image_has_u_to_the_right_and_v_upward():
 
 POSE = homogeneous(tangent_rotation(np.array([0.36, -0.48, 0.8])), np.array([-0.12, 0.1, 0.37]))
 HEIGHTS = -np.add.outer(np.linspace(-0.05, 0.05, 51) ** 2, 2 * np.linspace(-0.04, 0.04, 41) ** 2)
-BALL = meshes.revolved([(0.03 * math.sin(a), 0.03 * math.cos(a)) for a in np.linspace(math.pi, 0, 100)], 200)
+BALL = trimesh.creation.uv_sphere(radius=0.03, count=(100, 100))
 KINDS = {
     "heights": {"heights": HEIGHTS, "spacing": 2e-3, "origin": (0, 0)},
     "mesh": {"vertices": BALL.vertices, "faces": BALL.faces, "spacing": 2e-3, "origin": (0, 0)},

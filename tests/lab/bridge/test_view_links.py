@@ -59,7 +59,7 @@ def test_meshes_are_drawn_in_their_frames_and_what_cannot_be_read_is_said(lab):
     solid = {part.name: part for part in parts if part.name.startswith("solid")}
     assert [part.frame for part in solid.values()] == [0, 1, 1]
     base, arm, ball = (part.mesh.vertices for part in solid.values())
-    assert solid["solid_1"].colour == (255, 0, 0)
+    assert solid["solid_1_1"].colour == (255, 0, 0)
     assert np.ptp(base, axis=0) == pytest.approx((0.2, 0.1, 0.06)) and base.mean(axis=0)[0] == pytest.approx(1.0)
     assert {part.frame for part in parts if part not in solid.values()} == {2}
     # frame 1 is where joint 2 begins: 300 mm along x from the link that carries the mesh, its z along -y

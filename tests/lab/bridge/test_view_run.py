@@ -183,7 +183,7 @@ def test_the_trail_is_thinned_lifted_and_broken_where_the_probe_was():
 
 def test_the_path_of_a_run_stays_on_its_object(run):
     trail = trail_of(run)
-    shape = true_object(run.scene.object)
+    shape = true_object(run.setup.scene.object)
     height = np.array([shape.closest(p).distance for p in np.array(trail.segments).reshape(-1, 3)[::5]])
     assert len(trail) > 20 and height == pytest.approx(LIFT_M, abs=3e-4)
 

@@ -20,7 +20,7 @@ from canprobe.lab.studies.estimators import (
     settings,
 )
 from canprobe.lab.studies.ground import SURFACES
-from canprobe.lab.studies.result import Column, StudyResult, as_document, table_lines, write_study
+from canprobe.lab.studies.result import StudyResult, as_document, table_lines, write_study
 from canprobe.lab.studies.sweep import FORMS, STUDIES
 from canprobe.mechanics.touch.estimate.fit import METHODS
 
@@ -75,7 +75,7 @@ def test_ratios_are_to_the_paper_in_the_same_run():
 
 
 def result(draw=lambda path: path.write_bytes(b"")):
-    columns = (Column("name", "name"), Column("x_mm", "x mm", ".1f"))
+    columns = ("name", "x_mm")
     return StudyResult(
         "demo", columns, [{"name": "a", "x_mm": 1.25}, {"name": "b", "x_mm": float("nan")}], ["so"], {}, draw
     )
@@ -83,10 +83,20 @@ def result(draw=lambda path: path.write_bytes(b"")):
 
 def test_what_does_not_apply_is_null_and_a_dash(tmp_path):
     assert as_document(result())["rows"][1]["x_mm"] is None
-    assert table_lines(result())[1:] == ["a      1.2", "b        –"]
+    assert table_lines(result()) == ["name  x mm", "a     1.25", "b        –"]
     names = [path.name for path in write_study(result(), tmp_path / "deep")]
     assert names[:3] == ["demo.csv", "demo.txt", "demo.json"]
     assert (tmp_path / "deep/demo.csv").read_text().splitlines() == ["name,x_mm", "a,1.25", "b,"]
+
+
+def test_a_table_spells_units_and_shows_four_digits_or_all_before_the_point():
+    row = {"stiffness_n_m3": 1.27e8, "force_max_n": 12345.67, "error_per_m": 0.123456, "cycles": 72000, "held": True}
+    table = StudyResult("demo", tuple(row), [row], [], {}, lambda path: None)
+    heads, cells = (line.split("  ") for line in table_lines(table))
+    assert [head.strip() for head in heads if head] == [
+        "stiffness N/m³", "force max N", "error 1/m", "cycles", "held",
+    ]  # fmt: skip
+    assert [cell.strip() for cell in cells if cell] == ["1.27e+08", "12346", "0.1235", "72000", "yes"]
 
 
 def test_list(capsys):
@@ -122,4 +132,4 @@ def test_run_prints_the_table_and_writes_files(monkeypatch, tmp_path, capsys):
     assert main(["study", "estimators", "--out", str(tmp_path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rows"][0] == {"name": "a", "x_mm": 1.25}
     assert main(["study", "estimators", "--out", str(tmp_path)]) == 0
-    assert "a      1.2" in capsys.readouterr().out
+    assert "a     1.25" in capsys.readouterr().out

@@ -22,8 +22,7 @@ from canprobe.lab.studies import estimators, exploration, fault_cases, stability
 from canprobe.lab.studies import faults as faults_study
 from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
 from canprobe.lab.studies.estimators import draw_estimators
-from canprobe.lab.studies.faults_vcan import draw_ends
-from canprobe.lab.studies.figure import draw_points
+from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name, draw_points
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
@@ -128,14 +127,15 @@ def wrong_files(path):
         {"file": case.what, "plant": case.plant, "force_max_n": 3.0 + 0.3 * i}
         for i, case in enumerate(fault_cases.wrong_files(6))
     ]
-    faults_study.draw_forces(rows, "file", "plant", "Highest true force of a first touch with a wrong file", path)
+    title = "Highest true force of a first touch with a wrong file"
+    draw_by_name(rows, "file", FORCE_AXIS, path, title=title, by="plant")
 
 
 def ends(path):
     kinds = ("nodes killed", "nodes stopped", "master killed", "master stopped", "link down", "queue full")
-    draw_ends(
-        [{"fault": k, "ended_s": 0.2 + 0.3 * i, "failures": "moves" * (i == 3)} for i, k in enumerate(kinds)], path
-    )
+    rows = [{"fault": k, "ended_s": 0.2 + 0.3 * i, "failed": i == 3} for i, k in enumerate(kinds)]
+    title = "How long the master took to end after processes were killed or stopped, or the link failed, on vcan0"
+    draw_by_name(rows, "fault", ("ended_s", "from the fault to the end (s)"), path, title=title, by="failed", log=False)
 
 
 def map_of_touches(path):

@@ -3,7 +3,7 @@
 import pytest
 
 from canprobe.lab.studies.link_setups import KINDS, MACHINES, draw_machine, draw_setup
-from canprobe.lab.studies.realtime_link import RATES_HZ, RateCase, findings, measure_machine, rate_findings
+from canprobe.lab.studies.realtime_link import RATES_HZ, findings, measure_machine, rate_findings
 
 
 def test_set_ups_and_machines_follow_from_their_seed():
@@ -37,7 +37,7 @@ def test_predictions_count_from_enough_late_syncs_on():
 
 @pytest.mark.slow(reason="whole cells at five rates")
 def test_a_machine_has_overruns_where_a_check_foresees_them():
-    rows = measure_machine(RateCase(3600, 1.0))
+    rows = measure_machine((3600, 1.0))
     assert [found["rate_hz"] for found in rows] == list(RATES_HZ)
     assert rows[0]["seen_percent"] <= rows[-1]["seen_percent"]
     assert rows[-1]["predicted_percent"] > 0.5 and rows[-1]["seen_percent"] > 0.5

@@ -89,7 +89,7 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
 
 # The arithmetic of `realtime --soak`; it runs on vcan0 only.
 
-ZERO = {column.key: 0 for column in COLUMNS} | {
+ZERO = dict.fromkeys(COLUMNS, 0) | {
     "master_mib": 90.0,
     "nodes_mib": 80.0,
     "monitor_mib": 85.0,

@@ -122,7 +122,7 @@ def test_an_earlier_run_is_compared_by_kind(tmp_path):
     file.write_text(json.dumps({"rows": rows_of(scans)}))
     now = rows_of([one._replace(late=200) for one in scans])
     said = compared(now, earlier_rows(file))
-    assert "plane: refused 0 / 0, stopped 0 / 0, observed 0.500 / 0.800" in said[1]
+    assert "plane: refused 0 / 0, stopped 0 / 0, observed 0.5 / 0.8" in said[1]
     file.write_text('{"rows": 3}')
     with pytest.raises(UsageError, match=r"--against .*regions.json: expected the regions.json of an earlier run"):
         earlier_rows(file)

@@ -30,7 +30,7 @@ import os, signal, sys
 from dataclasses import dataclass
 from pathlib import Path
 import numpy as np
-from canprobe.lab.studies.result import Column, StudyResult
+from canprobe.lab.studies.result import StudyResult
 HERE = Path(__file__).parent
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def deaf():
 
 def run(*, quick, sweep):
     rows = sweep.map(measure, [Case(x) for x in range(6)], model=("lab/studies/sweep.py",))
-    return StudyResult("demo", (Column("square", "x²"),), rows, ["done"], {}, lambda path: path.write_bytes(b""))
+    return StudyResult("demo", ("square",), rows, ["done"], {}, lambda path: path.write_bytes(b""))
 
 if __name__ == "__main__":
     from types import MappingProxyType

@@ -55,7 +55,7 @@ def fit_parameters(
     S, V, D = (np.array([getattr(s, name) for _, s in touches]) for name in ("total", "moments", "remembered"))
     known = np.array([i for i, (d, _) in enumerate(touches) if d.force is not None], dtype=int)
     reference = np.array([touches[i][0].force for i in known], dtype=float)
-    a, b = (0.5 * (1.0 / plain.radius_m + kappa)).T
+    a, b = (0.5 * (1.0 / plain.pad.radius_m + kappa)).T
     side = max(plain.pad.shape)
     prior = np.array([math.log(1e8), 0.0, BLUR_PRIOR_PITCH[0], CROSSTALK_PRIOR[0], MEMORY_PRIOR[0]])
     widths = np.array(
@@ -63,7 +63,7 @@ def fit_parameters(
     )
 
     def residuals(z: Floats) -> Floats:
-        parameters = _as_parameters(z[:5], plain.pitch_m)
+        parameters = _as_parameters(z[:5], plain.pad.pitch_m)
         force = np.exp(z[5:])
         depth = np.sqrt(2.0 * force * np.sqrt(a * b) / (math.pi * parameters.stiffness))
         whole = ImageModel.of(parameters, NO_ERRORS, plain, seen=side)
@@ -83,7 +83,7 @@ def fit_parameters(
     start = np.concatenate([prior, np.log(np.maximum(S, 1e-3))])
     found: Any = least_squares(residuals, start, x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.03] + len(touches) * [0.05]))
     covariance = np.linalg.inv(found.jac.T @ found.jac)[:5, :5]
-    return ParameterFit(_as_parameters(found.x[:5], plain.pitch_m), covariance, np.exp(found.x[5:]))
+    return ParameterFit(_as_parameters(found.x[:5], plain.pad.pitch_m), covariance, np.exp(found.x[5:]))
 
 
 def moment_errors(model: ImageModel, touches: Touches, forces: Sequence[float]) -> Floats:
@@ -92,7 +92,7 @@ def moment_errors(model: ImageModel, touches: Touches, forces: Sequence[float]) 
     for (dwell, s), force in zip(touches, forces, strict=True):
         k = (dwell.kappa[0], 0.0, dwell.kappa[1])
         xx, _, yy = model.moments(k, force)
-        v = s.moments - model.memory * s.remembered
+        v = s.moments - model.parameters.memory * s.remembered
         errors.append((v[0] / xx - 1.0, v[2] / yy - 1.0, v[1] / math.sqrt(v[0] * v[2])))
     return np.array(errors)
 
@@ -101,7 +101,7 @@ def curvature_errors(model: ImageModel, touches: Touches, forces: Sequence[float
     """(n, 2) errors of the principal curvatures from each touch's moments alone, relative to (κ + 1/R_p)."""
     result = []
     for (dwell, s), force in zip(touches, forces, strict=True):
-        v = tuple((s.moments - model.memory * s.remembered).tolist())
+        v = tuple((s.moments - model.parameters.memory * s.remembered).tolist())
         v = (v[0], 0.0, v[2])
         shows = (dwell.kappa[0], 0.0, dwell.kappa[1])
         k = model.start(v, force) or shows

@@ -47,7 +47,7 @@ def fit_force(
     """
     dwells = [d for d, _ in touches]
     forces = [_forces(d, patch) for d in dwells]
-    units = [math.sqrt(2.0 * math.sqrt(_det(d, patch.radius_m)) / (math.pi * stiffness)) for d in dwells]
+    units = [math.sqrt(2.0 * math.sqrt(_det(d, patch.pad.radius_m)) / (math.pi * stiffness)) for d in dwells]
     creep, sigma = _creep(dwells, forces, units)
     loads = [i for i, d in enumerate(dwells) if d.force is not None]
     pairs = zip(dwells, forces, strict=True)

@@ -166,7 +166,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         way=dwell.expected[kept],
         t_s=dwell.t_s[kept],
         raw=raw,
-        usable=bad <= 0.2 * len(kept) and peak < STRAIGHT_SHARE * plain.full_scale_pa,
+        usable=bad <= 0.2 * len(kept) and peak < STRAIGHT_SHARE * plain.pad.full_scale_pa,
         push=float(dwell.push[kept].mean()),
         pushes=dwell.push[kept],
         sums=np.array(sums),

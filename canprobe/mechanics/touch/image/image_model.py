@@ -113,19 +113,9 @@ class ImageModel:
         cls, parameters: ImageParameters, errors: MomentErrors, patch: PatchCalibration, *, seen: int | None
     ) -> ImageModel:
         """The model of the taxels of a calibration; `seen` is the side of the window in taxels, None for all."""
-        count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
+        count, side = patch.pad.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
         seen = side if seen is None else seen
-        return cls(parameters, patch.radius_m, patch.pitch_m, LEVEL_COUNTS * count, count, side, seen, errors)
-
-    @property
-    def memory(self) -> float:
-        """Share of the patch's earlier places in its moments (`ImageParameters.memory`)."""
-        return self.parameters.memory
-
-    @property
-    def stiffness(self) -> float:
-        """Stiffness K/h of the layer, N/m³."""
-        return self.parameters.stiffness
+        return cls(parameters, patch.pad.radius_m, patch.pad.pitch_m, LEVEL_COUNTS * count, count, side, seen, errors)
 
     def with_stiffness(self, stiffness: float) -> ImageModel:
         """The same array on a layer of another stiffness (N/m³).

@@ -47,7 +47,7 @@ class MomentImage:
         self.level_pa = float(calibration.pascals[level_counts])
         self._table = read_only(np.maximum(calibration.pascals - self.level_pa, 0.0))
         self._weights = calibration.weights
-        self._square = calibration.pitch_m**2
+        self._square = calibration.pad.pitch_m**2
 
     def moments(self, taxels: NDArray[np.uint8]) -> Moments | None:
         """Moments uu, uv, vv (m²) of an image (rows, columns) in pad coordinates; None where they are no ellipse."""

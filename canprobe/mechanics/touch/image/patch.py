@@ -137,25 +137,10 @@ class PatchCalibration:
     weights: Floats = field(init=False, repr=False)
     continuation: Continuation = field(init=False, repr=False)
 
-    @property
-    def full_scale_pa(self) -> float:
-        """Pressure at the largest count, Pa."""
-        return self.pad.full_scale_pa
-
-    @property
-    def pitch_m(self) -> float:
-        """Distance of neighbouring taxels, m."""
-        return self.pad.pitch_m
-
-    @property
-    def radius_m(self) -> float:
-        """Radius R_p of the probe that the array is wrapped on, or of the sphere that a flat array is taken for, m."""
-        return self.pad.radius_m
-
     def __post_init__(self) -> None:
         positive("force_gain", self.force_gain)
         counts = np.arange(256.0)
-        pascals = self.full_scale_pa * (counts / COUNTS_MAX)
+        pascals = self.pad.full_scale_pa * (counts / COUNTS_MAX)
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
         weights = _moment_weights(self.pad)
@@ -233,7 +218,7 @@ def _nothing(peak_pa: float) -> Patch:
 def _force_and_centroid(total: float, u: float, v: float, calibration: PatchCalibration) -> tuple[float, float, float]:
     """Force (N) of a sum of pressure times area (N), and the centroid (m) of one in pitches."""
     force = calibration.force_gain * total + calibration.edge_gain * math.sqrt(total)
-    return force, u * calibration.pitch_m, v * calibration.pitch_m
+    return force, u * calibration.pad.pitch_m, v * calibration.pad.pitch_m
 
 
 def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) -> tuple[int, int, int]:

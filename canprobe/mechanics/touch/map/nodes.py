@@ -173,7 +173,7 @@ class Traces:
     """Sizes of patches in images that show traces of where the patch was before (`PadMemory`).
 
     Args:
-        share: share of those traces in the moments (`ImageModel.memory`).
+        share: share of those traces in the moments (`ImageParameters.memory`).
     """
 
     def __init__(self, share: float) -> None:

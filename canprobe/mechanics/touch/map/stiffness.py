@@ -63,7 +63,7 @@ def _log_of_image(model: ImageModel, patch: float, force: float, kappa: list[flo
     k = kappa[0], 0.0, kappa[1]
 
     def layer(stiffer: float) -> ImageModel:
-        return model.with_stiffness(model.stiffness * math.exp(stiffer))
+        return model.with_stiffness(model.parameters.stiffness * math.exp(stiffer))
 
     def apart(stiffer: float) -> float:
         xx, xy, yy = layer(stiffer).moments(k, force)
@@ -80,4 +80,5 @@ def _log_of_image(model: ImageModel, patch: float, force: float, kappa: list[flo
         trust = layer(stiffer).trust(k, force)
     except (ValueError, ZeroDivisionError):  # hollower than the probe, or nothing above the level
         return None
-    return math.log(model.stiffness) + stiffer if trust == 1.0 else None  # a cut patch looks like that of a soft layer
+    # a cut patch looks like that of a soft layer
+    return math.log(model.parameters.stiffness) + stiffer if trust == 1.0 else None

@@ -94,7 +94,7 @@ class SurfaceMap:
         self.pad, self.noise = pad, noise
         self.nodes = NodeGrid(0.0 if pad is None else pad.radius, noise.lateral)
         self._evidence = LayerEvidence(image_model)
-        self._traces = None if image_model is None else Traces(image_model.memory)
+        self._traces = None if image_model is None else Traces(image_model.parameters.memory)
         self._solved: Cells | None = None
 
     @classmethod

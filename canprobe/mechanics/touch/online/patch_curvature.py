@@ -154,7 +154,7 @@ class PatchCurvature:
 
     def __init__(self, model: ImageModel, sigma_stiffness: float = 1e-3) -> None:
         self.model = model
-        self.stiffness = ScanStiffness(model.stiffness, positive("sigma_stiffness", sigma_stiffness))
+        self.stiffness = ScanStiffness(model.parameters.stiffness, positive("sigma_stiffness", sigma_stiffness))
         self.refused = 0
         self._used: Slope | None = None
         self.reset()
@@ -196,7 +196,7 @@ class PatchCurvature:
         inward = -nx, -ny, -nz
         x_axis = self._axes[0] if self.frames else tangent_rotation(inward)[:, 0].tolist()
         self._axes = transported(x_axis, inward)
-        (uu, uv, vv), memory = sample.moments, self.model.memory
+        (uu, uv, vv), memory = sample.moments, self.model.parameters.memory
         tuu, tuv, tvv = (memory * trace for trace in overlapping(was, sample.moments))
         axis = self._pad_axis(direction, sample.T_base_probe)
         moments = _turned(uu - tuu, uv - tuv, vv - tvv, *axis)

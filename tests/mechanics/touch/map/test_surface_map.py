@@ -299,8 +299,8 @@ def of_scan(seen, true_share=1.0, larger=1.0):
     parameters = ImageParameters(stiffness=1.24e8, scale=1.0, blur=1.5e-3, crosstalk=0.0, memory=0.0)
     errors = MomentErrors(moment=1e-3, both=5e-4, shear=1e-3, frame_sigma=0.01)
     model = ImageModel(parameters, radius, 1.6e-3, level=1e3, count=500.0, side=16, seen=seen, errors=errors)
-    found = SurfaceMap(PadLayer(radius, model.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
-    samples = pad_samples(radius, model.stiffness, true_share * model.stiffness, model)
+    found = SurfaceMap(PadLayer(radius, model.parameters.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
+    samples = pad_samples(radius, model.parameters.stiffness, true_share * model.parameters.stiffness, model)
     found.add_samples([replace(s, moments=tuple(larger * moment for moment in s.moments)) for s in samples])
     return found, model
 
@@ -310,12 +310,12 @@ def test_the_scan_shows_the_stiffness_of_its_layer(true_share):
     found, model = of_scan(16, true_share)
     at = on_sphere(PLACES, 0.05)[0]
     assert np.abs(found.distance(at)[0]).max() < 5e-6
-    assert found.stiffness.value == pytest.approx(true_share * model.stiffness, rel=0.02)
+    assert found.stiffness.value == pytest.approx(true_share * model.parameters.stiffness, rel=0.02)
 
 
 def test_images_of_a_patch_that_does_not_fit_into_the_window_say_nothing_of_the_stiffness():
     found, model = of_scan(4, larger=1.1)
-    assert found.stiffness.value == pytest.approx(model.stiffness, rel=0.02)
+    assert found.stiffness.value == pytest.approx(model.parameters.stiffness, rel=0.02)
     assert found.stiffness.sigma == SOURCE_SIGMA
 
 
