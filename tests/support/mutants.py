@@ -204,8 +204,6 @@ class Tree:
         if child.exitcode == 0:
             return None
         failed = re.findall("^(?:FAILED|ERROR) (.*)", (self.folder / "out.txt").read_text(encoding="utf-8"), re.M)
-        if not failed and child.exitcode == pytest.ExitCode.USAGE_ERROR:
-            sys.exit("the record names tests that are not there: remove it")
         return failed[0] if failed else f"pytest ends with {child.exitcode}"
 
     def _run(self, tests: Iterable[str], test_s: float, plugins: tuple[object, ...]) -> None:
@@ -293,6 +291,8 @@ def main() -> None:
                 options.record.write_text(json.dumps(record), encoding="utf-8")
         else:
             record = json.loads(options.record.read_text(encoding="utf-8"))
+            if tree.run(["--collect-only", *record["seconds"]], 180, 600):
+                sys.exit("the record names tests that are not there: remove it")
         left_out = sum(seconds == math.inf for seconds in record["seconds"].values())
         print(f"{len(record['seconds'])} tests, and {left_out} of them left out, as they do not pass", flush=True)
         choice, killed = Choice(record, options.limit), 0

@@ -57,7 +57,7 @@ class PositionTrack:
         self._heard = False  # since the target moved on
         self._way, self._periods = 0.0, 0.0  # what was asked since the last report, up to the last target; counts
 
-    def aim(self, step_counts: float, periods: float = 1.0) -> None:
+    def aim(self, step_counts: float, periods: float) -> None:
         """The target moves on by this much, so many periods after it did so last."""
         if not self._heard:
             self._way += self._followed(periods)

@@ -205,12 +205,10 @@ class DepthWitness:
         if not order.size:
             return
         normals = np.array([self._believed[k].normal for k in order])
-        roots = np.array([self._believed[k].root for k in order])
         up = normals[0]
-        upright = normals @ up
-        if not (upright > 0.8).all():
-            keep = upright > 0.8
-            order, normals, roots, upright = order[keep], normals[keep], roots[keep], upright[keep]
+        facing = normals @ up > 0.8
+        order, normals = order[facing], normals[facing]
+        roots, upright = np.array([self._believed[k].root for k in order]), normals @ up
         points = centres[order] - normals * (self._radius - d1 * roots)[:, None]
         across = np.eye(3)[int(np.argmin(np.abs(up)))]
         across = across - up * float(across @ up)

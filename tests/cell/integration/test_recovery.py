@@ -51,6 +51,9 @@ def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_
     there = events[events.index("nodes 1, 2, 4-6: is PRE_OPERATIONAL") :]
     steps = ("node 3: booted", "nodes 1-6: NMT command reset node", "nodes 1-6: enabled")
     assert [there.index(step) for step in steps] == sorted(there.index(step) for step in steps)
+    ends = there[there.index("nodes 1-6: enabled") + 1 :]
+    assert any("no longer enabled" in event for event in ends), "the cell that came back is stopped as the first one is"
+    assert any(event.endswith("is PRE_OPERATIONAL") for event in ends)
     kinds = "\n".join(run.summary["faults"])
     words = ("node 3: lost: no usable TPDO .*", "the cell came back", "motion was asked for, and went on")
     lost_s, back_s, went_on_s = (float(re.search(rf"{one}, at ([\d.]+) s", kinds)[1]) for one in words)

@@ -228,7 +228,7 @@ PERIOD = 2_500_000
 def moving(rate=10, cycles=20, track=None, period_ns=PERIOD):
     track = track or PositionTrack(BASE)
     for k in range(cycles):
-        track.aim(abs(rate))
+        track.aim(abs(rate), 1)
         assert track.take(rate * k, k, k * period_ns, guarded=True) or k == 0
     return track
 
@@ -270,7 +270,7 @@ def test_what_a_target_asked_fades_with_the_time_and_not_with_the_cycles():
     """Twenty periods later an eighth of it counts, whether they are one cycle or twenty."""
     for cycles in (1, 20):
         track = moving(0)
-        track.aim(1000)
+        track.aim(1000, 1)
         for _ in range(cycles):
             track.aim(0, 20 / cycles)
         track.take(0, 20, 40 * PERIOD, guarded=True)
@@ -287,9 +287,9 @@ def test_a_drive_that_was_not_heard_while_it_moved_is_believed_when_all_hold(tur
     position = 20 * 19
     for _ in range(20, 24):
         position += turned * 40
-        track.aim(40)
+        track.aim(40, 1)
     for _ in range(24, 60):
-        track.aim(0)
+        track.aim(0, 1)
     assert track.take(position, 60, 60 * PERIOD, guarded=True)
 
 
@@ -446,7 +446,7 @@ def test_a_start_and_a_stop_are_believed():
     track, reference = PositionTrack(BASE), 0.0
     for k in range(200):
         step = 40.0 if 50 <= k < 120 else 0.0
-        track.aim(step)
+        track.aim(step, 1)
         for _ in range(50):
             reference += step / 50
             a = omega**2 * (reference - x) - 2 * 0.9 * omega * v

@@ -15,7 +15,8 @@ def look(witness, images, *, speed=5e-3, sigma=SIGMA, pressed=True, highest=130,
     for k, image in enumerate(images):
         t_ns = k * PERIOD_NS
         centre = np.array([speed * t_ns * 1e-9, 0.0, 0.0])
-        uv = tuple(rng.normal(0.0, scatter, 2)) if scatter else (1e-3, 1e-3)
+        rolled = 2e-3 - 4e-3 * t_ns * 1e-9 * np.array([1.0, 2.0])  # a centroid that moves on steadily
+        uv = tuple(rolled + rng.normal(0.0, scatter, 2)) if scatter else (1e-3, 1e-3)
         witness.look(t_ns, image, pressed=pressed, uv=uv, highest=highest, centre=centre, sigma=sigma)
         if witness.dead_since_ns is not None:
             return t_ns

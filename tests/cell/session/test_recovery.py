@@ -91,6 +91,9 @@ class Cell(Nodes):
     def stop(self):
         self.told.append("stop")
 
+    def close(self):
+        self.told.append("close")
+
 
 class Bench:
     """A recovery whose nodes are always there, on a clock that cells move on."""
@@ -112,6 +115,9 @@ class Bench:
 
     def now_ns(self):
         return self.now
+
+    def close(self):
+        self.opened -= 1
 
     def raise_ended(self):
         pass
@@ -171,6 +177,13 @@ def test_after_so_many_failures_it_ends_and_a_new_request_begins_anew(monkeypatc
         with pytest.raises(NodeError):
             bench.recovery.resume()
     assert bench.told()[1:] == [FAILED] * (BRING_UP_ATTEMPTS * (1 + again)) + [[]] * (BRING_UP_ATTEMPTS * (1 - again))
+
+
+def test_the_last_cell_is_stopped_and_then_the_bus_closed(monkeypatch):
+    bench = Bench(monkeypatch, [{}])
+    bench.run()
+    bench.recovery.close()
+    assert bench.told() == [["start", "stop"], [*UP, "close"]] and bench.opened == -1
 
 
 def test_a_lost_cell_is_brought_up_on_request(monkeypatch):

@@ -43,7 +43,7 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
     asked, done = [], []
 
     class Working(Mine):
-        retreats_itself, restarts = True, 3
+        retreats_itself, restarts, trail = True, 3, "the way that it came"
 
         def update(self):
             done.append("update")
@@ -54,12 +54,13 @@ def test_a_held_task_does_no_work_between_cycles_and_is_let_go_by_the_cell():
     held = PausedController(Working(), None, lambda: bool(asked))
     held.update()
     assert done == [] and not held.retreats_itself and held.restarts == 3
+    assert held.trail is None, "the way that the arm came before it was lost is no way back"
     held.step(Measurement(0, 0))
     asked.append(True)
     held.step(Measurement(1, 0))
     held.update()
     held.retreat("the force")
-    assert done == ["update", "the force"] and held.retreats_itself
+    assert done == ["update", "the force"] and held.retreats_itself and held.trail == Working.trail
     assert PausedController(Working(), None, None).retreats_itself, "a controller that is new begins at once"
 
 

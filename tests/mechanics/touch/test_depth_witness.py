@@ -131,3 +131,42 @@ def test_a_new_touch_begins_without_the_old_surface():
     witness.restart()
     touch_ball(witness, 0.0, depth(2.0), 2.0, 1.0)
     assert math.isnan(witness.depth) and not witness.contradicts
+
+
+def test_a_way_aside_may_lower_the_force_by_the_steepest_slope():
+    """From 2 N the probe goes aside over ground that falls away: by 0.29 of its way it does what it may, by 0.5 not."""
+    for slope, falls in ((0.29, False), (0.5, True)):
+        witness, way, up = DepthWitness(R), 0.4e-3, np.array([0.0, 0.0, 1.0])
+        for k in range(60):
+            witness.step(k * STEP_S, np.array([2e-5 * k, 0.0, R]), up, 2.0, d1=D1, force_max=LIMIT)
+        left = max(depth(2.0) - slope * way, 0.0)
+        aside = np.array([2e-5 * 59 + way, 0.0, R])
+        witness.step(60 * STEP_S, aside, up, (left / D1) ** 2, d1=D1, force_max=LIMIT)
+        assert (witness.fall is not None) == falls, slope
+
+
+@pytest.mark.parametrize(("radius", "known"), [(2.0 * R, True), (0.5 * R, False)])
+def test_in_a_hollow_that_is_narrower_than_the_probe_no_depth_is_known(radius, known):
+    """The probe goes round in a bowl."""
+    witness = DepthWitness(R)
+    for k in range(200):
+        x, y = 2e-3 * math.cos(0.05 * k), 2e-3 * math.sin(0.05 * k)
+        outward = np.array([-x, -y, math.sqrt(radius**2 - x * x - y * y)]) / radius
+        centre = np.array([0.0, 0.0, radius]) + (R - depth(2.0) - radius) * outward
+        witness.step(k * STEP_S, centre, outward, 2.0, d1=D1, force_max=LIMIT)
+    assert math.isfinite(witness.sigma) == known
+
+
+def test_a_contact_on_a_flank_does_not_show_the_top():
+    """A contact on a wall close by changes nothing of the depth."""
+    depths = []
+    for flank in (False, True):
+        witness = DepthWitness(R)
+        for k in range(300):
+            if flank and k == 150:
+                wall = np.array([1.0, 0.0, 1e-6])
+                witness.step(k * STEP_S, np.array([10e-3, 0.0, R]), wall, 2.0, d1=D1, force_max=LIMIT)
+            centre = np.array([2e-3 * math.sin(0.01 * k), 0.0, R - depth(2.0)])
+            witness.step(k * STEP_S, centre, np.array([0.0, 0.0, 1.0]), 2.0, d1=D1, force_max=LIMIT)
+        depths.append(witness.depth)
+    assert depths[1] == pytest.approx(depths[0], abs=1e-6)
