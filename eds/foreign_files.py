@@ -22,8 +22,9 @@ class FileKind(NamedTuple):
 
 
 _TSHARK = (
-    "type: tshark -r {path} -T fields -e frame.time_epoch -e can.id -e data.data"
-    " | awk '{{printf \"(%.6f) can0 %03X#%s\\n\", $1, $2, toupper($3)}}' > bus.log"
+    "type: tshark -r {path} -Y can.id -T fields -E separator=, -e frame.time_epoch -e can.id -e can.flags.xtd"
+    ' -e can.flags.rtr -e data.data | awk -F, \'{{printf "(%.6f) can0 " ($3 ~ /1|T/ ? "%08X" : "%03X") "#%s\\n",'
+    ' $1, $2, $4 ~ /1|T/ ? "R" : (length($5) > 16 ? "#1" : "") toupper($5)}}\' > bus.log'
 )
 _CONVERT = "type: can_logconvert {path} bus.log"
 _EXPORT = "export it as EDS with the maker's tool, or with CANopenEditor (File, Export)"

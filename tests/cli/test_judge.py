@@ -18,7 +18,7 @@ from waiting import wait_until
 
 import canprobe
 from canprobe.cli import main
-from canprobe.fieldbus.bus.candump import CandumpWriter
+from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
 
 SMALL = Path(__file__).parents[1] / "support" / "small_master.py"
 NODE = ("--eds", "puma260_joint", "--node-id", "1")
@@ -86,6 +86,13 @@ def test_the_log_of_a_run_has_nothing_to_blame(tmp_path, capsys):
     assert main(["judge", "free", "--record", str(tmp_path / "run" / "bus.log"), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert sum(row["verdict"] == "PASS" for row in rows) > 15
+    with (tmp_path / "screen.txt").open("w") as screen:  # as `candump can0` prints it, without times
+        for _, channel, can_id, data in read_candump(tmp_path / "run" / "bus.log"):
+            print(f"  {channel}  {can_id:03X}   [{len(data)}]  {data.hex(' ').upper()}", file=screen)
+    assert main(["judge", "free", "--record", str(tmp_path / "screen.txt"), "--json"]) == 0
+    told = capsys.readouterr()
+    assert "has no times, so no interval or time-out is judged" in told.err
+    assert sum(row["verdict"] == "PASS" for row in json.loads(told.out)["rows"]) > 12
 
 
 @pytest.mark.parametrize(

@@ -187,7 +187,7 @@ class SyncGaps(BusRule):
             self.looked += 1
             interval_ns = event.frame.t_ns - before.frame.t_ns
             words = []
-            if not 0.5 * period_ns <= interval_ns <= 1.5 * period_ns:
+            if self.bus.now_ns and not 0.5 * period_ns <= interval_ns <= 1.5 * period_ns:  # 0: a log without times
                 words.append(f"SYNC after {interval_ns * 1e-6:.2f} ms; the period is {period_ns * 1e-6:.2f} ms")
             if event.counter is not None and before.counter is not None:
                 overflow = max((node.number(0x1019) or 0 for node in self.bus.nodes.values()), default=0)
