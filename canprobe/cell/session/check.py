@@ -28,7 +28,7 @@ from canprobe.fieldbus.tools.link import (
     judge_link,
 )
 from canprobe.fieldbus.tools.link.figures import IDLE_FAST_NS, quantile, us
-from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, wake_lateness
+from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, stamps_text, wake_lateness
 
 IDLE_S = 2.0
 """Time of each loop that does nothing."""
@@ -193,6 +193,7 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     if not session.virtual:
         late = [_us(us(quantile(idle_ns[plan.sync.period_ns], share))) for share in (0.5, 0.99, 1.0)]
         machine = {"wakes_late_by": "p50 {}, p99 {}, at most {}, without a bus".format(*late), **machine}
+        machine["frames_stamped"] = stamps_text(meter, idle_ns[plan.sync.period_ns][-1])
         machine["controller"] = _controller(plan)
     found = session.cell.found
     return LinkReport(
