@@ -16,7 +16,8 @@ from canprobe.cell.session.first_second import link_limits
 from canprobe.cell.session.links import SOCKETCAN
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.port import ControllerState, Port
+from canprobe.fieldbus.bus.clock import wake_lateness
+from canprobe.fieldbus.bus.port import ControllerState, Port, stamps_text
 from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
@@ -28,7 +29,7 @@ from canprobe.fieldbus.tools.link import (
     judge_link,
 )
 from canprobe.fieldbus.tools.link.figures import IDLE_FAST_NS, quantile, us
-from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, stamps_text, wake_lateness
+from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts
 
 IDLE_S = 2.0
 """Time of each loop that does nothing."""

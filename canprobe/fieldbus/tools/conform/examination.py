@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.errors import CanprobeError, NodeError
-from canprobe.fieldbus.bus.port import ControllerState, Port, nothing
+from canprobe.fieldbus.bus.clock import wake_lateness
+from canprobe.fieldbus.bus.port import ControllerState, Port, nothing, stamps_text
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import CONTROLWORD, POWERED_STATES, describe_state, known_state
@@ -40,7 +41,6 @@ from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 from canprobe.fieldbus.tools.conform.surroundings import hear
-from canprobe.fieldbus.tools.link.machine import stamps_text, wake_lateness
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
 _BACK_ON_BUS_S = 5.0
