@@ -53,7 +53,25 @@ def test_a_log_of_a_good_master_and_what_became_better(tmp_path, capsys):
     assert main(["judge", *NODE, "--record", bad, "--json"]) == 1
     (tmp_path / "bad.json").write_text(capsys.readouterr().out)
     assert main(["judge", *NODE, "--record", good, "--baseline", str(tmp_path / "bad.json")]) == 0
-    assert "01 target at enable" in capsys.readouterr().out
+    assert "better: enable 01 target at enable" in capsys.readouterr().out
+
+
+def test_only_what_is_new_fails_where_ci_asks_for_that(tmp_path, capsys):
+    logs = {"bad": log_of(TargetElsewhere(), tmp_path / "bad.log"), "good": log_of(Master(), tmp_path / "good.log")}
+    for name, log in logs.items():
+        main(["judge", *NODE, "--record", log, "--json"])
+        (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
+    junit = tmp_path / "j.xml"
+    bad = ["judge", *NODE, "--record", logs["bad"], "--junit", str(junit), "--fail-on"]
+    for baseline, status, tag in (("bad", 0, "skipped"), ("good", 1, "failure")):
+        compared = ["--baseline", str(tmp_path / f"{baseline}.json")]
+        assert main([*bad, "new", *compared]) == status
+        assert main([*bad, "deviation", *compared]) == 1
+        main([*bad, "new", *compared])
+        assert ElementTree.parse(junit).find(".//testcase[@name='01 target at enable']")[0].tag == tag
+    capsys.readouterr()
+    assert main([*bad, "new"]) == 2
+    assert "--baseline FILE names it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
