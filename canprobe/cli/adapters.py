@@ -32,21 +32,8 @@ def run(args: argparse.Namespace) -> int:
 
     found, missing = find_adapters(), {name: missing_here(name) for name in BACKENDS}
     if args.json:
-        keys = ("hardware", "channel", "example", "driver", "bitrates_kbit")
-        print_json(
-            {
-                "found": [asdict(one) for one in found],
-                "interfaces": [
-                    {
-                        "interface": name,
-                        **{key: getattr(one, key) for key in keys},
-                        "has": sorted(one.features),
-                        "missing": missing[name],
-                    }
-                    for name, one in BACKENDS.items()
-                ],
-            }
-        )
+        interfaces = [{"interface": name, **asdict(one), "missing": missing[name]} for name, one in BACKENDS.items()]
+        print_json({"found": [asdict(one) for one in found], "interfaces": interfaces})
         return 0
     if found:
         rows = [(one.interface, one.channel, one.state, one.type_next) for one in found]

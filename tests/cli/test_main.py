@@ -534,7 +534,7 @@ def test_the_page_on_hardware_has_the_table():
     for name, backend in BACKENDS.items():
         _, hardware, channel, example, needs, *has, rates = table[name]
         assert (hardware, channel, example) == (backend.hardware, backend.channel, f"`{backend.example}`")
-        assert (backend.package is None) or f"pip install '{backend.required}'" in needs
+        assert (backend.package is None) or f"pip install 'python-can[{backend.extra}]'" in needs
         assert (backend.driver is None) or backend.driver.replace("sudo ", "") in needs
         assert backend.windows == ("Windows only" in needs)
         words = ({"fd", "fd-timing"}, {"filter"}, {"listen-only"}, {"errors"}, {"stamps"})

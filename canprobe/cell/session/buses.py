@@ -186,10 +186,7 @@ class RealBuses(SessionBuses):
         for port in before.values():
             port.close()
         ports = open_ports(
-            self._plan,
-            clock,
-            lambda name: Reports(record.error_writer(name), self._files.note),
-            self._options.bus,
+            self._plan, clock, lambda name: Reports(record.error_writer(name), self._files.note), self._options.bus
         )
         self.ports = self._open_ports.enter_context(ports)
         for name, port in before.items():

@@ -81,7 +81,9 @@ class Backend:
         if self.windows and sys.platform != "win32":
             lacks.append(f"{self.driver} is for Windows only")
         if self.package is not None and importlib.util.find_spec(self.package) is None:
-            lacks.append(f"the package {self.package} is not installed; type: {package_line(self.required)}")
+            lacks.append(
+                f"the package {self.package} is not installed; type: {package_line(f'python-can[{self.extra}]')}"
+            )
         if self.library is not None and ctypes.util.find_library(self.library) is None:
             lacks.append(f"{self.driver} is not installed")
         if lacks and self.module is not None and sys.platform == "linux":
@@ -92,11 +94,6 @@ class Backend:
     def features(self) -> frozenset[str]:
         """The words of `has`."""
         return frozenset(self.has.split())
-
-    @property
-    def required(self) -> str:
-        """The requirement that installs its package, for pip."""
-        return f"python-can[{self.extra}]"
 
 
 BACKENDS: Mapping[str, Backend] = {
@@ -174,12 +171,7 @@ BACKENDS: Mapping[str, Backend] = {
         has="errors stamps",
     ),
     "serial": Backend(
-        "python-can's own serial protocol",
-        "serial port",
-        "/dev/ttyUSB0",
-        package="serial",
-        extra="serial",
-        has="errors stamps",
+        "python-can's own serial protocol", "serial port", "/dev/ttyUSB0", "serial", "serial", has="errors stamps"
     ),
     "seeedstudio": Backend(
         "Seeed USB-CAN analyzer",
