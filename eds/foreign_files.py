@@ -27,9 +27,8 @@ _TSHARK = (
     ' $1, $2, $4 ~ /1|T/ ? "R" : (length($5) > 16 ? "#1" : "") toupper($5)}}\' > bus.log'
 )
 _CONVERT = "type: can_logconvert {path} bus.log"
-_EXPORT = "export it as EDS with the maker's tool, or with CANopenEditor (File, Export)"
 _PCAP = FileKind("a capture of tcpdump or Wireshark (pcap)", _TSHARK)
-_XML = FileKind("XML, as XDD and XDC files are", "", _EXPORT)
+XML = FileKind("XML, as XDD and XDC files are")
 
 
 def _packed(by: str, unpack: str) -> FileKind:
@@ -51,8 +50,8 @@ _KINDS = {
     b"\n\r\r\n": FileKind("a capture of Wireshark (pcapng)", _TSHARK),
     b"LOGG": FileKind("a log of Vector's tools (BLF)", _CONVERT),
     b"MDF ": FileKind("a measurement of ASAM MDF", _CONVERT),
-    b"<?xml": _XML,
-    b"<ISO15745": _XML,
+    b"<?xml": XML,
+    b"<ISO15745": XML,
 }
 """Kinds of files by their first bytes. Source: file(1), magic; pcap-savefile(5); CiA 311."""
 
@@ -61,6 +60,6 @@ def file_kind(head: bytes) -> FileKind | None:
     """Kind of a file that is neither a candump log nor an EDS file, by its first bytes; None for any other."""
     text = head.replace(b"\0", b"").lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n")  # a mark of UTF-8 or UTF-16, and blanks
     return next(
-        (kind for magic, kind in _KINDS.items() if head.startswith(magic) or (kind is _XML and text.startswith(magic))),
+        (kind for magic, kind in _KINDS.items() if head.startswith(magic) or (kind is XML and text.startswith(magic))),
         None,
     )
