@@ -266,6 +266,24 @@ def test_a_bus_off_and_what_an_adapter_sent_itself(monkeypatch: pytest.MonkeyPat
         assert port.state is ControllerState.BUS_OFF and port.counters.received == 1
 
 
+class GsUsbBus(FakeAdapter):
+    """Its error frames have the classes of SocketCAN, as those of python-can's class of this name."""
+
+
+class SocketCanDaemonBus(FakeAdapter):
+    """The same."""
+
+
+@pytest.mark.parametrize("kind", [GsUsbBus, SocketCanDaemonBus])
+def test_error_frames_with_classes_are_read_by_them(kind: type[FakeAdapter]) -> None:
+    off = can.Message(arbitration_id=0x040, is_error_frame=True, data=[0])
+    lost = can.Message(arbitration_id=0x002, is_error_frame=True, data=[0])  # arbitration, which is no error
+    with kind(received=[lost, off]) as bus:
+        port = open_port(bus, "adapter", BITRATE, MonotonicClock())
+        assert port.drain() == [] and port.state is ControllerState.BUS_OFF
+        assert port.counters.error_frames == 0
+
+
 def test_the_port_names_itself(ports: tuple[Port, Port]) -> None:
     one, two = ports
     assert one.channel == two.channel != ""

@@ -188,6 +188,12 @@ BACKENDS: Mapping[str, Backend] = {
     "neovi": Backend(
         "Intrepid neoVI, ValueCAN", "number, from 1", "1", "ics", "neovi", indexed=True, has="fd errors stamps"
     ),
+    "socketcand": Backend(
+        "an interface of another machine, by socketcand (its host and port stand in ~/.canrc)",
+        "name of the interface there",
+        "can0",
+        has="errors error-classes stamps",
+    ),
     "udp_multicast": Backend(
         "none: processes on this machine or network",
         "multicast address",
