@@ -145,6 +145,29 @@ def served(emulator: Any, bench: Any) -> Iterator[Any]:
     assert emulator.running, emulator.err
 
 
+SCREENS = ("-L", "", "-ta", "-tA", "-td", "-tz", "-ta -x", "-td -a -e")
+"""Options of candump; the first prints its log format."""
+
+
+def test_what_candump_prints_is_read_as_its_log_is(vcan0: str, tmp_path: Path) -> None:
+    tools = [Tool(tmp_path / f"{n}", tool("candump"), *words.split(), vcan0) for n, words in enumerate(SCREENS)]
+    try:
+        time.sleep(patience_s(0.5))  # all of them listen
+        for _ in range(3):
+            for frame in ("080#", "181#0102030405060708", "12345678#AA", "601#R", "201##1000102030405060708090A0B"):
+                send(frame)
+        time.sleep(patience_s(0.5))
+    finally:
+        for one in tools:
+            one.__exit__()
+    log, *screens = [list(read_candump(tmp_path / f"{n}")) for n in range(len(SCREENS))]
+    assert len(log) == 15
+    for words, screen in zip(SCREENS[1:], screens, strict=True):
+        assert [frame[1:] for frame in screen] == [frame[1:] for frame in log], words
+        if words:
+            assert [frame[0] - screen[0][0] for frame in screen] == [frame[0] - log[0][0] for frame in log], words
+
+
 def by_id(frames: Frames) -> dict[int, list[bytes]]:
     found: dict[int, list[bytes]] = {}
     for can_id, data in frames:
