@@ -21,7 +21,6 @@ from canprobe.cell.session.child_process import ChildProcess
 from canprobe.cell.tasks.requested import Request
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns, epoch_now_ns
-from canprobe.fieldbus.bus.system import system
 from canprobe.lab.bridge.pipe import Feed, pack_observation
 
 READY_TIMEOUT_S = 60.0
@@ -50,8 +49,6 @@ class BridgeProcess(ChildProcess):
     """
 
     def __init__(self, name: str, plan: Plan, out: Path | None, *, virtual: bool) -> None:
-        if not system.NON_BLOCKING_PIPES:
-            raise UsageError(f"bridge {name}: its process is fed by a pipe that never waits, which this system lacks")
         super().__init__()
         self.name = name
         self.requests: deque[Request] = deque(maxlen=100)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.observers import AnyObserver, Observation
@@ -28,6 +28,10 @@ from canprobe.cell.session.terminal import Progress
 from canprobe.cell.session.up import check_joints, home, up
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.real.adapters import interface_of
+
+if TYPE_CHECKING:
+    from can import BusABC
 
 __all__ = [
     "Command",
@@ -183,7 +187,7 @@ def open_cell(
     scene: Scene | str | Path,
     overrides: Mapping[str, Any] | None = None,
     *,
-    bus: str | None = None,
+    bus: str | BusABC | None = None,
     channel: str | Mapping[str, str] | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
@@ -207,7 +211,8 @@ def open_cell(
     The block is the run: when it is left, in whatever way, its result is complete and its files are written.
 
     Args:
-        scene, overrides, bus, channel, bitrate, seed: as for `run`.
+        scene, overrides, channel, bitrate, seed: as for `run`.
+        bus: as for `run`; or a bus of python-can, which stays open.
         out: folder for the same files as those of `run`; None writes nothing.
         say: called with each step.
         force, observers, bridge: as for `run`.
@@ -230,10 +235,12 @@ def open_cell(
         ResultsError: when the block is left: a file could not be written.
     """
     _refuse_wrong(overrides, out, observers, bridge)
-    given = {"scene.seed": seed, "bus.interface": bus, "bus.bitrate": bitrate}
+    opened = None if bus is None or isinstance(bus, str) else bus
+    interface = bus if opened is None else interface_of(opened) or "virtual"
+    given = {"scene.seed": seed, "bus.interface": interface, "bus.bitrate": bitrate}
     scene = load_scene(scene, _over(overrides, given))
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
-    options = RunOptions(folder, say, observers, rows_kept, recover=recover, to_home=to_home)
+    options = RunOptions(folder, say, observers, rows_kept, recover=recover, to_home=to_home, bus=opened)
     return OpenCell(make_plan(resolve(resolved)), options)

@@ -1,10 +1,11 @@
-"""Device descriptions: a reader for EDS and DCF files of any vendor, and the packaged files of the cell's nodes.
+"""Device descriptions: a reader for EDS, DCF, XDD and XDC files of any vendor, and the packaged files.
 
 The bytes of a file come in; an object dictionary of canopen and a list of findings go out. A finding is a warning where
 the meaning is clear or the standard decides it; it prevents serving where it is unknown what the device is.
 The stages, each in its module:
 
     sections      bytes → sections and keys, each with its line
+    xml_sections  the same from an XDD or XDC file
     source        one file while it is read: its sections, and the findings so far
     numbers       texts → numbers, sums with $NODEID, flags
     structure     sections → objects: the order of everything below; arrays and records, also in the compact form

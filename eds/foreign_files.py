@@ -22,13 +22,13 @@ class FileKind(NamedTuple):
 
 
 _TSHARK = (
-    "type: tshark -r {path} -T fields -e frame.time_epoch -e can.id -e data.data"
-    " | awk '{{printf \"(%.6f) can0 %03X#%s\\n\", $1, $2, toupper($3)}}' > bus.log"
+    "type: tshark -r {path} -Y can.id -T fields -E separator=, -e frame.time_epoch -e can.id -e can.flags.xtd"
+    ' -e can.flags.rtr -e data.data | awk -F, \'{{printf "(%.6f) can0 " ($3 ~ /1|T/ ? "%08X" : "%03X") "#%s\\n",'
+    ' $1, $2, $4 ~ /1|T/ ? "R" : (length($5) > 16 ? "#1" : "") toupper($5)}}\' > bus.log'
 )
 _CONVERT = "type: can_logconvert {path} bus.log"
-_EXPORT = "export it as EDS with the maker's tool, or with CANopenEditor (File, Export)"
 _PCAP = FileKind("a capture of tcpdump or Wireshark (pcap)", _TSHARK)
-_XML = FileKind("XML, as XDD and XDC files are", "", _EXPORT)
+XML = FileKind("XML, as XDD and XDC files are")
 
 
 def _packed(by: str, unpack: str) -> FileKind:
@@ -50,8 +50,8 @@ _KINDS = {
     b"\n\r\r\n": FileKind("a capture of Wireshark (pcapng)", _TSHARK),
     b"LOGG": FileKind("a log of Vector's tools (BLF)", _CONVERT),
     b"MDF ": FileKind("a measurement of ASAM MDF", _CONVERT),
-    b"<?xml": _XML,
-    b"<ISO15745": _XML,
+    b"<?xml": XML,
+    b"<ISO15745": XML,
 }
 """Kinds of files by their first bytes. Source: file(1), magic; pcap-savefile(5); CiA 311."""
 
@@ -60,6 +60,6 @@ def file_kind(head: bytes) -> FileKind | None:
     """Kind of a file that is neither a candump log nor an EDS file, by its first bytes; None for any other."""
     text = head.replace(b"\0", b"").lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n")  # a mark of UTF-8 or UTF-16, and blanks
     return next(
-        (kind for magic, kind in _KINDS.items() if head.startswith(magic) or (kind is _XML and text.startswith(magic))),
+        (kind for magic, kind in _KINDS.items() if head.startswith(magic) or (kind is XML and text.startswith(magic))),
         None,
     )

@@ -110,7 +110,7 @@ def _check_node_id(source: str | os.PathLike[str], node_id: int) -> None:
 
 
 def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.ObjectDictionary:
-    """Load an EDS or DCF file into canopen's object dictionary for one node.
+    """Load an EDS, DCF, XDD or XDC file into canopen's object dictionary for one node.
 
     Planner, master and emulator each ask for the same file, and parsing costs 60 ms: they get one object. Treat it as
     read-only; a node keeps its values elsewhere.
@@ -129,7 +129,7 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
 
 
 def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) -> Reading:
-    """Read an EDS or DCF file with all findings.
+    """Read an EDS, DCF, XDD or XDC file with all findings.
 
     Args:
         name_or_path: packaged name or path, as for `load_eds`.

@@ -1,4 +1,4 @@
-"""Reads an EDS or DCF file of any vendor into an object dictionary and a list of findings.
+"""Reads an EDS, DCF, XDD or XDC file of any vendor into an object dictionary and a list of findings.
 
 Findings are of two kinds: faults *prevent* serving (it is unknown what the device is, or which PDOs it has), warnings
 do not (the meaning is clear, or the rest can be served). What a file lacks or has wrong although the standard fixes it
@@ -21,12 +21,13 @@ from canprobe.errors import EdsError
 from canprobe.fieldbus.eds.description import described_entry, variable_at
 from canprobe.fieldbus.eds.device_info import commissioned_node, read_information
 from canprobe.fieldbus.eds.findings import EdsFinding, EdsFindings
-from canprobe.fieldbus.eds.foreign_files import HEAD_BYTES, file_kind
+from canprobe.fieldbus.eds.foreign_files import HEAD_BYTES, XML, file_kind
 from canprobe.fieldbus.eds.numbers import parse_sum
 from canprobe.fieldbus.eds.object_lists import check_lists
 from canprobe.fieldbus.eds.sections import Section, decode, split_sections
 from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
+from canprobe.fieldbus.eds.xml_sections import xml_sections
 from canprobe.fieldbus.protocol.frames import EFF_MASK, INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS
 
@@ -93,7 +94,7 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
     """Read a file, whatever is in it.
 
     Args:
-        path: path of an EDS or DCF file.
+        path: path of an EDS, DCF, XDD or XDC file.
         node_id: node id, 1..127, which replaces $NODEID; None for that of the DCF, or else 1.
         serving: whether to add mandatory objects that are missing, and to take what the default mapping of a PDO holds
             as mappable, whatever PDOMapping states. A master should not rely on either.
@@ -106,18 +107,20 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
     except OSError as error:
         raise EdsError(f"{path}: {error.strerror}") from error
     faults, od = EdsFindings(), ObjectDictionary()  # type: ignore[no-untyped-call]
-    if (kind := file_kind(data[:HEAD_BYTES])) is not None:
+    kind = file_kind(data[:HEAD_BYTES])
+    if kind not in (None, XML):
         way = f"; {kind.into_eds.format(path=shlex.quote(str(path)))}" if kind.into_eds else ""
         faults.fault(0, "", "", f"{kind.name}, not an EDS file{way}")
         data = b""
-    sections = split_sections(decode(data, faults), faults)
+    sections = xml_sections(data, faults) if kind is XML else split_sections(decode(data, faults), faults)
     source = Source(sections, commissioned_node(sections) or 1 if node_id is None else node_id, faults)
     read_information(source, od)
     heads, subs = find_objects(source)
     if heads or subs:
         source = replace(source, drive=_describes_drive(heads, set(subs), source.node_id))
         build_objects(source, heads, subs, od)
-        check_lists(source, {**{index: next(iter(members.values())) for index, members in subs.items()}, **heads})
+        if kind is not XML:
+            check_lists(source, {**{index: next(iter(members.values())) for index, members in subs.items()}, **heads})
         _Repair(source, heads, od).run(serving)
         if is_drive(od) and (more := [index for index in _FURTHER_CONTROLWORDS if index in heads]):
             words = ", ".join(f"{index:04X}h" for index in more)

@@ -32,16 +32,8 @@ def run(args: argparse.Namespace) -> int:
 
     found, missing = find_adapters(), {name: missing_here(name) for name in BACKENDS}
     if args.json:
-        keys = ("hardware", "channel", "example", "driver")
-        print_json(
-            {
-                "found": [asdict(one) for one in found],
-                "interfaces": [
-                    {"interface": name, **{key: getattr(one, key) for key in keys}, "missing": missing[name]}
-                    for name, one in BACKENDS.items()
-                ],
-            }
-        )
+        interfaces = [{"interface": name, **asdict(one), "missing": missing[name]} for name, one in BACKENDS.items()]
+        print_json({"found": [asdict(one) for one in found], "interfaces": interfaces})
         return 0
     if found:
         rows = [(one.interface, one.channel, one.state, one.type_next) for one in found]
@@ -50,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
         print("found here: no CAN interface")
     print()
     states = [
-        (name, one.hardware, "; ".join(missing[name]) or _READY.format(name, one.example))
+        (name, one.hardware, one.has, "; ".join(missing[name]) or _READY.format(name, one.example))
         for name, one in BACKENDS.items()
     ]
-    print_table([("--bus", "for", "missing"), *states])
+    print_table([("--bus", "for", "has, by python-can", "missing"), *states])
     return 0

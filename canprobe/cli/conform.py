@@ -53,7 +53,9 @@ _REAL_SLACK_S = 0.05
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("--node", metavar="N", type=whole(1, 127), help="node id of the device")
-    parser.add_argument("--eds", metavar="FILE", type=word, help="EDS or DCF file of the device, or a packaged name")
+    parser.add_argument(
+        "--eds", metavar="FILE", type=word, help="EDS, DCF, XDD or XDC file of the device, or a packaged name"
+    )
     parser.add_real_bus(", or lockstep")
     parser.add_argument(
         "--data-bitrate",

@@ -1,4 +1,4 @@
-"""List the packaged EDS files, print the path of one, or check the EDS or DCF file of any vendor."""
+"""List the packaged EDS files, print the path of one, or check the EDS, DCF, XDD or XDC file of any vendor."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def add_arguments(parser: Parser) -> None:
     check = actions.add_parser(
         "check",
         help="list the faults of a file, with section and line",
-        description="List the faults and warnings of an EDS or DCF file, with section and line.",
+        description="List the faults and warnings of an EDS, DCF, XDD or XDC file, with section and line.",
         epilog=_CHECK,
     )
-    check.add_argument("file", metavar="FILE", help="path of an EDS or DCF file, or name of a packaged file")
+    check.add_argument("file", metavar="FILE", help="path of an EDS, DCF, XDD or XDC file, or name of a packaged file")
     check.add_argument(
         "--node-id", metavar="N", type=whole(1, 127), help="node id that replaces $NODEID [that of the DCF, or 1]"
     )

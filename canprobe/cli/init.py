@@ -38,8 +38,8 @@ def add_arguments(parser: Parser) -> None:
         metavar="FILE",
         action="append",
         default=[],
-        help="EDS or DCF of the drives, or the name of a packaged one: given once for all of them, or once for each"
-        " joint from the base",
+        help="EDS, DCF, XDD or XDC of the drives, or the name of a packaged one: given once for all of them, or once"
+        " for each joint from the base",
     )
 
 

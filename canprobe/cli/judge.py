@@ -117,6 +117,8 @@ def _judge_record(args: argparse.Namespace) -> int:
     judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without).hear(frames)
     if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
         raise UsageError(_no_such_node(args, nodes, nodes_of(read_record(args.record, named[0] if named else None))))
+    if not judge.bus.now_ns:
+        args.report.say(f"{args.record} has no times, so no interval or time-out is judged; record with candump -ta")
     facts = {**_facts(args), "frames": str(judge.frame_count)}
     report = judge.report(f"the master in {args.record}", facts, log=str(args.record))
     _print(args, report)

@@ -138,7 +138,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_eds_nodes(self, *, more: str = "") -> None:
         """Add --eds and --node-id, which stand in pairs; `more` ends the help of the latter."""
-        what = "EDS or DCF file of a node; may be repeated, each with its --node-id"
+        what = "EDS, DCF, XDD or XDC file of a node; may be repeated, each with its --node-id"
         self.add_argument("--eds", metavar="FILE", action="append", default=[], help=what)
         what = f"node id for the --eds at the same position{more}"
         self.add_argument("--node-id", metavar="N", action="append", default=[], type=node_id, help=what)

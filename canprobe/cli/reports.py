@@ -9,14 +9,23 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from canprobe.errors import UsageError
+
 if TYPE_CHECKING:
     from canprobe.cli.parser import Parser
     from canprobe.fieldbus.tools.reports import Report, ReportChange
 
 
 def add_report_options(parser: Parser) -> None:
-    """Add --baseline, --junit, --html and --json."""
+    """Add --baseline, --fail-on, --junit, --html and --json."""
     parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
+    parser.add_argument(
+        "--fail-on",
+        metavar="WHAT",
+        choices=("deviation", "new"),
+        default="deviation",
+        help="exit with 1 for any deviation, or for a new one: not in the --baseline [deviation]",
+    )
     parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
     parser.add_shared("--json")
@@ -26,14 +35,19 @@ def read_baseline(args: argparse.Namespace) -> Report | None:
     """The older report, read before anything is sent; None where none is named."""
     from canprobe.fieldbus.tools.reports import read_json
 
+    if args.fail_on == "new" and args.baseline is None:
+        raise UsageError("--fail-on new compares with an older report: --baseline FILE names it")
     return read_json(args.baseline) if args.baseline is not None else None
 
 
 def write_report(args: argparse.Namespace, report: Report, baseline: Report | None) -> ReportChange | None:
     """Write the files that are asked for, and the step summary of GitHub; what changed since the baseline."""
-    from canprobe.fieldbus.tools.reports import append_step_summary, compare, write_html, write_junit
+    from canprobe.fieldbus.tools.reports import Verdict, append_step_summary, compare, write_html, write_junit
 
     change = None if baseline is None else compare(report, baseline)
+    if change is not None and args.fail_on == "new":
+        bad = [row.key for row in report.rows if row.verdict is Verdict.FAIL]
+        report.known = tuple(key for key in bad if key not in (*change.worse, *change.new))
     if args.junit is not None:
         write_junit(report, args.junit)
     if args.html is not None:

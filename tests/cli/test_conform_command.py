@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -116,3 +118,26 @@ def test_a_plan_reads_the_times_of_a_report(tmp_path, capsys):
     path.write_text(json.dumps(document), encoding="utf-8")
     assert main(["plan", "cylinder", "--measured", str(path)]) == 2
     assert "no node of the plan is a device" in capsys.readouterr().err
+
+
+def imported(program: str) -> set[str]:
+    """Packages that a program imports, besides Python's own."""
+    shown = "import sys; print('|', *{name.partition('.')[0] for name in sys.modules} - sys.stdlib_module_names)"
+    done = subprocess.run([sys.executable, "-c", f"{program}\n{shown}"], capture_output=True, text=True, check=True)
+    return set(done.stdout.rpartition("|")[2].split()) - {"canprobe", "__main__"}
+
+
+def test_it_begins_with_no_more_than_python_can_and_canopen(tmp_path):
+    """Neither numpy nor scipy, and for help nothing at all: a step of CI waits for the start of each command."""
+    (tmp_path / "bus.log").write_text("(0000000000.000000) can0 701#00\n")
+    nothing, both = imported(""), imported("import can, canopen")
+    assert {"can", "canopen"} <= both - nothing
+    judge = ["judge", "--eds", "puma260_joint", "--node-id", "1"]
+    for words, allowed in (
+        (["conform", "--help"], nothing),
+        (["judge", "--help"], nothing),
+        ([*ARGS, "--points", "100"], both),
+        ([*judge, "--record", str(tmp_path / "bus.log")], both),
+    ):
+        assert imported(f"from canprobe.cli import main\ntry: main({words})\nexcept SystemExit: pass") <= allowed
+    assert imported("import canprobe.fieldbus") == nothing

@@ -18,7 +18,7 @@ from waiting import wait_until
 
 import canprobe
 from canprobe.cli import main
-from canprobe.fieldbus.bus.candump import CandumpWriter
+from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
 
 SMALL = Path(__file__).parents[1] / "support" / "small_master.py"
 NODE = ("--eds", "puma260_joint", "--node-id", "1")
@@ -53,7 +53,25 @@ def test_a_log_of_a_good_master_and_what_became_better(tmp_path, capsys):
     assert main(["judge", *NODE, "--record", bad, "--json"]) == 1
     (tmp_path / "bad.json").write_text(capsys.readouterr().out)
     assert main(["judge", *NODE, "--record", good, "--baseline", str(tmp_path / "bad.json")]) == 0
-    assert "01 target at enable" in capsys.readouterr().out
+    assert "better: enable 01 target at enable" in capsys.readouterr().out
+
+
+def test_only_what_is_new_fails_where_ci_asks_for_that(tmp_path, capsys):
+    logs = {"bad": log_of(TargetElsewhere(), tmp_path / "bad.log"), "good": log_of(Master(), tmp_path / "good.log")}
+    for name, log in logs.items():
+        main(["judge", *NODE, "--record", log, "--json"])
+        (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
+    junit = tmp_path / "j.xml"
+    bad = ["judge", *NODE, "--record", logs["bad"], "--junit", str(junit), "--fail-on"]
+    for baseline, status, tag in (("bad", 0, "skipped"), ("good", 1, "failure")):
+        compared = ["--baseline", str(tmp_path / f"{baseline}.json")]
+        assert main([*bad, "new", *compared]) == status
+        assert main([*bad, "deviation", *compared]) == 1
+        main([*bad, "new", *compared])
+        assert ElementTree.parse(junit).find(".//testcase[@name='01 target at enable']")[0].tag == tag
+    capsys.readouterr()
+    assert main([*bad, "new"]) == 2
+    assert "--baseline FILE names it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -86,6 +104,13 @@ def test_the_log_of_a_run_has_nothing_to_blame(tmp_path, capsys):
     assert main(["judge", "free", "--record", str(tmp_path / "run" / "bus.log"), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert sum(row["verdict"] == "PASS" for row in rows) > 15
+    with (tmp_path / "screen.txt").open("w") as screen:  # as `candump can0` prints it, without times
+        for _, channel, can_id, data in read_candump(tmp_path / "run" / "bus.log"):
+            print(f"  {channel}  {can_id:03X}   [{len(data)}]  {data.hex(' ').upper()}", file=screen)
+    assert main(["judge", "free", "--record", str(tmp_path / "screen.txt"), "--json"]) == 0
+    told = capsys.readouterr()
+    assert "has no times, so no interval or time-out is judged" in told.err
+    assert sum(row["verdict"] == "PASS" for row in json.loads(told.out)["rows"]) > 12
 
 
 @pytest.mark.parametrize(

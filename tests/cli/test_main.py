@@ -532,8 +532,11 @@ def test_the_page_on_hardware_has_the_table():
     table = {row[0].strip("`"): row for row in rows if row[0].strip("`") in BACKENDS}
     assert list(table) == list(BACKENDS)
     for name, backend in BACKENDS.items():
-        _, hardware, channel, example, needs = table[name]
+        _, hardware, channel, example, needs, *has, rates = table[name]
         assert (hardware, channel, example) == (backend.hardware, backend.channel, f"`{backend.example}`")
-        assert (backend.package is None) or f"pip install '{backend.required}'" in needs
+        assert (backend.package is None) or f"pip install 'python-can[{backend.extra}]'" in needs
         assert (backend.driver is None) or backend.driver.replace("sudo ", "") in needs
         assert backend.windows == ("Windows only" in needs)
+        words = ({"fd", "fd-timing"}, {"filter"}, {"listen-only"}, {"errors"}, {"stamps"})
+        assert [cell == "yes" for cell in has] == [bool(word & backend.features) for word in words]
+        assert rates == (", ".join(f"{rate:g}" for rate in backend.bitrates_kbit) or "any")

@@ -29,8 +29,9 @@ def typed(folder: Path, *words: str, program: tuple[str, ...] = ("-m", "canprobe
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a run in `first`."""
+    """A folder with a run in `first`, and a scene with a bridge."""
     folder = tmp_path_factory.mktemp("there")
+    (folder / "fed.toml").write_text('[scene]\nname = "fed"\n[task]\nkind = "free"\n[bridge]\nuse = ["mcap"]\n')
     status, said = typed(folder, "run", "cylinder", "--duration", "0.3", "--no-figures", "--out", "first")
     assert status == 0, said
     return folder
@@ -72,10 +73,16 @@ def test_a_study_needs_no_posix(folder):
     ("words", "says"),
     [
         (("scan", "--bus", "pcan", "--channel", "PCAN_USBBUS1"), "PCAN-Basic of peak-system.com is not installed"),
-        (("run", "free", "--bridge", "mcap", *SHORT, "fed"), "bridge mcap: its process is fed by a pipe"),
+        (("run", "free", "--bridge", "mcap", *SHORT, "fed"), "canprobe replay FOLDER --bridge NAME"),
+        (("run", "fed.toml", *SHORT, "fed"), "bridge mcap: its process is fed by a pipe"),
         (("up", "free", "--bus", "socketcan", "--channel", "can0"), "no SocketCAN"),
     ],
 )
 def test_what_is_missing_is_named(folder, words, says):
     status, said = typed(folder, *words)
     assert status in (2, 3) and says in said and FAULT not in said
+
+
+def test_a_plan_says_what_its_system_cannot_do(folder):
+    status, said = typed(folder, "plan", "fed.toml")
+    assert status == 0 and "bridge mcap" in said and "a pipe that never waits, which this system lacks" in said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import time
 from collections.abc import Iterator
@@ -15,8 +16,11 @@ import pytest
 from patience import patience_s
 from slow_scene import write_slow_scene
 
+from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.port import ERR_FLAG
 from canprobe.fieldbus.protocol.frame_bits import best_case_bits, worst_case_bits
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
 
 pytestmark = pytest.mark.vcan
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
@@ -33,6 +37,26 @@ def tool(name: str) -> str:
         package = "tshark" if name == "tshark" else "can-utils"
         pytest.skip(f"{name} is NOT INSTALLED, so it bears no witness; type:  apt-get install -y {package}")
     return path
+
+
+def test_the_line_that_makes_a_log_of_a_capture_is_right_as_it_is_typed(tmp_path: Path) -> None:
+    tool("tshark")
+    frames = [
+        (1_002_500_000, "can0", 0x181, b"\x37\x06"),
+        (1_500_000_000, "can0", 0x12345 | EFF_FLAG, bytes(8)),
+        (1_750_000_000, "can0", 0x701 | RTR_FLAG, b""),
+        (2_000_000_000, "can0", 0x201, bytes(12)),
+    ]
+    capture = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 227)  # pcap, LINKTYPE_CAN_SOCKETCAN
+    for t_ns, _, can_id, data in [*frames, (3, "", ERR_FLAG | 4, bytes(8))]:
+        packet = struct.pack(">IBB2x", can_id, len(data), 5 if len(data) > 8 else 0) + data
+        stamp = (t_ns // 1_000_000_000, t_ns % 1_000_000_000 // 1000)
+        capture += struct.pack("<IIII", *stamp, len(packet), len(packet)) + packet
+    (tmp_path / "my capture.pcap").write_bytes(capture)
+    with pytest.raises(UsageError) as raised:
+        list(read_candump(tmp_path / "my capture.pcap"))
+    subprocess.run(str(raised.value).rpartition("type: ")[2], shell=True, check=True, cwd=tmp_path)
+    assert list(read_candump(tmp_path / "bus.log")) == frames
 
 
 class Tool:
@@ -119,6 +143,29 @@ def served(emulator: Any, bench: Any) -> Iterator[Any]:
     bench.bus.hear()
     yield emulator
     assert emulator.running, emulator.err
+
+
+SCREENS = ("-L", "", "-ta", "-tA", "-td", "-tz", "-ta -x", "-td -a -e")
+"""Options of candump; the first prints its log format."""
+
+
+def test_what_candump_prints_is_read_as_its_log_is(vcan0: str, tmp_path: Path) -> None:
+    tools = [Tool(tmp_path / f"{n}", tool("candump"), *words.split(), vcan0) for n, words in enumerate(SCREENS)]
+    try:
+        time.sleep(patience_s(0.5))  # all of them listen
+        for _ in range(3):
+            for frame in ("080#", "181#0102030405060708", "12345678#AA", "601#R", "201##1000102030405060708090A0B"):
+                send(frame)
+        time.sleep(patience_s(0.5))
+    finally:
+        for one in tools:
+            one.__exit__()
+    log, *screens = [list(read_candump(tmp_path / f"{n}")) for n in range(len(SCREENS))]
+    assert len(log) == 15
+    for words, screen in zip(SCREENS[1:], screens, strict=True):
+        assert [frame[1:] for frame in screen] == [frame[1:] for frame in log], words
+        if words:
+            assert [frame[0] - screen[0][0] for frame in screen] == [frame[0] - log[0][0] for frame in log], words
 
 
 def by_id(frames: Frames) -> dict[int, list[bytes]]:

@@ -38,6 +38,7 @@ class RunOptions:
         recover: a cell that has lost a node or its bus comes back; see `canprobe.cell.session.recovery`.
         rows_folder: folder of the rows while the run goes on, whose caller makes files of them at its end; None keeps
             them in memory.
+        bus: a bus of python-can that its caller has opened, in the place of the scene's interface; it stays open.
     """
 
     out: Path | None = None
@@ -49,6 +50,7 @@ class RunOptions:
     recover: bool = False
     to_check: bool = False
     rows_folder: Path | None = None
+    bus: Any = None
 
 
 DEFAULT_OPTIONS = RunOptions()

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 from canprobe.cell.scene.setup import Setup
 from canprobe.errors import UsageError, did_you_mean, install_line
+from canprobe.fieldbus.bus.system import system
+
+_ELSEWHERE = "leave it out, and feed the folder of the run on Linux or macOS: canprobe replay FOLDER --bridge NAME"
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,13 @@ class BridgeInfo:
     def missing(self) -> tuple[str, ...]:
         """Packages that are not installed."""
         return tuple(name for name in self.packages if importlib.util.find_spec(name) is None)
+
+    @property
+    def lacks(self) -> str:
+        """What it lacks here, with what to do; empty where it can be used."""
+        if not system.NON_BLOCKING_PIPES:
+            return "its process is fed by a pipe that never waits, which this system lacks; " + _ELSEWHERE
+        return f"needs {', '.join(self.missing)}; type: {self.pip}" if self.missing else ""
 
     @property
     def pip(self) -> str:
@@ -74,18 +84,13 @@ def check_bridges(names: Iterable[str], what: str = "bridge ") -> None:
             known = "; ".join(f"{known} ({info.what})" for known, info in BRIDGES.items())
             hint = did_you_mean(name, BRIDGES)
             raise UsageError(f"bridge {name!r}: there is no such bridge{hint}; there are: {known}")
-        info = BRIDGES[name]
-        if info.missing:
-            raise UsageError(f"{what}{name}: needs {', '.join(info.missing)}; type: {info.pip}")
+        if lacks := BRIDGES[name].lacks:
+            raise UsageError(f"{what}{name}: {lacks}")
 
 
 def unavailable_bridges(setup: Setup) -> tuple[tuple[str, str], ...]:
     """Bridges that the scene asks for and cannot have here, as (what, why)."""
-    return tuple(
-        (f"bridge {name}", f"{', '.join(BRIDGES[name].missing)} not installed: {BRIDGES[name].pip}")
-        for name in setup.bridge.use
-        if BRIDGES[name].missing
-    )
+    return tuple((f"bridge {name}", lacks) for name in setup.bridge.use if (lacks := BRIDGES[name].lacks))
 
 
 def bridge_outputs(setup: Setup) -> tuple[str, ...]:

@@ -28,20 +28,20 @@ SILENCE_NS = 1_000_000_000
 """Time without a frame on a bus after which the state of its controller is read."""
 
 
-def scan(target: Target, *, timeout_s: float | None = None, say: Say = quiet) -> list[dict[str, Any]]:
+def scan(target: Target | Port, *, timeout_s: float | None = None, say: Say = quiet) -> list[dict[str, Any]]:
     """List the nodes that answer or send heartbeats on a bus, with the identity that 1018h gives.
 
     Args:
-        target: the bus.
+        target: the bus, or a port of it, which stays open.
         timeout_s: longest time to one SDO answer; by default that of a bring-up.
         say: called with each warning about the interface's setting.
 
     Raises:
         InterfaceError: when there is no such interface, or the CAN controller's state explains that no node answers.
     """
-    with open_bus(target, say) as port:
+    with open_bus(target, say) if isinstance(target, Target) else contextlib.nullcontext(target) as port:
         nodes = scan_nodes(port, timeout_s or BringUpSettings().sdo_s)
-    if not nodes:
+    if not nodes and isinstance(target, Target):
         need_controllers(target.interface, {target.channel: port})
     return nodes
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.options import RunOptions, quiet
@@ -184,7 +184,9 @@ class RealBuses(SessionBuses):
         before = self.ports
         for port in before.values():
             port.close()
-        ports = open_ports(self._plan, clock, lambda name: Reports(record.error_writer(name), self._files.note))
+        ports = open_ports(
+            self._plan, clock, lambda name: Reports(record.error_writer(name), self._files.note), self._options.bus
+        )
         self.ports = self._open_ports.enter_context(ports)
         for name, port in before.items():
             self.ports[name].counters.add(port.counters)
@@ -219,7 +221,7 @@ def make_buses(plan: Plan, options: RunOptions, files: KeptFiles, stack: ExitSta
 
 @contextmanager
 def open_ports(
-    plan: Plan, clock: Clock, reports: Callable[[str], Reports] = lambda _: Reports()
+    plan: Plan, clock: Clock, reports: Callable[[str], Reports] = lambda _: Reports(), opened: Any = None
 ) -> Iterator[dict[str, Port]]:
     """The ports of a plan's buses, by channel; closed at the end.
 
@@ -227,19 +229,23 @@ def open_ports(
         plan: plan of the buses.
         clock: clock in real time.
         reports: makes the receivers of a port's reports, by channel.
+        opened: a bus of python-can in the place of the plan's only one.
 
     Raises:
+        UsageError: when the plan has several buses, and one is given.
         InterfaceError: when an interface is missing, down, or cannot be opened.
     """
     from canprobe.fieldbus.bus.real.opening import open_port
 
     bus = plan.scene.bus
+    if opened is not None and len(plan.buses) > 1:
+        raise UsageError(f"bus: one of python-can was given, and the scene has {len(plan.buses)}; name an interface")
     with ExitStack() as stack:
         ports: dict[str, Port] = {}
         for planned in plan.buses:
             name = planned.channel
             port = open_port(
-                bus.interface, name, bus.bitrate, clock, data_bitrate=data_bitrate(bus), reports=reports(name)
+                opened or bus.interface, name, bus.bitrate, clock, data_bitrate=data_bitrate(bus), reports=reports(name)
             )
             stack.callback(port.close)
             ports[name] = port

@@ -15,13 +15,14 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.links import SOCKETCAN
 from canprobe.cell.session.session import Session, link_limits
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.port import ControllerState, Port
+from canprobe.fieldbus.bus.clock import wake_lateness
+from canprobe.fieldbus.bus.port import ControllerState, Port, stamps_text
 from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.fieldbus.tools.link import Fitness, LinkFigures, LinkMeter, LinkVerdict, judge_link
 from canprobe.fieldbus.tools.link.figures import IDLE_FAST_NS, quantile, us
-from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts, wake_lateness
+from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts
 
 IDLE_S = 2.0
 """Time of each loop that does nothing."""
@@ -186,6 +187,7 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     if not session.virtual:
         late = [_us(us(quantile(idle_ns[plan.sync.period_ns], share))) for share in (0.5, 0.99, 1.0)]
         machine = {"wakes_late_by": "p50 {}, p99 {}, at most {}, without a bus".format(*late), **machine}
+        machine["frames_stamped"] = stamps_text(meter, idle_ns[plan.sync.period_ns][-1])
         machine["controller"] = _controller(plan)
     found = session.cell.found
     return LinkReport(

@@ -165,7 +165,7 @@ def emulate_eds(
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
 
     Args:
-        files: (name or path of an EDS or DCF file, node id) of each node; 255: it waits for LSS.
+        files: (name or path of an EDS, DCF, XDD or XDC file, node id) of each node; 255: it waits for LSS.
         target: the bus.
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.

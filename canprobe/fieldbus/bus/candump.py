@@ -10,8 +10,11 @@ from __future__ import annotations
 import contextlib
 import re
 import shlex
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
+from gzip import GzipFile
 from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
 from itertools import starmap
 from pathlib import Path
@@ -29,15 +32,24 @@ from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, EFF_FLAG,
 # candump pads the channel on the left (several interfaces), writes nine digits with -N, the DLC of a frame of 8 bytes
 # behind "_" with -8, and a line of its own for lost frames with -d.
 
+_DROPS = r"DROPCOUNT: dropped (?P<dropped>\d+) CAN frames? on '(?P<socket>[^']+)' socket \(total drops \d+\)"
 _LINE_PATTERN = re.compile(
     r"\((?P<s>\d+)\.(?P<fraction>\d{6}(?:\d{3})?)\) +(?P<channel>\S+) (?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
     r"(?:R(?:[0-7]?|8(?:_[9A-Fa-f])?)|#[0-9A-Fa-f](?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
     r"(?P<data>(?:[0-9A-Fa-f]{2}){0,7}|(?:[0-9A-Fa-f]{2}){8}(?:_[9A-Fa-f])?))|"
-    r"(?P<xl>[0-9A-Fa-f]{5}#[0-9A-Fa-f]{2}:[0-9A-Fa-f]{2}:[0-9A-Fa-f]{8}#(?:[0-9A-Fa-f]{2})*))(?: [RT])?|"
-    r"DROPCOUNT: dropped (?P<dropped>\d+) CAN frames? on '(?P<socket>[^']+)' socket \(total drops \d+\)"
+    r"(?P<xl>[0-9A-Fa-f]{5}#[0-9A-Fa-f]{2}:[0-9A-Fa-f]{2}:[0-9A-Fa-f]{8}#(?:[0-9A-Fa-f]{2})*))(?: [RT])?|" + _DROPS
 )
-_SCREEN_PATTERN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
-"""Line that candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
+_SCREEN_PATTERN = re.compile(
+    r" *(?:\((?:(?P<s>\d+)|(?P<date>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d))\.(?P<fraction>\d{6}(?:\d{3})?)\))? *"
+    r"(?P<channel>\S+)  (?:[RT]X [-B] [-E]  )? *(?:(?P<xl>[0-9A-F]{3} +\[\d{4}\] \(.*)|"
+    r"(?P<id>[0-9A-F]{8}|[0-9A-F]{3}) +\[(?P<length>\d+)\] *"
+    r"(?:remote request|(?P<data>(?:[0-9A-F]{2} ?){0,64})(?: *ERRORFRAME| *'.*')?))|" + _DROPS
+)
+"""Line that candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`; the time may be missing."""
+_SHORT_STAMP = re.compile(rb" *\(000\.0{6}")
+"""Beginning of a log whose stamps count from its first frame (candump -tz), or from the frame before (-td)."""
+_MAX_FALLS = 0.1
+"""Largest share of stamps that do not grow on their channel, as far as stamps are times; more are differences."""
 _ENCODINGS = {
     b"\xff\xfe": "utf-16",
     b"\xfe\xff": "utf-16",
@@ -204,8 +216,10 @@ CandumpLine = tuple[int, str, int, bytes]
 class CandumpReader:
     """Reads a candump log line by line: an iterable of `CandumpLine`. Lines without a CAN or CAN FD frame are counted.
 
+    What candump prints on a screen is read too; its frames without a time are at 0, and differences (-td) become times.
+
     Args:
-        path: path of the log, in ASCII, UTF-8 or UTF-16.
+        path: path of the log, in ASCII, UTF-8 or UTF-16, or the same compressed (.gz).
         whole: whether a torn last line is an error; else it is passed over, as a logger that is killed leaves one.
 
     Attributes:
@@ -228,46 +242,72 @@ class CandumpReader:
             UsageError: the file cannot be read, or a line is none of candump; the message has file and line number.
         """
         try:
-            file = self._opened()
-            head = file.peek(HEAD_BYTES)[:HEAD_BYTES]
-            with TextIOWrapper(file, _ENCODINGS.get(head[:2], "ascii"), errors="replace") as lines:
-                if (kind := file_kind(head)) is not None:
-                    way = f"; {kind.into_log.format(path=shlex.quote(str(self._path)))}" if kind.into_log else ""
-                    raise UsageError(f"{self._path}: {kind.name}, not a candump log{way}")
-                for self.number, line in enumerate(lines, 1):
-                    text = line.rstrip("\r\n")
-                    match = _LINE_PATTERN.fullmatch(text)
-                    if match is None:
-                        if text and (self._whole or line.endswith("\n")):
-                            raise self._no_line(text)
-                    elif match["dropped"]:
-                        self.lost[match["socket"]] += int(match["dropped"])
-                    elif match["xl"]:
-                        self.xl[match["channel"]] += 1
-                    else:
-                        yield _frame_of(match)
-        except OSError as error:
-            raise UsageError(f"{self._path}: {error.strerror}") from error
+            with self._opened() as file:
+                may_be_differences = _SHORT_STAMP.match(file.peek(HEAD_BYTES))
+            yield from with_times(self._frames) if may_be_differences else self._frames()
+        except (OSError, EOFError, zlib.error) as error:
+            raise UsageError(f"{self._path}: {getattr(error, 'strerror', None) or error}") from error
 
-    def _opened(self) -> BufferedReader:
-        """The file from its start; the content of a pipe is kept, as it comes only once."""
+    def _frames(self) -> Iterator[CandumpLine]:
         self.lost.clear()
         self.xl.clear()
+        parse: Callable[[str], re.Match[str] | None] = _LINE_PATTERN.fullmatch
+        frame_of = _frame_of
+        file = self._opened()
+        head = file.peek(HEAD_BYTES)[:HEAD_BYTES]
+        with TextIOWrapper(file, _ENCODINGS.get(head[:2], "ascii"), errors="replace") as lines:
+            if (kind := file_kind(head)) is not None:
+                way = f"; {kind.into_log.format(path=shlex.quote(str(self._path)))}" if kind.into_log else ""
+                raise UsageError(f"{self._path}: {kind.name}, not a candump log{way}")
+            for self.number, line in enumerate(lines, 1):
+                text = line.rstrip("\r\n")
+                if self.number == 1 and _SCREEN_PATTERN.fullmatch(text):
+                    parse, frame_of = _match_screen, _screen_frame
+                match = parse(text)
+                if match is None:
+                    if text.lstrip("\t") == text != "" and (self._whole or line.endswith("\n")):  # -e explains errors
+                        raise self._no_line(text)
+                elif match["dropped"]:
+                    self.lost[match["socket"]] += int(match["dropped"])
+                elif match["xl"]:
+                    self.xl[match["channel"]] += 1
+                else:
+                    yield frame_of(match)
+
+    def _opened(self) -> BufferedReader | GzipFile:
+        """The file from its start; the content of a pipe is kept, as it comes only once."""
         path = Path(self._path)
         if self._piped is None and path.is_fifo():
             self._piped = path.read_bytes()
-        if self._piped is None:
-            return regular_file(path).open("rb")
-        return BufferedReader(BytesIO(self._piped))
+        if self._piped is not None:
+            return BufferedReader(BytesIO(self._piped))
+        path = regular_file(path)
+        return GzipFile(path) if path.suffix.lower() == ".gz" else path.open("rb")
 
     def _no_line(self, text: str) -> UsageError:
-        where = f"{self._path}:{self.number}: no candump line: {text[:60]!r}"
-        if (shown := _SCREEN_PATTERN.fullmatch(text)) is not None:
-            short = re.fullmatch(r"\(\d{3}\.\d+\)", shown["stamp"] or "")
-            stamps = " with stamps that are differences (-td) or count from its first frame (-tz)" if short else ""
-            return UsageError(f"{where}; it is what candump prints on a screen{stamps}; record with `candump -l` or -L")
         form = "(seconds.microseconds) channel ID#DATA, or ID##fDATA for CAN FD"
-        return UsageError(f"{where}; expected '{form}'; python-can's can_logconvert converts other logs")
+        return UsageError(
+            f"{self._path}:{self.number}: no candump line: {text[:60]!r}; expected '{form}', or what candump prints;"
+            " a log of another tool is known by its suffix, such as .asc, .blf or .trc"
+        )
+
+
+def with_times(read: Callable[[], Iterator[CandumpLine]]) -> Iterator[CandumpLine]:
+    """Frames with stamps that may be differences from frame to frame; then they are added up.
+
+    Args:
+        read: function that gives the frames, and is called twice.
+    """
+    latest: dict[str, int] = {}
+    count = falls = 0
+    for t_ns, channel, _, _ in read():
+        count += 1
+        falls += t_ns <= latest.get(channel, -1)
+        latest[channel] = t_ns
+    are_differences, time_ns = falls > _MAX_FALLS * count, 0
+    for t_ns, channel, can_id, data in read():
+        time_ns = time_ns + t_ns if are_differences else t_ns
+        yield time_ns, channel, can_id, data
 
 
 def read_candump(path: str | Path, *, whole: bool = False) -> Iterator[CandumpLine]:
@@ -277,14 +317,29 @@ def read_candump(path: str | Path, *, whole: bool = False) -> Iterator[CandumpLi
 
 def _frame_of(match: re.Match[str]) -> CandumpLine:
     t_ns = int(match["s"]) * 1_000_000_000 + int(match["fraction"].ljust(9, "0"))
-    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or (match["data"] or "")[:16])
+    can_id = _parse_id(match["id"], match["data"] is None and match["fd"] is None)
+    return t_ns, match["channel"], can_id, bytes.fromhex(match["fd"] or (match["data"] or "")[:16])
 
 
-def _parse_id(match: re.Match[str]) -> int:
-    can_id = int(match["id"], 16)
-    if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
+def _match_screen(text: str) -> re.Match[str] | None:
+    match = _SCREEN_PATTERN.fullmatch(text)
+    is_torn = match and match["data"] is not None and len(bytes.fromhex(match["data"])) != int(match["length"])
+    return None if is_torn else match
+
+
+def _screen_frame(match: re.Match[str]) -> CandumpLine:
+    s = int(match["s"] or 0)
+    if match["date"]:
+        s = int(datetime.fromisoformat(match["date"]).replace(tzinfo=UTC).timestamp())
+    t_ns = s * 1_000_000_000 + int((match["fraction"] or "").ljust(9, "0"))
+    return t_ns, match["channel"], _parse_id(match["id"], match["data"] is None), bytes.fromhex(match["data"] or "")
+
+
+def _parse_id(text: str, is_remote: bool) -> int:
+    can_id = int(text, 16)
+    if len(text) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
         can_id = can_id | EFF_FLAG if can_id <= EFF_MASK else can_id
-    return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
+    return can_id | RTR_FLAG if is_remote else can_id
 
 
 class RecordingPort(TappedPort):

@@ -165,3 +165,14 @@ def elapsed_ns() -> int:
     It is real time on a virtual clock too, so that the cost of a cycle is measured in lockstep as well.
     """
     return time.perf_counter_ns()
+
+
+def wake_lateness(clock: Clock, period_ns: int, cycles: int) -> list[int]:
+    """Lateness of a loop that does nothing but wake at its deadlines, ascending, ns: the machine's own."""
+    deadline_ns, lateness = clock.now_ns() + period_ns, list[int]()
+    for _ in range(cycles):
+        clock.sleep_until_ns(deadline_ns)
+        late_ns = clock.now_ns() - deadline_ns
+        lateness.append(late_ns)
+        deadline_ns += (late_ns // period_ns + 1) * period_ns
+    return sorted(lateness)

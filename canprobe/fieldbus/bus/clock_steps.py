@@ -203,9 +203,9 @@ class RecordedBus:
         if middle[-1] - middle[0] >= _MIN_SYNC_DISTANCE_NS * (len(middle) // 2):
             return
         if stamps[0] == stamps[-1] == min(stamps) == max(stamps):
-            what = "all the same, as candump -H writes them without stamps of the hardware"
+            what = "all the same, as of candump without -t, or with -H without stamps of the hardware"
         else:
-            what = "differences from line to line (delta stamps, as of candump -td), no times"
+            what = "differences from line to line, no times"
         raise UsageError(
             f"{self._path}: the stamps of {channel} are {what}; record with `candump -l`, or -L with -ta or -tz"
         )

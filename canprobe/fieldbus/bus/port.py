@@ -190,6 +190,18 @@ class Port(Protocol):
         """Give the interface back. A second call is allowed; every other call afterwards raises InterfaceError."""
 
 
+def stamps_text(port: Port, late_ns: int) -> str:
+    """The clock that stamps the frames of a port, for people.
+
+    Args:
+        port: the port.
+        late_ns: lateness of wake-ups, the largest that was seen.
+    """
+    if port.stamps_arrival:
+        return "at their arrival, by the kernel or in virtual time"
+    return f"when python-can gives them, after the adapter's delay and up to {late_ns * 1e-6:.1f} ms of this machine"
+
+
 class PlainPort:
     """Base class of ports that wait and drain in two calls, and are woken by every frame."""
 

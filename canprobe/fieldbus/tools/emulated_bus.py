@@ -78,7 +78,7 @@ class EmulatedBus(ABC):
         """Power on a node from each EDS file.
 
         Args:
-            files: (name or path of an EDS or DCF file, node id) of each node.
+            files: (name or path of an EDS, DCF, XDD or XDC file, node id) of each node.
 
         Raises:
             EdsError: a file cannot be served.

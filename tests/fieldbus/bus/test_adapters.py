@@ -36,6 +36,36 @@ def test_the_table_names_interfaces_of_python_can_and_its_extras():
     assert {backend.extra for backend in BACKENDS.values() if backend.extra} <= extras
 
 
+def test_the_table_has_the_bit_rates_of_python_can():
+    """python-can sets a PCAN to 500 kbit/s where it does not know the rate, so that an unknown one must be refused."""
+    from can.interfaces.pcan.basic import PCAN_BITRATES
+    from can.interfaces.seeedstudio.seeedstudio import SeeedBus
+    from can.interfaces.slcan import slcanBus
+
+    known = {"pcan": PCAN_BITRATES, "slcan": slcanBus._BITRATES, "seeedstudio": SeeedBus.BITRATE}
+    for name, backend in BACKENDS.items():
+        assert {rate / 1000 for rate in known.get(name, ())} == set(backend.bitrates_kbit)
+    with pytest.raises(UsageError, match=r"PCAN_USBBUS1: pcan has no bit rate of 444 kbit/s, only 1000, 800, 500"):
+        open_port("pcan", "PCAN_USBBUS1", 444_000, MonotonicClock())
+
+
+@pytest.mark.parametrize(("name", "has"), [(name, one.features) for name, one in BACKENDS.items() if not one.indexed])
+def test_can_fd_is_asked_for_as_an_interface_takes_it(name, has, monkeypatch):
+    given = {}
+    monkeypatch.setattr(can, "Bus", lambda **options: given.update(options))
+    if name == "socketcan":
+        return  # a port of our own
+    if not has & {"fd", "fd-timing"}:
+        with pytest.raises(UsageError, match=f"{name} has no CAN FD in python-can"):
+            open_port(name, "x", 500_000, MonotonicClock(), data_bitrate=2_000_000)
+        return
+    open_port(name, "x", 500_000, MonotonicClock(), data_bitrate=2_000_000)
+    if "fd" in has:
+        assert (given["fd"], given["data_bitrate"]) == (True, 2_000_000)
+    else:
+        assert (given["timing"].nom_bitrate, given["timing"].data_bitrate) == (500_000, 2_000_000)
+
+
 @pytest.mark.parametrize("name", [name for name, one in BACKENDS.items() if one.package or one.library or one.windows])
 def test_a_port_that_cannot_be_opened_says_what_is_missing(name, monkeypatch):
     lacking(monkeypatch)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import socket
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import can
 import pytest
+from can.interfaces.pcan.pcan import PcanCanOperationError
+from can.interfaces.vector.exceptions import VectorOperationError
 
 from canprobe.errors import BusError, InterfaceError, UsageError
 from canprobe.fieldbus import LockstepBus, MonotonicClock, VirtualClock, open_port
@@ -29,6 +33,26 @@ def virtual() -> PortMaker:
     return lambda: open_port("virtual", channel, BITRATE, MonotonicClock())
 
 
+def udp_multicast_opened_by_its_user() -> PortMaker:
+    """Buses that are handed over, on an interface that gives a sender its own frames back."""
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as free:
+        free.bind(("::1", 0))
+        where = {"channel": f"ff11::{uuid.uuid4().hex[:4]}", "port": free.getsockname()[1], "hop_limit": 0}
+
+    def make() -> Port:
+        bus = can.Bus(interface="udp_multicast", **where)
+        port = open_port(bus, "opened before", BITRATE, MonotonicClock())
+
+        def close() -> None:
+            PythonCanPort.close(port)
+            bus.shutdown()
+
+        port.close = close
+        return port
+
+    return make
+
+
 def socketcan() -> PortMaker:
     return lambda: open_port("socketcan", "vcan0", BITRATE, MonotonicClock())
 
@@ -41,6 +65,7 @@ def python_can_socketcan() -> PortMaker:
     params=[
         lockstep,
         virtual,
+        udp_multicast_opened_by_its_user,
         pytest.param(socketcan, marks=pytest.mark.vcan),
         pytest.param(python_can_socketcan, marks=pytest.mark.vcan),
     ],
@@ -179,6 +204,82 @@ def test_error_frames_without_classes_are_bus_errors(monkeypatch: pytest.MonkeyP
     assert told == [(0x20000080, b"")] * 4
     assert (port.counters.error_frames, port.counters.overruns, port.counters.received) == (4, 0, 0)
     port.close()
+
+
+class FakeAdapter(can.BusABC):
+    """A bus that raises what the back-end of an adapter raises, and receives what it is told."""
+
+    def __init__(self, error: Exception | None = None, received: Sequence[can.Message] = ()) -> None:
+        self.error, self.received = error, list(received)
+        self.state_now = can.BusState.ACTIVE
+        super().__init__("fake")
+
+    @property
+    def state(self) -> can.BusState:
+        return self.state_now
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.error is not None:
+            raise self.error
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self.error is not None and not self.received:
+            raise self.error
+        return (self.received.pop(0) if self.received else None), False
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS),  # socketcan: full queue
+        PcanCanOperationError("The transmit queue is full"),
+        PcanCanOperationError("The driver is not loaded"),
+        VectorOperationError(11, "XL_ERR_QUEUE_IS_FULL", "xlCanTransmit"),
+        OSError(errno.ENODEV, "No such device (it may have been disconnected)"),  # usb.core.USBError, SerialException
+        can.CanTimeoutError("transmit timed out"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_what_a_back_end_raises_is_an_error_of_the_interface(error: Exception) -> None:
+    with FakeAdapter(error) as bus:
+        port = open_port(bus, "adapter", BITRATE, MonotonicClock())
+        with pytest.raises(InterfaceError, match=r"^adapter: sending 701 failed: "):
+            port.send_batch([(0x701, b"\5")])
+        for use in (port.drain, lambda: port.wait(port.clock.now_ns() + 1_000_000_000)):
+            with pytest.raises(InterfaceError, match=r"^adapter: receiving failed: "):
+                use()
+        assert (port.counters.transmit_full, port.counters.sent) == (1, 0)
+        port.close()
+        assert not bus._is_shutdown, "its user opened it"
+
+
+def test_a_bus_off_and_what_an_adapter_sent_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """gs_usb and cantact give a sender its frames back, marked; python-can's state says that the bus is off."""
+    own = can.Message(arbitration_id=0x080, is_extended_id=False, is_rx=False)
+    other = can.Message(arbitration_id=0x701, data=[5], is_extended_id=False)
+    with FakeAdapter(received=[own, other, can.Message(is_error_frame=True)]) as bus:
+        bus.state_now = can.BusState.ERROR
+        port = open_port(bus, "adapter", BITRATE, MonotonicClock())
+        assert [frame[:2] for frame in port.drain()] == [(0x701, b"\5")]
+        assert port.state is ControllerState.BUS_OFF and port.counters.received == 1
+
+
+class GsUsbBus(FakeAdapter):
+    """Its error frames have the classes of SocketCAN, as those of python-can's class of this name."""
+
+
+class SocketCanDaemonBus(FakeAdapter):
+    """The same."""
+
+
+@pytest.mark.parametrize("kind", [GsUsbBus, SocketCanDaemonBus])
+def test_error_frames_with_classes_are_read_by_them(kind: type[FakeAdapter]) -> None:
+    off = can.Message(arbitration_id=0x040, is_error_frame=True, data=[0])
+    lost = can.Message(arbitration_id=0x002, is_error_frame=True, data=[0])  # arbitration, which is no error
+    with kind(received=[lost, off]) as bus:
+        port = open_port(bus, "adapter", BITRATE, MonotonicClock())
+        assert port.drain() == [] and port.state is ControllerState.BUS_OFF
+        assert port.counters.error_frames == 0
 
 
 def test_the_port_names_itself(ports: tuple[Port, Port]) -> None:

@@ -330,12 +330,9 @@ def test_a_boolean_may_be_mapped_as_a_bit_or_as_a_byte_and_as_nothing_else():
 @pytest.mark.parametrize(
     ("head", "told"),
     [
-        (
-            b"<?xml version='1.0'?><ISO15745ProfileContainer/>",
-            "XML, as XDD and XDC files are, not an EDS file; export it",
-        ),
-        (b"\xef\xbb\xbf\r\n  <ISO15745ProfileContainer>", "XML, as XDD and XDC files are, not an EDS file; export it"),
-        ("<?xml version='1.0'?>".encode("utf-16"), "XML, as XDD and XDC files are, not an EDS file; export it"),
+        (b"<?xml version='1.0'?><ISO15745ProfileContainer/>", "whole file: no object in it"),
+        (b"\xef\xbb\xbf\r\n  <ISO15745ProfileContainer>", "line 2: not XML that can be read: no element found"),
+        ("<?xml version='1.0'?>".encode("utf-16"), "line 1: not XML that can be read: no element found"),
         (gzip.compress(b"[FileInfo]", mtime=0), "compressed by gzip, not an EDS file; type: zcat < "),
         (b"PK\3\4....", "compressed by zip, not an EDS file; type: unzip -p "),
         (b"\xd4\xc3\xb2\xa1\2\0\4\0", "a capture of tcpdump or Wireshark (pcap), not an EDS file"),

@@ -27,7 +27,7 @@ from defects import (
 )
 from examined import NODE_ID, Examined, eds_device, failed
 
-from canprobe.fieldbus import SlaveNode, TimedBus, VirtualClock, load_eds
+from canprobe.fieldbus import LockstepBus, SlaveNode, TimedBus, VirtualClock, load_eds
 from canprobe.fieldbus.node import Application, Quirks
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, NmtState
@@ -482,6 +482,22 @@ def test_every_tpdo_that_is_heard_is_compared_with_its_mapping(can_id, prefix, c
     points = [point for point in POINTS if point.title == "83 heard lengths"]
     device = whole(whole_eds, rewrites(can_id, prefix, change))
     assert failed(device.run(points=points)) == {"pdo 83 heard lengths": told}
+
+
+@pytest.mark.parametrize(("late_ms", "verdict"), [(4, Verdict.PASS), (12, Verdict.NOT_APPLICABLE)])
+def test_points_on_times_need_stamps_that_are_as_good(late_ms, verdict, whole_eds):
+    """On a port that stamps what it is given, a machine that wakes up late cannot judge when a frame came."""
+
+    class LateClock(VirtualClock):
+        def sleep_until_ns(self, t_ns):
+            super().sleep_until_ns(t_ns + late_ms * MS)
+
+    examined = eds_device(whole_eds, bus=LockstepBus(LateClock(), fd=True))
+    examined.port.stamps_arrival = False
+    report = examined.run(points=[point for point in POINTS if point.number in (101, 102)])
+    assert {row.verdict for row in report.rows} == {verdict}
+    told = f"up to {late_ms}.0 ms"
+    assert told in report.facts["frames are stamped"] and all(told in row.detail for row in report.rows if row.detail)
 
 
 def test_left_out_is_what_was_asked_for(whole_eds):

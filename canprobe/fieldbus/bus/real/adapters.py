@@ -32,6 +32,8 @@ from canprobe.fieldbus.bus.real.socketcan import has_socketcan, how_to_make
 LOCAL_GROUP = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
 SOCKETCAN = "socketcan"
+_FD_CLOCK_HZ = 80_000_000
+"""Clock of the controller of CAN FD adapters."""
 _WHERE_SHOWN = "`canprobe adapters` shows what works here"
 _ARPHRD_CAN = "280"
 _NET_FOLDER, _DEVICE_FOLDER = Path("/sys/class/net"), Path("/dev")
@@ -53,6 +55,10 @@ class Backend:
         windows: whether it exists on Windows only.
         indexed: whether its channels are numbers.
         module: driver of the Linux kernel for the same adapters, which are `socketcan` interfaces then.
+        has: what python-can reaches of it, in words: `fd` (CAN FD by bit rates, `fd-timing` by the timing of bits),
+            `filter` (of identifiers, below python-can), `listen-only`, `errors` (error frames, `error-classes` with
+            those of SocketCAN), `stamps` (of the adapter or its driver), `echo` (of frames that were sent, unmarked).
+        bitrates_kbit: bit rates that python-can sets it to, kbit/s; empty: those of its hardware.
     """
 
     hardware: str
@@ -65,6 +71,8 @@ class Backend:
     windows: bool = False
     indexed: bool = False
     module: str | None = None
+    has: str = ""
+    bitrates_kbit: tuple[float, ...] = ()
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -73,7 +81,9 @@ class Backend:
         if self.windows and sys.platform != "win32":
             lacks.append(f"{self.driver} is for Windows only")
         if self.package is not None and importlib.util.find_spec(self.package) is None:
-            lacks.append(f"the package {self.package} is not installed; type: {package_line(self.required)}")
+            lacks.append(
+                f"the package {self.package} is not installed; type: {package_line(f'python-can[{self.extra}]')}"
+            )
         if self.library is not None and ctypes.util.find_library(self.library) is None:
             lacks.append(f"{self.driver} is not installed")
         if lacks and self.module is not None and sys.platform == "linux":
@@ -81,13 +91,18 @@ class Backend:
         return tuple(lacks)
 
     @property
-    def required(self) -> str:
-        """The requirement that installs its package, for pip."""
-        return f"python-can[{self.extra}]"
+    def features(self) -> frozenset[str]:
+        """The words of `has`."""
+        return frozenset(self.has.split())
 
 
 BACKENDS: Mapping[str, Backend] = {
-    SOCKETCAN: Backend("adapters with a driver in the Linux kernel; vcan", "name of the interface", "can0"),
+    SOCKETCAN: Backend(
+        "adapters with a driver in the Linux kernel; vcan",
+        "name of the interface",
+        "can0",
+        has="fd filter listen-only errors error-classes stamps",
+    ),
     "pcan": Backend(
         "PEAK PCAN",
         "name of the channel in PCAN-Basic",
@@ -95,6 +110,8 @@ BACKENDS: Mapping[str, Backend] = {
         driver="PCAN-Basic of peak-system.com",
         library="PCANBasic" if sys.platform == "win32" else "pcanbasic",
         module="peak_usb",
+        has="fd-timing listen-only errors stamps",
+        bitrates_kbit=(1000, 800, 500, 250, 125, 100, 95, 83, 50, 47, 33, 20, 10, 5),
     ),
     "kvaser": Backend(
         "Kvaser",
@@ -104,12 +121,24 @@ BACKENDS: Mapping[str, Backend] = {
         library="canlib32" if sys.platform == "win32" else "canlib",
         indexed=True,
         module="kvaser_usb",
+        has="fd filter listen-only errors stamps",
     ),
     "ixxat": Backend(
-        "HMS Ixxat", "number, from 0", "0", driver="the VCI 4 driver of ixxat.com", windows=True, indexed=True
+        "HMS Ixxat",
+        "number, from 0",
+        "0",
+        driver="the VCI 4 driver of ixxat.com",
+        windows=True,
+        indexed=True,
+        has="fd filter errors stamps",
     ),
     "vector": Backend(
-        "Vector VN, CANcase", "number, from 0", "0", driver="the XL Driver Library of vector.com", windows=True
+        "Vector VN, CANcase",
+        "number, from 0",
+        "0",
+        driver="the XL Driver Library of vector.com",
+        windows=True,
+        has="fd filter listen-only errors stamps",
     ),
     "slcan": Backend(
         "CANable (slcan firmware), USBtin, Lawicel: a serial line",
@@ -117,6 +146,8 @@ BACKENDS: Mapping[str, Backend] = {
         "/dev/ttyACM0",
         package="serial",
         extra="serial",
+        has="fd-timing listen-only",
+        bitrates_kbit=(1000, 750, 500, 250, 125, 100, 83.3, 50, 20, 10),
     ),
     "gs_usb": Backend(
         "candleLight, CANable (candleLight firmware), CANtact, by USB",
@@ -128,6 +159,7 @@ BACKENDS: Mapping[str, Backend] = {
         library="usb-1.0",
         indexed=True,
         module="gs_usb",
+        has="errors error-classes stamps",
     ),
     "usb2can": Backend(
         "8devices USB2CAN",
@@ -136,19 +168,41 @@ BACKENDS: Mapping[str, Backend] = {
         driver="usb2can.dll of 8devices",
         windows=True,
         module="usb_8dev",
+        has="errors stamps",
     ),
     "serial": Backend(
-        "python-can's own serial protocol", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"
+        "python-can's own serial protocol", "serial port", "/dev/ttyUSB0", "serial", "serial", has="errors stamps"
     ),
-    "seeedstudio": Backend("Seeed USB-CAN analyzer", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"),
+    "seeedstudio": Backend(
+        "Seeed USB-CAN analyzer",
+        "serial port",
+        "/dev/ttyUSB0",
+        package="serial",
+        extra="serial",
+        has="listen-only",
+        bitrates_kbit=(1000, 800, 500, 400, 250, 200, 125, 100, 50, 20, 10, 5),
+    ),
     "robotell": Backend("Robotell USB-CAN", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"),
-    "cantact": Backend("CANtact", "number, from 0", "0", package="cantact", extra="cantact", indexed=True),
-    "canalystii": Backend("CANalyst-II", "number, from 0", "0", package="canalystii", extra="canalystii"),
-    "neovi": Backend("Intrepid neoVI, ValueCAN", "number, from 1", "1", package="ics", extra="neovi", indexed=True),
-    "udp_multicast": Backend(
-        "none: processes on this machine or network", "multicast address", LOCAL_GROUP, "msgpack", "multicast"
+    "cantact": Backend("CANtact", "number, from 0", "0", "cantact", "cantact", indexed=True, has="listen-only stamps"),
+    "canalystii": Backend("CANalyst-II", "number, from 0", "0", "canalystii", "canalystii", has="stamps"),
+    "neovi": Backend(
+        "Intrepid neoVI, ValueCAN", "number, from 1", "1", "ics", "neovi", indexed=True, has="fd errors stamps"
     ),
-    "virtual": Backend("none: within one process", "any name", "vcan0"),
+    "socketcand": Backend(
+        "an interface of another machine, by socketcand (its host and port stand in ~/.canrc)",
+        "name of the interface there",
+        "can0",
+        has="errors error-classes stamps",
+    ),
+    "udp_multicast": Backend(
+        "none: processes on this machine or network",
+        "multicast address",
+        LOCAL_GROUP,
+        "msgpack",
+        "multicast",
+        has="fd stamps echo",
+    ),
+    "virtual": Backend("none: within one process", "any name", "vcan0", has="fd errors"),
 }
 """Interface of python-can → what reaches it, the usual ones first."""
 
@@ -217,6 +271,42 @@ def backend_channel(interface: str, channel: str) -> str | int:
             + "".join(f"; {lacking}" for lacking in (*backend.missing, _WHERE_SHOWN))
         )
     return int(channel)
+
+
+def bus_options(interface: str, channel: str, bitrate: int, data_bitrate: int | None) -> dict[str, Any]:
+    """Arguments of `can.Bus` for an interface.
+
+    Raises:
+        UsageError: the interface does not exist, does not take this channel or bit rate, or has no CAN FD.
+    """
+    check_interface_name(interface)
+    options: dict[str, Any] = {
+        "interface": interface,
+        "channel": backend_channel(interface, channel),
+        "bitrate": bitrate,
+    }
+    backend = BACKENDS.get(interface, Backend("", "", "", has="fd"))
+    if backend.bitrates_kbit and bitrate / 1000 not in backend.bitrates_kbit:
+        known = ", ".join(f"{rate:g}" for rate in backend.bitrates_kbit)
+        raise UsageError(f"{channel}: {interface} has no bit rate of {bitrate / 1000:g} kbit/s, only {known}")
+    if data_bitrate is None:
+        return options
+    if not backend.features & {"fd", "fd-timing"}:
+        raise UsageError(f"{channel}: {interface} has no CAN FD in python-can; leave the data bit rate out")
+    if "fd" in backend.features:
+        return options | {"fd": True, "data_bitrate": data_bitrate}
+    from can import BitTimingFd
+
+    rates = {"nom_bitrate": bitrate, "data_bitrate": data_bitrate, "f_clock": _FD_CLOCK_HZ}
+    return options | {"timing": BitTimingFd.from_sample_point(**rates, nom_sample_point=80.0, data_sample_point=80.0)}
+
+
+def interface_of(bus: object) -> str:
+    """Interface of a bus of python-can; empty where it is of a class that python-can does not know."""
+    from can.interfaces import BACKENDS as CLASSES
+
+    names = {kind: name for name, (_, kind) in CLASSES.items()}
+    return next((names[kind.__name__] for kind in type(bus).__mro__ if kind.__name__ in names), "")
 
 
 def open_failure(interface: str, channel: str, error: Exception) -> str:

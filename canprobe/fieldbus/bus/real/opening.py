@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.port import Port, Reports
@@ -9,9 +11,12 @@ from canprobe.fieldbus.bus.real.mmsg import HAS_BATCHES
 from canprobe.fieldbus.bus.real.python_can import PythonCanPort
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
+if TYPE_CHECKING:
+    from can import BusABC
+
 
 def open_port(
-    interface: str,
+    interface: str | BusABC,
     channel: str,
     bitrate: int,
     clock: Clock,
@@ -23,8 +28,9 @@ def open_port(
     """Open `channel` of `interface`.
 
     Args:
-        interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces.
-        channel: channel in the words of that interface, such as `can0`.
+        interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces; or a bus of python-can,
+            which stays open.
+        channel: channel in the words of that interface, such as `can0`; for an open bus any name.
         bitrate: bit rate, bit/s; a SocketCAN interface has its own, set with `ip link`.
         clock: clock in real time.
         data_bitrate: bit rate of the data phase of CAN FD frames; None: classical frames only.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
 
 import can
 
@@ -25,7 +24,7 @@ from canprobe.fieldbus.bus.port import (
     TimedFrame,
     state_after,
 )
-from canprobe.fieldbus.bus.real.adapters import backend_channel, check_interface_name, open_failure
+from canprobe.fieldbus.bus.real.adapters import BACKENDS, SOCKETCAN, bus_options, interface_of, open_failure
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
@@ -35,10 +34,6 @@ _STATES = {
     can.BusState.PASSIVE: ControllerState.PASSIVE,
     can.BusState.ERROR: ControllerState.BUS_OFF,
 }
-_ECHOING_INTERFACES = ("udp_multicast",)
-"""Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
-_ERROR_CLASS_INTERFACES = ("socketcan", "socketcand")
-"""Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
 
 
 class Echoes:
@@ -73,7 +68,8 @@ class PythonCanPort(PlainPort):
     """One python-can bus.
 
     Args:
-        interface: name of the interface in python-can, such as `virtual`, `pcan`, `slcan`.
+        interface: name of the interface in python-can, such as `virtual`, `pcan`, `slcan`; or a bus of python-can,
+            which stays open.
         channel: channel in the words of that interface.
         bitrate: bit rate, bit/s, for interfaces that set it themselves.
         clock: clock for waits and stamps.
@@ -91,7 +87,7 @@ class PythonCanPort(PlainPort):
 
     def __init__(
         self,
-        interface: str,
+        interface: str | can.BusABC,
         channel: str,
         bitrate: int,
         clock: Clock,
@@ -101,14 +97,19 @@ class PythonCanPort(PlainPort):
     ) -> None:
         self._fd = data_bitrate is not None
         self._reports = reports or Reports()
-        self._has_classes = interface in _ERROR_CLASS_INTERFACES
+        name = interface if isinstance(interface, str) else interface_of(interface)
+        features = BACKENDS[name].features if name in BACKENDS else ()
+        self._has_classes = "error-classes" in features
+        self._hears_neighbours = name == SOCKETCAN  # which are marked as if this port had sent their frames
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
-        self._echoes = Echoes() if interface in _ECHOING_INTERFACES else None
-        self._bus: can.BusABC | None = _open(interface, channel, bitrate, data_bitrate)
+        self._echoes = Echoes() if "echo" in features else None
+        self._owns = isinstance(interface, str)
+        opened = _open(interface, channel, bitrate, data_bitrate) if isinstance(interface, str) else interface
+        self._bus: can.BusABC | None = opened
 
     stamps_arrival = False
 
@@ -119,7 +120,7 @@ class PythonCanPort(PlainPort):
             message = _message(self.channel, can_id, data, self._fd)
             try:
                 bus.send(message)
-            except can.CanError as error:
+            except (can.CanError, OSError) as error:
                 self.counters.transmit_full += 1
                 raise InterfaceError(f"{self.channel}: sending {can_id:03X} failed: {error}") from error
             self.counters.sent += 1
@@ -149,9 +150,9 @@ class PythonCanPort(PlainPort):
                 self._arrived.append(message)
 
     def close(self) -> None:
-        """Shut the python-can bus down."""
+        """Shut the python-can bus down, unless it was open before."""
         bus, self._bus = self._bus, None
-        if bus is not None:
+        if bus is not None and self._owns:
             bus.shutdown()
 
     def _open_bus(self) -> can.BusABC:
@@ -163,12 +164,14 @@ class PythonCanPort(PlainPort):
         try:
             # BusABC.recv goes by the wall clock: set back meanwhile, it waits as much longer. No filters are set here.
             return bus._recv_internal(timeout_s)[0]
-        except can.CanError as error:
+        except (can.CanError, OSError) as error:
             raise InterfaceError(f"{self.channel}: receiving failed: {error}") from error
 
     def _frame(self, message: can.Message, t_ns: int) -> TimedFrame | None:
         if message.is_error_frame:
             self._note_error(message, t_ns)
+            return None
+        if not message.is_rx and not self._hears_neighbours:
             return None
         if message.is_fd and not self._fd:
             self.counters.ignored += 1
@@ -194,13 +197,9 @@ class PythonCanPort(PlainPort):
 
 def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.CRITICAL)
-    check_interface_name(interface)
-    given = backend_channel(interface, channel)
-    options: dict[str, Any] = {"interface": interface, "channel": given, "bitrate": bitrate}
-    if data_bitrate is not None:
-        options |= {"fd": True, "data_bitrate": data_bitrate}
-        if interface == "virtual":
-            options = {**options, "protocol": can.CanProtocol.CAN_FD}
+    options = bus_options(interface, channel, bitrate, data_bitrate)
+    if interface == "virtual" and data_bitrate is not None:
+        options |= {"protocol": can.CanProtocol.CAN_FD}
     try:
         return can.Bus(**options)
     except Exception as error:  # where the library of a driver is missing, python-can raises anything

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.errors import CanprobeError, NodeError
-from canprobe.fieldbus.bus.port import ControllerState, Port, nothing
+from canprobe.fieldbus.bus.clock import wake_lateness
+from canprobe.fieldbus.bus.port import ControllerState, Port, nothing, stamps_text
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import CONTROLWORD, POWERED_STATES, describe_state, known_state
@@ -43,6 +44,8 @@ from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
 _BACK_ON_BUS_S = 5.0
 _STATE_READS = 10
+STAMP_NS = 10_000_000
+"""Largest delay of a stamp for points on times, a half of what they allow the machine."""
 _WAY_OUT = "type: canprobe conform --restore {path} --node {node_id}"
 
 
@@ -103,6 +106,7 @@ class Examination:
         self.report = Report("conform", f"node {node_id} on {port.channel}")
         self._port, self._node_id, self._description = port, node_id, description
         self._boots = 0
+        self._late_ns = 0  # of a stamp
         self._ended = ""
 
     def run(
@@ -169,6 +173,9 @@ class Examination:
         history = [f"{device.number(0x1003, n):08X}h" for n in range(1, device.number(0x1003) + 1)]
         self.report.facts.update(facts)
         self.report.facts["error history (1003h) before"] = ", ".join(history) or "empty"
+        if not self._port.stamps_arrival:
+            self._late_ns = wake_lateness(self._port.clock, 2_000_000, 100)[-1]
+        self.report.facts["frames are stamped"] = stamps_text(self._port, self._late_ns)
         self.report.facts["bus"] = f"{self._port.channel}, beside the device: {surroundings.text()}"
         if surroundings.lacks("nmt") and device.has(0x1017):
             self.report.facts["warning"] = "another master may watch the heartbeat of the device, which points change"
@@ -282,6 +289,8 @@ class Examination:
             return "no EDS was given; --eds FILE names it"
         if "drive" in point.needs and not self.bench.device.is_drive:
             return "the device is no CiA 402 drive"
+        if "stamps" in point.needs and self._late_ns > STAMP_NS:
+            return f"its stamps may be {STAMP_NS * 1e-6:.0f} ms late, and are up to {self._late_ns * 1e-6:.1f} ms here"
         if "motion" in point.needs and not self.settings.motion:
             return "it switches the power stage on; --motion permits it"
         for need in ("nmt", "sync", "alone"):

@@ -26,7 +26,8 @@ class Point:
         expected: what is accepted, in words.
         run: function that examines it: it returns where the device conforms, else raises an error of `outcome`.
         needs: what must be there: ``eds``, ``nmt`` (no other master), ``sync`` (no other SYNC producer), ``alone`` (no
-            other node), ``drive``, ``motion`` (permission to switch the power stage on).
+            other node), ``stamps`` (late by 10 ms at most), ``drive``, ``motion`` (permission to switch the power
+            stage on).
         hint: what the author of a firmware can look at.
     """
 

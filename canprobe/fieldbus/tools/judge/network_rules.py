@@ -144,7 +144,7 @@ def sync_gaps(case: Case) -> Watch[SyncSeen]:
         case.looked += 1
         interval_ns = event.frame.t_ns - before.frame.t_ns
         words = []
-        if not 0.5 * period_ns <= interval_ns <= 1.5 * period_ns:
+        if case.bus.now_ns and not 0.5 * period_ns <= interval_ns <= 1.5 * period_ns:  # 0: a log without times
             words.append(f"SYNC after {interval_ns * 1e-6:.2f} ms; the period is {period_ns * 1e-6:.2f} ms")
         if event.counter is not None and before.counter is not None:
             overflow = max((node.number(0x1019) or 0 for node in case.bus.nodes.values()), default=0)

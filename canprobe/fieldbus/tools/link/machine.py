@@ -8,7 +8,6 @@ from __future__ import annotations
 import platform
 from pathlib import Path
 
-from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.system import system
 
 NOT_AVAILABLE = "not available"
@@ -35,17 +34,6 @@ def machine_facts(channel: str | None = None) -> dict[str, str]:
         facts["driver"] = driver.resolve().name if driver.exists() else NOT_AVAILABLE
         facts["transmit_queue"] = _read(f"/sys/class/net/{channel}/tx_queue_len")
     return facts
-
-
-def wake_lateness(clock: Clock, period_ns: int, cycles: int) -> list[int]:
-    """Lateness of a loop that does nothing but wake at its deadlines, ascending, ns: the machine's own."""
-    deadline_ns, lateness = clock.now_ns() + period_ns, list[int]()
-    for _ in range(cycles):
-        clock.sleep_until_ns(deadline_ns)
-        late_ns = clock.now_ns() - deadline_ns
-        lateness.append(late_ns)
-        deadline_ns += (late_ns // period_ns + 1) * period_ns
-    return sorted(lateness)
 
 
 def _preemption() -> str:

@@ -69,6 +69,5 @@ def _worst(rows: Iterable[ReportRow]) -> dict[str, int]:
     """How bad each row is, by its key; of rows with one key the worst counts."""
     worst: dict[str, int] = {}
     for row in rows:
-        key = f"{row.group} {row.name}"
-        worst[key] = max(worst.get(key, 0), _BADNESS[row.verdict])
+        worst[row.key] = max(worst.get(row.key, 0), _BADNESS[row.verdict])
     return worst

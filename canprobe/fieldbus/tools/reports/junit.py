@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -26,11 +27,14 @@ _MAX_FRAMES = 200
 def write_junit(report: Report, path: Path) -> None:
     """Write a report as JUnit XML: a suite ``canprobe.<tool>.<group>`` for each group, a case for each row.
 
-    A failed row is a failure of the type of its clause, one that does not apply is skipped, and an error is an error.
+    A failed row is a failure of the type of its clause, one that does not apply or is known is skipped, and an error is
+    an error.
 
     Raises:
         ResultsError: the file cannot be written.
     """
+    rows = [_skipped(row) if row.verdict is Verdict.FAIL and row.key in report.known else row for row in report.rows]
+    report = replace(report, rows=rows)
     root = ElementTree.Element("testsuites", {"name": f"canprobe {report.tool}", **_totals(report.rows)})
     del root.attrib["skipped"]  # the schema of Jenkins has it at a suite only
     for group, rows in report.groups().items():
@@ -44,6 +48,10 @@ def write_junit(report: Report, path: Path) -> None:
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode", xml_declaration=False)
     write_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
+
+
+def _skipped(row: ReportRow) -> ReportRow:
+    return replace(row, verdict=Verdict.NOT_APPLICABLE, detail=f"known, it failed in the baseline too: {row.detail}")
 
 
 def _totals(rows: Sequence[ReportRow]) -> dict[str, str]:

@@ -61,6 +61,11 @@ class ReportRow:
     written: tuple[str, ...] = ()
     seconds: float = 0.0
 
+    @property
+    def key(self) -> str:
+        """Group and name, by which reports are compared."""
+        return f"{self.group} {self.name}"
+
 
 @dataclass(slots=True)
 class Report:
@@ -75,6 +80,7 @@ class Report:
         manual: steps for a person.
         distributions: measured times by name, ms.
         log: path of the recorded frames; None where they were not kept.
+        known: keys of rows that failed in the baseline too, and may fail.
     """
 
     tool: str
@@ -85,6 +91,7 @@ class Report:
     manual: list[str] = field(default_factory=list)
     distributions: dict[str, tuple[float, ...]] = field(default_factory=dict)
     log: str | None = None
+    known: tuple[str, ...] = ()
 
     def counts(self) -> dict[Verdict, int]:
         """Number of rows of each verdict, zeros included."""
@@ -100,9 +107,9 @@ class Report:
 
     @property
     def exit_status(self) -> int:
-        """Exit status of the tool: 1 where a row failed, else 3 where one could not be examined, else 0."""
-        counts = self.counts()
-        return 1 if counts[Verdict.FAIL] else 3 if counts[Verdict.ERROR] else 0
+        """Exit status of the tool: 1 where a row failed that may not, else 3 where one was not examined, else 0."""
+        failed = any(row.verdict is Verdict.FAIL and row.key not in self.known for row in self.rows)
+        return 1 if failed else 3 if self.counts()[Verdict.ERROR] else 0
 
 
 def printable(text: str) -> str:

@@ -43,7 +43,11 @@ def sdo_time(bench: Bench) -> None:
 
 
 @point(
-    101, "SYNC to TPDO", "CiA 301, synchronous TPDO", "one TPDO for each of 50 SYNCs, within 10 ms", needs="nmt sync"
+    101,
+    "SYNC to TPDO",
+    "CiA 301, synchronous TPDO",
+    "one TPDO for each of 50 SYNCs, within 10 ms",
+    needs="nmt sync stamps",
 )
 def sync_time(bench: Bench) -> None:
     """Times from SYNC to a TPDO of type 1, at 100 Hz."""
@@ -60,7 +64,7 @@ def sync_time(bench: Bench) -> None:
     bench.distributions[SYNC_TIME] = tuple(times)
 
 
-@point(102, "heartbeat", "CiA 301, 1017h", "no period differs by more than 20 % from 1017h")
+@point(102, "heartbeat", "CiA 301, 1017h", "no period differs by more than 20 % from 1017h", needs="stamps")
 def heartbeat_time(bench: Bench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
