@@ -29,7 +29,8 @@ from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import home_joints
 from canprobe.cell.tasks.from_plan import estimates_of
-from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandMotion, HandWay, jog_way, joint_way, refuse
+from canprobe.cell.tasks.hand_motion import HandMotion
+from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, jog_way, joint_way, refuse
 from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
 from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError

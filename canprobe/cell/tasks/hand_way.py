@@ -1,33 +1,26 @@
-"""A motion that a person asks for: its way, why it may not be gone, and the controller that follows it.
+"""The way of a motion that a person asks for: where it goes, how fast it may be, and why it may not be gone.
 
 A way is known as a whole before it begins: joint positions along it, close to each other. So limits, keep-out places
-and the speed of each joint are looked at before anything moves. The motion brakes when nobody wants it. What the array
-feels on the way ends it, and the probe goes back the way that it came, which was free; joints that do not follow are
-seen by the supervision.
+and the speed of each joint are looked at before anything moves; what happens on it is `cell.tasks.hand_motion`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from canprobe.cell.master.array import make_patch_reader
-from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.first_touch import blind_s, depth_at
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import lag_s
-from canprobe.cell.tasks.task import MotionTime
 from canprobe.errors import PlanError, UsageError, did_you_mean
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.motion_profile import MotionProfile
 from canprobe.mechanics.touch.linear_algebra import checked
-from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 JERK_S = 0.05
@@ -244,99 +237,3 @@ def touch_speed(plan: Plan) -> float | None:
 
 def _tips(guard: JointGuard, q: Floats) -> Floats:
     return np.array([guard.T_base_tip(one)[:3, 3] for one in q])
-
-
-ELSEWHERE_RAD = 0.002
-"""Distance from the way's start, rad, by which an arm has been moved since; of a sliding joint by `ArmModel.radian`."""
-ARRIVAL_S = 0.5
-"""Longest time from the end of the way until the joints have arrived, s."""
-BACK_M = 5e-3
-"""Way of the probe back from what it has touched, m."""
-
-
-class HandMotion(Controller):
-    """Follows a way once.
-
-    Args:
-        plan: plan of a cell with an arm.
-        way: the way, from where the arm stands.
-        renewed: asked in each cycle whether the motion is still wanted; where it is not, it brakes.
-
-    Attributes:
-        share: share of the way that is gone.
-        ended_by: why the motion ended before its end; None where it did not.
-    """
-
-    def __init__(self, plan: Plan, way: HandWay, renewed: Callable[[], bool] = lambda: True) -> None:
-        arm = plan.setup.needed_arm()
-        self._model, self._way, self._renewed = arm.model, way, renewed
-        self._jog_force = plan.setup.limits.jog_force
-        self._count = np.abs(arm.model.q_per_unit).sum(axis=1)
-        self.reader = make_patch_reader(plan.setup)
-        self._time = MotionTime(plan.sync.period_ns)
-        self._motion = way.profile()
-        self._back: MotionProfile | None = None
-        self._t = self._touched_at = self.share = 0.0
-        self._late_ns = 0
-        self._interrupt: KeyboardInterrupt | None = None
-        self.ended_by: str | None = None
-
-    def inspect(self, q: Floats) -> str | None:
-        away = np.abs(q - self._way.q[0]) / self._model.radian
-        if away.max() <= ELSEWHERE_RAD:
-            return None
-        joint = int(away.argmax())
-        its = self._model.joints[joint]
-        stands, was = its.text(q[joint], ".2f"), its.text(self._way.q[0][joint], ".2f")
-        return f"joint {joint + 1} stands at {stands}, and was at {was} when the way was planned: plan it again"
-
-    def brake(self, interrupt: KeyboardInterrupt) -> bool:
-        self._end("interrupted")
-        self._interrupt = interrupt
-        return True
-
-    def step(self, measurement: Measurement) -> Command:
-        self._t += 1e-9 * self._time.step(measurement.t_ns)
-        self._feel(measurement)
-        if self.ended_by is None and not self._renewed():
-            self._end("no longer asked for")
-        motion = self._motion if self._back is None else self._back
-        gone = motion.at(self._t)[0]
-        self.share = gone if self._back is None else self._touched_at - gone
-        q = self._way.at(self.share)
-        if self._t < motion.duration_s:
-            return Command(q)
-        self._late_ns = self._late_ns or measurement.t_ns + round(1e9 * ARRIVAL_S)
-        assert measurement.q is not None
-        if measurement.t_ns < self._late_ns and (np.abs(measurement.q - q) > self._count).any():
-            return Command(q)
-        if self._interrupt is not None:
-            raise self._interrupt
-        return Command(q, done=True, stop_reason=self.ended_by if self._back is not None else None)
-
-    def _end(self, why: str) -> None:
-        """Brake, once."""
-        self.ended_by = why
-        self._motion.brake(self._t)
-
-    def _feel(self, measurement: Measurement) -> None:
-        """Begin the way back where the array shows the force of a jog."""
-        sample = measurement.tactile
-        if self.reader is None or sample is None or self._back is not None:
-            return
-        force = self.reader.read(sample).force
-        if force < max(self._jog_force, TOUCH_FORCE):
-            return
-        self._touched_at = self._motion.at(self._t)[0]
-        self.ended_by = (
-            f"the array showed {force:.2f} N (limits.jog_force_n = {self._jog_force:g}) after"
-            f" {100.0 * self._touched_at:.0f} % of the way: the probe went back the way that it came"
-        )
-        way = self._way
-        length = min(self._touched_at, self._share_of_back())
-        self._back, self._t = MotionProfile(length, way.speed, way.acceleration, way.jerk), 0.0
-
-    def _share_of_back(self) -> float:
-        """Share of the way on which the probe goes `BACK_M`."""
-        steps = np.linalg.norm(np.diff(self._way.tip, axis=0), axis=1)
-        return BACK_M / max(float(steps.sum()), 1e-9)
