@@ -121,7 +121,7 @@ def described(cell: OpenCell, found: HandWay, speed: float) -> str:
     """The way in words: what each joint does, and how long it takes."""
     arm = cell.plan.setup.arm
     assert arm is not None
-    start, end = found.q[0], found.q[-1]
+    start, end, duration_s = found.q[0], found.q[-1], found.profile().duration_s
     lines = [
         f"  joint {i + 1}: {its.shown(start[i]):.2f} to {its.text(end[i], '.2f')} ({its.shown(end[i] - start[i]):+.2f})"
         for i, its in enumerate(arm.model.joints)
@@ -129,7 +129,7 @@ def described(cell: OpenCell, found: HandWay, speed: float) -> str:
     tip = found.tip[-1]
     places = ", ".join(f"{1e3 * value:.0f}" for value in tip)
     slowed = f"; {found.slowed_by}" if found.slowed_by else ""
-    head = f"the way: {found.profile().duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
+    head = f"the way: {duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
     return "\n".join([head, *lines, f"  the probe's tip comes to {places} mm"])
 
 

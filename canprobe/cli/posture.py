@@ -75,13 +75,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(plan: Plan) -> int:
     """Print what is wrong with each posture; status 2 where something is."""
-    from canprobe.cell.tasks.hand_way import joint_way, refuse
+    from canprobe.cell.tasks.hand_way import joint_way
 
     arm, wrong = plan.setup.arm, 0
     assert arm is not None
     for name, q in arm.postures.items():
         try:
-            refuse(plan, joint_way(plan, arm.q_start, q))
+            joint_way(plan, arm.q_start, q).whole()
             print(f"{name}: fits")
         except UsageError as error:
             wrong += 1
