@@ -127,8 +127,8 @@ class HandMotion(Controller):
             return
         self._touched_at = self._begin + self._motion.at(self._t)[0]
         self.ended_by = (
-            f"the array showed {force:.2f} N (limits.jog_force_n = {self._jog_force:g}) after {self._t:.1f} s: the probe"
-            " went back the way that it came"
+            f"the array showed {force:.2f} N (limits.jog_force_n = {self._jog_force:g}) after {self._t:.1f} s: the"
+            " probe went back the way that it came"
         )
         way = self._way
         length = min(self._touched_at, BACK_M / max(way.tip_way(), 1e-9))

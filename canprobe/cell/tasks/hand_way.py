@@ -116,7 +116,9 @@ class HandWay:
         why = self.look(self.length)
         if why is not None:
             share = len(self.q) / self.length
-            raise UsageError(f"{why}, {self._time_at(len(self.q)):.2f} s after the start, {100 * share:.0f} % of the way")
+            raise UsageError(
+                f"{why}, {self._time_at(len(self.q)):.2f} s after the start, {100 * share:.0f} % of the way"
+            )
         return self
 
     @property
@@ -166,8 +168,9 @@ class HandWay:
         model, self.slowed_by = self._model, None
         fastest = min(self._most, float((self._highest[moves] / rates[moves]).min()))
         acceleration = float((model.qdd_max[moves] / rates[moves]).min())
-        if self._guided and fastest > (stopping := acceleration * (GUIDED_STOP_S - GUIDED_JERK_S)):
-            fastest, self.slowed_by = stopping, "as it has to stop at once where nobody renews it"
+        stopping = acceleration * (GUIDED_STOP_S - GUIDED_JERK_S)
+        if self._guided and fastest > stopping * (1.0 + 1e-6):
+            fastest, self.slowed_by = stopping, "no faster, as it has to stop at once where nobody renews it"
         tip_rate = float(np.linalg.norm(np.diff(self.tip, axis=0), axis=1).max())
         touch = touch_speed(self._plan) if self._bounded else None
         if touch is not None and fastest * tip_rate > touch:
@@ -295,7 +298,9 @@ def _probe_places(plan: Plan, start: Floats, way: Floats, turn: Floats) -> Itera
         try:
             q = inverse_near(arm.model, pose, guard.T_flange_tip, q, max_move_rad=MAX_MOVE_RAD)
         except PlanError as error:
-            gone = f"{1e3 * place * np.linalg.norm(way):.1f} mm and {math.degrees(place * np.linalg.norm(turn)):.1f} deg"
+            gone = (
+                f"{1e3 * place * np.linalg.norm(way):.1f} mm and {math.degrees(place * np.linalg.norm(turn)):.1f} deg"
+            )
             raise UsageError(f"the arm cannot go there, after {gone} of the way: {error}; move its joints") from error
         yield q
 
