@@ -13,7 +13,6 @@ import json
 import os
 import select
 import sys
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +32,8 @@ examples:
   canprobe console cell.toml --bus socketcan --channel can0
   canprobe console cell.toml --plain --bus socketcan --channel can0
 """
+PATIENCE_S = 2.0
+"""Longest time without a reader at the end, s."""
 _MOST_WAITING = 100_000
 """Bytes that wait for a reader; what comes then is left out."""
 _WRITTEN = 2048
@@ -70,10 +71,14 @@ def run(args: argparse.Namespace) -> int:
     say = output.show if args.json else args.report.say
     cell = api.open_cell(scene, say=say, rows_kept=ROWS, to_home=homes, observers=[observe])
     session = HandSession(cell, output.show, Path(args.cell or args.scene))
-    session.take = Words(session, partial(typed, sys.stdin.fileno()), output.show).take
+
+    def lines() -> tuple[bytes, bool]:
+        return (b"", False) if output.gone else typed(sys.stdin.fileno())
+
+    session.take = Words(session, lines, output.show).take
     with left_by_ctrl_c(), cell:
         session.run()
-    output.flush()
+    output.flush(PATIENCE_S)
     return 0
 
 
@@ -83,10 +88,14 @@ class WaitingOutput:
     Args:
         descriptor: file descriptor of a terminal, file or pipe.
         as_json: each line is a JSON document, and states are written, too.
+
+    Attributes:
+        gone: whether nobody reads it any more.
     """
 
     def __init__(self, descriptor: int, *, as_json: bool) -> None:
         self._descriptor, self._as_json, self._waiting = descriptor, as_json, b""
+        self.gone = False
 
     def show(self, what: str | dict[str, Any]) -> None:
         """Write a text or a state; states are left out where something waits."""
@@ -96,11 +105,10 @@ class WaitingOutput:
             self._waiting += what.encode() + b"\n"
         self.flush()
 
-    def flush(self) -> None:
-        """Write as much as the reader takes."""
-        while self._waiting and select.select([], [self._descriptor], [], 0)[1]:
+    def flush(self, patience_s: float = 0.0) -> None:
+        """Write as much as the reader takes, without waiting for it any longer than that."""
+        while self._waiting and not self.gone and select.select([], [self._descriptor], [], patience_s)[1]:
             try:
-                written = os.write(self._descriptor, self._waiting[:_WRITTEN])
-            except OSError as error:
-                raise BrokenPipeError("the terminal is gone") from error
-            self._waiting = self._waiting[written:]
+                self._waiting = self._waiting[os.write(self._descriptor, self._waiting[:_WRITTEN]) :]
+            except OSError:
+                self.gone = True
