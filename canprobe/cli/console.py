@@ -51,8 +51,8 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the screen, whose cell is a process of its own; or take lines from stdin."""
-    on_terminal = sys.stdin.isatty() and sys.stdout.isatty() and not (args.plain or args.json)
-    if on_terminal and importlib.util.find_spec("textual") is not None:
+    on_terminal = all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr))
+    if on_terminal and not (args.plain or args.json) and importlib.util.find_spec("textual") is not None:
         from canprobe.cli.console_screen import run_screen
 
         return run_screen(args.arguments)

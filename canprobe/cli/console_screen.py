@@ -53,8 +53,19 @@ KEYS = (
 """Keys, what they do, and how the screen names it; besides, 1 to 9, x, y, z and X, Y, Z choose what is jogged."""
 DIM_COUNTS = 32
 """Counts of a taxel that are shown at full brightness where none has more."""
+CHANGES = 4
+"""Changes of nodes and drives that are shown."""
 BAR = 12
 """Width of the bar of a joint's range, characters."""
+
+
+class CommandLine(Input):
+    """The command line; while something moves, a space is a stop there, too."""
+
+    moves = False
+
+    def check_consume_key(self, key: str, character: str | None) -> bool:
+        return super().check_consume_key(key, character) and not (key == "space" and self.moves)
 
 
 class ConsoleScreen(App[int]):
@@ -62,6 +73,9 @@ class ConsoleScreen(App[int]):
 
     Args:
         cell: process of the cell, with pipes at stdin and stdout.
+
+    Attributes:
+        state: the state of the cell that was printed last.
     """
 
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -72,7 +86,8 @@ class ConsoleScreen(App[int]):
     ]
     CSS = """
     Horizontal, #left { height: auto; }
-    #array { width: 48; }
+    #left { width: 1fr; }
+    #array { width: auto; height: auto; }
     #events { height: 1fr; border-top: solid $primary; }
     Input { dock: bottom; height: 1; border: none; margin-bottom: 1; }
     """
@@ -82,7 +97,7 @@ class ConsoleScreen(App[int]):
     def __init__(self, cell: subprocess.Popen[bytes]) -> None:
         super().__init__()
         self._cell, self._text, self._open = cell, b"", True
-        self._state: dict[str, Any] = {
+        self.state: dict[str, Any] = {
             "state": "starts",
             "joints": (),
             "step": 1.0,
@@ -101,11 +116,12 @@ class ConsoleScreen(App[int]):
             with Vertical(id="left"):
                 yield Static(id="joints")
                 yield Static(id="nodes")
+                yield Static(id="changes")
             yield Static(id="array")
         log = RichLog(id="events", wrap=True, max_lines=500)
         log.can_focus = False
         yield log
-        yield Input(placeholder=": or a key; `help` lists the commands")
+        yield CommandLine(placeholder=": or a key; `help` lists the commands", select_on_focus=False)
         yield Footer()
 
     def on_mount(self) -> None:
@@ -128,7 +144,7 @@ class ConsoleScreen(App[int]):
             self._show(states[-1])
         if not self._open:
             self.exit(self._cell.wait())
-        elif self._state["state"] in ("holds", "moves") and self._driver is not None:
+        elif self.state["state"] in ("holds", "moves") and self._driver is not None:
             self._driver.write("\x1b[6n")
             self._driver.flush()
 
@@ -138,10 +154,6 @@ class ConsoleScreen(App[int]):
 
     # keys
 
-    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """A space is one in the command line, unless something moves."""
-        return action != "stop" or not isinstance(self.focused, Input) or self._state["state"] == "moves"
-
     def on_key(self, event: events.Key) -> None:
         if isinstance(self.focused, Input):
             if event.key in ("up", "down") and self._history:
@@ -150,7 +162,7 @@ class ConsoleScreen(App[int]):
                 self.focused.value, self.focused.cursor_position = line, len(line)
         elif event.character in AXES:
             self._chosen = AXES[event.character]
-        elif event.character is not None and event.character in "123456789"[: len(self._state["joints"])]:
+        elif event.character is not None and event.character in "123456789"[: len(self.state["joints"])]:
             self._chosen = event.character
 
     def action_send(self, line: str) -> None:
@@ -170,31 +182,31 @@ class ConsoleScreen(App[int]):
         self.action_send(f"jog {self._chosen} {sign}")
 
     def action_choose(self, by: int) -> None:
-        count = len(self._state["joints"]) or 1
+        count = len(self.state["joints"]) or 1
         number = int(self._chosen) if self._chosen.isdecimal() else 1
         self._chosen = str((number - 1 + by) % count + 1)
 
     def action_step(self) -> None:
-        place = STEPS.index(f"{self._state['step']:g}") + 1
-        self._state["step"] = float(STEPS[place % len(STEPS)])  # as the next state will say
-        self.action_send(f"step {self._state['step']:g}")
+        place = STEPS.index(f"{self.state['step']:g}") + 1
+        self.state["step"] = float(STEPS[place % len(STEPS)])  # as the next state will say
+        self.action_send(f"step {self.state['step']:g}")
 
     def action_speed(self, factor: float) -> None:
-        self._state["speed_percent"] = min(max(self._state["speed_percent"] * factor, 0.5), 100.0)
-        self.action_send(f"speed {self._state['speed_percent']:g}%")
+        self.state["speed_percent"] = min(max(self.state["speed_percent"] * factor, 0.5), 100.0)
+        self.action_send(f"speed {self.state['speed_percent']:g}%")
 
     def action_frame(self) -> None:
-        self._state["frame"] = "base" if self._state["frame"] == "probe" else "probe"
-        self.action_send(f"frame {self._state['frame']}")
+        self.state["frame"] = "base" if self.state["frame"] == "probe" else "probe"
+        self.action_send(f"frame {self.state['frame']}")
 
     def action_home(self) -> None:
         self.action_send(f"home {self._chosen}")
 
     def action_begin(self, text: str) -> None:
         """Begin a line in the command line."""
-        line = self.query_one(Input)
+        line = self.query_one(CommandLine)
         line.value, line.cursor_position, self._recalled = text, len(text), 0
-        line.focus()
+        self.set_focus(line)
 
     def action_leave(self) -> None:
         self.set_focus(None)
@@ -209,7 +221,8 @@ class ConsoleScreen(App[int]):
     # panels
 
     def _show(self, state: dict[str, Any]) -> None:
-        self._state = state
+        self.state = state
+        self.query_one(CommandLine).moves = state["state"] == "moves"
         if state["asks"] != self._asked:
             self._asked = state["asks"]
             if self._asked is not None:
@@ -227,6 +240,7 @@ class ConsoleScreen(App[int]):
         self.query_one("#status", Static).update(head)
         self.query_one("#joints", Static).update(self._joints(state["joints"]))
         self.query_one("#nodes", Static).update(_nodes(state))
+        self.query_one("#changes", Static).update(Text("\n".join(state["events"][-CHANGES:]), "dim"))
         self.query_one("#array", Static).update(_array(state))
 
     def _joints(self, joints: Sequence[dict[str, Any]]) -> Table:
@@ -261,7 +275,7 @@ def _array(state: dict[str, Any]) -> Text:
         return Text("no array" if taxels is None else "no image")
     sigma = "" if touch["force_sigma_n"] is None else f" ± {touch['force_sigma_n']:.3f}"
     place = "no contact" if touch["u_mm"] is None else f"u {touch['u_mm']:+.1f}, v {touch['v_mm']:+.1f} mm"
-    picture = Text(f"{touch['force_n']:.3f}{sigma} N, {place}, age {touch['age_cycles']}\n")
+    picture = Text(f"{touch['force_n']:.3f}{sigma} N, {place}\n{touch['age_cycles']} cycles old\n")
     brightest = max(DIM_COUNTS, *(taxel for row in taxels for taxel in row))
     for row in taxels:
         for taxel in row:

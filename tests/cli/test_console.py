@@ -1,5 +1,6 @@
 """`canprobe console`: lines that move the arm, and what ends a motion; the screen's keys as lines."""
 
+import asyncio
 import json
 import os
 import pty
@@ -14,6 +15,7 @@ import pytest
 import canprobe
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.tasks.guided_arm import LIFETIME_S
+from canprobe.cli import stdin
 from canprobe.cli.console_words import Words
 from canprobe.cli.hand_session import HandSession
 from canprobe.errors import UsageError
@@ -325,3 +327,86 @@ def test_what_cannot_be_is_one_clear_line():
     assert (q == q[0]).all(), "nothing has moved"
     with pytest.raises(UsageError, match="listen has no arm; `canprobe listen` shows an array"):
         Typist("listen")
+
+
+class Cell:
+    """The cell behind a screen: what the screen writes can be read, and it shows what is said."""
+
+    def __init__(self):
+        ends = [os.pipe(), os.pipe()]
+        self.stdout, self._says = (os.fdopen(end, mode, 0) for end, mode in zip(ends[0], ("rb", "wb"), strict=True))
+        self._typed, self.stdin = (os.fdopen(end, mode, 0) for end, mode in zip(ends[1], ("rb", "wb"), strict=True))
+
+    def says(self, document):
+        self._says.write(json.dumps(document).encode() + b"\n")
+
+    def typed(self):
+        return stdin.typed(self._typed.fileno())[0].decode().splitlines()
+
+    def wait(self):
+        return 7
+
+    def end(self):
+        self._says.close()
+
+    def close(self):
+        for stream in (self.stdout, self.stdin, self._typed, self._says):
+            stream.close()
+
+
+def test_keys_of_the_screen_are_lines():
+    from textual import events
+
+    from canprobe.cli.console_screen import ConsoleScreen
+
+    typist, cell = Typist(), Cell()
+    typist.run(typist.enabled())
+    state, screen = typist.states[-1] | {"asks": None}, ConsoleScreen(cell)
+
+    async def use():
+        async with screen.run_test(size=(120, 40)) as pilot:
+
+            async def shown(**changes):
+                cell.says(state | changes)
+                while any(screen.state.get(key) != value for key, value in changes.items()):
+                    await pilot.pause()
+
+            async def typed(keys, count=1):
+                await pilot.press(*keys.split())
+                lines = []
+                while len(lines) < count:
+                    await pilot.pause()
+                    lines += cell.typed()
+                return lines
+
+            await shown(state="holds")
+            for keys, lines in (
+                ("right", ["jog 1 +"]),
+                ("3 left minus", ["jog 3 -", "jog 3 -"]),
+                ("down plus up up right", ["jog 4 +", "jog 2 +"]),
+                ("z right Z left", ["jog z +", "jog rz -"]),
+                ("s s", ["step 10", "step 0.1"]),
+                ("comma full_stop", ["speed 5%", "speed 10%"]),
+                ("f f", ["frame probe", "frame base"]),
+                ("2 h T e d r enter", ["home 2", "tare", "enable", "disable", "reset", ""]),
+                ("m a enter", ["move a"]),
+                ("t space b enter", ["teach  b"]),
+                ("colon s t e p space 1 enter", ["step 1"]),
+                ("colon up up enter", ["teach  b"]),
+                ("colon escape space", ["stop"]),
+            ):
+                assert await typed(keys, len(lines)) == lines, keys
+            screen.post_message(events.CursorPosition(1, 1))
+            assert await typed("") == ["renew"], "the answer of the terminal, and nothing else, renews a motion"
+            await shown(asks="move?")
+            assert screen.focused is not None, "an answer is typed"
+            assert await typed("y space enter") == ["y "]
+            await shown(state="moves", asks="again?")
+            assert await typed("space") == ["stop"], "a space stops what moves, wherever the cursor is"
+            cell.end()
+            while screen.return_value is None:
+                await pilot.pause()
+
+    asyncio.run(use())
+    assert screen.return_value == 7
+    cell.close()
