@@ -235,6 +235,50 @@ def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault
     assert not powered(typist.cell)
 
 
+@pytest.mark.parametrize(
+    ("jog", "keys", "said"),
+    [
+        ("jog z -", {"keep_out.floor_mm": 270.0}, "the floor is at 270 mm"),
+        ("jog z -", {"limits.workspace_min_mm": [-999, -999, 350]}, "workspace ends at 350.0 mm"),
+        ("jog 3 +", {"joints.joint_3.start_deg": 53.0}, "joint 3 is at its limit"),
+    ],
+    ids=["floor", "workspace", "range"],
+)
+def test_a_jog_ends_softly_before_a_limit(jog, keys, said):
+    keys = keys | ({"limits.workspace_max_mm": [999, 999, 999]} if "limits.workspace_min_mm" in keys else {})
+    typist = Typist("free", **keys)
+
+    def script():
+        yield from typist.enabled()
+        yield from typist.wait(1.5, every=0.04, line=jog)
+        yield from typist.wait(0.2)
+        assert typist.states[-1]["state"] == "holds" and typist.heard(said)
+        yield "quit"
+
+    _, q = typist.run(script())
+    q = q[np.isfinite(q).all(axis=1)]
+    assert np.abs(q[-1] - q[0]).max() > np.radians(1.0), "it went there"
+    assert np.abs(np.diff(q, n=2, axis=0)).max() * 400**2 < 1.05 * typist.cell.plan.setup.arm.model.qdd_max.max()
+
+
+def test_an_arm_beyond_a_limit_is_jogged_back_only():
+    typist = Typist("free", **{"joints.joint_3.start_deg": 50.0})
+    q_max = typist.cell.plan.setup.arm.model.q_max
+    q_max.setflags(write=True)
+    q_max[2] = np.radians(49.0)  # a stop that was set while the arm stood beyond it
+
+    def script():
+        yield from typist.enabled()
+        yield from typist.wait(0.3, every=0.04, line="jog 3 +")
+        assert typist.heard("joint 3 is at its limit") and typist.q()[2] < 50.02
+        yield "jog 3 -"
+        yield from typist.wait(0.5, every=0.04)
+        assert typist.q()[2] == pytest.approx(49.0, abs=0.02)
+        yield "quit"
+
+    typist.run(script())
+
+
 def test_postures_a_tare_and_a_quick_stop(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(packaged_files("cells")["puma260"].read_text())

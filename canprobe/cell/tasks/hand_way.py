@@ -32,6 +32,8 @@ GUIDED_JERK_S = 0.01
 """The same in a guided motion, s, which has to stop soon."""
 GUIDED_STOP_S = 0.06
 """Longest time in which a guided motion brakes, s: no faster than it can."""
+JOG_GROWTH = 4.0
+"""How many times quicker a joint may become in a jog of the probe: beyond it is near a singular pose."""
 USUAL_SPEED = 0.1
 """Share of the speed limits that a motion by hand has where nothing else is asked for."""
 STEP_RAD, STEP_M = math.radians(0.5), 1e-3
@@ -56,6 +58,7 @@ class HandWay:
         most: highest speed, places/s.
         bounded: it is so slow that it can stop at what it touches, see `touch_speed`.
         guided: it is so slow, and its jerk so high, that it brakes within `GUIDED_STOP_S`.
+        growth: how many times quicker a joint may become than at the start of a guided motion, which is slower for it.
 
     Attributes:
         q, tip: joint positions (n,), rad or m, and the probe's tip (3,) in base, m, at each place that was looked at.
@@ -75,6 +78,7 @@ class HandWay:
         most: float = math.inf,
         bounded: bool = False,
         guided: bool = False,
+        growth: float = 1.0,
     ) -> None:
         arm = plan.setup.arm
         assert arm is not None
@@ -82,6 +86,7 @@ class HandWay:
         self._low, self._high = np.minimum(self._guard.low, start), np.maximum(self._guard.high, start)
         self._highest = speed * plan.setup.limits.speed_share * arm.model.qd_max
         self._places, self._most, self._bounded, self._guided = places, most, bounded, guided
+        self._growth = growth if guided else 1.0
         self.length = length
         self.q, self.tip = [start], [self._guard.T_base_tip(start)[:3, 3]]
         self.refused: str | None = None
@@ -99,7 +104,11 @@ class HandWay:
                 self.refused = str(error)
                 break
             self.refused = self._forbidden(q)
-            if self._begun and (np.abs(q - self.q[-1]) * self.speed > self._highest * (1.0 + 1e-6)).any():
+            rates, most = np.abs(q - self.q[-1]), 1.0 + 1e-6
+            quick = (rates * self.speed > most * self._highest) | (
+                rates * self.acceleration > most * self._model.qdd_max
+            )
+            if self._begun and quick.any():
                 self.refused = "the arm comes near a singular pose, where a joint would be too quick; move its joints"
             if self.refused is None:
                 self.q.append(q)
@@ -167,7 +176,7 @@ class HandWay:
             return
         model, self.slowed_by = self._model, None
         fastest = min(self._most, float((self._highest[moves] / rates[moves]).min()))
-        acceleration = float((model.qdd_max[moves] / rates[moves]).min())
+        acceleration = float((model.qdd_max[moves] / rates[moves]).min()) / self._growth
         stopping = acceleration * (GUIDED_STOP_S - GUIDED_JERK_S)
         if self._guided and fastest > stopping * (1.0 + 1e-6):
             fastest, self.slowed_by = stopping, "no faster, as it has to stop at once where nobody renews it"
@@ -274,7 +283,9 @@ def jog_way(
         direction = guard.T_base_tip(start)[:3, :3] @ direction
     still = np.zeros(3)
     places = _probe_places(plan, start, *((direction, still) if about is None else (still, direction)))
-    return HandWay(plan, start, places, number, speed, most=speed * most / step, bounded=True, guided=guided)
+    return HandWay(
+        plan, start, places, number, speed, most=speed * most / step, bounded=True, guided=guided, growth=JOG_GROWTH
+    )
 
 
 def _probe_places(plan: Plan, start: Floats, way: Floats, turn: Floats) -> Iterator[Floats]:
