@@ -236,21 +236,21 @@ def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault
 
 
 @pytest.mark.parametrize(
-    ("jog", "keys", "said"),
+    ("scene", "jog", "keys", "said"),
     [
-        ("jog z -", {"keep_out.floor_mm": 270.0}, "the floor is at 270 mm"),
-        ("jog z -", {"limits.workspace_min_mm": [-999, -999, 350]}, "workspace ends at 350.0 mm"),
-        ("jog 3 +", {"joints.joint_3.start_deg": 53.0}, "joint 3 is at its limit"),
+        ("puma260", "jog z -", {"keep_out.boxes_mm": [[[-250, -250, 0], [-60, -60, 345]]]}, "from box 1 of keep_out"),
+        ("free", "jog z -", {"limits.workspace_min_mm": [-999, -999, 350]}, "workspace ends at 350.0 mm"),
+        ("free", "jog 3 +", {"joints.joint_3.start_deg": 53.0}, "joint 3 is at its limit"),
     ],
-    ids=["floor", "workspace", "range"],
+    ids=["keep out", "workspace", "range"],
 )
-def test_a_jog_ends_softly_before_a_limit(jog, keys, said):
+def test_a_jog_ends_softly_before_a_limit(scene, jog, keys, said):
     keys = keys | ({"limits.workspace_max_mm": [999, 999, 999]} if "limits.workspace_min_mm" in keys else {})
-    typist = Typist("free", **keys)
+    typist = Typist(scene, **keys)
 
     def script():
         yield from typist.enabled()
-        yield from typist.wait(1.5, every=0.04, line=jog)
+        yield from typist.wait(2.0, every=0.04, line=jog)
         yield from typist.wait(0.2)
         assert typist.states[-1]["state"] == "holds" and typist.heard(said)
         yield "quit"
