@@ -41,7 +41,7 @@ class Typist:
         with self.cell:
             self.session.run()
         log = self.cell.session.cell.log.arrays()
-        return log["t_s"], log["q_target_rad"]
+        return log["t_s"], log.get("q_target_rad")
 
     def _show(self, what):
         (self.said if isinstance(what, str) else self.states).append(what)
@@ -454,3 +454,22 @@ def test_keys_of_the_screen_are_lines():
     asyncio.run(use())
     assert screen.return_value == 7
     cell.close()
+
+
+@pytest.mark.parametrize("renewed", [True, False])
+def test_homing_goes_on_while_it_is_renewed(renewed):
+    joint = {"joints.joint_3.zero": "homing", "joints.joint_3.homing_method": 33, "joints.joint_3.home_deg": 15.0}
+    typist = Typist(**joint)
+
+    def script():
+        yield "home 1"
+        yield "home 3"
+        assert typist.heard('joint 1 of puma260 has zero = "homing"') and typist.heard("home it by method 33")
+        yield "yes"
+        while not typist.heard("is homed") and not typist.heard("stopped: "):
+            yield "renew" if renewed else None
+        yield "quit"
+
+    typist.run(script())
+    assert typist.heard("joint 3 is homed" if renewed else "stopped: homing was not renewed for 150 ms")
+    assert not powered(typist.cell)
