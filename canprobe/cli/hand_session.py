@@ -28,7 +28,7 @@ from canprobe.cli.listen import array_line
 from canprobe.cli.move import described, positions_of, standing
 from canprobe.cli.posture_file import save_posture
 from canprobe.cli.stdin import LOOK_S
-from canprobe.errors import NodeError, SafetyStop, UsageError
+from canprobe.errors import NodeError, ResultsError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import nothing
 
@@ -72,12 +72,8 @@ class HandSession:
         self.ended = False
         self._cell, self._plan, self._model, self._show, self._cell_file = cell, cell.plan, arm.model, show, cell_file
         self._taught: dict[str, Any] = {}
-        self._paced, self._clock, self._behind_ns, self._shown_ns = (
-            paced and cell.session.virtual,
-            MonotonicClock(),
-            0,
-            0,
-        )
+        self._paced, self._clock = paced and cell.session.virtual, MonotonicClock()
+        self._behind_ns = self._shown_ns = 0
         self._arm = GuidedArm(cell.plan, self._attend)
         self._allowed = self._enables = self._enabled = self._moved = False
         self._stopped: str | None = None
@@ -112,7 +108,7 @@ class HandSession:
             action()
         except (SafetyStop, NodeError) as error:
             self._stop_for(error)
-        except (UsageError, argparse.ArgumentTypeError) as error:
+        except (UsageError, ResultsError, argparse.ArgumentTypeError) as error:
             self._show(str(error))
 
     # enabled and disabled

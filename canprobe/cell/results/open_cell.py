@@ -261,7 +261,7 @@ class OpenCell:
         length = float(checked("jog: velocity", velocity, ())) * float(checked("jog: for_s", for_s, ()))
         if velocity == 0.0 or for_s <= 0.0:
             raise UsageError(f"jog: expected a velocity and a time above 0, got {velocity:g} for {for_s:g} s")
-        start = self._stands()  # of a cell with an arm
+        start = self._stands()  # refuses a cell without an arm
         speed = min(1.0, abs(velocity) / jog_speed(self.plan, joint, about=about is not None))
         way = jog_way(
             self.plan,
