@@ -1,9 +1,9 @@
 """The screen of `canprobe console`, with Textual (extra `console`): a process beside that of the cell.
 
 The cell runs as `canprobe console … --json`: the screen sends it the lines that somebody could type, and shows the
-states that it prints. While the drives are enabled, the screen asks the terminal for its cursor 50 times a second, and
-each answer renews the motion: so it ends with the screen, the terminal, or the connection between them. A jog by a key
-that is held is renewed by the repeats of that key alone.
+states that it prints. 50 times a second it asks the terminal for its cursor, and each answer renews a motion: so that
+ends with the screen, the terminal, or the connection between them. A jog by a key that is held is renewed by the
+repeats of that key alone.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class ConsoleScreen(App[int]):
     """
 
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("space", "stop", "STOP", priority=True),
+        Binding("space", "send('stop')", "STOP", priority=True),
         Binding("ctrl+c", "send('quit')", "quit", priority=True, show=False),
         *(Binding(key, action, words) for key, action, words in KEYS),
         Binding("escape", "leave", "leave the line", show=False),
@@ -144,7 +144,7 @@ class ConsoleScreen(App[int]):
             self._show(states[-1])
         if not self._open:
             self.exit(self._cell.wait())
-        elif self.state["state"] in ("holds", "moves") and self._driver is not None:
+        elif self._driver is not None:
             self._driver.write("\x1b[6n")
             self._driver.flush()
 
@@ -174,9 +174,6 @@ class ConsoleScreen(App[int]):
                 self._cell.stdin.flush()
             except BrokenPipeError:  # it has ended, which its stdout says too
                 self._open = False
-
-    def action_stop(self) -> None:
-        self.action_send("stop")
 
     def action_jog(self, sign: str) -> None:
         self.action_send(f"jog {self._chosen} {sign}")

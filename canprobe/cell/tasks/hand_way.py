@@ -103,13 +103,7 @@ class HandWay:
             except UsageError as error:
                 self.refused = str(error)
                 break
-            self.refused = self._forbidden(q)
-            rates, most = np.abs(q - self.q[-1]), 1.0 + 1e-6
-            quick = (rates * self.speed > most * self._highest) | (
-                rates * self.acceleration > most * self._model.qdd_max
-            )
-            if self._begun and quick.any():
-                self.refused = "the arm comes near a singular pose, where a joint would be too quick; move its joints"
+            self.refused = self._forbidden(q) or self._too_quick(q)
             if self.refused is None:
                 self.q.append(q)
                 self.tip.append(self._guard.T_base_tip(q)[:3, 3])
@@ -124,10 +118,9 @@ class HandWay:
         """
         why = self.look(self.length)
         if why is not None:
-            share = len(self.q) / self.length
-            raise UsageError(
-                f"{why}, {self._time_at(len(self.q)):.2f} s after the start, {100 * share:.0f} % of the way"
-            )
+            place = len(self.q)
+            percent = 100.0 * place / self.length
+            raise UsageError(f"{why}, {self._time_at(place):.2f} s after the start, {percent:.0f} % of the way")
         return self
 
     @property
@@ -167,6 +160,14 @@ class HandWay:
         if (why := guard.outside(q)) is None and keep_out is not None:
             why = keep_out.touched(self._model.chain, q)
         return why
+
+    def _too_quick(self, q: Floats) -> str | None:
+        """Why a place may not be gone in a motion whose speed and acceleration are set."""
+        rates, most = np.abs(q - self.q[-1]), 1.0 + 1e-6
+        quick = (rates * self.speed > most * self._highest) | (rates * self.acceleration > most * self._model.qdd_max)
+        if not (self._begun and quick.any()):
+            return None
+        return "the arm comes near a singular pose, where a joint would be too quick; move its joints"
 
     def _limit(self) -> None:
         """Set the limits of the motion by the places that were looked at."""
@@ -309,9 +310,7 @@ def _probe_places(plan: Plan, start: Floats, way: Floats, turn: Floats) -> Itera
         try:
             q = inverse_near(arm.model, pose, guard.T_flange_tip, q, max_move_rad=MAX_MOVE_RAD)
         except PlanError as error:
-            gone = (
-                f"{1e3 * place * np.linalg.norm(way):.1f} mm and {math.degrees(place * np.linalg.norm(turn)):.1f} deg"
-            )
+            gone = f"{1e3 * np.linalg.norm(place * way):.1f} mm and {np.degrees(np.linalg.norm(place * turn)):.1f} deg"
             raise UsageError(f"the arm cannot go there, after {gone} of the way: {error}; move its joints") from error
         yield q
 
