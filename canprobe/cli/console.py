@@ -51,12 +51,12 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the screen, whose cell is a process of its own; or take lines from stdin."""
+    scene = scene_of(args)
     on_terminal = all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr))
     if on_terminal and not (args.plain or args.json) and importlib.util.find_spec("textual") is not None:
         from canprobe.cli.console_screen import run_screen
 
         return run_screen(args.arguments)
-    scene = scene_of(args)
 
     from canprobe import api
     from canprobe.cli.console_words import Words

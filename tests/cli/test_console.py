@@ -241,8 +241,9 @@ def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault
         ("puma260", "jog z -", {"keep_out.boxes_mm": [[[-250, -250, 0], [-60, -60, 345]]]}, "from box 1 of keep_out"),
         ("free", "jog z -", {"limits.workspace_min_mm": [-999, -999, 350]}, "workspace ends at 350.0 mm"),
         ("free", "jog 3 +", {"joints.joint_3.start_deg": 53.0}, "joint 3 is at its limit"),
+        ("free", "jog z +", {"joints.joint_3.start_deg": -75.0}, "the arm cannot go there, after"),
     ],
-    ids=["keep out", "workspace", "range"],
+    ids=["keep out", "workspace", "range", "reach"],
 )
 def test_a_jog_ends_softly_before_a_limit(scene, jog, keys, said):
     keys = keys | ({"limits.workspace_max_mm": [999, 999, 999]} if "limits.workspace_min_mm" in keys else {})
