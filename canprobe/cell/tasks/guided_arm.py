@@ -15,6 +15,8 @@ from canprobe.mechanics.types import Floats
 
 LIFETIME_S = 0.15
 """Time from the last renewal of a motion until the arm stands, s."""
+SETTLE_LAGS = 3.0
+"""Time from the last motion of the targets until the joints stand, in lags of the drives."""
 
 
 class GuidedArm(Controller):
@@ -34,7 +36,7 @@ class GuidedArm(Controller):
 
     def __init__(self, plan: Plan, attend: Callable[[Measurement], None]) -> None:
         self._plan, self._attend = plan, attend
-        self._reader, self._lag_ns = make_patch_reader(plan.setup), round(1e9 * lag_s(plan.setup))
+        self._reader, self._settle_ns = make_patch_reader(plan.setup), round(1e9 * SETTLE_LAGS * lag_s(plan.setup))
         self._now_ns = self._renewed_ns = 0
         self.target: Floats | None = None
         self.motion: HandMotion | None = None
@@ -77,5 +79,5 @@ class GuidedArm(Controller):
     def _wanted(self) -> bool:
         """Whether the motion is renewed so recently that it comes to rest in time, if it brakes in the next cycle."""
         assert self.motion is not None
-        stop_ns = round(1e9 * self.motion.stop_s) + self._lag_ns + self._plan.sync.period_ns
+        stop_ns = round(1e9 * self.motion.stop_s) + self._settle_ns + self._plan.sync.period_ns
         return not self.leaves and self._now_ns + stop_ns < self._renewed_ns + round(1e9 * LIFETIME_S)
