@@ -93,7 +93,7 @@ class HandSession:
             while not self.ended:
                 if self._enables and not self._errands:
                     self._hold()
-                while waiting := self._errands or self._writes:
+                while not self.ended and (waiting := self._errands or self._writes):
                     self.attempt(waiting.pop(0))
                 self._attend(cell.idle(LOOK_S))
                 if session.observers is not None:
@@ -166,6 +166,7 @@ class HandSession:
         self._stopped = str(error)
         self._allowed = self._enables = False
         self.asked = self._paused_at = self._looks_at = None
+        self._errands.clear()
         self._show(f"stopped: {error}")
         self._show("look at the arm; `reset` asks whether it may move again")
 
@@ -357,7 +358,10 @@ class HandSession:
         assert homing is not None
         self._arm.stop_reason, homing.link.attend = None, self._attend_homing
         self.renew()
-        self._cell.home([joint])
+        try:
+            self._cell.home([joint])
+        finally:
+            homing.link.attend = nothing
         self._show(f"joint {joint} is homed")
 
     def _attend_homing(self) -> None:

@@ -224,8 +224,11 @@ def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault
         yield "jog 1 +"
         yield from typist.wait(0.1, every=0.02)
         faulty.inject(f"node 2: {fault}", typist.cell.session.buses.lockstep.clock.now_ns())
+        yield "tare"
+        yield "yes"  # it does not come to that
         yield from typist.wait(0.5, every=0.02)
         assert typist.states[-1]["state"] == "stopped" and typist.heard("stopped: node 2")
+        assert not typist.heard("tared")
         yield "reset"
         yield from typist.wait(0.2)
         assert typist.states[-1]["state"] == "stopped" and "may the arm move again?" in typist.states[-1]["asks"]
