@@ -190,6 +190,8 @@ EXTRA_OF = {
     "pandas": "data",
     "xarray": "data",
     "pyarrow": "data",
+    "textual": "console",
+    "rich": "console",
 }
 """Extra that installs a package, by the package's import name."""
 

@@ -96,6 +96,7 @@ EXTRAS = {
     "lab/bridge/view/stage.py": {"viser"},
     "lab/bridge/view/links.py": {"trimesh"},
     "cli/completion.py": {"argcomplete"},
+    "cli/console_screen.py": {"textual", "rich"},
     "cell/results/picture.py": {"matplotlib"},
     "mechanics/robot/dynamics.py": {"mujoco"},
     "cell/scene/surface_files.py": {"trimesh"},

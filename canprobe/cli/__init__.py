@@ -39,6 +39,7 @@ COMMANDS = (
     "check",
     "run",
     "up",
+    "console",
     "move",
     "home",
     "tare",
@@ -104,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     report, args = StepReport(), argparse.Namespace()
     try:
         args = parser_of(arguments).parse_args(arguments or ["--help"])
-        args.report, report.verbosity = report, getattr(args, "verbosity", 0)
+        args.arguments, args.report, report.verbosity = arguments, report, getattr(args, "verbosity", 0)
         report.words = partial(with_scene, args=args)
         with termination_interrupts():
             status = int(args.run(args))

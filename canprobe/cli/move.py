@@ -20,6 +20,8 @@ from canprobe.errors import UsageError
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from canprobe.cell.master.controller import Measurement
+    from canprobe.cell.planning.model import Plan
     from canprobe.cell.results.open_cell import OpenCell
     from canprobe.cell.tasks.hand_way import HandWay
 
@@ -78,14 +80,14 @@ def run(args: argparse.Namespace) -> int:
     stdin = InputOpen()
     with opened(args) as cell:
         found = cell.way_to(_goal(args, cell), args.speed)
-        print(described(cell, found, args.speed))
+        print(described(cell.plan, found, args.speed))
         if args.dry_run or not agreed(args, cell, "move?"):
             args.report.say("nothing was moved")
             return 0
         if not stdin.watched:
             args.report.say("Ctrl-C brakes the motion")
         ended = cell.move(found, wanted=stdin)
-        print(f"the arm stands at {standing(cell)}")
+        print(f"the arm stands at {standing(cell.plan, cell.read())}")
     if ended is not None:
         args.report.say("warning: stdin has ended, and the motion was braked")
     return 0
@@ -108,20 +110,32 @@ def _goal(args: argparse.Namespace, cell: OpenCell) -> str | npt.ArrayLike:
         q = q.copy()
         q[args.joint - 1] += number / its.shown(1.0)
         return q
+    return positions_of(cell.plan, args.to)
+
+
+def positions_of(plan: Plan, text: str) -> str | list[float]:
+    """Joint positions, rad or m, of a text with commas; another text is the name of a posture.
+
+    Raises:
+        UsageError: they are not as many as the joints.
+    """
+    arm = plan.setup.arm
+    assert arm is not None
+    joints = arm.model.joints
     try:
-        numbers = [float(part) for part in args.to.split(",")]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        return str(args.to)
+        return text
     if len(numbers) != len(joints):
-        raise UsageError(f"move: expected positions of {len(joints)} joints, got {len(numbers)}: {args.to}")
+        raise UsageError(f"move: expected positions of {len(joints)} joints, got {len(numbers)}: {text}")
     return [number / joint.shown(1.0) for number, joint in zip(numbers, joints, strict=True)]
 
 
-def described(cell: OpenCell, found: HandWay, speed: float) -> str:
+def described(plan: Plan, found: HandWay, speed: float) -> str:
     """The way in words: what each joint does, and how long it takes."""
-    arm = cell.plan.setup.arm
+    arm = plan.setup.arm
     assert arm is not None
-    start, end = found.q[0], found.q[-1]
+    start, end, duration_s = found.q[0], found.q[-1], found.profile().duration_s
     lines = [
         f"  joint {i + 1}: {its.shown(start[i]):.2f} to {its.text(end[i], '.2f')} ({its.shown(end[i] - start[i]):+.2f})"
         for i, its in enumerate(arm.model.joints)
@@ -129,12 +143,12 @@ def described(cell: OpenCell, found: HandWay, speed: float) -> str:
     tip = found.tip[-1]
     places = ", ".join(f"{1e3 * value:.0f}" for value in tip)
     slowed = f"; {found.slowed_by}" if found.slowed_by else ""
-    head = f"the way: {found.profile().duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
+    head = f"the way: {duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
     return "\n".join([head, *lines, f"  the probe's tip comes to {places} mm"])
 
 
-def standing(cell: OpenCell) -> str:
+def standing(plan: Plan, measurement: Measurement) -> str:
     """Where the arm stands, in deg or mm."""
-    arm, q = cell.plan.setup.arm, cell.read().q
+    arm, q = plan.setup.arm, measurement.q
     assert arm is not None and q is not None
     return ", ".join(its.text(value, ".2f") for its, value in zip(arm.model.joints, q, strict=True))

@@ -75,13 +75,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(plan: Plan) -> int:
     """Print what is wrong with each posture; status 2 where something is."""
-    from canprobe.cell.tasks.hand_way import joint_way, refuse
+    from canprobe.cell.tasks.hand_way import joint_way
 
     arm, wrong = plan.setup.arm, 0
     assert arm is not None
     for name, q in arm.postures.items():
         try:
-            refuse(plan, joint_way(plan, arm.q_start, q))
+            joint_way(plan, arm.q_start, q).whole()
             print(f"{name}: fits")
         except UsageError as error:
             wrong += 1
@@ -95,10 +95,11 @@ def _save(args: argparse.Namespace) -> int:
 
     path = Path(args.cell or args.scene)
     with opened(args) as cell:
-        arm, q = cell.plan.setup.arm, cell.read().q
+        arm, measurement = cell.plan.setup.arm, cell.read()
+        q = measurement.q
         if arm is None or q is None:
             raise UsageError(f"posture: {cell.plan.setup.name} has no arm")
-        text = standing(cell)
+        text = standing(cell.plan, measurement)
         posture = [round(its.shown(value), 4) for its, value in zip(arm.model.joints, q, strict=True)]
     save_posture(path, args.name, posture)
     print(f"{path}: {args.name} is {text}")

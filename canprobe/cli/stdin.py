@@ -33,7 +33,10 @@ def typed(descriptor: int) -> tuple[bytes, bool]:
     """What can be read from a terminal or pipe without waiting, and whether it is still open."""
     found = b""
     while select.select([descriptor], [], [], 0)[0]:
-        data = os.read(descriptor, 4096)
+        try:
+            data = os.read(descriptor, 4096)
+        except OSError:  # EIO: the terminal has been closed
+            data = b""
         if not data:
             return found, False
         found += data

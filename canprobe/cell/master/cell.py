@@ -411,6 +411,15 @@ class Cell:
 
     # the way out
 
+    def disable(self) -> None:
+        """Stop the drives, then disable them; the nodes stay up.
+
+        Raises:
+            CanprobeError: the bus fails.
+        """
+        if self._power is not None and self.cycle is not None:
+            self._power.disable()
+
     def close(self) -> None:
         """Stop safely and close the bus. Never raises; failures are faults."""
         self.stop()
@@ -425,8 +434,7 @@ class Cell:
             return
         self._stopped = True
         self._try(self.cycles.record_last)
-        if self._power is not None and self.cycle is not None:
-            self._try(self._power.disable)
+        self._try(self.disable)
         self.cycles.note_pressing()
         if isinstance(self.tactile, RawReceiver):
             self._try(partial(self.tactile.stop, self.port))

@@ -18,6 +18,7 @@ from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import CanprobeError, NodeError
+from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
 from canprobe.fieldbus.protocol.cia402 import (
@@ -47,6 +48,7 @@ class SdoLink:
 
     Attributes:
         beats: whether heartbeats are sent: nodes that have heard one expect more.
+        attend: called as `supervise`, by whoever looks after the drive.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class SdoLink:
         self.watch, self.times, self.clock = watch, times, network.port.clock
         self.beats, self._heartbeat_ns = False, 0
         self._network, self._supervise = network, supervise
+        self.attend: Callable[[], None] = nothing
 
     def hold(self, node_id: int, dialogue: Dialogue) -> Any:
         """Hold a dialogue, and return its result."""
@@ -78,6 +81,7 @@ class SdoLink:
         """
         self.pump(lambda: False, POLL_S)
         self._supervise()
+        self.attend()
 
     def pump(self, done: Callable[[], bool], timeout_s: float) -> None:
         """Wait until `done`, with a heartbeat where one is due."""

@@ -30,13 +30,14 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import home_joints
 from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.hand_motion import HandMotion
-from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, jog_way, joint_way, refuse
+from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_speed, jog_way, joint_way, share_of_speed
 from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
 from canprobe.cell.tasks.task import record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.touch import Patch
+from canprobe.mechanics.touch.linear_algebra import checked
 from canprobe.mechanics.types import Floats
 
 MOST_REPLAYED = 40
@@ -187,9 +188,7 @@ class OpenCell:
         Raises:
             UsageError: there is no such posture, or the way leads through a limit or what the arm keeps out of.
         """
-        way = joint_way(self.plan, self._stands(), to, speed)
-        refuse(self.plan, way)
-        return way
+        return joint_way(self.plan, self._stands(), goal_of(self.plan, to), share_of_speed(speed)).whole()
 
     def move(
         self,
@@ -252,18 +251,22 @@ class OpenCell:
             UsageError: not one of joint, along and about, or as `way_to`.
             SafetyStop, BusError: as `move`.
         """
+        length = float(checked("jog: velocity", velocity, ())) * float(checked("jog: for_s", for_s, ()))
+        if velocity == 0.0 or for_s <= 0.0:
+            raise UsageError(f"jog: expected a velocity and a time above 0, got {velocity:g} for {for_s:g} s")
+        start = self._stands()  # refuses a cell without an arm
+        speed = min(1.0, abs(velocity) / jog_speed(self.plan, joint, about=about is not None))
         way = jog_way(
             self.plan,
-            self._stands(),
+            start,
             joint,
             along=along,
             about=about,
-            velocity=velocity,
-            for_s=for_s,
+            length=length,
+            speed=speed,
             in_probe_frame=in_probe_frame,
         )
-        refuse(self.plan, way)
-        return self.move(way, wanted=wanted)
+        return self.move(way.whole(), wanted=wanted)
 
     def tare(self) -> None:
         """Take what the array shows for zero: nothing may touch it.

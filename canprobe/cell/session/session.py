@@ -198,6 +198,7 @@ class Session:
         """
         if self._stopped_for is not None and not self._left:
             self._stopped_for = None
+            self.cell.watch.start(self.cell.port.clock.now_ns())  # alarms from before have been looked at
             return
         if self._recovery is None or self._left:
             raise UsageError(

@@ -11,6 +11,8 @@
   commands are out, and are used from the next cycle on.
 - `free_and_listen` has the tasks without touch: hold, swing, listen. `joint_check` moves each joint alone for the first
   time, by a small and a larger way, and `joint_finding` has the results.
+- `hand_way` is a way that a person asks for, `hand_motion` goes it, and `guided_arm` lets one after the other go, each
+  as long as it is renewed.
 - `paused` holds the arm of a cell that has come back from a loss, until motion is asked for.
 - `trajectory` follows points, for own scripts and for ROS 2: `canprobe.cell.tasks.Trajectory`.
 - `task` has the results that a task leaves for the summary.

@@ -7,10 +7,11 @@ probe goes back the way that it came, which was free; joints that do not follow 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 
 import numpy as np
 
-from canprobe.cell.master.array import make_patch_reader
+from canprobe.cell.master.array import PatchReader, make_patch_reader
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.tasks.hand_way import HandWay
@@ -23,6 +24,7 @@ ELSEWHERE_RAD = 0.002
 """Distance from the way's start, rad, by which an arm has been moved since; of a sliding joint by `ArmModel.radian`."""
 ARRIVAL_S = 0.5
 """Longest time from the end of the way until the joints have arrived, s."""
+UNWANTED = "no longer asked for"
 BACK_M = 5e-3
 """Way of the probe back from what it has touched, m."""
 
@@ -34,22 +36,34 @@ class HandMotion(Controller):
         plan: plan of a cell with an arm.
         way: the way, from where the arm stands.
         renewed: asked in each cycle whether the motion is still wanted; where it is not, it brakes.
+        begin: place of the way from which it goes.
+        reader: reader of the tactile samples; None makes one.
 
     Attributes:
-        share: share of the way that is gone.
+        place: place of the way where the motion is.
+        stop_s: time in which it would come to rest now, s.
         ended_by: why the motion ended before its end; None where it did not.
     """
 
-    def __init__(self, plan: Plan, way: HandWay, renewed: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        way: HandWay,
+        renewed: Callable[[], bool] = lambda: True,
+        *,
+        begin: float = 0.0,
+        reader: PatchReader | None = None,
+    ) -> None:
         arm = plan.setup.needed_arm()
         self._model, self._way, self._renewed = arm.model, way, renewed
         self._jog_force = plan.setup.limits.jog_force
         self._count = np.abs(arm.model.q_per_unit).sum(axis=1)
-        self.reader = make_patch_reader(plan.setup)
+        self.reader = reader or make_patch_reader(plan.setup)
         self._time = MotionTime(plan.sync.period_ns)
-        self._motion = way.profile()
+        self._motion = way.profile(begin)
         self._back: MotionProfile | None = None
-        self._t = self._touched_at = self.share = 0.0
+        self._t = self._touched_at = self.stop_s = 0.0
+        self._begin = self.place = begin
         self._late_ns = 0
         self._interrupt: KeyboardInterrupt | None = None
         self.ended_by: str | None = None
@@ -71,12 +85,18 @@ class HandMotion(Controller):
     def step(self, measurement: Measurement) -> Command:
         self._t += 1e-9 * self._time.step(measurement.t_ns)
         self._feel(measurement)
-        if self.ended_by is None and not self._renewed():
-            self._end("no longer asked for")
+        if self.ended_by is None:
+            stop = copy(self._motion)
+            stop.brake(self._t)
+            self.stop_s = stop.duration_s - self._t
+            if not self._renewed():
+                self._end(UNWANTED)
+            elif (why := self._way.look(self._begin + stop.length + 1.0)) is not None:
+                self._end(why)
         motion = self._motion if self._back is None else self._back
         gone = motion.at(self._t)[0]
-        self.share = gone if self._back is None else self._touched_at - gone
-        q = self._way.at(self.share)
+        self.place = self._begin + gone if self._back is None else self._touched_at - gone
+        q = self._way.at(self.place)
         if self._t < motion.duration_s:
             return Command(q)
         self._late_ns = self._late_ns or measurement.t_ns + round(1e9 * ARRIVAL_S)
@@ -100,16 +120,11 @@ class HandMotion(Controller):
         force = self.reader.read(sample).force
         if force < max(self._jog_force, TOUCH_FORCE):
             return
-        self._touched_at = self._motion.at(self._t)[0]
+        self._touched_at = self._begin + self._motion.at(self._t)[0]
         self.ended_by = (
-            f"the array showed {force:.2f} N (limits.jog_force_n = {self._jog_force:g}) after"
-            f" {100.0 * self._touched_at:.0f} % of the way: the probe went back the way that it came"
+            f"the array showed {force:.2f} N (limits.jog_force_n = {self._jog_force:g}) after {self._t:.1f} s: the"
+            " probe went back the way that it came"
         )
         way = self._way
-        length = min(self._touched_at, self._share_of_back())
+        length = min(self._touched_at, BACK_M / max(way.tip_way(), 1e-9))
         self._back, self._t = MotionProfile(length, way.speed, way.acceleration, way.jerk), 0.0
-
-    def _share_of_back(self) -> float:
-        """Share of the way on which the probe goes `BACK_M`."""
-        steps = np.linalg.norm(np.diff(self._way.tip, axis=0), axis=1)
-        return BACK_M / max(float(steps.sum()), 1e-9)

@@ -60,7 +60,7 @@ def test_no_joint_is_faster_than_its_limits_on_any_way(name):
     for _ in range(10):
         start, goal = (low + rng.random() * (high - low) for _ in range(2))
         share = rng.choice((0.05, 0.3, 1.0))
-        way = joint_way(plan, start, goal, share)
+        way = joint_way(plan, start, goal, share).whole()
         motion = way.profile()
         t = np.linspace(0.0, motion.duration_s, 1500)
         q = np.array([way.at(motion.at(one)[0]) for one in t])

@@ -1,0 +1,79 @@
+"""An enabled arm that a person guides: it holds its place, and moves as long as somebody renews the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from canprobe.cell.master.array import make_patch_reader
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.units import lag_s
+from canprobe.cell.tasks.hand_motion import HandMotion
+from canprobe.cell.tasks.hand_way import HandWay
+from canprobe.mechanics.types import Floats
+
+LIFETIME_S = 0.15
+"""Time from the last renewal of a motion until the arm stands, s."""
+SETTLE_LAGS = 3.0
+"""Time from the last motion of the targets until the joints stand, in lags of the drives."""
+
+
+class GuidedArm(Controller):
+    """Holds the arm where it is, and lets one motion after the other go, each as long as it is renewed.
+
+    Args:
+        plan: plan of a cell with an arm.
+        attend: called in each cycle before the motion goes on, such as to take what a person asks for.
+
+    Attributes:
+        target: joint positions (n,), rad or m, that the drives have; None before they are enabled.
+        motion: the motion that goes on, or has gone last; None before the first.
+        moves: whether it goes on.
+        leaves: whether the arm is to be disabled as soon as it rests.
+        stop_reason: why it is stopped at once; None where it is not.
+    """
+
+    def __init__(self, plan: Plan, attend: Callable[[Measurement], None]) -> None:
+        self._plan, self._attend = plan, attend
+        self.reader, self._settle_ns = make_patch_reader(plan.setup), round(1e9 * SETTLE_LAGS * lag_s(plan.setup))
+        self._now_ns = self._renewed_ns = 0
+        self.target: Floats | None = None
+        self.motion: HandMotion | None = None
+        self.moves = self.leaves = False
+        self.stop_reason: str | None = None
+
+    def inspect(self, q: Floats) -> str | None:
+        self.target = q
+        return None
+
+    def go(self, way: HandWay, begin: float = 0.0) -> None:
+        """Begin a motion along a way, from a place of it on, where the arm stands."""
+        self.motion, self.moves = HandMotion(self._plan, way, self._wanted, begin=begin, reader=self.reader), True
+        self.renew()
+
+    def renew(self) -> None:
+        """Let the motion go on for another `LIFETIME_S`."""
+        self._renewed_ns = self._now_ns
+
+    def end_motion(self) -> None:
+        """Let the motion brake."""
+        self._renewed_ns = self._now_ns - round(1e9 * LIFETIME_S)
+
+    def brake(self, interrupt: KeyboardInterrupt) -> bool:
+        return self.moves and self.motion is not None and self.motion.brake(interrupt)
+
+    def step(self, measurement: Measurement) -> Command:
+        self._now_ns = measurement.t_ns
+        self._attend(measurement)
+        if self.stop_reason is not None or self.motion is None or not self.moves:
+            return Command(self.target, done=self.leaves, stop_reason=self.stop_reason)
+        command = self.motion.step(measurement)
+        self.target, self.moves = command.q_target, not command.done
+        return replace(command, done=False)
+
+    def _wanted(self) -> bool:
+        """Whether the motion is renewed so recently that it comes to rest in time, if it brakes in the next cycle."""
+        assert self.motion is not None
+        stop_ns = round(1e9 * self.motion.stop_s) + self._settle_ns + self._plan.sync.period_ns
+        return not self.leaves and self._now_ns + stop_ns < self._renewed_ns + round(1e9 * LIFETIME_S)
