@@ -68,6 +68,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
 def scene_of(folder: Path) -> Scene:
     short = {
         "task.duration_s": SECONDS,
+        "cycle.rate_hz": 200.0,
         "task.clearance_mm": 0.2,
         "task.length_mm": 8.0,
         "task.width_mm": 2.0,
