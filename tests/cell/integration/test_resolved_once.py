@@ -135,7 +135,6 @@ def test_files_that_change_and_are_removed_meanwhile_change_nothing(
             if column != "sync_late_us":
                 np.testing.assert_array_equal(values, columns[column], err_msg=f"{name}: {column}")
     assert score_lines(result) == score_lines(undisturbed)
-    assert result.plot().axes
     again = canprobe.replay(out)
     assert again.summary["online"]["K_max_difference_per_m"] == 0.0
     assert json.loads(json.dumps(again.summary["shape"])) == summary["shape"]
