@@ -30,7 +30,7 @@ def test_a_kind_trips_the_conditions_that_it_declares(names):
     rate_hz = 400.0 if names[0] in CROWDING else 200.0
     scene, node_id, at, until = ("free", 3, round(0.2 * rate_hz), round(0.275 * rate_hz))
     if kind.needs == "array":
-        scene, node_id, at, until = ("press", 16, HOLD_CYCLE, 55)
+        scene, node_id, at, until = ("press", 16, HOLD_CYCLE - 40, 55)  # as soon as the force is there
 
     def throw(run):
         for name in names:
