@@ -63,6 +63,7 @@ ALLOWED_SKIPS = (
 )
 """Why a test may be skipped, by the beginning of its reason, where everything that can be installed is installed."""
 gc.disable()  # until all tests are collected: what is made meanwhile stays
+gc.set_threshold(50_000)  # at Python's 700 a tenth of the suite's time is spent looking for garbage
 for _hook in sys.meta_path:  # the package is a plugin of pytest, too, whose asserts would be rewritten: there are few
     if hasattr(_hook, "_must_rewrite"):
         _hook._must_rewrite -= {name for name in _hook._must_rewrite if name.partition(".")[0] == "canprobe"}

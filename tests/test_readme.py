@@ -65,7 +65,7 @@ def folder(tmp_path_factory):
     shutil.copy(scenes_folder() / "cylinder.toml", folder / "mine.toml")
     shutil.copy(eds_path("puma260_joint"), folder / "drive.eds")
     assert main(["init", str(folder / "my-cell"), "--eds", str(folder / "drive.eds")]) == 0
-    undrawn_run(load_scene("cylinder"), out=folder / "runs" / "first", duration_s=0.5)
+    undrawn_run(load_scene("cylinder", {"task.clearance_mm": 0.3}), out=folder / "runs" / "first", duration_s=0.5)
     shutil.copy(folder / "runs" / "first" / "bus.log", folder / "candump.log")
     shutil.copy(folder / "drive.eds", folder / "epos4.dcf")
     assert main(["init", str(folder / "rehearsal"), "--eds", str(folder / "epos4.dcf")]) == 0
@@ -76,11 +76,11 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("block", blocks("python"))
 def test_python_block_runs(block, tmp_path, monkeypatch, capsys):
-    def load_undrawn(scene, overrides=None):
-        return load_scene(scene, {"scene.figures": False, **(overrides or {})})
+    def load_quick(scene, overrides=None):
+        return load_scene(scene, {"scene.figures": False, "cycle.rate_hz": 200.0, **(overrides or {})})
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("canprobe.api.load_scene", load_undrawn)
+    monkeypatch.setattr("canprobe.api.load_scene", load_quick)
     monkeypatch.setattr("canprobe.lab.studies.executors.system.processors", lambda: 1)  # each would import anew
     exec(compile(block, "page", "exec"), {"__name__": "page"})
     out = capsys.readouterr().out

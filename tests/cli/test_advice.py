@@ -21,7 +21,7 @@ import pytest
 
 from canprobe.cli import COMMANDS, main
 
-QUICK, ALL = 8, 300
+QUICK, ALL = 6, 300
 KEY, VALUE = r"[a-z_]+(?:\.[A-Za-z0-9_]+)+", r'"[^"]*"|-?[0-9][0-9.e+]*[0-9]|[0-9]|true|false'
 SCANS = ("cylinder", "sphere", "plane", "axial", "foam", "saddle", "steel")
 CELLS = ("puma260", "puma560", "seven-axis", "gantry", "prbt")

@@ -112,7 +112,10 @@ def test_a_tare_shows_the_image_before_and_after(capsys):
     assert [line.split()[0] for line in lines] == ["before:", "after:"]
 
 
-@pytest.mark.parametrize(("answer", "said"), [("n", "nothing was moved"), ("y", "the arm stands at 70.00 deg")])
+MOVED = pytest.param("y", "the arm stands at 70.00 deg", marks=pytest.mark.slow(reason="a second process; --yes moves"))
+
+
+@pytest.mark.parametrize(("answer", "said"), [("n", "nothing was moved"), MOVED])
 def test_a_person_is_asked_and_may_say_no(answer, said):
     command = [sys.executable, "-m", "canprobe", "move", "puma260", "--joint", "1", "--by", "-20deg"]
     master, slave = pty.openpty()

@@ -323,10 +323,11 @@ GRIPPER = (
 )
 
 
-@pytest.mark.parametrize("beside", [fixed("base_frame", "l0"), fixed("base_frame", "l0") + GRIPPER])
-def test_the_only_tip_that_drives_can_move_is_taken(tmp_path, beside):
+def test_the_only_tip_that_drives_can_move_is_taken(tmp_path):
     """A frame that stands still, and a finger that mimics another joint, are no tips."""
-    status, cell = begun(tmp_path, chain_of(*ARM, after=fixed("tool0", "l4", "0.05 0 0") + beside))
+    status, cell = begun(
+        tmp_path, chain_of(*ARM, after=fixed("tool0", "l4", "0.05 0 0") + fixed("base_frame", "l0") + GRIPPER)
+    )
     assert status == 0 and list(cell["joints"]) == ["j1", "j2", "j3", "j4"]
 
 
@@ -356,9 +357,7 @@ def test_five_axes_with_the_roll_last_scan_as_without_it(tmp_path, capsys):
     [
         ("0.05 0 0", "0 0 0", [0, 90, 0], "x"),
         ("0.05 0 0", "0 1.5708 0", [0, 0, 0], "z"),
-        ("0.05 0 0", "0 -1.5708 0", [180, 0, 0], "-z"),
         ("0.05 0 0", "0 0 1.5708", [90, 0, 0], "-y"),
-        ("0 0 0", "0 0 0", [0, 0, 0], "z"),
         ("0.05 0 0.04", "0 0 0", [0, 0, 0], "z"),
     ],
 )

@@ -32,7 +32,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run in `first`, and a scene with a bridge."""
     folder = tmp_path_factory.mktemp("there")
     (folder / "fed.toml").write_text('[scene]\nname = "fed"\n[task]\nkind = "free"\n[bridge]\nuse = ["mcap"]\n')
-    status, said = typed(folder, "run", "cylinder", "--duration", "0.3", "--no-figures", "--out", "first")
+    quick = ("--set", "task.clearance_mm=0.3", "--set", "cycle.rate_hz=200", "--set", "shape.also=[]")
+    status, said = typed(folder, "run", "cylinder", *quick, "--duration", "0.3", "--no-figures", "--out", "first")
     assert status == 0, said
     return folder
 
@@ -69,18 +70,27 @@ def test_a_study_needs_no_posix(folder):
     assert status == 0, said
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("scan", "--bus", "pcan", "--channel", "PCAN_USBBUS1"), "PCAN-Basic of peak-system.com is not installed"),
-        (("run", "free", "--bridge", "mcap", *SHORT, "fed"), "canprobe replay FOLDER --bridge NAME"),
-        (("run", "fed.toml", *SHORT, "fed"), "bridge mcap: its process is fed by a pipe"),
-        (("up", "free", "--bus", "socketcan", "--channel", "can0"), "no SocketCAN"),
-    ],
-)
-def test_what_is_missing_is_named(folder, words, says):
-    status, said = typed(folder, *words)
-    assert status in (2, 3) and says in said and FAULT not in said
+MISSING = {
+    "PCAN-Basic of peak-system.com is not installed": ("scan", "--bus", "pcan", "--channel", "PCAN_USBBUS1"),
+    "canprobe replay FOLDER --bridge NAME": ("run", "free", "--bridge", "mcap", *SHORT, "fed"),
+    "bridge mcap: its process is fed by a pipe": ("run", "fed.toml", *SHORT, "fed"),
+    "no SocketCAN": ("up", "free", "--bus", "socketcan", "--channel", "can0"),
+}
+EACH = """
+import contextlib, io, json, sys
+from canprobe.cli import main
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.redirect_stdout(said):
+        status = main(words)
+    print(json.dumps((status, said.getvalue())))
+"""
+
+
+def test_what_is_missing_is_named(folder):
+    _, answers = typed(folder, json.dumps([*MISSING.values()]), program=("-c", EACH))
+    for says, answer in zip(MISSING, answers.splitlines(), strict=True):
+        status, said = json.loads(answer)
+        assert status in (2, 3) and says in said and FAULT not in said
 
 
 def test_a_plan_says_what_its_system_cannot_do(folder):

@@ -70,7 +70,7 @@ def test_what_does_not_fit_begins_with_that(capsys):
 
 
 def test_a_rehearsal_says_what_was_done(capsys):
-    assert main(["plan", "press", "--rehearse"]) == 0
+    assert main(["plan", "press", "--rehearse", "--set", "cycle.rate_hz=200"]) == 0
     assert capsys.readouterr().out.rstrip().splitlines()[-1].startswith("rehearsed in lockstep: 7 nodes brought up")
     assert main(["plan", "listen", "--rehearse", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rehearsed"].endswith('task.kind = "listen": done')

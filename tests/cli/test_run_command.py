@@ -17,6 +17,7 @@ from canprobe.cli import main
 def run(out: Path, *words: str) -> list[str]:
     """The lines of stdout and stderr, in the order in which they appeared."""
     command = [sys.executable, "-m", "canprobe", "run", "cylinder", "--bus", "direct", "--duration", "1.2", "-v"]
+    command += ["--set", "cycle.rate_hz=200"]
     done = subprocess.run(
         [*command, "--out", str(out), *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
     )

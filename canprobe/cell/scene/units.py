@@ -6,6 +6,7 @@ section by this table, and `in_units` writes one.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -61,11 +62,13 @@ UNITS: Mapping[str, Unit] = {  # the longest end that fits
 NO_UNIT = Unit("", None)
 
 
+@functools.cache
 def unit_of(key: str) -> Unit:
     """The unit of a key, `NO_UNIT` for a number without one and for what is no number."""
     return next((unit for end, unit in UNITS.items() if f"_{key}".endswith(f"_{end}")), NO_UNIT)
 
 
+@functools.cache
 def quantity_of(key: str) -> str:
     """The name of a key without its unit; that of a key which keeps its unit is the key."""
     end = next((end for end in UNITS if f"_{key}".endswith(f"_{end}")), "")

@@ -108,10 +108,10 @@ def inverse_near(
     """
     near = np.asarray(q_near, dtype=float)
     pose = _PosedTool(model, np.asarray(T_base_tool, dtype=float), np.asarray(T_flange_tool, dtype=float))
-    q = _reach(pose, near)
+    q, left = _reach(pose, near)
     if pose.rows < model.n:
-        q = _rest(pose, q, near if q_rest is None else np.asarray(q_rest, dtype=float))
-    if float(np.linalg.norm(pose.error(q)[0])) > _ROUNDING_ERROR:
+        q, left = _rest(pose, q, left, near if q_rest is None else np.asarray(q_rest, dtype=float))
+    if float(np.linalg.norm(left)) > _ROUNDING_ERROR:
         raise PlanError([_out_of_reach(pose, q)])
     moves = np.abs(q - near) / model.radian
     if float(moves.max()) > max_move_rad:
@@ -173,8 +173,8 @@ def _turn_of_pole(R: Floats, pole: Floats) -> Floats:
     return axis if cosine > 0.0 else np.array(pi * R[:, 0])
 
 
-def _reach(pose: _PosedTool, near: Floats) -> Floats:
-    """The joints with the least error of a pose, starting from a posture: Levenberg-Marquardt, joints held at stops."""
+def _reach(pose: _PosedTool, near: Floats) -> tuple[Floats, Floats]:
+    """The joints with the least error of a pose, and that error: Levenberg-Marquardt, joints held at stops."""
     model = pose.model
     q = np.clip(near, model.q_min, model.q_max)
     left, J = pose.error(q)
@@ -195,7 +195,7 @@ def _reach(pose: _PosedTool, near: Floats) -> Floats:
             q, left, J, damping = tried, new_left, new_J, max(damping * 0.1, _MIN_DAMPING)
         else:
             damping = max(10.0 * damping, 1e-6)
-    return q
+    return q, left
 
 
 def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float) -> Floats:
@@ -207,11 +207,11 @@ def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float) -> F
     return step
 
 
-def _rest(pose: _PosedTool, reached: Floats, rest: Floats) -> Floats:
-    """Of the joints that hold a pose, those nearest to a posture `rest`.
+def _rest(pose: _PosedTool, reached: Floats, error: Floats, rest: Floats) -> tuple[Floats, Floats]:
+    """Of the joints that hold a pose, those nearest to a posture `rest`, and their error.
 
     Newton steps go towards the pose, and along the null space towards the posture. Where they do not settle, the answer
-    is `reached`.
+    is `reached` with its error.
     """
     model, q = pose.model, reached
     for _ in range(_MAX_STEPS):
@@ -228,9 +228,8 @@ def _rest(pose: _PosedTool, reached: Floats, rest: Floats) -> Floats:
         settled, q = float(np.abs(moved - q).max()) < _ROUNDING_ERROR, moved
         if settled:
             break
-    back = _reach(pose, q)
-    still = float(np.linalg.norm(pose.error(back)[0])) <= _ROUNDING_ERROR
-    return back if still else reached
+    back, left = _reach(pose, q)
+    return (back, left) if float(np.linalg.norm(left)) <= _ROUNDING_ERROR else (reached, error)
 
 
 def _out_of_reach(pose: _PosedTool, q: Floats) -> str:

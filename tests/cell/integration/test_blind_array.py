@@ -52,7 +52,6 @@ def run(scene, text, phase, after_s, **changes):
         ("press", "node 16: gain-lost", Phase.SCAN, 0.3, "the measured force fell from"),
         ("press", "node 16: replayed-image", Phase.SETTLE, 0.05, "depth in the surface that it touched before means"),
         ("press", "node 16: dead-rows first=0 rows=16", Phase.APPROACH, 0.05, "torques of the drives show a push of"),
-        ("cylinder", "node 16: stuck-image", Phase.SCAN, 0.3, "the array has sent the same image for"),
         (
             "calibrate",
             "node 16: dead-rows first=0 rows=16",
@@ -60,7 +59,6 @@ def run(scene, text, phase, after_s, **changes):
             0.0,
             "torques of the drives show a push of",
         ),
-        ("calibrate", "node 16: stuck-image", Phase.SETTLE, 0.02, "the array has sent the same image for"),
     ],
 )
 def test_a_blind_array_presses_no_harder(scene, text, phase, after_s, words):

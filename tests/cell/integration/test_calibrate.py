@@ -26,7 +26,11 @@ def fast(scene, **sections):
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
     """One scan over a layer a third as stiff as stated: by the force alone the depth would be wrong, and the tool."""
-    scene = fast(canprobe.load_scene("calibrate"), task={"touches": 5}, plant={"stiffness_n_m3": 1.27e8 / 3})
+    scene = fast(
+        canprobe.load_scene("calibrate", {"cycle.rate_hz": 200.0}),
+        task={"touches": 5},
+        plant={"stiffness_n_m3": 1.27e8 / 3},
+    )
     return undrawn_run(scene, out=tmp_path_factory.mktemp("calibrate"))
 
 

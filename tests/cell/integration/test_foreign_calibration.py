@@ -22,6 +22,7 @@ SCAN = {
     "shape.also": [],
     "scene.figures": False,
     "bus.interface": "direct",
+    "cycle.rate_hz": 200.0,
 }
 SAID = "the array is not as its calibration says"
 

@@ -14,7 +14,7 @@ from canprobe.fieldbus.eds.packaged import FULL_SCALE
 
 
 def press(full_scale_kpa, mode):
-    scene = canprobe.load_scene("press")
+    scene = canprobe.load_scene("press", {"cycle.rate_hz": 200.0})
     return replace(
         scene,
         sensor=replace(scene.sensor, full_scale_kpa=full_scale_kpa, mode=mode),

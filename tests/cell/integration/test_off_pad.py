@@ -23,7 +23,7 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
 
     The scene says a plane, as the plan would refuse the fillet.
     """
-    scene = canprobe.load_scene("fillet", {"task.duration_s": 3.0})
+    scene = canprobe.load_scene("fillet", {"task.duration_s": 3.0, "bus.interface": "direct"})
     scene = replace(
         scene,
         task=replace(scene.task, strategy="straight", width_mm=9.0, wavelength_mm=12.0, rolling_share=0.36),

@@ -17,7 +17,9 @@ from canprobe.cell.tasks.shape import replay_samples
 @pytest.fixture(scope="module")
 def axial():
     """The session and its controller after 2 s (50 mm) on the axial scene."""
-    session = Session(canprobe.load_scene("axial", {"task.duration_s": 2.0, "task.clearance_mm": 0.3}))
+    session = Session(
+        canprobe.load_scene("axial", {"task.duration_s": 2.0, "task.clearance_mm": 0.3, "cycle.rate_hz": 200.0})
+    )
     controller = make_task(session.plan)
     with session:
         session.run(controller)
@@ -82,7 +84,9 @@ def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
 
 def test_across_a_circumferential_path_the_curvature_is_0_within_2_per_m():
     """Scored absolutely: there is nothing to divide by."""
-    scene = canprobe.load_scene("axial", {"task.duration_s": 1.8, "task.clearance_mm": 0.3, "bus.timed": False})
+    scene = canprobe.load_scene(
+        "axial", {"task.duration_s": 1.8, "task.clearance_mm": 0.3, "cycle.rate_hz": 200.0, "bus.timed": False}
+    )
     scene = replace(scene, task=replace(scene.task, heading_deg=110.0, length_mm=20.0))
     session = Session(scene)
     controller = make_task(session.plan)

@@ -18,7 +18,7 @@ from canprobe.fieldbus.protocol.frames import NmtState
 
 def press_begun_pressed(**limits):
     """Reason of the stop, and the session: of a press where the object stands 0.3 mm in the way of the arm at rest."""
-    scene = canprobe.load_scene("press", {"task.duration_s": 3.0})
+    scene = canprobe.load_scene("press", {"task.duration_s": 3.0, "cycle.rate_hz": 200.0})
     session = Session(replace(scene, limits=replace(scene.limits, **limits)))
     x, y, z = scene.object.position_mm
     raised = true_object(replace(scene.object, position_mm=(x, y, z + 8.3)))

@@ -71,7 +71,6 @@ def somebody_resets(run):
 @pytest.mark.parametrize(
     "action",
     [
-        "node 3: bus-off for 400 ms",
         "node 5: sync-lost for 300 ms",
         "node 1: heartbeat-off for 400 ms",
         "node 4: nmt command=129",

@@ -44,12 +44,6 @@ def test_a_node_that_boots_again():
     assert "INITIALISING" in str(run.error) or "PRE_OPERATIONAL" in str(run.error)
 
 
-def test_a_sensor_that_leaves_operation_in_contact():
-    run = Injected("press", HOLD_CYCLE, lambda r: r.inject("node 16: nmt command=2"))
-    run.assert_within("nmt_state").assert_drives_off()
-    assert "node 16: left operation: NMT state STOPPED" in str(run.error)
-
-
 def test_a_drive_fault():
     run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 2: drive-fault"))
     run.assert_within("drive_fault").assert_drives_off()

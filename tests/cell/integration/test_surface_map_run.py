@@ -15,7 +15,7 @@ from canprobe.mechanics.touch.map import nodes
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory):
     """Four seconds over the cylinder; its files without figures."""
-    scene = canprobe.load_scene("cylinder", {"task.clearance_mm": 0.3})
+    scene = canprobe.load_scene("cylinder", {"task.clearance_mm": 0.3, "cycle.rate_hz": 200.0})
     scene = replace(scene, shape=replace(scene.shape, also=()))
     result = canprobe.run(scene, bus="direct", duration_s=4.0, files=False)
     out = tmp_path_factory.mktemp("scan")

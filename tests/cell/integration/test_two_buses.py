@@ -20,7 +20,7 @@ from canprobe.fieldbus.protocol.frames import NmtState
 
 
 def split_scene():
-    scene = canprobe.load_scene("press", {"task.clearance_mm": 0.3})
+    scene = canprobe.load_scene("press", {"task.clearance_mm": 0.3, "cycle.rate_hz": 200.0})
     return dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode="image", channel="can1"))
 
 

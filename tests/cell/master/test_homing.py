@@ -42,7 +42,7 @@ def switch(joint, method):
 
 def scene_of(methods, *, emulated=False, **keys):
     """A PUMA 260 whose joints are homed by the methods, from the base; 0: it has an absolute encoder."""
-    scene = canprobe.load_scene("free")
+    scene = canprobe.load_scene("free", {"cycle.rate_hz": 200.0})
     joints = dict(scene.joints)
     for (name, joint), method in zip(scene.joints.items(), methods, strict=False):
         if method:

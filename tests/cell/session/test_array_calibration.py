@@ -22,7 +22,7 @@ AT = (-120.0, -122.5, 374.0)
 
 
 def plan_of(known):
-    scene = load_scene("press")
+    scene = load_scene("press", {"cycle.rate_hz": 200.0})
     return make_plan(
         resolve(
             replace(

@@ -24,7 +24,8 @@ def on_both(scene, controller=make_task):
 
 
 def loaded(name, cell=None, duration_s=0.2, **sections):
-    scene = canprobe.load_scene(name, {"task.duration_s": duration_s} | ({} if cell is None else {"cell": cell}))
+    keys = {"task.duration_s": duration_s} | ({"cycle.rate_hz": 200.0} if cell is None else {"cell": cell})
+    scene = canprobe.load_scene(name, keys)
     return replace(scene, **{key: replace(getattr(scene, key), **keys) for key, keys in sections.items()})
 
 

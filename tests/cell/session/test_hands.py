@@ -19,7 +19,9 @@ READY = [80.0, 70.0, 10.0, 5.0, 90.0, 20.0]
 
 
 def cell(scene="puma260", out=None, **changes):
-    keys = {"bus.timed": False, "scene.figures": False} | ({"postures.ready": READY} if scene == "puma260" else {})
+    keys = {"bus.timed": False, "scene.figures": False, "cycle.rate_hz": 200.0} | (
+        {"postures.ready": READY} if scene == "puma260" else {}
+    )
     return canprobe.open_cell(
         scene, {**keys, **{key.replace("__", "."): value for key, value in changes.items()}}, bus="lockstep", out=out
     )
@@ -148,13 +150,13 @@ def test_a_motion_that_is_no_longer_wanted_ends_in_a_tenth_of_a_second():
 @pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
 def test_an_interrupt_from_inside_or_outside_brakes_and_then_ends(number, kind):
     with cell() as opened, pytest.raises(kind):
-        opened.move("ready", 0.3, progress=lambda m: m.cycle == 160 and signal.raise_signal(number))
+        opened.move("ready", 0.3, progress=lambda m: m.cycle == 80 and signal.raise_signal(number))
     q = log_of(opened)["q_target_rad"]
     q = q[np.isfinite(q).all(axis=1)]
-    speed = np.abs(np.diff(q, axis=0)).max(axis=1) * 400
+    speed = np.abs(np.diff(q, axis=0)).max(axis=1) * 200
     last = np.flatnonzero(speed > 0)[-1]
     assert speed[last] < 0.01 * speed.max(), "it came to rest before the end"
-    assert np.abs(np.diff(speed[: last + 2])).max() * 400 < 1.05 * opened.plan.setup.arm.model.qdd_max.max()
+    assert np.abs(np.diff(speed[: last + 2])).max() * 200 < 1.05 * opened.plan.setup.arm.model.qdd_max.max()
 
 
 def test_an_arm_that_stands_beyond_a_limit_is_jogged_back_and_no_further_out():
@@ -174,7 +176,7 @@ def test_a_fault_of_a_drive_ends_a_motion(kind):
     faulty = opened.session.buses.world.make_faulty()
 
     def throw(measurement):
-        if measurement.cycle == 160:
+        if measurement.cycle == 80:
             faulty.inject(f"node 2: {kind}", opened.session.buses.lockstep.clock.now_ns())
 
     with opened:

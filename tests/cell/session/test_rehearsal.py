@@ -20,14 +20,14 @@ MOST_CYCLES = 1200
 
 @pytest.mark.parametrize("name", ["press", "calibrate", "free", "listen"])
 def test_a_scene_is_done_in_few_cycles(name):
-    with Session(shortened(load_scene(name))) as session:
+    with Session(shortened(load_scene(name, {"cycle.rate_hz": 200.0}))) as session:
         session.run(make_task(session.plan))
     assert len(session.cell.log) < MOST_CYCLES
 
 
 def test_a_scan_is_felt_estimated_and_left():
     answers = []
-    with Session(shortened(load_scene("cylinder"))) as session:
+    with Session(shortened(load_scene("cylinder", {"cycle.rate_hz": 200.0}))) as session:
         task = make_task(session.plan)
 
         def step(measurement):
@@ -42,18 +42,18 @@ def test_a_scan_is_felt_estimated_and_left():
 
 
 def test_a_shorter_scene_stays_as_short():
-    scene = load_scene("press")
+    scene = load_scene("press", {"cycle.rate_hz": 200.0})
     short = replace(scene, task=replace(scene.task, duration_s=0.01, clearance_mm=0.1, touches=2))
     assert shortened(short).task == short.task
 
 
 def test_what_goes_wrong_in_it_is_of_no_interest():
-    scene = load_scene("press")
+    scene = load_scene("press", {"cycle.rate_hz": 200.0})
     rehearse(canprobe.plan(replace(scene, limits=replace(scene.limits, force_max_n=2.1))))
 
 
 def test_real_nodes_are_emulated_in_it():
-    scene = load_scene("press")
+    scene = load_scene("press", {"cycle.rate_hz": 200.0})
     plan = canprobe.plan(
         replace(scene, arm=replace(scene.arm, emulated=False), bus=replace(scene.bus, interface="socketcan"))
     )
@@ -68,7 +68,7 @@ def test_joints_keep_within_their_drives_in_it_as_in_the_plan(tmp_path):
     section, end, tail = rest.partition("\n[")
     section = re.sub("AccessType=.*", "AccessType=ro", re.sub("DefaultValue=.*", "DefaultValue=2000", section))
     (tmp_path / "slow.eds").write_text(head + mark + section + end + tail)
-    scene = load_scene("press")
+    scene = load_scene("press", {"cycle.rate_hz": 200.0})
     plan = canprobe.plan(replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "slow.eds"))))
     assert "607Fh: drives that fault below the speeds of their joints" in plan.warnings[0]
     session = run_beginning(plan)

@@ -425,7 +425,9 @@ def test_what_presses_on_the_array_stops_the_joint_and_is_named(cell):
     assert_disabled(cell.session)
 
 
-@pytest.mark.parametrize(("noise", "seen"), [(True, True), (False, False)])
+@pytest.mark.parametrize(
+    ("noise", "seen"), [pytest.param(True, True, marks=pytest.mark.slow(reason="the usual case")), (False, False)]
+)
 def test_an_array_of_which_no_image_changes_is_no_witness(cell, noise, seen):
     quiet = canprobe.load_scene("press", {**SLOW, "bus.timed": False, "plant.noise": noise})
     cell.operator = Watcher(0, {5})

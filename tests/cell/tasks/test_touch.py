@@ -62,7 +62,11 @@ def test_what_is_no_command_cannot_be_requested(kind, value):
 
 @pytest.fixture
 def press():
-    return Session(canprobe.load_scene("press", {"task.duration_s": 3.0, "task.clearance_mm": 0.3, "bus.timed": False}))
+    return Session(
+        canprobe.load_scene(
+            "press", {"task.duration_s": 3.0, "task.clearance_mm": 0.3, "cycle.rate_hz": 200.0, "bus.timed": False}
+        )
+    )
 
 
 def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
@@ -99,7 +103,9 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
 def test_a_stop_lets_a_calibration_go_of_its_ball():
     """Stopped in its second touch, it does not leave the probe pressing."""
     session = Session(
-        canprobe.load_scene("calibrate", {"bus.timed": False, "task.touches": 3, "task.clearance_mm": 1.0})
+        canprobe.load_scene(
+            "calibrate", {"bus.timed": False, "task.touches": 3, "task.clearance_mm": 1.0, "cycle.rate_hz": 200.0}
+        )
     )
     queue, task = deque(), make_task(session.plan)
     controller = RequestedTask(task, None, (queue,), 2.5e-3)

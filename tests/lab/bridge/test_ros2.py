@@ -304,8 +304,11 @@ def own_network_permitted():
     )
 
 
+NETWORK = pytest.mark.slow(reason="a domain that was asked for; the default tries that the others refuse")
+
+
 @pytest.mark.skipif(not own_network_permitted(), reason="a network of its own is not permitted")
-@pytest.mark.parametrize(("kept", "answer"), [("loopback", "refused"), ("network", "taken")])
+@pytest.mark.parametrize(("kept", "answer"), [("loopback", "refused"), pytest.param("network", "taken", marks=NETWORK)])
 def test_another_host_reaches_the_domain_only_where_it_is_asked_for(kept, answer, monkeypatch):
     """Two network namespaces with a wire between them are two hosts."""
     monkeypatch.setenv(

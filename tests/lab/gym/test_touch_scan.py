@@ -50,7 +50,7 @@ def test_gymnasium_has_nothing_to_say_against_it(make, kind):
 
 def test_the_same_seed_gives_the_same_trace_and_another_one_another(make):
     env = make(observation="oracle")
-    actions = np.random.default_rng(0).uniform(-1, 1, (8, 3)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1, 1, (4, 3)).astype(np.float32)
 
     def trace(**seed):
         first, info = env.reset(**seed)

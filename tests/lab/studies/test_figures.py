@@ -42,7 +42,7 @@ FILLED, TILES = 0.3, 3
 
 @functools.cache
 def run_of(scene, seconds):
-    return canprobe.run(canprobe.load_scene(scene), bus="direct", duration_s=seconds, files=False)
+    return canprobe.run(scene, {"cycle.rate_hz": 200.0}, bus="direct", duration_s=seconds, files=False)
 
 
 def draw_scene(scene, seconds, *, draw=draw_run, **summary):

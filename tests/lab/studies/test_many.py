@@ -19,7 +19,7 @@ from canprobe.lab.studies.cell_store import CellStore
 from canprobe.lab.studies.many import run_many
 from canprobe.lab.studies.sweep import Sweep
 
-QUICK = {"task.clearance_mm": 0.5, "task.duration_s": 0.2}
+QUICK = {"task.clearance_mm": 0.2, "task.duration_s": 0.2, "cycle.rate_hz": 200.0}
 VARY = {"limits.force_max_n": [5.0, np.float64(2.1)], "bus.bit_error_rate": [0.0, 1e-5]}
 SERIES = ("force_n", "contact_mm", "truth.force_n")
 
@@ -57,9 +57,9 @@ def test_each_is_the_run_that_it_stands_for(runs):
     assert data["contact_mm"].dims == ("run", "time", "contact_mm_0") and data["contact_mm"].attrs == {"units": "mm"}
     assert data["time"].attrs == {"units": "s"}
     assert data["status"].values.tolist() == runs.table()["status"].tolist()
-    of_one, rows = data["force_n"].sel(run=1), len(one.log["force_n"][::4])
+    of_one, rows = data["force_n"].sel(run=1), len(one.log["force_n"][::2])
     np.testing.assert_allclose(of_one["time"][:3], [0.0, 0.01, 0.02])
-    np.testing.assert_array_equal(of_one[:rows], one.log["force_n"][::4])
+    np.testing.assert_array_equal(of_one[:rows], one.log["force_n"][::2])
     assert np.isnan(data["truth.force_n"][4]).all()
 
 

@@ -145,7 +145,7 @@ def soup(vertices, faces, jitter_m, seed=0):
     )
 
 
-@pytest.mark.parametrize(("jitter_m", "edge"), [(0.0, 5e-4), (1e-9, 1e-3), (1e-8, 5e-4), (1e-8, 1e-3)])
+@pytest.mark.parametrize(("jitter_m", "edge"), [(0.0, 5e-4), (1e-8, 1e-3)])
 def test_vertices_that_are_almost_at_one_place_are_one(jitter_m, edge):
     params, height = BODIES["sphere"]
     vertices, faces = patch_of(height, edge)
@@ -165,7 +165,7 @@ def test_no_detail_is_merged_away():
     assert len(points) == len(vertices) + len(fine[0]) and len(corners) == len(both[1]) and state.merged == 0
 
 
-@pytest.mark.parametrize(("share", "edge"), [(0.02, 5e-4), (0.3, 2e-3)])
+@pytest.mark.parametrize(("share", "edge"), [(0.3, 2e-3)])
 def test_facets_that_are_turned_over_are_turned_back(share, edge):
     params, height = BODIES["sphere"]
     vertices, faces = patch_of(height, edge)
@@ -185,7 +185,7 @@ def test_open_edges_and_edges_of_three_facets_are_counted():
     assert (repaired(*fin)[2].open_edges, repaired(*fin)[2].odd_edges) == (2, 1)
 
 
-@pytest.mark.parametrize(("radius", "rings"), [(0.03, 20), (0.02, 20)])
+@pytest.mark.parametrize(("radius", "rings"), [(0.02, 20)])
 def test_the_spacing_that_is_chosen_or_named_has_the_curvature_of_a_coarse_ball(radius, rings):
     """Edges of 3 to 6 mm, by which no rule of thumb holds; the error is measured without the body."""
     vertices, faces = ball(radius, rings, 2 * rings)
@@ -250,8 +250,8 @@ def ring_of(low_m, high_m, at_m, n=61):
 @pytest.mark.parametrize(
     ("at_mm", "width_mm", "nodes"),
     [
-        *((0.0, *size) for size in ((8.0, 9), (8.00002, 9), (8.3, 9), (8.99, 9), (20.45, 21))),
-        *((at_mm, *size) for at_mm in (100.0, -1000.0) for size in ((8.0, 9), (8.99, 9))),
+        *((0.0, *size) for size in ((8.00002, 9), (8.3, 9), (20.45, 21))),
+        *((at_mm, *size) for at_mm, size in ((100.0, (8.0, 9)), (-1000.0, (8.99, 9)))),
     ],
 )
 def test_no_node_lies_beyond_the_border(at_mm, width_mm, nodes):

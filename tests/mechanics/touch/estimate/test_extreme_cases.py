@@ -140,7 +140,7 @@ def test_motion(row, method, truth):
         path = truth.placed(truth.surface("cylinder"), np.zeros(160), np.zeros(160))
     else:
         path = truth.straight("cylinder", {"straight": 0.0, "oblique": 0.6, "axial": 0.5 * math.pi}[way])
-    for seed in range(3):
+    for seed in range(2 if method in MUST else 1):
         e = fed(make(method), roll(*path.noisy(*SIGMA, seed), share=share, spin=spin))
         if e is None:
             assert rank == 0
@@ -155,7 +155,7 @@ def test_motion(row, method, truth):
 
 class TestSize:
     @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("radius", [1e-3, 5e-3, 0.05, 1.0, 100.0])
+    @pytest.mark.parametrize("radius", [1e-3, 0.05, 100.0])
     def test_radius(self, radius, method, truth):
         """A path of R/2 at most and 20 mm at most; noise of the same share of it."""
         size = min(1.0, radius / 0.04)
@@ -171,7 +171,7 @@ class TestSize:
             assert e.umbilic
 
     @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("unit", [1e3, 39.37, 1e-3])
+    @pytest.mark.parametrize("unit", [39.37, 1e-3])
     def test_unit_of_length(self, unit, method, truth):
         """m, mm, inch, km: one answer within 1e-6, batch and online."""
         path = truth.path("ellipsoid", T=truth.any_pose(2))
@@ -194,14 +194,14 @@ class TestSize:
 
 class TestLongRuns:
     def test_standing_still_after_a_scan_changes_nothing(self, truth):
-        """2e4 samples (1e6 in tests/bench): nothing is forgotten or made up."""
+        """1e4 samples (1e6 in tests/bench): nothing is forgotten or made up."""
         path = truth.path("ellipsoid", T=truth.any_pose(3))
         estimator = make("recursive")
         fed(estimator, truth.samples(*path.noisy(*SIGMA, 0)))
         rng = np.random.default_rng(1)
         n, T, r = path.normals[-1], np.eye(4), np.array([0.0, 0.0, 0.04])
         cloud = path.points[-1] + SIGMA[0] * rng.normal(size=(5000, 3))
-        for i in range(20_000):
+        for i in range(10_000):
             estimator.add(ContactSample(1.0 + 0.005 * i, cloud[i % 5000], n, T, r, 1.0))
             if i == 999:
                 settled = estimator.estimate()
@@ -213,7 +213,7 @@ class TestLongRuns:
         assert frobenius(path.error(after)) < 4.0 * math.sqrt(WEIGHT @ np.diag(after.covariance))
 
     def test_motion_after_long_rest_counts_at_once(self, truth):
-        """5e4 samples of rest from the start (an hour in tests/bench); then all is as without them."""
+        """2e4 samples of rest from the start (an hour in tests/bench); then all is as without them."""
         path = truth.path("cylinder")
         p, n = path.noisy(*SIGMA, 2)
         fresh = fed(make("recursive"), truth.samples(p, n))
@@ -221,11 +221,11 @@ class TestLongRuns:
         T, r = np.eye(4), np.array([0.0, 0.0, 0.04])
         cloud = path.points[0] + SIGMA[0] * rng.normal(size=(5000, 3))
         estimator = make("recursive")
-        for i in range(50_000):
+        for i in range(20_000):
             estimator.add(ContactSample(0.005 * i, cloud[i % 5000], path.normals[0], T, r, 1.0))
         waiting = estimator.estimate()
         assert waiting is None or not waiting.observed.any()
-        e = fed(estimator, truth.samples(p, n, 0.005 * 50_000))
+        e = fed(estimator, truth.samples(p, n, 0.005 * 20_000))
         assert e.rank == 3
         assert np.allclose(np.diag(e.covariance), np.diag(fresh.covariance), rtol=0.3)
         assert frobenius(path.error(e)) < 4.0 * math.sqrt(WEIGHT @ np.diag(e.covariance))

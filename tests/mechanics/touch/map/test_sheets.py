@@ -17,7 +17,7 @@ SHEETS = {
 }
 
 
-@pytest.mark.parametrize("gap", [0.3e-3, 1e-3, 2e-3, 5e-3])
+@pytest.mark.parametrize("gap", [0.3e-3, 1e-3, 5e-3])
 @pytest.mark.parametrize("facing", ["same", "opposite"])
 @pytest.mark.parametrize("sheets", SHEETS)
 def test_two_sheets_make_no_curvature_that_is_stated_narrowly(sheets, facing, gap):
