@@ -405,6 +405,13 @@ def test_what_a_real_bus_may_be_late_hides_no_defect(title, defect, whole_eds):
     assert found.keys() == {title}, found
 
 
+def test_a_heartbeat_may_be_off_by_less_than_a_tenth(whole_eds):
+    points = [point for point in POINTS if point.title == "8 producer"]
+    for period_ms, wrong in ((54, set()), (46, set()), (57, {"heartbeat 8 producer"}), (43, {"heartbeat 8 producer"})):
+        device = whole(whole_eds, replaces("2b1710003200", f"2b171000{period_ms:02x}00"))
+        assert failed(device.run(PERMITTED, points)).keys() == wrong, period_ms
+
+
 class Undervoltage(Application):
     """An error that stays: the device reports it after each boot-up; 1001h and 1003h have it."""
 
