@@ -1,11 +1,12 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `whole_cell`, `vcan0`, `pace`,
-`side_by_side`, `growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `pictures`, one of
-`FORMS`, or one of `PRINTED`, what a page shows of a command that the tests repeat. Without names everything is measured
-but what takes more than half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the
-figures. Every entry has its own command, date, commit and machine, so that one can be measured anew without the others;
-an entry whose study is gone stays with its commit. Then `python docs/generate.py` writes the pages.
+`side_by_side`, `growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `canopen_node_vcan`,
+`pictures`, `report_pictures`, one of `FORMS`, or one of `PRINTED`, what a page shows of a command that the tests
+repeat. Without names everything is measured but what takes more than half an hour or needs clones (`LONG`). Measure on
+a machine that does nothing else: computing time is among the figures. Every entry has its own command, date, commit and
+machine, so that one can be measured anew without the others; an entry whose study is gone stays with its commit. Then
+`python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from typing import Any
 from gallery import draw_panel
 from moving_picture import draw_moving
 from PIL import Image
+from report_pictures import draw_reports
 
 import canprobe
 from canprobe.cell.results.expected import figures_of
@@ -49,7 +51,7 @@ SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
 IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
-LONG = ("faults", "soak", "growth", "held", "canopen_node")
+LONG = ("faults", "soak", "growth", "held", "canopen_node", "canopen_node_vcan")
 FORMS = {
     "bound": "estimators",
     "calibrations": "calibration",
@@ -342,10 +344,17 @@ def bridges() -> Entry:
 
 
 def canopen_node() -> Entry:
-    """What `canprobe conform` finds in CANopenNode's demo device; CANOPEN_NODE names the two clones."""
-    node, demo = os.environ["CANOPEN_NODE"].split()
+    """What `canprobe conform` finds in CANopenNode's demo device; CANOPEN_NODE names the clones."""
+    node, demo, _ = os.environ["CANOPEN_NODE"].split()
     entry = json.loads(printed(f"python tests/support/canopen_node.py {shlex.quote(node)} {shlex.quote(demo)}"))
     return {"command": "python tests/support/canopen_node.py CANopenNode CANopenDemo"} | entry
+
+
+def canopen_node_vcan() -> Entry:
+    """What it finds on a vcan0 in the same device for Linux, and in those with a defect."""
+    script = "python tests/support/canopen_node_vcan.py"
+    entry = json.loads(printed(f"{script} {shlex.join(os.environ['CANOPEN_NODE'].split())}"))
+    return {"command": f"{script} CANopenNode CANopenDemo CANopenLinux"} | entry
 
 
 def local_node() -> Entry:
@@ -402,10 +411,21 @@ def pictures() -> Entry:
         path = IMAGES / f"{name}.png"
         Image.open(path).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(path, optimize=True)
     panels = [draw_panel(name).relative_to(IMAGES).as_posix() for name, _ in packaged("scene")]
+    return drawn("pictures", OF_SCENES, panels)
+
+
+def report_pictures() -> Entry:
+    """The pictures of the reports of `conform` and `judge`."""
+    draw_reports(IMAGES)
+    return drawn("report_pictures", OF_REPORTS)
+
+
+def drawn(entry: str, pictures: Iterable[str], panels: Iterable[str] = ()) -> Entry:
+    """An entry of pictures: the code that has drawn them, and what it drew; panels are drawn by the code of one."""
     return {
-        "command": "python docs/measure.py pictures",
-        "drawn_by": {name: drawing_code(name) for name in DRAWN_BY},
-        "pictures": {name: picture_digest(name) for name in sorted({*DRAWN_BY, *panels})},
+        "command": f"python docs/measure.py {entry}",
+        "drawn_by": {name: drawing_code(name) for name in pictures},
+        "pictures": {name: picture_digest(name) for name in sorted({*pictures, *panels})},
     }
 
 
@@ -415,12 +435,18 @@ def picture_digest(name: str) -> str:
 
 
 RESULTS = DOCS.parent / "canprobe" / "cell" / "results"
-DRAWN_BY: Mapping[str, Sequence[Path]] = {
+REPORTS = DOCS.parent / "canprobe" / "fieldbus" / "tools" / "reports"
+OF_SCENES: Mapping[str, Sequence[Path]] = {
     "cylinder.png": [RESULTS / f"{name}.py" for name in ("figures", "picture", "surface_figure")],
     "surface.png": [RESULTS / f"{name}.py" for name in ("surface_figure", "picture")],
     "scan.webp": [DOCS / "moving_picture.py"],
     "scenes/cylinder.png": [DOCS / "gallery.py", *(RESULTS / f"{name}.py" for name in ("figures", "picture"))],
 }
+OF_REPORTS: Mapping[str, Sequence[Path]] = {
+    name: [DOCS / "report_pictures.py", REPORTS / "page.py", REPORTS / "page.css"]
+    for name in ("conform.png", "judge.png")
+}
+DRAWN_BY = {**OF_SCENES, **OF_REPORTS}
 """Code that draws a picture: where it changes, the picture is drawn anew, and with the one of a scene all of them."""
 
 
@@ -428,13 +454,15 @@ def drawing_code(name: str) -> str:
     """Digest of the code that draws a picture."""
     digest = hashlib.sha256()
     for module in DRAWN_BY[name]:
-        digest.update(ast.dump(ast.parse(module.read_text(encoding="utf-8"))).encode())
+        text = module.read_text(encoding="utf-8")
+        digest.update((ast.dump(ast.parse(text)) if module.suffix == ".py" else text).encode())
     return digest.hexdigest()[:16]
 
 
 OTHERS: Mapping[str, Callable[[], Entry]] = {
     "local_node": local_node,
     "canopen_node": canopen_node,
+    "canopen_node_vcan": canopen_node_vcan,
     "one_scan": one_scan,
     "whole_cell": whole_cell,
     "vcan0": vcan0,
@@ -446,6 +474,7 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "learning": learning,
     "bridges": bridges,
     "pictures": pictures,
+    "report_pictures": report_pictures,
     **{name: partial(shown, name) for name in PRINTED},
 }
 

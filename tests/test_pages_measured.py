@@ -37,7 +37,8 @@ def test_each_of_them_is_on_a_page_and_a_choice_of_subjects_keeps_what_is_set_in
 @pytest.mark.parametrize("name", measure.DRAWN_BY)
 def test_a_picture_is_drawn_by_the_present_code(name):
     assert any(f"img/{name})" in text for text in TEXTS.values())
-    assert MEASURED["pictures"]["drawn_by"][name] == measure.drawing_code(name), "type: python docs/measure.py pictures"
+    entry = "report_pictures" if name in measure.OF_REPORTS else "pictures"
+    assert MEASURED[entry]["drawn_by"][name] == measure.drawing_code(name), f"type: python docs/measure.py {entry}"
 
 
 def test_a_picture_is_the_one_that_was_drawn_with_the_figures_beside_it():

@@ -192,7 +192,7 @@ def _port(args: argparse.Namespace) -> Iterator[Port]:
         if args.bus == "lockstep":
             port = _emulated(args)
         else:
-            from canprobe.cell.session.bus_tools import open_bus
+            from canprobe.cell.session.opened_bus import open_bus
             from canprobe.cell.session.target import refuse_virtual
 
             refuse_virtual(args.bus, "conform")

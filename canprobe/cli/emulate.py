@@ -131,9 +131,9 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
         raise UsageError(f"emulate: with {source} there is one channel, without a name: --channel CH")
     target = real_target(args.bus, channels[0], args.bitrate)
 
-    from canprobe import api
+    from canprobe.cell.session.served import emulate_eds
 
-    return lambda: api.emulate_eds(
+    return lambda: emulate_eds(
         files,
         target,
         store_folder=args.store,

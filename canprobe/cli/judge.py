@@ -168,17 +168,19 @@ def _server(
     args: argparse.Namespace, bench: MasterBench, nodes: Mapping[int, Description]
 ) -> tuple[Target, Callable[[], None]]:
     """The bus, and the function that serves the nodes on it; drives stand away from 0, where a jump to 0 is seen."""
-    from canprobe import api
-    from canprobe.fieldbus.tools.judge import start_position
-
     channels = args.channel or [(None, None)]
     if len(channels) > 1 or channels[0][0] is not None:
         raise UsageError("judge: the nodes are served on one channel, without a name: --channel CH")
     if args.scene is None:
+        from canprobe.cell.session.served import emulate_eds
+        from canprobe.fieldbus.tools.judge import start_position
+
         target = real_target(args.bus, channels[0][1], args.bitrate)
         files = eds_files(args, "judge")
         positions = [start_position(node) for node in nodes.values()]
-        return target, lambda: api.emulate_eds(files, target, positions=positions, observer=bench, say=args.report.say)
+        return target, lambda: emulate_eds(files, target, positions=positions, observer=bench, say=args.report.say)
+    from canprobe import api
+
     scene = loaded(args)
     target = scene_target(args, scene)
     node_ids = (*scene.drives, *([scene.sensor.node_id] if scene.sensor and scene.array_is_node else ()))

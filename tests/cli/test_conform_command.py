@@ -133,10 +133,13 @@ def test_it_begins_with_no_more_than_python_can_and_canopen(tmp_path):
     nothing, both = imported(""), imported("import can, canopen")
     assert {"can", "canopen"} <= both - nothing
     judge = ["judge", "--eds", "puma260_joint", "--node-id", "1"]
+    real = ["--bus", "virtual", "--channel", "1"]
     for words, allowed in (
         (["conform", "--help"], nothing),
         (["judge", "--help"], nothing),
         ([*ARGS, "--points", "100"], both),
+        (["conform", "--node", "5", *real, "--listen", "0.1", "--timeout", "0.1"], both),
+        ([*judge, *real, "--", "true"], both),
         ([*judge, "--record", str(tmp_path / "bus.log")], both),
     ):
         assert imported(f"from canprobe.cli import main\ntry: main({words})\nexcept SystemExit: pass") <= allowed

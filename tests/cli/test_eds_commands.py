@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from canprobe import api
+from canprobe.cell.session import served
 from canprobe.cli import main
 
 MESSY = Path(__file__).parents[1] / "fieldbus" / "eds" / "messy"
@@ -88,7 +89,7 @@ def test_a_file_that_cannot_be_served_is_told_fault_by_fault(capsys):
 
 def test_pairs_of_file_and_node_id_reach_the_api(monkeypatch):
     calls = []
-    monkeypatch.setattr(api, "emulate_eds", lambda files, target, **_: calls.append((files, target)))
+    monkeypatch.setattr(served, "emulate_eds", lambda files, target, **_: calls.append((files, target)))
     pairs = ["--eds", "a.eds", "--node-id", "5", "--eds", "b.dcf", "--node-id", "20"]
     assert main(["emulate", *pairs, "--bus", "virtual", "--channel", "c", "--bitrate", "500000"]) == 0
     assert calls == [([("a.eds", 5), ("b.dcf", 20)], api.Target("virtual", "c", 500_000))]

@@ -29,7 +29,7 @@ def bus(monkeypatch):
 def serve(bus, monkeypatch):
     """Runs `canprobe emulate`; its nodes live on the bus afterwards."""
     monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
-    monkeypatch.setattr("canprobe.cell.session.emulation.ask_for_processor", lambda: False)
+    monkeypatch.setattr("canprobe.cell.session.served.ask_for_processor", lambda: False)
     nodes = []
 
     def attach(buses, stop, **_):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Iterator, Sequence
 
 from canprobe.cell.planning.array import TOLERATED_LOSS_SHARE, cut_patch
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.scene.setup import Arm, Array, Setup
 from canprobe.cell.scene.surface_files import mesh_warnings
-from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
+from canprobe.fieldbus.bus.real.adapters import bus_open_to_others
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FIXED_POLE, FULL_POSE, rolls_last, task_rows
 from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
@@ -30,28 +29,6 @@ def _open_to_others(setup: Setup) -> Iterator[str]:
             f"bridge.ros2_loopback = false: every machine on this network segment {may};"
             " bridge.ros2_loopback = true keeps its topics on this machine, CYCLONEDDS_URI on some interfaces"
         )
-
-
-def bus_open_to_others(interface: str, channel: str) -> Iterator[str]:
-    """A warning where other machines reach a bus.
-
-    Args:
-        interface: interface of python-can.
-        channel: its channel.
-    """
-    if interface == "udp_multicast" and not _is_interface_local(channel):
-        yield (
-            f"bus.channel = {channel}: every machine on this network segment hears this bus and can command its"
-            f" nodes; --channel {LOCAL_GROUP} keeps it on this machine"
-        )
-
-
-def _is_interface_local(channel: str) -> bool:
-    try:
-        group = ipaddress.ip_address(channel)
-    except ValueError:
-        return False
-    return group.version == 6 and group.is_multicast and int(group) >> 112 & 0xF == 1
 
 
 def _unstated(array: Array) -> list[str]:

@@ -20,7 +20,9 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     first_second    the same verdict on the first second of a run
     joint_record    what a check of the joints has shown, for later runs
     bus_tools       a bus without a cell: scan, node ids, monitor
-    emulation       emulated nodes for other masters
+    opened_bus      a bus for a command without a scene
+    emulation       emulated nodes of a scene for other masters
+    served          nodes of EDS files for them, and how nodes are served
     array_calibration    touches of known objects, visit by visit, and the fit
     terminal        steps and a progress bar on a terminal
 

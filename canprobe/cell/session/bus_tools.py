@@ -17,9 +17,9 @@ from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import open_ports
-from canprobe.cell.session.links import ExpectedLink, check_links, expected_of, need_controllers
+from canprobe.cell.session.links import check_links, expected_of, need_controllers
+from canprobe.cell.session.opened_bus import open_bus
 from canprobe.cell.session.target import Target, refuse_virtual
-from canprobe.errors import BusError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
 
@@ -80,23 +80,6 @@ def commission(
     if not done.nodes and not done.unconfigured:
         need_controllers(target.interface, {target.channel: port})
     return done
-
-
-@contextlib.contextmanager
-def open_bus(target: Target, say: Say, data_bitrate: int | None = None) -> Iterator[Port]:
-    """A port of a bus without a scene, of CAN FD where a data bit rate is given; a wrong setting is only a warning."""
-    from canprobe.fieldbus.bus.real.opening import open_port
-
-    interface, channel = target.interface, target.channel
-    check_links(interface, {channel: ExpectedLink(target.bitrate, of_scene=False)}, say, must=False)
-    port = open_port(interface, channel, target.bitrate, MonotonicClock(), data_bitrate=data_bitrate)
-    try:
-        yield port
-    except BusError as error:
-        need_controllers(interface, {channel: port}, error)
-        raise
-    finally:
-        port.close()
 
 
 def monitor(scene: Scene, *, duration_s: float | None = None, say: Say = quiet) -> Iterator[CellView]:

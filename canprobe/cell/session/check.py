@@ -12,11 +12,11 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.links import SOCKETCAN
 from canprobe.cell.session.session import Session, link_limits
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.fieldbus.bus.clock import wake_lateness
 from canprobe.fieldbus.bus.port import ControllerState, Port, stamps_text
+from canprobe.fieldbus.bus.real.adapters import SOCKETCAN
 from canprobe.fieldbus.bus.real.link import read_link
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.hardware import BusSettings
 from canprobe.errors import BusError, InterfaceError
 from canprobe.fieldbus.bus.port import ControllerState, Port
+from canprobe.fieldbus.bus.real.adapters import SOCKETCAN
 from canprobe.fieldbus.bus.real.link import (
     FAST_SAMPLE_POINTS,
     MAX_SLOW_BITRATE,
@@ -22,6 +22,10 @@ from canprobe.fieldbus.bus.real.link import (
     read_link,
     setting_line,
 )
+
+if TYPE_CHECKING:  # a command for one device needs none of a cell
+    from canprobe.cell.planning.model import Plan
+    from canprobe.cell.scene.hardware import BusSettings
 
 RATE_TOLERANCE = 0.005
 TERMINATION = "with the bus unpowered, 60 ohm between CAN_H and CAN_L are right, 120 is one terminator missing"
@@ -151,9 +155,6 @@ def _symptom(link: LinkState) -> str:
     if sent == heard:
         return f"{unheard}; or {broken}"
     return unheard if sent > heard else broken
-
-
-SOCKETCAN = "socketcan"
 
 
 def check_links(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from canprobe.cell.scene.hardware import DIRECT
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import Scene
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.real.adapters import SOCKETCAN, check_interface_name
+
+if TYPE_CHECKING:
+    from canprobe.cell.scene.model import Scene
 
 LOCKSTEP = "lockstep"
 VIRTUAL = (LOCKSTEP, DIRECT)
@@ -50,6 +52,8 @@ class Target:
         Raises:
             UsageError: when the scene names no such channel, or a value would be refused in its file.
         """
+        from canprobe.cell.scene.load import load_scene
+
         others = dict(channel) if isinstance(channel, Mapping) else {}
         if unknown := sorted(str(name) for name in others if name not in scene.channels):
             raise UsageError(f"channel: the scene has no channel {unknown[0]}, only {', '.join(scene.channels)}")

@@ -20,12 +20,12 @@ from canprobe.cell.planning.identifiers import order_by_deadline
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.planning.report_json import plan_dict
-from canprobe.cell.planning.warnings import LOCAL_GROUP
 from canprobe.cell.plant.elastic_contact import elastic_contact
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
 from canprobe.errors import PlanError, SceneError
+from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
 from canprobe.fieldbus.protocol.frames import is_restricted
 from canprobe.fieldbus.protocol.response_times import Message, worst_case_response
 

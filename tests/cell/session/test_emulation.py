@@ -7,9 +7,9 @@ from contextlib import nullcontext
 
 import pytest
 
-from canprobe.cell.planning.warnings import LOCAL_GROUP
 from canprobe.cli import main
 from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
+from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.eds.packaged import load_eds
 
@@ -25,7 +25,7 @@ def served(monkeypatch):
         monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
         monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
         for name, stand_in in (("ask_for_processor", lambda: False), ("garbage_collection_paused", nullcontext)):
-            monkeypatch.setattr(f"canprobe.cell.session.emulation.{name}", stand_in)  # not for the tests' own process
+            monkeypatch.setattr(f"canprobe.cell.session.served.{name}", stand_in)  # not for the tests' own process
 
         def serve(buses, stop, **_):
             emulate.look = stop

@@ -32,6 +32,7 @@ from canprobe.fieldbus.node import Application, Quirks
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, NmtState
 from canprobe.fieldbus.tools.conform import POINTS, ExaminationSettings, WriteList
+from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.point import HINTS
 from canprobe.fieldbus.tools.reports import Verdict
 
@@ -391,6 +392,25 @@ def test_a_defect_is_found_by_its_point_alone(title, whole_eds):
     device = whole(whole_eds, DEFECTS[title])
     found = failed(device.run(replace(PERMITTED, ask=device.switch)))
     assert found.keys() == {title} | ALSO.get(title, set()), found
+
+
+@pytest.mark.parametrize(
+    ("title", "defect"),
+    [
+        ("heartbeat 8 producer", replaces("2b1710003200", "2b1710003c00")),  # 60 ms for 50 ms
+        ("emcy 47 error register", rewrites(EMCY, "4082", lambda text: "408200" + text[6:])),
+    ],
+)
+def test_what_a_real_bus_may_be_late_hides_no_defect(title, defect, whole_eds):
+    found = failed(whole(whole_eds, defect).run(replace(PERMITTED, times=BenchTimes(slack_s=0.05))))
+    assert found.keys() == {title}, found
+
+
+def test_a_heartbeat_may_be_off_by_less_than_a_tenth(whole_eds):
+    points = [point for point in POINTS if point.title == "8 producer"]
+    for period_ms, wrong in ((54, set()), (46, set()), (57, {"heartbeat 8 producer"}), (43, {"heartbeat 8 producer"})):
+        device = whole(whole_eds, replaces("2b1710003200", f"2b171000{period_ms:02x}00"))
+        assert failed(device.run(PERMITTED, points)).keys() == wrong, period_ms
 
 
 class Undervoltage(Application):

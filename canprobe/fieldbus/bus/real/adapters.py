@@ -16,11 +16,12 @@ from __future__ import annotations
 import ctypes.util
 import importlib
 import importlib.util
+import ipaddress
 import json
 import logging
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -254,6 +255,28 @@ def check_interface_name(name: str, own: Iterable[str] = ()) -> None:
         f"no interface {name!r}{did_you_mean(name, [*own, *known], 0.6)}; {mine}python-can has: {', '.join(known)};"
         f" {_WHERE_SHOWN}"
     )
+
+
+def bus_open_to_others(interface: str, channel: str) -> Iterator[str]:
+    """A warning where other machines reach a bus.
+
+    Args:
+        interface: interface of python-can.
+        channel: its channel.
+    """
+    if interface == "udp_multicast" and not _is_interface_local(channel):
+        yield (
+            f"bus.channel = {channel}: every machine on this network segment hears this bus and can command its"
+            f" nodes; --channel {LOCAL_GROUP} keeps it on this machine"
+        )
+
+
+def _is_interface_local(channel: str) -> bool:
+    try:
+        group = ipaddress.ip_address(channel)
+    except ValueError:
+        return False
+    return group.version == 6 and group.is_multicast and int(group) >> 112 & 0xF == 1
 
 
 def backend_channel(interface: str, channel: str) -> str | int:

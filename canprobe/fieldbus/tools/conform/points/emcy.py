@@ -5,7 +5,7 @@ The error that is provoked is a SYNC of the wrong length (8240h), which a right 
 
 from __future__ import annotations
 
-from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, is_no_error
+from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, Emcy, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE
 from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
 from canprobe.fieldbus.tools.conform import accepted
@@ -19,14 +19,14 @@ _INHIBIT_MS = 200
 _GENERIC, _COMMUNICATION = 0x01, 0x10
 
 
-def _provoke(bench: Bench) -> int:
-    """Provoke 8240h; return when it came."""
+def _provoke(bench: Bench) -> tuple[Emcy, int]:
+    """Provoke 8240h; return it and when it came."""
     plain_sync(bench)
     bench.start()
     bench.sync_and_wait()
     bench.sync(1)
     try:
-        return bench.emcy(SYNC_LENGTH_CODE, 1.5e-3 * _INHIBIT_MS)[1]
+        return bench.emcy(SYNC_LENGTH_CODE, 1.5e-3 * _INHIBIT_MS)
     except Deviation as error:
         raise PointNotApplicable("no EMCY could be provoked: a SYNC of the wrong length brings none") from error
 
@@ -94,7 +94,7 @@ def inhibit_time(bench: Bench) -> None:
     """An error and its end within 200 ms."""
     bench.need((0x1015, 0))
     bench.put(0x1015, 0, _INHIBIT_MS * 10)
-    first_ns = _provoke(bench)
+    _, first_ns = _provoke(bench)
     bench.emergencies.clear()
     bench.sync()
     bench.pass_time(3e-3 * _INHIBIT_MS)  # the end comes after one inhibit time, which runs once more
@@ -107,14 +107,15 @@ def inhibit_time(bench: Bench) -> None:
     47,
     "error register",
     "CiA 301, 1001h",
-    "bits 0 and 4 with 8240h, at least one of them; as before after its end",
+    "bits 0 and 4 with 8240h, at least one of them; as the EMCY says; as before after its end",
     needs="nmt sync",
 )
 def error_register(bench: Bench) -> None:
     """1001h before, during and after an error."""
     before = bench.number(0x1001)
-    _provoke(bench)
+    emcy, _ = _provoke(bench)
     during = bench.number(0x1001)
+    bench.expect(emcy.register == during, f"EMCY 8240h says {emcy.register:02X}h, 1001h is {during:02X}h")
     if not during & (_GENERIC | _COMMUNICATION):
         bench.deviates(f"1001h is {during:02X}h during a communication error, expected bits 0 and 4")
     if not during & _GENERIC:
