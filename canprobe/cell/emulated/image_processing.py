@@ -7,12 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.fieldbus.protocol.tactile import (
-    DEFAULT_WINDOW,
-    MAX_SIDE,
-    Features,
-    Shape,
-)
+from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW, MAX_SIDE, Features, Shape
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.types import Floats
 

@@ -26,14 +26,7 @@ from matplotlib.axes import Axes
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, picture
 from canprobe.lab.studies.cell_store import as_json
 from canprobe.lab.studies.ground import PATHS, SURFACES, Ground, make_ground
-from canprobe.lab.studies.result import (
-    CHI2_95_OF_3,
-    FROBENIUS,
-    Row,
-    StudyResult,
-    measuring_facts,
-    sigma_values,
-)
+from canprobe.lab.studies.result import CHI2_95_OF_3, FROBENIUS, Row, StudyResult, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch import Prior, cramer_rao, fit_surface
 from canprobe.mechanics.types import Floats

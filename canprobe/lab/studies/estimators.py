@@ -23,14 +23,7 @@ from matplotlib.axes import Axes
 from canprobe.cell.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
 from canprobe.lab.studies.bound import run_bound
 from canprobe.lab.studies.ground import Ground, make_ground
-from canprobe.lab.studies.result import (
-    FROBENIUS,
-    Row,
-    StudyResult,
-    mean_and_interval,
-    measuring_facts,
-    sigma_values,
-)
+from canprobe.lab.studies.result import FROBENIUS, Row, StudyResult, mean_and_interval, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch import ContactSample, Estimator, cramer_rao, make_estimator
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation

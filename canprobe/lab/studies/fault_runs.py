@@ -35,14 +35,7 @@ from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.tools.faults import Fault
 from canprobe.fieldbus.tools.faults.fault import FOREVER_NS
-from canprobe.lab.studies.fault_cases import (
-    CONTACT_SHARE,
-    LIFT_OFF_NS,
-    FaultCase,
-    Windows,
-    WrongFile,
-    task_plan,
-)
+from canprobe.lab.studies.fault_cases import CONTACT_SHARE, LIFT_OFF_NS, FaultCase, Windows, WrongFile, task_plan
 from canprobe.lab.studies.sweep import error_text
 from canprobe.lab.studies.witnessed_run import Witness, longest_above, run_to_end
 

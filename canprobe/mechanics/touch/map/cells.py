@@ -26,13 +26,7 @@ from canprobe.mechanics.touch.map.discs import Discs
 from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs, stiffness_error
 from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND
-from canprobe.mechanics.touch.map.stiffness import (
-    MAX_IMAGES,
-    Stiffness,
-    fused_stiffness,
-    log_of_images,
-    log_of_slope,
-)
+from canprobe.mechanics.touch.map.stiffness import MAX_IMAGES, Stiffness, fused_stiffness, log_of_images, log_of_slope
 from canprobe.mechanics.types import Floats
 
 ROBUST_CHI2 = 6.0
