@@ -166,11 +166,14 @@ def _again(report: Report) -> str:
 
 
 def _points(args: argparse.Namespace) -> tuple[Point, ...]:
-    from canprobe.fieldbus.tools.conform.own_points import read_points
     from canprobe.fieldbus.tools.conform.registry import POINTS, chosen_points
 
-    own = () if args.own is None else read_points(args.own)
-    return chosen_points((*POINTS, *own), (args.points or "").split(","))
+    points = POINTS
+    if args.own is not None:
+        from canprobe.fieldbus.tools.conform.own_points import read_points
+
+        points = (*POINTS, *read_points(args.own))
+    return chosen_points(points, (args.points or "").split(","))
 
 
 def _description(args: argparse.Namespace) -> Description | None:

@@ -30,7 +30,8 @@ from canprobe.errors import UsageError
 if TYPE_CHECKING:
     from canprobe.cell.session.target import Target
     from canprobe.fieldbus.eds.description import Description
-    from canprobe.fieldbus.tools.judge import Judge, MasterBench
+    from canprobe.fieldbus.tools.judge import Judge
+    from canprobe.fieldbus.tools.judge.bench import MasterBench
     from canprobe.fieldbus.tools.reports import Report, ReportRow
 
 HELP = "judge a CANopen master by what it sends"
@@ -136,7 +137,7 @@ def _no_such_node(args: argparse.Namespace, asked: Iterable[int], found: Sequenc
 
 
 def _judge_served(args: argparse.Namespace) -> int:
-    from canprobe.fieldbus.tools.judge import MasterBench, write_log
+    from canprobe.fieldbus.tools.judge.bench import MasterBench, write_log
 
     nodes = _descriptions(args)
     output = args.output or Path(tempfile.mkstemp(prefix="canprobe-judge-", suffix=".txt")[1])
@@ -173,7 +174,7 @@ def _server(
         raise UsageError("judge: the nodes are served on one channel, without a name: --channel CH")
     if args.scene is None:
         from canprobe.cell.session.served import emulate_eds
-        from canprobe.fieldbus.tools.judge import start_position
+        from canprobe.fieldbus.tools.judge.bench import start_position
 
         target = real_target(args.bus, channels[0][1], args.bitrate)
         files = eds_files(args, "judge")
@@ -221,7 +222,7 @@ def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mappi
 def _report_of(
     args: argparse.Namespace, bench: MasterBench, judge: Judge, nodes: Mapping[int, Description], target: Target
 ) -> Report:
-    from canprobe.fieldbus.tools.judge import first_answers
+    from canprobe.fieldbus.tools.judge.bench import first_answers
 
     facts = {
         **_facts(args),

@@ -42,15 +42,19 @@ def read_baseline(args: argparse.Namespace) -> Report | None:
 
 def write_report(args: argparse.Namespace, report: Report, baseline: Report | None) -> ReportChange | None:
     """Write the files that are asked for, and the step summary of GitHub; what changed since the baseline."""
-    from canprobe.fieldbus.tools.reports import Verdict, append_step_summary, compare, write_html, write_junit
+    from canprobe.fieldbus.tools.reports import Verdict, append_step_summary, compare
 
     change = None if baseline is None else compare(report, baseline)
     if change is not None and args.fail_on == "new":
         bad = [row.key for row in report.rows if row.verdict is Verdict.FAIL]
         report.known = tuple(key for key in bad if key not in (*change.worse, *change.new))
     if args.junit is not None:
+        from canprobe.fieldbus.tools.reports import write_junit
+
         write_junit(report, args.junit)
     if args.html is not None:
+        from canprobe.fieldbus.tools.reports import write_html
+
         write_html(report, args.html, change)
     append_step_summary(report, os.environ, change)
     return change

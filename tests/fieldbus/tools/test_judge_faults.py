@@ -9,7 +9,8 @@ import pytest
 
 from canprobe.fieldbus import Description, LockstepBus, VirtualClock, load_eds, make_eds_node
 from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
-from canprobe.fieldbus.tools.judge import BusFrame, Judge, first_answers
+from canprobe.fieldbus.tools.judge import BusFrame, Judge
+from canprobe.fieldbus.tools.judge.bench import first_answers
 from canprobe.fieldbus.tools.judge.injections import STANDARD_FAULTS, Injections
 
 NODES = (1, 2)

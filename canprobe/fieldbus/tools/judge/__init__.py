@@ -11,7 +11,8 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
                 work. One module a family: enable (and homing), targets, pdo_rules, sdo_rules, network_rules (NMT,
                 SYNC, watchdogs), reactions
     judging     the table of all rules, and `Judge`: events to rules, findings to a report
-    bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile
+    bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile.
+                It is imported by itself: a log needs no nodes
 
 Guards against false alarms: a node is judged after its state was seen; three SYNCs after an NMT start and frames that
 may have waited in a queue are passed over; what is wrong counts when it is wrong twice in a row, but for faults that
@@ -22,7 +23,6 @@ Several axes in one node (objects from 6800h on) are not known.
 Start reading at `bus_state`, then `rule`, then `enable`.
 """
 
-from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, start_position, write_log
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, nodes_of, read_record
 from canprobe.fieldbus.tools.judge.judging import RULES, Judge
 
@@ -30,10 +30,6 @@ __all__ = [
     "RULES",
     "BusFrame",
     "Judge",
-    "MasterBench",
-    "first_answers",
     "nodes_of",
     "read_record",
-    "start_position",
-    "write_log",
 ]

@@ -22,26 +22,36 @@ run, as baselines and the history of a CI server know a row by them; nothing her
 Only the standard library is used. Start reading at `report`.
 """
 
-from canprobe.fieldbus.tools.reports.baseline import ReportChange, compare
-from canprobe.fieldbus.tools.reports.json_file import read_json, report_document, write_json
-from canprobe.fieldbus.tools.reports.junit import write_junit
-from canprobe.fieldbus.tools.reports.page import write_html
-from canprobe.fieldbus.tools.reports.report import Report, ReportRow, Verdict
-from canprobe.fieldbus.tools.reports.text import append_step_summary, closing_text, row_text, verdict_text
+from __future__ import annotations
 
-__all__ = [
-    "Report",
-    "ReportChange",
-    "ReportRow",
-    "Verdict",
-    "append_step_summary",
-    "closing_text",
-    "compare",
-    "read_json",
-    "report_document",
-    "row_text",
-    "verdict_text",
-    "write_html",
-    "write_json",
-    "write_junit",
-]
+from typing import TYPE_CHECKING
+
+from canprobe.fieldbus import door
+
+if TYPE_CHECKING:  # for type checkers, which do not read the table
+    from canprobe.fieldbus.tools.reports.baseline import ReportChange as ReportChange
+    from canprobe.fieldbus.tools.reports.baseline import compare as compare
+    from canprobe.fieldbus.tools.reports.json_file import read_json as read_json
+    from canprobe.fieldbus.tools.reports.json_file import report_document as report_document
+    from canprobe.fieldbus.tools.reports.json_file import write_json as write_json
+    from canprobe.fieldbus.tools.reports.junit import write_junit as write_junit
+    from canprobe.fieldbus.tools.reports.page import write_html as write_html
+    from canprobe.fieldbus.tools.reports.report import Report as Report
+    from canprobe.fieldbus.tools.reports.report import ReportRow as ReportRow
+    from canprobe.fieldbus.tools.reports.report import Verdict as Verdict
+    from canprobe.fieldbus.tools.reports.text import append_step_summary as append_step_summary
+    from canprobe.fieldbus.tools.reports.text import closing_text as closing_text
+    from canprobe.fieldbus.tools.reports.text import row_text as row_text
+    from canprobe.fieldbus.tools.reports.text import verdict_text as verdict_text
+
+__getattr__, __dir__, __all__ = door(
+    __name__,
+    {
+        "tools.reports.baseline": ("ReportChange", "compare"),
+        "tools.reports.json_file": ("read_json", "report_document", "write_json"),
+        "tools.reports.junit": ("write_junit",),
+        "tools.reports.page": ("write_html",),
+        "tools.reports.report": ("Report", "ReportRow", "Verdict"),
+        "tools.reports.text": ("append_step_summary", "closing_text", "row_text", "verdict_text"),
+    },
+)
