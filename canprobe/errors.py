@@ -18,7 +18,6 @@ All can be imported from `canprobe`.
 
 from __future__ import annotations
 
-import difflib
 import errno
 import os
 import stat
@@ -267,6 +266,8 @@ def _advised(value: float, digits: int, rounding: str) -> str:
 
 def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     """The text `; did you mean X?`, whatever the case; empty when no known word is close."""
+    import difflib
+
     folded = {word.lower(): word for word in known}
     close = difflib.get_close_matches(got.lower(), folded, n=1, cutoff=cutoff)
     return f"; did you mean {folded[close[0]]}?" if close else ""

@@ -27,7 +27,6 @@ from canprobe.fieldbus.eds.object_lists import check_lists
 from canprobe.fieldbus.eds.sections import Section, decode, split_sections
 from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
-from canprobe.fieldbus.eds.xml_sections import xml_sections
 from canprobe.fieldbus.protocol.frames import EFF_MASK, INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS
 
@@ -112,7 +111,12 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
         way = f"; {kind.into_eds.format(path=shlex.quote(str(path)))}" if kind.into_eds else ""
         faults.fault(0, "", "", f"{kind.name}, not an EDS file{way}")
         data = b""
-    sections = xml_sections(data, faults) if kind is XML else split_sections(decode(data, faults), faults)
+    if kind is XML:
+        from canprobe.fieldbus.eds.xml_sections import xml_sections
+
+        sections = xml_sections(data, faults)
+    else:
+        sections = split_sections(decode(data, faults), faults)
     source = Source(sections, commissioned_node(sections) or 1 if node_id is None else node_id, faults)
     read_information(source, od)
     heads, subs = find_objects(source)

@@ -138,6 +138,7 @@ def packages(names: set[str]) -> set[str]:
 
 NODES = {f"canprobe.fieldbus.{name}" for name in ("node.slave_node", "drive.drive", "tools.faults.fault")}
 FILES = {f"canprobe.fieldbus.tools.{name}" for name in ("reports.page", "reports.junit", "conform.own_points")}
+FILES |= {"canprobe.fieldbus.eds.xml_sections", "difflib", "html"}
 
 
 def test_it_begins_with_no_more_than_python_can_and_canopen(tmp_path):

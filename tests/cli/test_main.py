@@ -16,6 +16,7 @@ from canprobe import api
 from canprobe.cell.master.monitor import Monitor
 from canprobe.cell.results import text
 from canprobe.cell.scene.load import load_scene, packaged
+from canprobe.cell.session import served
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.argument_types import channel, node_ids
 from canprobe.cli.interrupts import termination_interrupts
@@ -193,7 +194,8 @@ UNTIL_CTRL_C = ("up", "emulate", "emulate_eds", "monitor")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_what_a_signal_ends_has_its_status(name, number, monkeypatch, capsys):
     """Ctrl-C is the normal end of what only holds or shows; SIGTERM is 143 everywhere."""
-    monkeypatch.setattr(api, name, lambda *_, **__: signal.raise_signal(number))
+    place = served if name == "emulate_eds" else api
+    monkeypatch.setattr(place, name, lambda *_, **__: signal.raise_signal(number))
     assert main(BUSY[name]) == (143 if number == signal.SIGTERM else 0 if name in UNTIL_CTRL_C else 130)
     assert "Traceback" not in capsys.readouterr().err
 

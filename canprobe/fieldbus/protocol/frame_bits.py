@@ -19,6 +19,7 @@ from typing import Any
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, EFF_MASK, RTR_FLAG
 
+NS_PER_S = 1_000_000_000
 ERROR_FLAG_BITS = 6
 ERROR_DELIMITER_BITS = 8
 INTERMISSION_BITS = 3

@@ -24,9 +24,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.frame_bits import worst_case_bits
-
-NS_PER_S = 1_000_000_000
+from canprobe.fieldbus.protocol.frame_bits import NS_PER_S, worst_case_bits
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,14 @@ from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ERR_BUS, ERR_FLAG, ERR_PROTOCOL
 from canprobe.fieldbus.bus.virtual.controllers import Controllers, ErrorCounters, WireErrors
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, LockstepPort, Participant, arbitration_key
-from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
+from canprobe.fieldbus.protocol.frame_bits import (
+    ERROR_DELIMITER_BITS,
+    ERROR_FLAG_BITS,
+    INTERMISSION_BITS,
+    NS_PER_S,
+    exact_bits,
+)
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
-from canprobe.fieldbus.protocol.response_times import NS_PER_S
 
 Queue = Literal["priority", "fifo"]
 MAX_CLOSING_NS = 50_000_000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import re
 from collections import Counter
 from collections.abc import Mapping
@@ -117,4 +116,6 @@ def _line(text: str) -> str:
 
 def _cell(text: str) -> str:
     """The text in one cell of a table in Markdown."""
+    import html
+
     return html.escape(printable(_line(text)), quote=False).replace("|", "\\|")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from canprobe.fieldbus.protocol.response_times import NS_PER_S
+from canprobe.fieldbus.protocol.frame_bits import NS_PER_S
 from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS, Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
