@@ -1,15 +1,12 @@
 """Draw docs/img/console.svg: the screen of `canprobe console press`, with the probe on the object.
 
-    python docs/console_picture.py [FILE]
-
-A session in virtual time jogs joint 3 until the probe touches; the screen gets what it has printed.
+`python docs/measure.py screens` does it. A session in virtual time jogs joint 3 until the probe touches; the screen
+gets what it has printed.
 """
 
-import asyncio
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -64,7 +61,7 @@ def printed() -> list[Any]:
     return shown[: last + 1]
 
 
-async def draw(path: Path) -> None:
+async def draw_console(path: Path) -> None:
     """Draw the screen after the last state."""
     lines = [json.dumps({"says": one} if isinstance(one, str) else one) for one in printed()]
     with subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as cell:
@@ -78,7 +75,3 @@ async def draw(path: Path) -> None:
             os.write(cell.stdin.fileno(), lines[-1].encode() + b"\n")
             await pilot.pause(0.5)
             path.write_text(screen.export_screenshot(title="canprobe console press"), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    asyncio.run(draw(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/img/console.svg")))

@@ -2,7 +2,7 @@
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `whole_cell`, `vcan0`, `pace`,
 `side_by_side`, `growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `canopen_node_vcan`,
-`pictures`, `report_pictures`, one of `FORMS`, or one of `PRINTED`, what a page shows of a command that the tests
+`pictures`, `screens`, one of `FORMS`, or one of `PRINTED`, what a page shows of a command that the tests
 repeat. Without names everything is measured but what takes more than half an hour or needs clones (`LONG`). Measure on
 a machine that does nothing else: computing time is among the figures. Every entry has its own command, date, commit and
 machine, so that one can be measured anew without the others; an entry whose study is gone stays with its commit. Then
@@ -12,6 +12,7 @@ machine, so that one can be measured anew without the others; an entry whose stu
 from __future__ import annotations
 
 import ast
+import asyncio
 import contextlib
 import datetime
 import hashlib
@@ -33,6 +34,7 @@ from gallery import draw_panel
 from moving_picture import draw_moving
 from PIL import Image
 from report_pictures import draw_reports
+from view_picture import draw_view
 
 import canprobe
 from canprobe.cell.results.expected import figures_of
@@ -414,10 +416,14 @@ def pictures() -> Entry:
     return drawn("pictures", OF_SCENES, panels)
 
 
-def report_pictures() -> Entry:
-    """The pictures of the reports of `conform` and `judge`."""
+def screens() -> Entry:
+    """The pictures of reports, of the view and of the console."""
     draw_reports(IMAGES)
-    return drawn("report_pictures", OF_REPORTS)
+    draw_view(IMAGES / "view.png")
+    from console_picture import draw_console  # imports the extra `console`
+
+    asyncio.run(draw_console(IMAGES / "console.svg"))
+    return drawn("screens", OF_SCREENS)
 
 
 def drawn(entry: str, pictures: Iterable[str], panels: Iterable[str] = ()) -> Entry:
@@ -442,11 +448,14 @@ OF_SCENES: Mapping[str, Sequence[Path]] = {
     "scan.webp": [DOCS / "moving_picture.py"],
     "scenes/cylinder.png": [DOCS / "gallery.py", *(RESULTS / f"{name}.py" for name in ("figures", "picture"))],
 }
-OF_REPORTS: Mapping[str, Sequence[Path]] = {
-    name: [DOCS / "report_pictures.py", REPORTS / "page.py", REPORTS / "page.css"]
-    for name in ("conform.png", "judge.png")
+OF_SCREENS: Mapping[str, Sequence[Path]] = {
+    **dict.fromkeys(
+        ("conform.png", "judge.png"), (DOCS / "report_pictures.py", REPORTS / "page.py", REPORTS / "page.css")
+    ),
+    "view.png": [DOCS / "view_picture.py", *sorted((DOCS.parent / "bridge" / "view").glob("*.py"))],
+    "console.svg": [DOCS / "console_picture.py", DOCS.parent / "canprobe" / "cli" / "console_screen.py"],
 }
-DRAWN_BY = {**OF_SCENES, **OF_REPORTS}
+DRAWN_BY = {**OF_SCENES, **OF_SCREENS}
 """Code that draws a picture: where it changes, the picture is drawn anew, and with the one of a scene all of them."""
 
 
@@ -474,7 +483,7 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "learning": learning,
     "bridges": bridges,
     "pictures": pictures,
-    "report_pictures": report_pictures,
+    "screens": screens,
     **{name: partial(shown, name) for name in PRINTED},
 }
 

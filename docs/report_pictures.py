@@ -1,4 +1,4 @@
-"""Draw docs/img/conform.png and judge.png, the tops of two reports. `python docs/measure.py report_pictures`
+"""Draw docs/img/conform.png and judge.png, the tops of two reports. `python docs/measure.py screens`
 
 Chromium draws them, as it shows the files of --html.
 """
@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
@@ -53,13 +54,18 @@ def judged(folder: Path) -> Report:
 
 def draw_reports(images: Path) -> None:
     """Draw both into a folder."""
-    chromium = next(filter(None, map(shutil.which, CHROMIUM)))
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         for name, report in (("conform", examined()), ("judge", judged(folder))):
             page, path = folder / f"{name}.html", images / f"{name}.png"
             write_html(report, page)
-            window = [f"--window-size={WIDTH},{HEIGHTS[name]}", f"--force-device-scale-factor={SCALE}"]
-            words = [chromium, "--headless", "--no-sandbox", "--hide-scrollbars", *window, f"--screenshot={path}"]
-            subprocess.run([*words, page.as_uri()], check=True, capture_output=True)
+            screenshot(page, path, (WIDTH, HEIGHTS[name]), [f"--force-device-scale-factor={SCALE}"])
             Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
+
+
+def screenshot(page: Path, path: Path, window: tuple[int, int], words: Sequence[str]) -> None:
+    """Draw a page of HTML as chromium shows it in a window, CSS pixels."""
+    chromium = next(filter(None, map(shutil.which, CHROMIUM)))
+    size = f"--window-size={window[0]},{window[1]}"
+    command = [chromium, "--headless", "--no-sandbox", "--hide-scrollbars", size, *words, f"--screenshot={path}"]
+    subprocess.run([*command, page.as_uri()], check=True, capture_output=True)

@@ -37,14 +37,14 @@ def test_each_of_them_is_on_a_page_and_a_choice_of_subjects_keeps_what_is_set_in
 @pytest.mark.parametrize("name", measure.DRAWN_BY)
 def test_a_picture_is_drawn_by_the_present_code(name):
     assert any(f"img/{name})" in text for text in TEXTS.values())
-    entry = "report_pictures" if name in measure.OF_REPORTS else "pictures"
+    entry = "screens" if name in measure.OF_SCREENS else "pictures"
     assert MEASURED[entry]["drawn_by"][name] == measure.drawing_code(name), f"type: python docs/measure.py {entry}"
 
 
 def test_a_picture_is_the_one_that_was_drawn_with_the_figures_beside_it():
     entries = [entry.get("pictures", {}) for entry in MEASURED.values()]
     noted = {name: digest for entry in entries for name, digest in entry.items()}
-    shown = {path.relative_to(measure.IMAGES).as_posix() for path in measure.IMAGES.rglob("*.[pw]*")} - {"view.png"}
+    shown = {path.relative_to(measure.IMAGES).as_posix() for path in measure.IMAGES.rglob("*.[pw]*")} | {"console.svg"}
     assert noted == {name: measure.picture_digest(name) for name in shown}, "type: python docs/measure.py STUDY"
 
 
