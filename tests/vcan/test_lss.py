@@ -23,9 +23,6 @@ def scan(bench: Any, *words: str) -> Any:
     return json.loads(command.out)
 
 
-@pytest.mark.slow(
-    reason="two processes; the search is tried on a real bus in fieldbus/conformance, the command without"
-)
 def test_a_blank_node_gets_its_id(bench: Any) -> None:
     nodes = served(bench, "4")
     done = scan(bench, "--assign", "4=44")
