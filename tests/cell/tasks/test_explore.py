@@ -90,7 +90,7 @@ def test_the_log_shows_the_deviation_over_the_path(reached):
     assert sigma[known][-1] <= 15.0
 
 
-@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back from a hollow")
 def test_a_target_below_what_the_scan_has_in_common_is_not_reached_and_it_says_why():
     explored = run(SMALL | {"task.target_sigma_um": 3.0}, 3.0).summary["explore"]
     assert not explored["reached"]
@@ -109,7 +109,7 @@ def test_contacts_contradict_a_smooth_surface_where_they_scatter_more_than_the_s
     assert explored["rough_fraction"] == rough and ("contradict" in explored["why_not"]) == (rough > 0.0)
 
 
-@pytest.mark.slow(reason="a whole exploration; the default has one that ends")
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back from a hollow")
 @pytest.mark.parametrize(("radius_mm", "seed"), [(14.0, 0), (18.0, 2)])
 def test_a_ridge_that_is_much_rounder_than_the_probe_is_smooth_ground(radius_mm, seed):
     ridge = ObjectSettings("cylinder", radius_mm=radius_mm, position_mm=(-170, -175, 300), rotation_deg=(0, 0, 20))
@@ -137,7 +137,7 @@ def height_field(folder, heights):
     )
 
 
-@pytest.mark.slow(reason="a whole exploration; the default has one that ends")
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back from a hollow")
 def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
     side, end = np.arange(-13, 13.1, 0.5)[:, None], np.arange(-25, 25.1, 0.5)[None]
     plate = height_field(tmp_path, -(side**2 + end**2) / 300.0)
@@ -148,7 +148,6 @@ def test_it_turns_back_from_the_edge_of_a_plate(tmp_path):
     assert result.summary["contact"]["force_max_n"] < 5.0
 
 
-@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
 def test_it_turns_back_from_a_hollow_as_tight_as_the_probe(tmp_path):
     """Beyond 14 mm the hollow has a radius of 31 mm: the probe of 40 mm would touch both of its walls."""
     x = np.arange(-25, 25.1, 0.5)
@@ -162,7 +161,7 @@ def test_it_turns_back_from_a_hollow_as_tight_as_the_probe(tmp_path):
     assert result.summary["contact"]["force_max_n"] < 5.0
 
 
-@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back from a hollow")
 def test_it_turns_back_before_the_contact_runs_off_the_array():
     """The pad does not follow the surface, and the object is rounder than the scene says."""
     keys = {"task.length_mm": 30.0, "task.width_mm": 20.0, "task.rolling_share": 1.0, "task.duration_s": 2.5}
@@ -172,7 +171,7 @@ def test_it_turns_back_before_the_contact_runs_off_the_array():
     assert 0.0 < explored["closed_fraction"] < 0.6
 
 
-@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back at an edge")
+@pytest.mark.slow(reason="a whole exploration; the default has one that ends and one that turns back from a hollow")
 def test_it_turns_back_before_a_joint_comes_to_its_limit():
     """The margin of joint 1 is set so that a part of the rectangle lies beyond it, which the plan did not see."""
     plan = make_plan(resolve(scene_with(SMALL | {"task.duration_s": 3.0}, object=ball(60.0))))
