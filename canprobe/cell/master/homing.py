@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.master.led_drive import POSITION, LedDrive, SdoLink
+from canprobe.cell.master.led_drive import LedDrive, SdoLink
 from canprobe.cell.master.node_bringup import IDENTITY
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
@@ -39,6 +39,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     HOMING_ERROR_BIT,
     HOMING_START_BIT,
     NEW_SETPOINT_BIT,
+    POSITION,
     SETPOINT_ACKNOWLEDGE_BIT,
     TARGET_REACHED_BIT,
     OperationMode,

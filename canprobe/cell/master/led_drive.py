@@ -22,7 +22,9 @@ from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
 from canprobe.fieldbus.protocol.cia402 import (
+    CONTROLWORD,
     POWERED_STATES,
+    STATUSWORD,
     DriveState,
     OperationMode,
     controlword_toward,
@@ -32,7 +34,6 @@ from canprobe.fieldbus.protocol.cia402 import (
 from canprobe.fieldbus.protocol.frames import NmtState, pack_heartbeat
 
 POLL_S = 0.01
-CONTROLWORD, STATUSWORD, POSITION = 0x6040, 0x6041, 0x6064
 _OFF = frozenset(DriveState) - POWERED_STATES
 _DISABLED = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON})
 

@@ -17,10 +17,9 @@ from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, SdoTimeoutError, hold_dialogues
-from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, STATUSWORD, state_of
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState, pack_nmt
 
-STATUSWORD = 0x6041
 _COMMANDS = {NmtState.OPERATIONAL: NmtCommand.START, NmtState.STOPPED: NmtCommand.STOP}
 
 

@@ -64,7 +64,6 @@ class SupervisedCycle:
         self.notes: Notes = Notes() if before is None else before.notes
         self.say: Say = self.notes.saying(options.say)
         self.cycle: Cycle  # once started
-        self._started = False
         self.controller = Controller()
         self.reader: PatchReader | None = make_patch_reader(plan.setup)
         self.start_ns = 0
@@ -82,7 +81,7 @@ class SupervisedCycle:
 
     def start(self, cycle: Cycle) -> None:
         """Take the cycle on the bus, once the nodes are up."""
-        self.cycle, self._started = cycle, True
+        self.cycle = cycle
         self.start_ns = cycle.t_first_ns - self._origin_ns
         self.log.start_s = self.start_ns * 1e-9
 
@@ -158,7 +157,7 @@ class SupervisedCycle:
     def record_last(self) -> None:
         """Record the last cycle, where an error left it before its row."""
         last = self.supervisor.seen.measurement
-        if self._started and last is not self.recorded:
+        if last is not self.recorded:
             self.record(last, None)
 
     def run_s(self, measurement: Measurement) -> float:

@@ -21,7 +21,7 @@ from canprobe.cell.tasks.free_and_listen import HoldTask
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
+from canprobe.fieldbus.protocol.cia402 import POSITION, STATUSWORD, TARGET_POSITION, DriveState, known_state
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 
@@ -35,7 +35,6 @@ SLACK_S = 1.0
 """Time that a cell may take from the boot-up of a node to the hold, besides the node's SDO times."""
 SCENES: Mapping[str, str] = {"hold": "free", "free": "free", "press": "press", "scan": "plane"}
 """Scene of each kind of work."""
-STATUSWORD, POSITION, TARGET = 0x6041, 0x6064, 0x607A
 LOST: Mapping[str, str] = {
     "reboot": "reboot",
     "bus-off": "bus-off",
@@ -315,7 +314,6 @@ class FirstTargets:
 
     Args:
         plan: plan of the cell.
-
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -339,8 +337,8 @@ class FirstTargets:
         if STATUSWORD in got:
             enabled = known_state(got[STATUSWORD]) is DriveState.OPERATION_ENABLED
             self._ages[node_id] = (age + 1, times + (age < 0)) if enabled else (-1, times)
-        elif TARGET in got and times > 1 and 0 <= age < FIRST_SYNCS and POSITION in values:
-            return abs(got[TARGET] - values[POSITION])
+        elif TARGET_POSITION in got and times > 1 and 0 <= age < FIRST_SYNCS and POSITION in values:
+            return abs(got[TARGET_POSITION] - values[POSITION])
         return 0
 
 

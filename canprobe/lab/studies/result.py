@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import canprobe
+from canprobe.cell.scene.units import unit_of
 from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text
 from canprobe.lab.studies.cell_store import PACKAGE, model_digest
 from canprobe.mechanics.types import Floats
@@ -30,12 +31,11 @@ CHANNEL = "vcan0"
 CHI2_95_OF_3 = 7.815
 FROBENIUS = np.array([1.0, 2.0, 1.0])
 """Weights of (K11², K12², K22²) in ‖K‖²."""
-
-
 UNITS = {
-    "n_m3": "N/m³", "n_m": "N/m", "per_m": "1/m", "n": "N", "us": "µs", "um": "µm", "hz": "Hz", "kpa": "kPa",
-    "mib": "MiB", "percent": "%",
-}  # fmt: skip
+    **{end: unit_of(end).text for end in ("n_m3", "n_m", "n", "us", "um", "hz", "kpa", "percent")},
+    "per_m": "1/m",
+    "mib": "MiB",
+}
 """Units at the end of a key that a table spells otherwise."""
 
 
