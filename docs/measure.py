@@ -5,8 +5,8 @@ A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_s
 `hard_cases`, `test_lines`, `pictures`, `screens`, one of `FORMS`, or one of `PRINTED`, what a page shows of a command
 that the tests repeat. Without names everything is measured but what takes more than half an hour or needs clones
 (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has its own
-command, date, commit and machine, so that one can be measured anew without the others; an entry whose study is gone stays with its commit. Then
-`python docs/generate.py` writes the pages.
+command, date, commit and machine, so that one can be measured anew without the others; an entry whose study is gone
+stays with its commit. Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
