@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from canprobe.fieldbus.tools.judge.rules import RULES
+from canprobe.fieldbus.tools.judge import RULES
 
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
 
