@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from canprobe.fieldbus.tools.judge import RULES
 
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
+from canprobe.fieldbus.tools.judge import RULES
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 sys.path.append(str(DOCS))  # as for `python docs/measure.py`
