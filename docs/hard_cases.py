@@ -63,6 +63,10 @@ CASES: Mapping[str, tuple[str, Callable[[], Score]]] = {
     ),
     "dead-rows": ("four of sixteen rows dead in the middle of the first contact: press", partial(of_study, 297)),
     "half-torque": ("drive of joint 2 loses half of its torque: explore, dynamic plant", partial(of_study, 1469)),
+    "no-torque": (
+        "drive of joint 2 loses 0.9 of its torque between two touches: calibrate, dynamic plant",
+        partial(of_study, 2030),
+    ),
     "zero-2": ("zero of joint 2 shifts before the first motion: calibrate", partial(of_study, 244)),
     "zero-3": ("zero of joint 3 shifts before the first motion: explore", partial(of_study, 1213)),
     **{
