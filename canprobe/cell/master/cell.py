@@ -295,7 +295,7 @@ class Cell:
             BusError: another master has come.
         """
         if self.drives is not None:
-            self.drives.goal = DriveState.SWITCH_ON_DISABLED
+            self.drives.targets.goal = DriveState.SWITCH_ON_DISABLED
         for _ in range(max(1, round(seconds * 1e9 / self._plan.sync.period_ns))):
             self.cycles.recorded = self.cycles.begin()
             self.cycles.cycle.end(None)

@@ -23,8 +23,9 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
 from canprobe.fieldbus.protocol.cia402 import (
     CONTROLWORD,
-    POWERED_STATES,
+    DISABLED_STATES,
     STATUSWORD,
+    UNPOWERED_STATES,
     DriveState,
     OperationMode,
     controlword_toward,
@@ -34,8 +35,6 @@ from canprobe.fieldbus.protocol.cia402 import (
 from canprobe.fieldbus.protocol.frames import NmtState, pack_heartbeat
 
 POLL_S = 0.01
-_OFF = frozenset(DriveState) - POWERED_STATES
-_DISABLED = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON})
 
 
 class SdoLink:
@@ -178,8 +177,8 @@ class LedDrive:
             try:
                 stop_s = self._link.times.stop_s
                 with contextlib.suppress(NodeError):  # by 605Ah it may stay in quick stop
-                    self._lead(DriveState.QUICK_STOP_ACTIVE, _OFF, stop_s, supervised=False)
-                self._lead(DriveState.SWITCH_ON_DISABLED, _DISABLED, stop_s, supervised=False)
+                    self._lead(DriveState.QUICK_STOP_ACTIVE, UNPOWERED_STATES, stop_s, supervised=False)
+                self._lead(DriveState.SWITCH_ON_DISABLED, DISABLED_STATES, stop_s, supervised=False)
                 if self.setup.mode is not None:
                     self.write(Write(MODE, 0, self.setup.mode, "mode of operation"))
             except KeyboardInterrupt:

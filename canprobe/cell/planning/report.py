@@ -291,7 +291,8 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
         also = f"; on the same data afterwards: {', '.join(shape.also)}" if shape.also else ""
         yield ["estimator", shape.method + also]
     if setup.emulates:
-        nodes = f"nodes {', '.join(map(str, setup.emulated_node_ids))}" if setup.emulated_node_ids else ""
+        ids = ", ".join(str(node.node_id) for node in plan.nodes if node.emulated)
+        nodes = f"nodes {ids}" if ids else ""
         raw = "the array" if setup.array is not None and setup.array.raw is not None and setup.array.emulated else ""
         emulated = " and ".join(filter(None, (nodes, raw)))
         yield ["emulator", f"{emulated}; arm {setup.truth.fidelity}" if setup.arm is not None else emulated]
