@@ -20,8 +20,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from canprobe.mechanics.types import Floats
-
 ROWS_FOLDER = "rows"
 """Folder of the rows in the folder of a run; it is gone when the run has ended and its files are written."""
 BLOCK_ROWS = 200
@@ -173,7 +171,7 @@ def read_left_rows(folder: Path, table: str) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def joint_columns(name: str, q: Floats, prismatic: NDArray[np.bool_] | None) -> dict[str, Floats]:
+def joint_columns(name: str, q: NDArray[Any], prismatic: NDArray[np.bool_] | None) -> dict[str, NDArray[Any]]:
     """Joint positions as columns of the log: of an arm whose joints all turn `name_rad` alone, else with `name_m`.
 
     Args:
@@ -190,7 +188,7 @@ def joint_columns(name: str, q: Floats, prismatic: NDArray[np.bool_] | None) -> 
     return sliding if prismatic.all() else {f"{name}_rad": np.where(prismatic, np.nan, q), **sliding}
 
 
-def joint_positions(log: Mapping[str, Floats], name: str = "q") -> Floats | None:
+def joint_positions(log: Mapping[str, NDArray[Any]], name: str = "q") -> NDArray[Any] | None:
     """The inverse of `joint_columns` for a whole log: (rows, n) rad or m; None where it has no such columns.
 
     Args:

@@ -123,7 +123,7 @@ class PlantState(NamedTuple):
 
 
 @dataclass(slots=True, eq=False)
-class Solution:
+class SolvedContact:
     """The contact at one instant."""
 
     q: tuple[float, ...]
@@ -189,7 +189,7 @@ class ContactSolver:
             self._shares = [[(i, share) for i, share in enumerate(row) if share] for row in model.q_per_unit.tolist()]
             self._at_zero = units_to_joints(model, np.zeros(model.n)).tolist() if model.zero_units.any() else None
 
-    def solve(self, state: PlantState, first_image_s: float | None) -> Solution:
+    def solve(self, state: PlantState, first_image_s: float | None) -> SolvedContact:
         """The contact in a state.
 
         Args:
@@ -202,7 +202,7 @@ class ContactSolver:
             q = tuple([a + b for a, b in zip(q, self._at_zero, strict=True)])
         probe = self._probe(q, qd) if self._pressed is None else self._pressed.at(1e-9 * state.t_ns, first_image_s)
         if config.object is None:
-            return Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), _POLE, _ORIGIN)
+            return SolvedContact(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), _POLE, _ORIGIN)
         foot = config.object.nearest(probe.centre)
         if config.compliance is not None and foot.distance < config.radius_m:
             q = self._given_way(q, foot, config.compliance)
@@ -225,11 +225,11 @@ class ContactSolver:
         uv = pad_coordinates(d, config.radius_m)
         force = contact.force
         push = (force * nx, force * ny, force * nz) if push is None else push
-        return Solution(
+        return SolvedContact(
             q, probe, foot, depth, rate, contact, uv, d, push, several=config.object.by_gaps or touches is not None
         )
 
-    def torques(self, s: Solution) -> list[float]:
+    def torques(self, s: SolvedContact) -> list[float]:
         """The object's push, (n,) torques on the motors, in motor coordinates.
 
         Without friction every force on a ball acts through its centre, however many places touch:

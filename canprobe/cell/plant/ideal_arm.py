@@ -223,14 +223,9 @@ class IdealArm:
         """
 
     def _states(self) -> list[State]:
-        if self._evaluated is None:
-            self._evaluated = self._evaluate(self.t_ns)
-        return self._evaluated
-
-    def _evaluate(self, t_ns: int) -> list[State]:
         """All states at once. At the very end of a ramp its own formula still holds."""
-        states: list[State] = []
-        lag, last_ns, tau = self.lag_s, -1, 0.0
+        self._evaluated = states = []
+        t_ns, lag, last_ns, tau = self.t_ns, self.lag_s, -1, 0.0
         p11 = p12 = p21 = p22 = 0.0
         for a in self._axes:
             if t_ns > a.event_ns or a.coming:

@@ -15,10 +15,9 @@ from math import inf
 
 import numpy as np
 
-from canprobe.cell.plant.arms import make_arm
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.contact import ContactSolver, PlantState, Solution, TruthRow
-from canprobe.cell.plant.dynamic_arm import DynamicArm
+from canprobe.cell.plant.contact import ContactSolver, PlantState, SolvedContact, TruthRow
+from canprobe.cell.plant.dynamic_arm import DynamicArm, make_arm
 from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.fieldbus.drive.profile import MotorDynamics
@@ -68,7 +67,7 @@ class Plant:
                 stiffness_n_m3=config.stiffness_n_m3,
                 pad=config.pad,
             )
-        self._solved: Solution | None = None
+        self._solved: SolvedContact | None = None
         self._image: tuple[int, Image] | None = None
         self._first_image_s: float | None = None
 
@@ -190,7 +189,7 @@ class Plant:
             return np.zeros(self.config.pad.shape)
         return self._compression(self.array, s) * (self.config.stiffness_n_m3 * s.contact.damping_factor)
 
-    def _compression(self, array: TaxelArray, s: Solution) -> Floats:
+    def _compression(self, array: TaxelArray, s: SolvedContact) -> Floats:
         """(rows, columns) taxel means of the layer's compression, m."""
         if s.depth <= 0.0:
             return np.zeros(array.pad.shape)
@@ -230,10 +229,10 @@ class Plant:
         """`truth` in plain numbers; that of the present state costs nothing where the array was just sampled."""
         return (self._solution() if state is None else self._solve(state)).truth
 
-    def _solve(self, state: PlantState) -> Solution:
+    def _solve(self, state: PlantState) -> SolvedContact:
         return self._solver.solve(state, self._first_image_s)
 
-    def _solution(self) -> Solution:
+    def _solution(self) -> SolvedContact:
         if self._solved is None:
             self._solved = self._solve(self.state())
         return self._solved

@@ -18,8 +18,7 @@ from canprobe.cell.planning.array import (
 from canprobe.cell.planning.free_parameters import opened, second_channel
 from canprobe.cell.planning.identifiers import order_by_deadline
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.report_json import plan_dict
+from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main

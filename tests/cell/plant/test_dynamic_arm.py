@@ -8,9 +8,8 @@ import pytest
 from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
 from scipy.integrate import solve_ivp
 
-from canprobe.cell.plant.arms import make_arm, make_equations
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import DynamicArm, Reference, Stepping
+from canprobe.cell.plant.dynamic_arm import DynamicArm, Reference, Stepping, make_arm, make_equations
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.equations import Effects
 from canprobe.cell.plant.ideal_arm import NEVER, IdealArm

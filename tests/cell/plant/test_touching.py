@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from puma_arm import BODIES, ELBOW_FORM, UPENN
 
-from canprobe.cell.plant.arms import make_equations
 from canprobe.cell.plant.config import PlantConfig
+from canprobe.cell.plant.dynamic_arm import make_equations
 from canprobe.cell.plant.elastic_contact import elastic_contact, force_laws, total_force
 from canprobe.cell.plant.equations import Effects
 from canprobe.cell.plant.integrators import rosenbrock2
