@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.log import joint_positions
 from canprobe.cell.results.run_files import (
     LOG,
     TACTILE,
@@ -25,6 +24,7 @@ from canprobe.cell.results.run_files import (
     read_tactile,
 )
 from canprobe.cell.results.surface_file import SURFACE, load_surface_map
+from canprobe.cell.rows import joint_positions
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup

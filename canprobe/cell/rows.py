@@ -1,7 +1,8 @@
 """Rows of a run while it goes on: in memory, or in blocks in an ``.npy`` file that `numpy.load` reads at any moment.
 
 A run of an hour has 1.4 million cycles. Its rows go to disk, so that memory does not grow with them and a process that
-is killed leaves them. At the end columns are made of them, one after the other.
+is killed leaves them. At the end columns are made of them, one after the other. Joints that turn and joints that slide
+have columns of their own (`joint_columns`).
 """
 
 from __future__ import annotations
@@ -168,3 +169,33 @@ def read_left_rows(folder: Path, table: str) -> dict[str, NDArray[Any]]:
             if column.shape[1:] == kind[name].shape[1:]:
                 column[at] = kind[name]
     return columns
+
+
+def joint_columns(name: str, q: NDArray[Any], prismatic: NDArray[np.bool_] | None) -> dict[str, NDArray[Any]]:
+    """Joint positions as columns of the log: of an arm whose joints all turn `name_rad` alone, else with `name_m`.
+
+    Args:
+        name: `q` or `q_target`.
+        q: (n,) rad or m.
+        prismatic: (n,) which joints slide; None: none of them.
+
+    Returns:
+        (n,) each, NaN where a joint is of the other kind.
+    """
+    if prismatic is None:
+        return {f"{name}_rad": q}
+    sliding = {f"{name}_m": np.where(prismatic, q, np.nan)}
+    return sliding if prismatic.all() else {f"{name}_rad": np.where(prismatic, np.nan, q), **sliding}
+
+
+def joint_positions(log: Mapping[str, NDArray[Any]], name: str = "q") -> NDArray[Any] | None:
+    """The inverse of `joint_columns` for a whole log: (rows, n) rad or m; None where it has no such columns.
+
+    Args:
+        log: columns by name.
+        name: `q` or `q_target`.
+    """
+    turning, sliding = log.get(f"{name}_rad"), log.get(f"{name}_m")
+    if turning is None or sliding is None:
+        return sliding if turning is None else turning
+    return np.where(np.isnan(turning), sliding, turning)

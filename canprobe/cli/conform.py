@@ -195,8 +195,7 @@ def _port(args: argparse.Namespace) -> Iterator[Port]:
         if args.bus == "lockstep":
             port = _emulated(args)
         else:
-            from canprobe.cell.session.opened_bus import open_bus
-            from canprobe.cell.session.target import refuse_virtual
+            from canprobe.cell.session.target import open_bus, refuse_virtual
 
             refuse_virtual(args.bus, "conform")
             target = real_target(args.bus, args.channel, args.bitrate, channel_else="can0")

@@ -97,8 +97,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
     from canprobe.cell.planning.free_parameters import opened
     from canprobe.cell.planning.make import make_plan
-    from canprobe.cell.planning.report import plan_text, verdict_text
-    from canprobe.cell.planning.report_json import plan_dict, refused_dict
+    from canprobe.cell.planning.report import plan_dict, plan_text, refused_dict, verdict_text
     from canprobe.cell.scene.resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):

@@ -1,7 +1,6 @@
 """The emulated side of a cell: its drives and its array, made of a plan and put on one plant.
 
-- `world` makes the nodes from a plan, with a recorder of the truth.
-- `truth_columns` has the names of the columns of `truth.npz`.
+- `world` makes the nodes from a plan, with a recorder of the truth and the names of its columns.
 - `array` is the tactile node of a CANopen array, and an array that knows no CANopen.
 - `array_faults` are the faults of the array, beside those of `canprobe.fieldbus.tools.faults`.
 - `image_processing` is the processing of a raw image in the sensor before it is sent.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import RawArray, TactileApplication
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
-from canprobe.cell.emulated.truth_columns import with_units
 from canprobe.cell.planning.model import Plan, PlannedNode
 from canprobe.cell.planning.motion import parked_posture
 from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.cell.plant.config import PlantConfig, PressMotion
-from canprobe.cell.plant.plant import Plant, PlantState, TruthRow, truth_columns
+from canprobe.cell.plant.contact import PlantState, TruthRow
+from canprobe.cell.plant.plant import Plant, truth_columns
 from canprobe.cell.plant.taxels import TaxelConfig
-from canprobe.cell.rows import BLOCK_ROWS, LazyColumns, Rows
+from canprobe.cell.rows import BLOCK_ROWS, LazyColumns, Rows, joint_columns
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
@@ -34,6 +34,29 @@ from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
 from canprobe.mechanics.robot.chain import Chain, forward
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
+
+NAMES = {
+    "probe_centre": "probe_centre_m",
+    "force": "force_n",
+    "depth": "depth_m",
+    "depth_rate": "depth_rate_m_s",
+    "contact_point": "contact_point_m",
+    "kappa": "kappa_per_m",
+    "pad_uv": "pad_uv_m",
+}
+"""Name in the plant, where all is SI without a suffix → name in `truth.npz`. Other columns have no unit."""
+
+
+def with_units(columns: Mapping[str, NDArray[Any]], prismatic: Sequence[bool]) -> dict[str, NDArray[Any]]:
+    """The plant's columns, as `Plant.truths` names them and others, under the names of the file.
+
+    The joints `q` are `q_rad` and `q_m`, as in `log.npz`, by which of them slide.
+    """
+    named: dict[str, NDArray[Any]] = {}
+    slides = np.array(prismatic, dtype=bool) if any(prismatic) else None
+    for name, column in columns.items():
+        named |= joint_columns("q", column, slides) if name == "q" else {NAMES.get(name, name): column}
+    return named
 
 
 class TruthRecorder(Participant):

@@ -15,10 +15,9 @@ A `cell.Cell` is made of a plan and a port; nothing is sent before it is entered
    pre-operational and closes the bus.
 
 `position_track` is the position of a motor as its TPDOs report it, `tactile_frame` the frame that controllers see;
-`observers` see every cycle after its work. `log` keeps rows, with positions as `joint_columns`. `homing` finds the
-zeros of drives without an absolute encoder, each led by SDO (`led_drive`, `entries`), and `node_record` keeps them.
-`monitor` reads a bus without sending. `scan` lists nodes; `commission` gives node ids by LSS. `restore_nodes` leaves
-nodes as a check found them; `options` is what the caller of a run sets.
+`observers` see every cycle after its work. `log` keeps rows. `homing` finds the zeros of drives without an absolute
+encoder, each led by SDO (`entries`), and `node_record` keeps them. `monitor` reads a bus without sending.
+`commission` lists nodes, and gives node ids by LSS; `options` is what the caller of a run sets.
 The room knows `Setup`, `Plan`, `Clock` and `Port`; it never sees the emulator.
 Start reading at `cell`, then `conditions`.
 """

@@ -9,13 +9,11 @@ from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import CanprobeError, NodeError, SafetyStop
-from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState
+from canprobe.fieldbus.protocol.cia402 import DISABLED_STATES, UNPOWERED_STATES, DriveState
 
 WARM_UP_S = 0.1
 """Time of cycles before the drives are enabled, s, until both sides run at their usual speed."""
 REST_TIMEOUT_S = 2.0
-_OFF = frozenset(DriveState) - POWERED_STATES
-_DISABLED = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON})
 
 
 class ArmPower:
@@ -45,8 +43,8 @@ class ArmPower:
         """
         drives, cycles = self._drives, self._cycles
         cycles.say("enable the drives")
-        drives.forget_targets()  # of a controller before this one: the arm may stand elsewhere
-        drives.goal = DriveState.SWITCH_ON_DISABLED
+        drives.targets.forget()  # of a controller before this one: the arm may stand elsewhere
+        drives.targets.goal = DriveState.SWITCH_ON_DISABLED
         enable_s, one_cycle_s = self._times.enable_s, 1.5e-9 * self._period_ns
         with self._bring_up.confirm_modes(enable_s) as modes:
             self._cycle_until(frozenset(), WARM_UP_S, modes.serve)
@@ -60,7 +58,7 @@ class ArmPower:
             raise self._restless()
         if (reason := cycles.controller.inspect(drives.joints())) is not None:
             raise SafetyStop(reason)
-        drives.goal = DriveState.OPERATION_ENABLED
+        drives.targets.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until(frozenset({DriveState.OPERATION_ENABLED}), enable_s, check):
             i, instead = drives.first_not_in(DriveState.OPERATION_ENABLED)
             node_id = drives.axes[i].node_id
@@ -88,11 +86,11 @@ class ArmPower:
         if not self._drives.heard_all:
             return
         self._cycles.say("stop and disable the drives")
-        self._drives.goal = DriveState.QUICK_STOP_ACTIVE
-        self._stop_until(_OFF)  # with 605Ah = 2 a drive at rest leaves quick stop by itself
-        self._drives.goal = DriveState.SWITCH_ON_DISABLED
-        if not self._stop_until(_DISABLED):
-            stuck = self._others_than(_DISABLED)
+        self._drives.targets.goal = DriveState.QUICK_STOP_ACTIVE
+        self._stop_until(UNPOWERED_STATES)  # with 605Ah = 2 a drive at rest leaves quick stop by itself
+        self._drives.targets.goal = DriveState.SWITCH_ON_DISABLED
+        if not self._stop_until(DISABLED_STATES):
+            stuck = self._others_than(DISABLED_STATES)
             which = f"node {stuck[0] if stuck else '?'}"
             self._cycles.notes.add(f"while stopping: {which} did not confirm that it is disabled")
 

@@ -341,12 +341,15 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> ArrayReceiver 
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow, array.channel)
 
 
-def force_columns(patch: Patch) -> dict[str, float | Floats]:
-    """Columns of the log with the force of a patch, its standard deviation, and the parts of that by their causes."""
+def sample_columns(sample: TactileSample, patch: Patch) -> dict[str, float | Floats]:
+    """Columns of the log with an image's force, standard deviation and the parts of that by their causes, and place."""
     return {
+        "sample_cycle": float(sample.cycle),
         "force_n": patch.force,
         "force_sigma_n": patch.sigma.total,
         "force_sigma_parts_n": np.array(patch.sigma),
+        "pad_u_mm": patch.u * 1e3,
+        "pad_v_mm": patch.v * 1e3,
     }
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from canprobe.cell.master.arm_power import ArmPower
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
-from canprobe.cell.master.bringup import BringUp
+from canprobe.cell.master.bringup import BringUp, FoundNodes
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
@@ -20,7 +20,6 @@ from canprobe.cell.master.homing import Homing
 from canprobe.cell.master.lift_off import LiftOff
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
-from canprobe.cell.master.restore_nodes import FoundNodes
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.master.supervision import Condition, CycleState, Finding, Reaction, limits_of
 from canprobe.cell.master.watch import NodeWatch
@@ -295,7 +294,7 @@ class Cell:
             BusError: another master has come.
         """
         if self.drives is not None:
-            self.drives.goal = DriveState.SWITCH_ON_DISABLED
+            self.drives.targets.goal = DriveState.SWITCH_ON_DISABLED
         for _ in range(max(1, round(seconds * 1e9 / self._plan.sync.period_ns))):
             self.cycles.recorded = self.cycles.begin()
             self.cycles.cycle.end(None)

@@ -195,14 +195,15 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> NodeError | None:
 @_checked("following", "joint that does not follow its targets", Reaction.LIFT, _cycles(2))
 def _following(seen: CycleState) -> NodeError | None:
     drives = seen.drives
-    if drives is None or seen.compares_motion or not (beyond := drives.beyond_lag()):
+    if drives is None or seen.compares_motion or not (beyond := drives.targets.beyond_lag()):
         return None
-    i = max(beyond, key=beyond.__getitem__)
+    i, model = max(beyond, key=beyond.__getitem__), drives.model
+    motion = model.joints[i].text(abs(beyond[i] / float(model.units_per_q[i, i])), ".2f")
     lag_ms = seen.limits.lag_ns * 1e-6
     lag = f"a lag of {lag_ms:.3g} ms (servo.drive_lag_ms)" if lag_ms else "its lag"
     return NodeError(
         drives.axes[i].node_id,
-        f"(joint {i + 1}) does not follow its targets: its motion is {drives.joint_text(i, beyond[i])} beside what"
+        f"(joint {i + 1}) does not follow its targets: its motion is {motion} beside what"
         f" {lag} explains; see to its brake and its power stage, or state the lag of the drive",
     )
 

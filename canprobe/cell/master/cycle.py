@@ -245,7 +245,7 @@ class Cycle:
     def end(self, command: Command | None) -> None:
         """Send the commands of this cycle and set the next deadline."""
         if self._drives is not None and command is not None:
-            self._drives.set_target(command.q_target)
+            self._drives.targets.set(command.q_target)
         self.begun = False
         self.send_commands()
         self._sent_ns = elapsed_ns() if self._started_ns else 0
@@ -253,7 +253,7 @@ class Cycle:
 
     def send_commands(self) -> None:
         """Send the RPDOs of this cycle, and the heartbeat when it is due."""
-        frames = self._drives.frames() if self._drives is not None else []
+        frames = self._drives.targets.frames() if self._drives is not None else []
         if self.sync_ns >= self._heartbeat_ns:
             self._heartbeat_ns = self._deadline + HEARTBEAT_PRODUCED_MS * 1_000_000
             frames.append(pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL))

@@ -115,9 +115,7 @@ DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
 
 
 class DriveGroup:
-    """State of the arm's CiA 402 drives in cyclic synchronous or interpolated position mode.
-
-    No RPDO goes to a drive before its position is known: the first target is where it is.
+    """The arm's CiA 402 drives as their TPDOs report them, in cyclic synchronous or interpolated position mode.
 
     Args:
         axes: the drives, joint 1 first.
@@ -130,8 +128,11 @@ class DriveGroup:
         torque_permille: torque of each drive, NaN for one whose TPDO has no torque; empty where none has.
         late, missed, malformed: counts of TPDOs that came late, not at all, or too short.
         lateness_ns: time of the last late TPDO of each drive behind its SYNC, ns.
+        implausible: count of TPDOs with a position that an enabled drive cannot have reached.
+        sync_ns, deadline_ns: when the SYNC of this cycle was sent, and when it was due.
         answer_ns: time from the SYNC to the last TPDO that was used.
-        stopped: node ids of drives that stop while the others go on.
+        tracks: positions of the motors as they are reported.
+        targets: where the drives are sent.
     """
 
     def __init__(
@@ -142,69 +143,25 @@ class DriveGroup:
         period_ns: int = PERIOD_NS,
         lag_s: float = 0.0,
     ) -> None:
-        self.axes = axes
-        self.goal = DriveState.OPERATION_ENABLED
+        self.axes, self.model, self.period_ns = axes, model, period_ns
         self.statuswords = [0] * len(axes)
         sources = feedback_frames(axes)
         with_torque = [any(one.torque is not None for one in sources if one.axis == i) for i in range(len(axes))]
         self.torque_permille = [0 if sent else math.nan for sent in with_torque] if any(with_torque) else []
-        self.late = 0
+        self.late = self.missed = self.malformed = self.implausible = 0
         self.lateness_ns = dict.fromkeys(range(len(axes)), 0)
-        self.missed = 0
-        self.malformed = 0
         self.answer_ns = 0
-        self.implausible = 0
-        self.stopped: frozenset[int] = frozenset()
-        self._model = model
+        self.tracks = tuple([PositionTrack(base, period_ns) for base in rest_counts(model)])
+        self.cycle = -1
+        self.sync_ns = self._sync_before_ns = self.deadline_ns = 0
         self._sources = {one.layout.cob_id: (k, one) for k, one in enumerate(sources)}
-        self._tracks = tuple([PositionTrack(base, period_ns) for base in rest_counts(model)])
-        self._following = Following(model, lag_s, period_ns)
-        self._period_ns = period_ns
-        self._deadline_ns = self._aimed_ns = 0
         self._heard = [-1] * len(sources)
         self._all_heard = False
-        self._targets: list[int] | None = None
-        self._aimed: tuple[int, ...] | None = None
-        self._words = [0] * len(axes)
-        self._constants: list[int] = []
-        self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
-        self._steady: tuple[object, ...] | None = None
-        rpdos: dict[int, list[tuple[int, PdoLayout]]] = {}
-        for i, axis in enumerate(axes):
-            for layout in axis.commands:
-                rpdos.setdefault(layout.cob_id, []).append((i, layout))
-        self._plan = [
-            (
-                cob_id,
-                parts[0][1].transmission_type <= SYNCHRONOUS_MAX,  # in every cycle, else on change
-                [layout.pack for _, layout in parts],
-                [_fetcher(self._places_of(i, layout)) for i, layout in parts],
-                tuple(i for i, _ in parts),
-            )
-            for cob_id, parts in sorted(rpdos.items())
-        ]
-        self._sent: dict[int, tuple[list[tuple[int, ...]], int]] = {}
-        self._repeat = repeat_cycles
         self._pending = 0
         self._open = False
-        self._cycle = -1
-        self._sync_ns = self._sync_before_ns = 0
         self._quickest_ns = period_ns
         self._irregular = False
-
-    def _places_of(self, axis: int, layout: PdoLayout) -> list[int]:
-        """Places of the values of a part in the list of controlwords, targets and constants."""
-        places, n = [], len(self.axes)
-        for entry in layout.signals:
-            place = entry.index, entry.subindex
-            if place == (0x6040, 0):
-                places.append(axis)
-            elif place in _TARGETS:
-                places.append(n + axis)
-            else:
-                places.append(2 * n + len(self._constants))
-                self._constants.append(self.axes[axis].constants[place])
-        return places
+        self.targets = DriveTargets(self, repeat_cycles, lag_s)
 
     @property
     def feedback_ids(self) -> frozenset[int]:
@@ -213,9 +170,9 @@ class DriveGroup:
 
     def begin(self, cycle: int, t_ns: int = 0, deadline_ns: int | None = None) -> None:
         """Begin a cycle: a SYNC was sent at ``t_ns`` for ``deadline_ns``, and every TPDO is expected once."""
-        self._cycle = cycle
-        self._deadline_ns = t_ns if deadline_ns is None else deadline_ns
-        self._sync_before_ns, self._sync_ns = self._sync_ns, t_ns
+        self.cycle = cycle
+        self.deadline_ns = t_ns if deadline_ns is None else deadline_ns
+        self._sync_before_ns, self.sync_ns = self.sync_ns, t_ns
         self._pending = len(self._heard)
         self._open, self._irregular = True, False
 
@@ -232,10 +189,10 @@ class DriveGroup:
         `DOUBTED_CYCLES` in a row where its statusword says that the drive is in another state.
         """
         k, source = self._sources[can_id]
-        if not self._open or t_ns < self._sync_ns or self._heard[k] == self._cycle:
+        if not self._open or t_ns < self.sync_ns or self._heard[k] == self.cycle:
             self.late += 1
             self._irregular = True
-            self.lateness_ns[source.axis] = t_ns - (self._sync_ns if t_ns >= self._sync_ns else self._sync_before_ns)
+            self.lateness_ns[source.axis] = t_ns - (self.sync_ns if t_ns >= self.sync_ns else self._sync_before_ns)
             return
         try:
             values = source.unpack(data)
@@ -250,16 +207,16 @@ class DriveGroup:
             return
         k, source = found
         i = source.axis
-        self._heard[k] = self._cycle
+        self._heard[k] = self.cycle
         self._pending -= 1
-        self.answer_ns = t_ns - self._sync_ns
+        self.answer_ns = t_ns - self.sync_ns
         word = self.statuswords[i] if source.word is None else values[source.word]
         if source.counts is not None:
-            track, counts = self._tracks[i], values[source.counts]
-            doubtful = self._cycle - track.cycle <= DOUBTED_CYCLES or known_state(word) in _UNTOLD
+            track, counts = self.tracks[i], values[source.counts]
+            doubtful = self.cycle - track.cycle <= DOUBTED_CYCLES or known_state(word) in _UNTOLD
             enabled = self.statuswords[i] & _STATE_BITS == _ENABLED and doubtful
-            guarded = enabled and self._aimed is not None  # a log without targets does not say where it was to go
-            if not track.take(counts, self._cycle, self._deadline_ns, guarded=guarded):
+            guarded = enabled and self.targets.sent is not None  # a log does not say where it was to go
+            if not track.take(counts, self.cycle, self.deadline_ns, guarded=guarded):
                 self.implausible += 1
                 return  # nor is the rest of it believed
         self.statuswords[i] = word
@@ -283,31 +240,36 @@ class DriveGroup:
 
     def ages(self) -> tuple[int, ...]:
         """Cycles since each drive last reported a position that can be believed."""
-        return tuple([self._cycle - track.cycle for track in self._tracks])
+        return tuple([self.cycle - track.cycle for track in self.tracks])
 
     @property
     def rests(self) -> tuple[bool, ...]:
         """Whether each drive has reported the same position for a while."""
-        return tuple([track.rested_ns >= REST_NS for track in self._tracks])
+        return tuple([track.rested_ns >= REST_NS for track in self.tracks])
 
     @property
     def brakeable(self) -> tuple[bool, ...]:
         """Whether each drive is enabled and moved a moment ago, by its reports: a target where it is brakes it."""
-        moved = [track.cycle == self._cycle and track.rested_ns < MOVED_NS for track in self._tracks]
+        moved = [track.cycle == self.cycle and track.rested_ns < MOVED_NS for track in self.tracks]
         return tuple([one and on for one, on in zip(moved, self.enabled_ones(), strict=True)])
 
     def joints(self) -> Floats:
         """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""
-        now, now_ns = self._cycle, self._deadline_ns
-        counts = [t.counts if t.cycle == now else t.position(now, now_ns) for t in self._tracks]
-        q = units_to_joints(self._model, counts)
+        now, now_ns = self.cycle, self.deadline_ns
+        counts = [t.counts if t.cycle == now else t.position(now, now_ns) for t in self.tracks]
+        q = units_to_joints(self.model, counts)
         q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it
         return q
 
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Position of each drive as it was last believed, counts."""
+        return tuple([track.counts for track in self.tracks])
+
     def last_place(self, time_ns: int) -> tuple[Floats, Floats]:
         """Joint positions as last reported (n,), rad or m, and the way (n,) that each may have gone on in a time."""
-        ways = np.abs(self._model.q_per_unit) @ np.array([track.way(time_ns) for track in self._tracks])
-        return units_to_joints(self._model, [float(track.counts) for track in self._tracks]), ways
+        ways = np.abs(self.model.q_per_unit) @ np.array([track.way(time_ns) for track in self.tracks])
+        return units_to_joints(self.model, self.counts), ways
 
     @property
     def states(self) -> tuple[DriveState | None, ...]:
@@ -332,64 +294,121 @@ class DriveGroup:
     def disbelieved(self) -> bool:
         """A drive reported last a position that it cannot have reached."""
         positions = [(k, source.axis) for k, source in self._sources.values() if source.counts is not None]
-        return any(self._heard[k] > self._tracks[axis].cycle for k, axis in positions)
+        return any(self._heard[k] > self.tracks[axis].cycle for k, axis in positions)
 
-    def set_target(self, q: Floats | None) -> None:
+    @property
+    def jitter_ns(self) -> int:
+        """Time by which the drives may have seen the SYNC of this cycle later than usual."""
+        return self.period_ns if self._irregular else max(self.answer_ns - self._quickest_ns, 0)
+
+
+class DriveTargets:
+    """Where the drives are sent, in state and position, the RPDOs that say so, and whether the drives follow.
+
+    No RPDO goes to a drive before its position is known: the first target is where it is.
+
+    Args:
+        drives: what the drives report.
+        repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
+        lag_s: lag of the drives behind a ramp.
+
+    Attributes:
+        goal: state that the drives are led into.
+        stopped: node ids of drives that stop while the others go on.
+        sent: targets of the last RPDOs, counts; None before the first ones.
+    """
+
+    def __init__(self, drives: DriveGroup, repeat_cycles: int, lag_s: float) -> None:
+        axes = drives.axes
+        self.goal = DriveState.OPERATION_ENABLED
+        self.stopped: frozenset[int] = frozenset()
+        self.sent: tuple[int, ...] | None = None
+        self._drives = drives
+        self._following = Following(drives.model, lag_s, drives.period_ns)
+        self._sent_ns = 0
+        self._counts: list[int] | None = None
+        self._words = [0] * len(axes)
+        self._constants: list[int] = []
+        self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
+        self._steady: tuple[object, ...] | None = None
+        rpdos: dict[int, list[tuple[int, PdoLayout]]] = {}
+        for i, axis in enumerate(axes):
+            for layout in axis.commands:
+                rpdos.setdefault(layout.cob_id, []).append((i, layout))
+        self._plan = [
+            (
+                cob_id,
+                parts[0][1].transmission_type <= SYNCHRONOUS_MAX,  # in every cycle, else on change
+                [layout.pack for _, layout in parts],
+                [_fetcher(self._places_of(axes[i], i, layout)) for i, layout in parts],
+                tuple(i for i, _ in parts),
+            )
+            for cob_id, parts in sorted(rpdos.items())
+        ]
+        self._on_change: dict[int, tuple[list[tuple[int, ...]], int]] = {}
+        self._repeat = repeat_cycles
+
+    def _places_of(self, axis: DriveAxis, number: int, layout: PdoLayout) -> list[int]:
+        """Places of the values of a part in the list of controlwords, targets and constants."""
+        places, n = [], len(self._words)
+        for entry in layout.signals:
+            place = entry.index, entry.subindex
+            if place == (0x6040, 0):
+                places.append(number)
+            elif place in _TARGETS:
+                places.append(n + number)
+            else:
+                places.append(2 * n + len(self._constants))
+                self._constants.append(axis.constants[place])
+        return places
+
+    def set(self, q: Floats | None) -> None:
         """Joint target (n,), rad or m, of the next RPDOs; None holds the last one."""
         if q is not None:
-            self._targets = [round(c) for c in joints_to_units(self._model, q).tolist()]
+            self._counts = [round(c) for c in joints_to_units(self._drives.model, q).tolist()]
 
-    def forget_targets(self) -> None:
+    def forget(self) -> None:
         """Let the target of each drive be its reported position again, as before the first one was set."""
-        self._targets = self._aimed = None
+        self._counts = self.sent = None
         self._following.forget()
 
     @property
     def aimed(self) -> Floats:
         """Targets (n,) of the last RPDOs, counts; before the first ones the positions."""
-        return np.array(self._aimed or [track.counts for track in self._tracks], dtype=float)
+        return np.array(self.sent or self._drives.counts, dtype=float)
 
     def beyond_lag(self) -> dict[int, float]:
         """Drives, by number from 0, that follow their targets less than their lag explains, and how much less, counts.
 
         Only those count that were heard in this cycle, and are enabled and not stopped.
         """
-        found = {}
-        for i, track in enumerate(self._tracks):
-            heard = track.cycle == self._cycle and self.statuswords[i] & _STATE_BITS == _ENABLED
-            if heard and (beyond := self._following.beyond(i, track.counts, self._sync_ns, self._jitter_ns)):
+        drives, found = self._drives, {}
+        for i, (axis, track, on) in enumerate(zip(drives.axes, drives.tracks, drives.enabled_ones(), strict=True)):
+            heard = track.cycle == drives.cycle and on and axis.node_id not in self.stopped
+            if heard and (beyond := self._following.beyond(i, track.counts, drives.sync_ns, drives.jitter_ns)):
                 found[i] = beyond
-        return {i: beyond for i, beyond in found.items() if self.axes[i].node_id not in self.stopped}
-
-    def joint_text(self, axis: int, counts: float) -> str:
-        """A motion of a drive, counts, as one of its joint, for people."""
-        return self._model.joints[axis].text(abs(counts / float(self._model.units_per_q[axis, axis])), ".2f")
+        return found
 
     def aim(self, targets: Sequence[int]) -> None:
         """Note the `targets` (counts) of this cycle: they bound the motion that the drives may report next."""
-        before, periods = self._aimed, max((self._deadline_ns - self._aimed_ns) / self._period_ns, 1.0)
+        drives, before = self._drives, self.sent
+        periods = max((drives.deadline_ns - self._sent_ns) / drives.period_ns, 1.0)
         if before is None:
-            before, periods = tuple([track.counts for track in self._tracks]), 1.0
-        for track, target, last in zip(self._tracks, targets, before, strict=True):
+            before, periods = drives.counts, 1.0
+        for track, target, last in zip(drives.tracks, targets, before, strict=True):
             track.aim(abs(target - last), periods)
-        self._aimed, self._aimed_ns = tuple(targets), self._deadline_ns
-        now = [track.counts if track.cycle == self._cycle else None for track in self._tracks]
-        self._following.aim(self._aimed, now, self._sync_ns, self._jitter_ns)
-
-    @property
-    def _jitter_ns(self) -> int:
-        """Time by which the drives may have seen the SYNC of this cycle later than usual."""
-        return self._period_ns if self._irregular else max(self.answer_ns - self._quickest_ns, 0)
+        self.sent, self._sent_ns = tuple(targets), drives.deadline_ns
+        now = [track.counts if track.cycle == drives.cycle else None for track in drives.tracks]
+        self._following.aim(self.sent, now, drives.sync_ns, drives.jitter_ns)
 
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle, as `commands`, packed."""
         frames = []
         for cob_id, packs, parts in self.commands():
-            data = packs[0](*parts[0])
-            if len(parts) > 1:
-                for pack, values in zip(packs[1:], parts[1:], strict=True):
-                    bits = int.from_bytes(data, "little") | int.from_bytes(pack(*values), "little")
-                    data = bits.to_bytes(len(data), "little")  # each leaves zeros where the values of the other are
+            data, *others = [pack(*values) for pack, values in zip(packs, parts, strict=True)]
+            for other in others:  # each leaves zeros where the values of the other are
+                bits = int.from_bytes(data, "little") | int.from_bytes(other, "little")
+                data = bits.to_bytes(len(data), "little")
             frames.append((cob_id, data))
         return frames
 
@@ -398,19 +417,20 @@ class DriveGroup:
 
         Until a target is set, the target of a drive is its reported position. A drive that was never heard gets none.
         """
-        targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
+        drives = self._drives
+        targets = drives.counts if self._counts is None else self._counts
         self.aim(targets)
-        key = (self.goal, self.stopped, *self.statuswords)
+        key = (self.goal, self.stopped, *drives.statuswords)
         if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
-            goals = [self._goal_of(axis.node_id) for axis in self.axes]
-            words = list(map(_controlword, self.states, goals, self._words, self._interpolated))
+            goals = [self._goal_of(axis.node_id) for axis in drives.axes]
+            words = list(map(_controlword, drives.states, goals, self._words, self._interpolated))
             self._steady = key if words == self._words else None
             self._words = words
         values = [*self._words, *targets, *self._constants]
-        heard_all = self.heard_all
+        heard_all = drives.heard_all
         commands = []
         for cob_id, every_cycle, packs, fetches, axes in self._plan:
-            if not heard_all and any(self._tracks[axis].cycle < 0 for axis in axes):
+            if not heard_all and any(drives.tracks[axis].cycle < 0 for axis in axes):
                 continue
             parts = [fetch(values) for fetch in fetches]
             if every_cycle or self._due(cob_id, parts):
@@ -423,10 +443,10 @@ class DriveGroup:
 
     def _due(self, cob_id: int, parts: list[tuple[int, ...]]) -> bool:
         """An event-driven frame goes on a change, and again before its receiver's event timer runs out."""
-        sent, cycle = self._sent.get(cob_id, ([], 0))
-        if parts == sent and self._cycle - cycle < self._repeat:
+        sent, cycle = self._on_change.get(cob_id, ([], 0))
+        if parts == sent and self._drives.cycle - cycle < self._repeat:
             return False
-        self._sent[cob_id] = (parts, self._cycle)
+        self._on_change[cob_id] = (parts, self._drives.cycle)
         return True
 
 

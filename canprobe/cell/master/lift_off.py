@@ -101,7 +101,7 @@ class LiftOff:
         self._retrace: Retrace | None = None
         self._begun = False
         booted = any(watch.states.get(axis.node_id) is NmtState.INITIALISING for axis in drives.axes)
-        self._all_there = not booted and not any(ages) and not drives.beyond_lag()
+        self._all_there = not booted and not any(ages) and not drives.targets.beyond_lag()
 
     @property
     def possible(self) -> bool:
@@ -115,7 +115,7 @@ class LiftOff:
         and with the others. Its quick stop has a ramp, on which it would go millimetres into the object without them.
         """
         axes = zip(self._drives.axes, self._free, self._drives.brakeable, strict=True)
-        self._drives.stopped = frozenset(axis.node_id for axis, free, brakes in axes if not (free or brakes))
+        self._drives.targets.stopped = frozenset(axis.node_id for axis, free, brakes in axes if not (free or brakes))
 
     def command(self, supervisor: Supervisor) -> Command | None:
         """The command of this cycle; None at the end, and where a witness shows that the force grows."""
@@ -128,7 +128,7 @@ class LiftOff:
             self._retrace = self._trail.back(measurement.q, self._step_max) if self._trail is not None else None
         retrace = self._retrace
         # a drive that is silent, has booted or does not follow stands: the others do not go on without it
-        targets = self._drives.aimed if self._all_there else joints_to_units(self._model, measurement.q)
+        targets = self._drives.targets.aimed if self._all_there else joints_to_units(self._model, measurement.q)
         q = self._way.step(measurement.q, targets) if retrace is None else retrace.step(self._period_s)
         if q is None:
             return None
@@ -140,7 +140,7 @@ class LiftOff:
         """A TPDO may be missing now and then; a drive that has left operation or stands does not come back."""
         enabled = np.array(self._drives.enabled_ones())
         late = np.array(self._drives.ages()) >= 3
-        beyond = self._drives.beyond_lag()
+        beyond = self._drives.targets.beyond_lag()
         return not bool((self._free & (~enabled | late)).any()) and not any(self._free[i] for i in beyond)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from canprobe.cell.master.array import PatchReader, make_patch_reader
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle
-from canprobe.cell.master.log import RunLog, TactileLog, joint_columns
+from canprobe.cell.master.log import RunLog, TactileLog
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions, Say
@@ -21,6 +21,7 @@ from canprobe.cell.master.supervision import CycleState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.rows import joint_columns
 from canprobe.fieldbus.bus.port import Port
 from canprobe.mechanics.touch import Patch
 

@@ -182,9 +182,7 @@ class TouchState:
     force_sigma: float = 0.0
     images: ImageWitness = field(default_factory=ImageWitness)
     depth: DepthWitness | None = None
-    _hidden_since_ns: int | None = None
-    _off_pad_since_ns: int | None = None
-    _bridged_since_ns: int | None = None
+    _since_ns: dict[str, int] = field(default_factory=dict)
 
     @property
     def force_upper(self) -> float:
@@ -200,15 +198,18 @@ class TouchState:
             known: the force is known where the array is saturated, too.
         """
         self.force, self.force_sigma = patch.force, patch.sigma.total
-        self._hidden_since_ns = _since(self._hidden_since_ns, patch.saturated and not known, t_ns)
-        self.hidden_s = _passed_s(self._hidden_since_ns, t_ns)
-        off_pad = patch.off_pad and patch.force > TOUCH_FORCE / 2
-        self._off_pad_since_ns = _since(self._off_pad_since_ns, off_pad, t_ns)
-        self.off_pad_s = _passed_s(self._off_pad_since_ns, t_ns)
+        felt = patch.force > TOUCH_FORCE / 2
+        self.hidden_s = self._lasts_s("hidden", patch.saturated and not known, t_ns)
+        self.off_pad_s = self._lasts_s("off pad", felt and patch.off_pad, t_ns)
         self.bridged = patch.bridged
-        bridged = patch.bridged > MAX_BRIDGED_SHARE and patch.force > TOUCH_FORCE / 2
-        self._bridged_since_ns = _since(self._bridged_since_ns, bridged, t_ns)
-        self.bridged_s = _passed_s(self._bridged_since_ns, t_ns)
+        self.bridged_s = self._lasts_s("bridged", felt and patch.bridged > MAX_BRIDGED_SHARE, t_ns)
+
+    def _lasts_s(self, what: str, holds: bool, t_ns: int) -> float:
+        """Duration of the unbroken run of samples for which something holds, s."""
+        if not holds:
+            self._since_ns.pop(what, None)
+            return 0.0
+        return (t_ns - self._since_ns.setdefault(what, t_ns)) * 1e-9
 
     def look(self, sample: TactileSample, patch: Patch, centre: Floats | None, sigma: float | None = None) -> None:
         """Look whether the array lives, by a sample and its patch.
@@ -228,17 +229,6 @@ class TouchState:
             centre=centre,
             sigma=sigma,
         )
-
-
-def _since(since_ns: int | None, holds: bool, t_ns: int) -> int | None:
-    """Beginning of an unbroken run of samples for which something holds."""
-    if not holds:
-        return None
-    return t_ns if since_ns is None else since_ns
-
-
-def _passed_s(since_ns: int | None, t_ns: int) -> float:
-    return 0.0 if since_ns is None else (t_ns - since_ns) * 1e-9
 
 
 class Reaction(Enum):

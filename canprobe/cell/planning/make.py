@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from canprobe.cell.planning.advice import omitted_features, outputs, warnings
 from canprobe.cell.planning.array import array_problems, as_supported, cut_patch, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_configurations
@@ -23,14 +24,12 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.motion import check_motion
-from canprobe.cell.planning.omitted_features import omitted_features, outputs
 from canprobe.cell.planning.operation import choose_mode, early_stops, operation_problems
 from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.cell.planning.raw_frames import plan_raw_frames, raw_frame_problems
 from canprobe.cell.planning.sync import interpolations, period_problem, plan_ratio, plan_sync
 from canprobe.cell.planning.traffic import PlannedTraffic, plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
-from canprobe.cell.planning.warnings import warnings
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
 from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies

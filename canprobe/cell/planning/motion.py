@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.planning.contact import contact_problems, saturation_problem
-from canprobe.cell.planning.first_touch import first_touch_problems
-from canprobe.cell.planning.force import force_problems
+from canprobe.cell.planning.contact import contact_problems, first_touch_problems, force_problems, saturation_problem
 from canprobe.cell.planning.model import JointSpeeds
 from canprobe.cell.planning.surface_path import (
     SurfacePath,

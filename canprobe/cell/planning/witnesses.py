@@ -7,6 +7,7 @@ The checks themselves are in `canprobe.cell.master.conditions`: rows `image_dead
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.pdos import TORQUE
@@ -39,12 +40,13 @@ def witness_rows(plan: Plan) -> list[tuple[str, str]]:
     most, held = (depth_on_plane(force, probe.stiffness, probe.radius) for force in (limits.force_max, touch.force))
     margin = most - held
     speed = touch.scan.speed if isinstance(touch, Touch) and touch.scan is not None else 0.0
-    error = CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * speed)
+    error = _depth_error(speed)
     known = f"{touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm"
     if speed:
         known += f" on new ground at {speed * 1e3:g} mm/s"
     if error > margin:
-        known = f"silent above {math.floor(_fastest(margin) * 1e3)} mm/s: {known}"
+        fastest = bisect_right(range(1, 1001), margin, key=lambda mm_s: _depth_error(1e-3 * mm_s))
+        known = f"silent above {fastest} mm/s: {known}"
     return [
         ("images", f"one that repeats or does not scatter is noticed within {within}"),
         ("depth", known),
@@ -75,10 +77,6 @@ def _force(probe: Probe, depth: float) -> float:
     return (depth / depth_on_plane(1.0, probe.stiffness, probe.radius)) ** 2
 
 
-def _fastest(margin: float) -> float:
-    """Highest speed, m/s, at which the depth on new ground is known to a margin, m."""
-    low, high = 0.0, 1.0
-    while high - low > 1e-4:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * middle) <= margin else (low, middle)
-    return low
+def _depth_error(speed: float) -> float:
+    """How well the depth on new ground is known at a speed, m/s: m."""
+    return CERTAIN_SIGMAS * sigma_ahead(SUSPECT_S * speed)

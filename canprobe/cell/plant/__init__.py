@@ -4,10 +4,10 @@
 
 - Both arms have 1 to 8 joints that turn or slide. `ideal_arm`: each drive is a second-order system, solved exactly.
   `dynamic_arm`: rigid links, friction, the drive `cascade` and the object's push, by `equations` and one of the
-  `integrators` on dynamics held over a cycle; `pushing` is the contact forces near one posture. `arms` makes the arm
-  that a configuration asks for, `ramps` are the targets of a drive.
-- `probe` is the probe's ball in space, `elastic_contact` its elastic layer on an object (Winkler, Hunt–Crossley
-  damping, regularised friction), `several_contacts` a ball that touches in several places.
+  `integrators` on dynamics held over a cycle; `pushing` is the contact forces near one posture. `make_arm`
+  makes the arm that a configuration asks for.
+- `contact` finds the contact of a state: where the probe's ball is, what it touches and what presses. `elastic_contact`
+  has the laws of its elastic layer (Winkler, Hunt–Crossley damping), in one place and in several.
 - `pressure` averages the contact over each taxel; `taxels` makes counts of it: blur, gains, saturation, hysteresis,
   creep, crosstalk, noise, quantisation.
 - `config` is the configuration of a plant.

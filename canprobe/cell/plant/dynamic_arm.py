@@ -1,4 +1,4 @@
-"""Dynamic arm: rigid links, friction, drive cascade and the object's push, in the ideal arm's place.
+"""Dynamic arm: rigid links, friction, drive cascade and the object's push, in the ideal arm's place; and its choice.
 
 Time goes in steps from the last change of a reference on; a step ends where a reference bends. What is asked between
 two steps is answered by a shorter step that is then forgotten, so that asking changes nothing. Mass matrix, bias and
@@ -7,18 +7,80 @@ contact geometry are held over ``hold_ns``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.cell.plant.equations import ArmEquations
-from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE
+from canprobe.cell.plant.cascade import DriveLoops
+from canprobe.cell.plant.config import PlantConfig
+from canprobe.cell.plant.equations import ArmEquations, Effects
+from canprobe.cell.plant.ideal_arm import NEVER, PEAK_PERMILLE, IdealArm, Ramp
 from canprobe.cell.plant.integrators import STEPS
-from canprobe.cell.plant.ramps import Reference
+from canprobe.cell.plant.pushing import Neighbourhood, Rubbing
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.motors import joints_per_motor, units_per_motor
 from canprobe.mechanics.types import Floats
+
+
+class Reference:
+    """Reference of one motor: straight ramps of counts, one after the other; the end of a ramp is held.
+
+    Args:
+        counts: position until the first ramp.
+    """
+
+    __slots__ = ("_ramps",)
+
+    def __init__(self, counts: float) -> None:
+        self._ramps: list[Ramp] = [(-1, -1, counts, counts)]
+
+    def add(self, ramp: Ramp, now_ns: int) -> None:
+        """Follow a ramp from its start on, or from now on where it began in the past; drops what was to come later.
+
+        Args:
+            ramp: not before the ramps that act already.
+            now_ns: the present time.
+        """
+        last = self._ramps[-1]
+        if last[0] <= now_ns and last[0] < ramp[0]:
+            self._ramps = [last, ramp]
+            return
+        start = max(ramp[0], now_ns)
+        kept: Sequence[Ramp] = [r for r in self._ramps if r[0] < start or r[0] < 0]
+        past = [r for r in kept if r[0] <= now_ns]
+        self._ramps = [*past[-1:], *(r for r in kept if r[0] > now_ns), ramp]
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        """Reference (counts) and its slope (counts/s) from t on.
+
+        Args:
+            t_ns: not before the last ramp that began.
+        """
+        t0, t1, start, end = self._ramps[-1]
+        if t0 > t_ns:
+            t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
+        if t_ns >= t1:
+            return end, 0.0
+        slope = (end - start) / (t1 - t0)
+        return start + slope * (t_ns - t0), 1e9 * slope
+
+    def next_bend(self, t_ns: int) -> int:
+        """First time after t at which the slope may change, ns.
+
+        Args:
+            t_ns: ns.
+        """
+        bend = NEVER
+        for t0, t1, _, _ in self._ramps:
+            if t_ns < t0 < bend:
+                bend = t0
+            if t_ns < t1 < bend:
+                bend = t1
+        return bend
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,3 +217,57 @@ class DynamicArm:
             self.equations.hold(self._y)
             self._hold_ns = self._y_ns
         return self._step(self.equations, 1e-9 * self._y_ns, self._y, 1e-9 * (end_ns - self._y_ns))
+
+
+def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:
+    """An ideal or a dynamic arm.
+
+    Args:
+        config: configuration of a plant with an arm.
+
+    Raises:
+        PlanError: a dynamic arm without bodies, or without the extra `dynamics`.
+    """
+    assert config.model is not None
+    if config.fidelity == "ideal":
+        return IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
+    d = config.dynamics
+    return DynamicArm(config.model, config.q0, make_equations(config), Stepping(d.integrator, d.step_ns, d.hold_ns))
+
+
+def make_equations(config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> ArmEquations:
+    """Equations of motion of a dynamic arm.
+
+    Args:
+        config: configuration of a plant with an arm and the bodies of its links.
+        effects: effects that act; all by default.
+        held: see ``ArmEquations``.
+
+    Raises:
+        PlanError: see ``make_arm``.
+    """
+    assert config.model is not None
+    model, d, T_probe, effects = config.model, config.dynamics, config.T_flange_probe_centre, effects or Effects()
+    if config.bodies is None:
+        raise PlanError([dynamics_problem(model.name, None) or ""])
+    centre = (model.chain.T_last_flange @ T_probe)[:3, 3]
+    bodies = *config.bodies[:-1], joined(config.bodies[-1], ball(d.payload, config.radius_m, centre))
+    body = RigidBody(model.chain, bodies, GRAVITY_M_S2 if effects.gravity else 0.0)
+    back = joints_per_motor(model)
+    inertia = np.array([joint.rotor_inertia for joint in model.joints])
+    if effects.links:  # a drive is tuned to what its motor moves in the first posture
+        inertia = inertia + np.diag(back.T @ body.terms(config.q0, np.zeros(model.n))[0] @ back)
+    loops = DriveLoops(model, inertia, config.bandwidth_hz, config.damping_ratio, d, friction=effects.friction)
+    if config.object is None:
+        return ArmEquations(model, body, loops, effects=effects, held=held)
+    touching = Neighbourhood(
+        model.chain,
+        back,
+        T_probe,
+        config.base_offset_m,
+        config.object,
+        radius=config.radius_m,
+        stiffness_n_m3=config.stiffness_n_m3,
+        rubbing=Rubbing(config.damping_s_m, d.friction),
+    )
+    return ArmEquations(model, body, loops, touching, effects, held=held)

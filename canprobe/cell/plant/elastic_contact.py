@@ -1,8 +1,10 @@
-"""Contact of the probe's elastic layer with a surface of known curvature.
+"""Laws of the probe's elastic layer on a surface of known curvature, in one place and in several at once.
 
 Model: a thin elastic layer (Winkler) on a rigid sphere against a rigid body, no friction:
 ``p = k (d - A x^2 - B y^2)`` where positive, with ``A = (1/R_p + kappa1) / 2``, ``B = (1/R_p + kappa2) / 2``.
-It stops being true where the patch is no longer small against both radii.
+It stops being true where the patch is no longer small against both radii. A piece of an edge of radius r presses as a
+long cylinder: ``(4/3) k d^1.5 / sqrt(A)`` a metre, A = (1/R_p + 1/r) / 2; summed along an edge that is shorter than the
+ball is wide it gives the law of the point again.
 """
 
 from __future__ import annotations
@@ -10,30 +12,30 @@ from __future__ import annotations
 from math import pi, sqrt
 from typing import NamedTuple
 
+import numpy as np
+
+from canprobe.mechanics.touch.shapes import TouchedPlaces
+from canprobe.mechanics.types import Floats
+
+MIN_CURVATURE_SHARE = 1e-2
+"""Least curvature of the gap, as a share of the ball's: a tighter hollow counts as a hollow that leaves this much."""
+NEAR_M = 2e-3
+"""Gaps wider than this cannot close within a cycle of the cell."""
+
 
 class Indentation(NamedTuple):
     """The contact of an indentation.
 
     Attributes:
         force: N, never negative (never adhesive).
-        a: half-axis of the patch along the direction of kappa1, m.
-        b: half-axis along the direction of kappa2, m; a <= b.
-        area: m^2.
-        peak_pressure: pressure at the middle of the patch, Pa, damping included.
-        stiffness: elastic dF/dd, N/m.
         damping_factor: factor of force and pressure due to the rate of indentation, >= 0.
     """
 
     force: float
-    a: float
-    b: float
-    area: float
-    peak_pressure: float
-    stiffness: float
-    damping_factor: float
+    damping_factor: float = 1.0
 
 
-NO_CONTACT = Indentation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+NO_CONTACT = Indentation(0.0)
 
 
 def relative_curvatures(kappa: tuple[float, float], radius: float) -> tuple[float, float]:
@@ -66,7 +68,7 @@ def elastic_contact(
     depth_rate: float = 0.0,
     damping: float = 0.0,
 ) -> Indentation:
-    """Force and patch of an indentation.
+    """Force of an indentation.
 
     Args:
         depth: indentation, m; <= 0 is no contact.
@@ -89,16 +91,7 @@ def elastic_contact(
     A, B = relative_curvatures(kappa, radius)
     factor = max(0.0, 1.0 + 1.5 * damping * depth_rate)
     elastic = pi * stiffness_n_m3 * depth * depth / (2.0 * sqrt(A * B))
-    a, b = sqrt(depth / A), sqrt(depth / B)
-    return Indentation(
-        force=factor * elastic,
-        a=a,
-        b=b,
-        area=pi * a * b,
-        peak_pressure=factor * stiffness_n_m3 * depth,
-        stiffness=2.0 * elastic / depth,
-        damping_factor=factor,
-    )
+    return Indentation(factor * elastic, factor)
 
 
 def depth_for_force(force: float, kappa: tuple[float, float], radius: float, stiffness_n_m3: float) -> float:
@@ -118,3 +111,48 @@ def depth_for_force(force: float, kappa: tuple[float, float], radius: float, sti
     """
     A, B = relative_curvatures(kappa, radius)
     return sqrt(2.0 * force * sqrt(A * B) / (pi * stiffness_n_m3))
+
+
+def widened(kappa: Floats, radius: float) -> Floats:
+    """Curvatures of a surface, hollows as tight as the ball replaced by the least that the laws can take.
+
+    Args:
+        kappa: (..., 2) 1/m.
+        radius: radius of the ball, m.
+    """
+    return np.maximum(kappa, (MIN_CURVATURE_SHARE - 1.0) / radius)
+
+
+def force_laws(touches: TouchedPlaces, radius: float, stiffness_n_m3: float) -> tuple[Floats, Floats]:
+    """Coefficient and exponent of ``force = coefficient depth^exponent`` of every place.
+
+    Args:
+        touches: n places.
+        radius: radius of the ball, m.
+        stiffness_n_m3: stiffness of its layer.
+
+    Returns:
+        (n,) in N and m, and (n,).
+    """
+    A, B = (0.5 * (1.0 / radius + widened(touches.kappa, radius))).T
+    edge = touches.edge_m > 0.0
+    point = 0.5 * np.pi * stiffness_n_m3 / np.sqrt(A * B)
+    line = 4.0 / 3.0 * stiffness_n_m3 * touches.edge_m / np.sqrt(A)
+    return np.where(edge, line, point), np.where(edge, 1.5, 2.0)
+
+
+def total_force(touches: TouchedPlaces, radius: float, stiffness_n_m3: float, rates: Floats, damping: float) -> Floats:
+    """(3,) sum of the forces on the ball, N.
+
+    Args:
+        touches: n places.
+        radius: radius of the ball, m.
+        stiffness_n_m3: stiffness of its layer.
+        rates: (n,) of indentation, m/s.
+        damping: Hunt-Crossley alpha, s/m.
+    """
+    coefficient, exponent = force_laws(touches, radius, stiffness_n_m3)
+    depth = np.maximum(radius - touches.distances, 0.0)
+    force = coefficient * depth**exponent * np.maximum(0.0, 1.0 + 1.5 * damping * rates)
+    total: Floats = force @ touches.normals
+    return total

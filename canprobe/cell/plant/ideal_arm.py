@@ -14,14 +14,16 @@ from math import cos, exp, pi, sin, sqrt, tanh
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.cell.plant.ramps import NEVER
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units
 
 PEAK_PERMILLE = 2000
 """Peak torque of a drive, permille of its rated torque (assumed)."""
 STICTION_RATE = 0.01
 """Speed over which the Coulomb torque changes its sign, rad/s; of a prismatic joint m/s."""
-
+NEVER = 1 << 62
+"""A time, ns, that no run reaches."""
+Ramp = tuple[int, int, float, float]
+"""Of a reference: start and end time (ns), start and end (counts)."""
 Transition = tuple[float, float, float, float]
 State = tuple[float, float, float]
 """Position, rate and reference of one motor: counts, counts/s, counts."""
@@ -68,7 +70,7 @@ class _Axis:
     def __init__(self, q: float, lag: float) -> None:
         self.t_ns, self.q, self.v, self.r, self.slope = 0, q, 0.0, q, 0.0
         self.end, self.end_ns, self.event_ns, self.lag = q, NEVER, NEVER, lag
-        self.coming: list[tuple[int, int, float, float]] = []
+        self.coming: list[Ramp] = []
 
     def at(self, phi: Transition, tau: float) -> tuple[float, float, float]:
         """Position, rate and reference at a time before the next event."""
@@ -77,7 +79,7 @@ class _Axis:
         r = self.r + self.slope * tau
         return r - self.lag * self.slope + p11 * e + p12 * de, self.slope + p21 * e + p22 * de, r
 
-    def begin(self, ramp: tuple[int, int, float, float]) -> None:
+    def begin(self, ramp: Ramp) -> None:
         """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
         t0, t1, start, end = ramp
         if self.t_ns >= t1:
@@ -221,14 +223,9 @@ class IdealArm:
         """
 
     def _states(self) -> list[State]:
-        if self._evaluated is None:
-            self._evaluated = self._evaluate(self.t_ns)
-        return self._evaluated
-
-    def _evaluate(self, t_ns: int) -> list[State]:
         """All states at once. At the very end of a ramp its own formula still holds."""
-        states: list[State] = []
-        lag, last_ns, tau = self.lag_s, -1, 0.0
+        self._evaluated = states = []
+        t_ns, lag, last_ns, tau = self.t_ns, self.lag_s, -1, 0.0
         p11 = p12 = p21 = p22 = 0.0
         for a in self._axes:
             if t_ns > a.event_ns or a.coming:

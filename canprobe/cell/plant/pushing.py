@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canprobe.cell.plant.several_contacts import NEAR_M, force_laws
+from canprobe.cell.plant.elastic_contact import NEAR_M, force_laws
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, posture
 from canprobe.mechanics.touch.shapes import PlacedShape, TouchedPlaces
 from canprobe.mechanics.types import Floats, Vec

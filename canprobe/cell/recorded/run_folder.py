@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import Measurement
-from canprobe.cell.master.log import joint_positions
 from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_files import LOG, TACTILE, is_recorded, needed, read_log, read_summary, read_tactile
+from canprobe.cell.rows import joint_positions
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase

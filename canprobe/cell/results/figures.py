@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure, SubFigure
 
-from canprobe.cell.master.log import joint_positions
 from canprobe.cell.results.picture import (
     BLUE,
     GREEN,
@@ -28,6 +27,7 @@ from canprobe.cell.results.picture import (
 )
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.surface_figure import TWO_SIGMA, MapPlane, add_sheet, map_surface, true_surface
+from canprobe.cell.rows import joint_positions
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError

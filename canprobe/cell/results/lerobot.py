@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.log import joint_positions
 from canprobe.cell.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
+from canprobe.cell.rows import joint_positions
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
 from canprobe.errors import UsageError, needed_module

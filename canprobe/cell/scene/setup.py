@@ -526,16 +526,9 @@ class Setup:
         return self.task.shape if isinstance(self.task, Touch) else None
 
     @property
-    def emulated_node_ids(self) -> tuple[int, ...]:
-        """The nodes that are emulated, ascending."""
-        array = self.array
-        arrays = (array,) if array is not None and array.raw is None else ()
-        return tuple(sorted(node.node_id for node in (*self.drives, *arrays) if node.emulated))
-
-    @property
     def emulates(self) -> bool:
         """Whether any part of the cell is emulated."""
-        return bool(self.emulated_node_ids) or (self.array is not None and self.array.emulated)
+        return any(drive.emulated for drive in self.drives) or (self.array is not None and self.array.emulated)
 
     def line_to_type(self, command: str, *options: str) -> str:
         """The line of a command on the cell's bus; on SocketCAN where the scene names none."""

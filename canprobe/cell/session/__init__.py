@@ -6,7 +6,7 @@ lockstep bus or without a bus, in a child (`child_process`) on a real one. It li
 it stops everything in the reverse order: drives disabled, logs flushed, bus closed, children ended, truth kept.
 
     session         one cell from bring-up to safe stop
-    target          the bus of a run or a command: interface, channels and bit rate, put into a scene by one function
+    target          the bus of a run or a command: its interface, channels and bit rate; put into a scene, or opened
     buses           the three kinds of bus, with what is on their other side: no bus, virtual, real
     links           check of the interfaces' settings, and of their controllers, before anything is sent
     folder          the folder of a run, the file of its steps, and the files of what a cell keeps
@@ -17,10 +17,8 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     recovery        a cell that comes back after a node or the bus was lost
     up              a cell that holds its position for days; its joints one after the other: which is which, their zeros
     check           a verdict on link and machine before motion
-    first_second    the same verdict on the first second of a run
     joint_record    what a check of the joints has shown, for later runs
     bus_tools       a bus without a cell: scan, node ids, monitor
-    opened_bus      a bus for a command without a scene
     emulation       emulated nodes of a scene for other masters
     served          nodes of EDS files for them, and how nodes are served
     array_calibration    touches of known objects, visit by visit, and the fit

@@ -2,9 +2,9 @@
 
 Thirty-nine touches: the plane at 4 places of the pad with 3 forces, three reference loads, two short rolls to and fro
 at two speeds along both axes of the pad; the ball at 9 places with 2 forces; plane and ball once more with the probe
-turned about its pole by half a turn; the rod at two angles, only to verify. Each is a press of `tasks.roll` on a cell
-that is brought up for one object and stopped again. An emulated cell has the objects; at a real one a person is asked
-for them.
+turned about its pole by half a turn; the rod at two angles, only to verify. Each is a press of `tasks.calibrate` on a
+cell that is brought up for one object and stopped again. An emulated cell has the objects; at a real one a person is
+asked for them.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import LOCKSTEP, Target
+from canprobe.cell.tasks.calibrate import Press, RollRecord, RollTask
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.probing import Phase
-from canprobe.cell.tasks.roll import Press, RollRecord, RollTask
 from canprobe.errors import PlanError, UsageError
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import task_rows

@@ -7,19 +7,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from canprobe.cell.master.commission import Commissioned, Wanted, wanted_by
+from canprobe.cell.master.commission import Commissioned, Wanted, scan_nodes, wanted_by
 from canprobe.cell.master.commission import commission as commission_nodes
 from canprobe.cell.master.monitor import CellView, Monitor
 from canprobe.cell.master.options import Say, quiet
-from canprobe.cell.master.scan import scan_nodes
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import open_ports
 from canprobe.cell.session.links import check_links, expected_of, need_controllers
-from canprobe.cell.session.opened_bus import open_bus
-from canprobe.cell.session.target import Target, refuse_virtual
+from canprobe.cell.session.target import Target, open_bus, refuse_virtual
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
 

@@ -119,7 +119,7 @@ class DirectCycle(Cycle):
         super().__init__(port, plan, drives=drives, tactile=tactile, watch=watch, **more)
         self._clock, self._first_look_ns = port.clock, plan.traffic.budget.looks_ns[0]
         self._counter = 0
-        self._commands = drives.commands if drives is not None else tuple
+        self._commands = drives.targets.commands if drives is not None else tuple
         self._take = drives.take if drives is not None else nothing
         self._see = tactile.put if tactile is not None else nothing
         self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)

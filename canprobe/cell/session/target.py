@@ -1,16 +1,21 @@
-"""The bus of a scene or a command: interface, channels and bit rate as one object, which is applied to a scene."""
+"""The bus of a scene or a command: interface, channels and bit rate as one object, applied to a scene or opened."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from canprobe.cell.scene.hardware import DIRECT
-from canprobe.errors import UsageError
+from canprobe.cell.session.links import ExpectedLink, check_links, need_controllers
+from canprobe.errors import BusError, UsageError
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.real.adapters import SOCKETCAN, check_interface_name
 
 if TYPE_CHECKING:
+    from canprobe.cell.master.options import Say
     from canprobe.cell.scene.model import Scene
 
 LOCKSTEP = "lockstep"
@@ -90,3 +95,20 @@ def refuse_virtual(interface: str, command: str) -> None:
             f"{command}: {what}; name a real one, such as --bus {SOCKETCAN} --channel can0 (`canprobe adapters` lists"
             " those here)"
         )
+
+
+@contextlib.contextmanager
+def open_bus(target: Target, say: Say, data_bitrate: int | None = None) -> Iterator[Port]:
+    """A port of a bus without a scene, of CAN FD where a data bit rate is given; a wrong setting is only a warning."""
+    from canprobe.fieldbus.bus.real.opening import open_port
+
+    interface, channel = target.interface, target.channel
+    check_links(interface, {channel: ExpectedLink(target.bitrate, of_scene=False)}, say, must=False)
+    port = open_port(interface, channel, target.bitrate, MonotonicClock(), data_bitrate=data_bitrate)
+    try:
+        yield port
+    except BusError as error:
+        need_controllers(interface, {channel: port}, error)
+        raise
+    finally:
+        port.close()

@@ -3,9 +3,9 @@
 `from_plan.make_task` gives the controller of a plan's task; nothing is imported that the task does not need.
 
 - `touch` approaches, settles, scans or holds, and retreats; `regain` searches for a lost contact, `requested` lets a
-  bridge start, stop and set the task. `calibrate` touches a ball from several sides; `roll` presses and rolls on a
-  known object. All derive from `probing.ProbingTask`, which has the order of a cycle and its phases; `probe_motion`
-  turns the probe's pose into joint targets.
+  bridge start, stop and set the task. `calibrate` touches a known object again and again: a ball from several sides,
+  or it presses and rolls there. All derive from `probing.ProbingTask`, which has the order of a cycle and its phases;
+  `probe_motion` turns the probe's pose into joint targets.
 - `sensing` makes a contact of a measurement: joints at the instant of the image, the patch, the squeezed layer.
 - `shape` is the estimator in the loop: contacts go in when they are measured, answers are computed in `update` when the
   commands are out, and are used from the next cycle on.

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import PatchReader, force_columns
+from canprobe.cell.master.array import PatchReader, sample_columns
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.tasks.task import Task, TaskRecord
 from canprobe.mechanics.touch import PatchCalibration
@@ -70,13 +70,7 @@ class ListenTask(Task):
         self._left -= self._period
         if measurement.tactile is not None:
             self.taxels = measurement.tactile.frame.taxels
-            patch = self.reader.read(measurement.tactile)
-            self._columns = {
-                "sample_cycle": float(measurement.tactile.cycle),
-                **force_columns(patch),
-                "pad_u_mm": patch.u * 1e3,
-                "pad_v_mm": patch.v * 1e3,
-            }
+            self._columns = sample_columns(measurement.tactile, self.reader.read(measurement.tactile))
         return Command(done=self._left <= 0, columns=self._columns)
 
 

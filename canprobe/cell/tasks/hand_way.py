@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from canprobe.cell.master.supervisor import JointGuard
-from canprobe.cell.planning.first_touch import blind_s, depth_at
+from canprobe.cell.planning.contact import blind_s, depth_at
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import lag_s
 from canprobe.errors import PlanError, UsageError, did_you_mean

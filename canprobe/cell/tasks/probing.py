@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import force_columns
+from canprobe.cell.master.array import sample_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import Finding, TouchState, limits_of
@@ -205,20 +205,6 @@ class ProbingTask(Task):
             estimate=self._estimate,
         )
 
-    def _felt_columns(
-        self, sample: TactileSample, patch: Patch, contact: ContactSample | None
-    ) -> dict[str, float | Floats]:
-        """Columns of the log with the data of an image."""
-        return {
-            "phase": float(self.phase),
-            "sample_cycle": float(sample.cycle),
-            **force_columns(patch),
-            "pad_u_mm": patch.u * 1e3,
-            "pad_v_mm": patch.v * 1e3,
-            "contact_mm": contact.p_base * 1e3 if contact is not None else np.full(3, np.nan),
-            "normal": contact.n_base if contact is not None else np.full(3, np.nan),
-        }
-
     # phases: each returns the pose for this cycle
 
     def _enter(self, phase: Phase) -> None:
@@ -277,3 +263,15 @@ class ProbingTask(Task):
     def _off(self) -> None:
         """The probe is off the object."""
         self._enter(Phase.DONE)
+
+
+def felt_columns(
+    phase: Phase, sample: TactileSample, patch: Patch, contact: ContactSample | None
+) -> dict[str, float | Floats]:
+    """Columns of the log with the data of an image."""
+    return {
+        "phase": float(phase),
+        **sample_columns(sample, patch),
+        "contact_mm": contact.p_base * 1e3 if contact is not None else np.full(3, np.nan),
+        "normal": contact.n_base if contact is not None else np.full(3, np.nan),
+    }

@@ -14,7 +14,7 @@ from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.cell.tasks.contact_learning import ContactLearning
-from canprobe.cell.tasks.probing import LEAVING, Phase, ProbingTask
+from canprobe.cell.tasks.probing import LEAVING, Phase, ProbingTask, felt_columns
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
@@ -207,8 +207,8 @@ class TouchTask(ProbingTask):
                 self.shape.add(contact)
             if self.phase is Phase.SCAN and (check := self.learned.check) is not None:
                 check.see(contact.t_s, self.sensing.reader.image, sample.frame.window, patch)
-        felt_columns = self._felt_columns(sample, patch, contact)
-        self._columns = felt_columns | self.learned.columns | {"depth_at_1n_mm": depth_at_1n_mm}
+        felt = felt_columns(self.phase, sample, patch, contact)
+        self._columns = felt | self.learned.columns | {"depth_at_1n_mm": depth_at_1n_mm}
         return contact
 
     def _at_hollow(self, radius: float) -> None:

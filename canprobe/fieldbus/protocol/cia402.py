@@ -137,6 +137,9 @@ AUTOMATIC_TRANSITIONS: dict[tuple[DriveState, Event], DriveState] = {
 
 POWERED_STATES = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
 """States in which the drive function is on, so that torque may act on the motor."""
+UNPOWERED_STATES = frozenset(DriveState) - POWERED_STATES
+DISABLED_STATES = frozenset({_S.SWITCH_ON_DISABLED, _S.FAULT, _S.NOT_READY_TO_SWITCH_ON})
+"""States of a drive that was disabled."""
 
 _BIT_5_FREE = (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
 _STATES = {state.value: state for state in DriveState} | {state.value | 0x20: state for state in _BIT_5_FREE}

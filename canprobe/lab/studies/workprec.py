@@ -23,11 +23,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.integrate import solve_ivp
 
-from canprobe.cell.plant.arms import make_equations
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping
+from canprobe.cell.plant.contact import PlantState
+from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping, make_equations
 from canprobe.cell.plant.elastic_contact import depth_for_force
-from canprobe.cell.plant.plant import Plant, PlantState
+from canprobe.cell.plant.plant import Plant
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, log_scale, picture
 from canprobe.cell.scene.arms import Bodies, arm_model
 from canprobe.cell.scene.load import read_cell

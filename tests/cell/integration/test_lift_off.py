@@ -36,7 +36,7 @@ def lifted(run):
 
 def turned(run):
     """How far each motor turned after the fault, counts."""
-    return np.ptp(run.session.buses.truth["q_rad"][run.at :] @ run.session.cell.drives._model.units_per_q.T, axis=0)
+    return np.ptp(run.session.buses.truth["q_rad"][run.at :] @ run.session.cell.drives.model.units_per_q.T, axis=0)
 
 
 def mute(node_id):

@@ -534,7 +534,7 @@ def test_a_measured_jump_that_no_joint_can_make():
     class Unguarded(Injected):
         def after(self, measurement):
             self.session.cell.cycles.controller.compares_motion = True
-            for track in self.session.cell.drives._tracks:
+            for track in self.session.cell.drives.tracks:
                 track._asked = 1e9
 
     change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731

@@ -102,7 +102,7 @@ def test_without_a_target_each_drive_is_told_to_stay():
     group = make_group()
     group.begin(0)
     hear(group, [11, 22, 33, 44, 55, -66])
-    assert group.frames()[5] == (0x206, (15).to_bytes(2, "little") + (-66).to_bytes(4, "little", signed=True))
+    assert group.targets.frames()[5] == (0x206, (15).to_bytes(2, "little") + (-66).to_bytes(4, "little", signed=True))
 
 
 def test_a_drive_that_is_stopped_among_others_that_go_on_is_commanded_so_at_once():
@@ -110,10 +110,10 @@ def test_a_drive_that_is_stopped_among_others_that_go_on_is_commanded_so_at_once
     group, words = make_group(), []
     for cycle in range(4):
         if cycle == 3:
-            group.stopped = frozenset({2})
+            group.targets.stopped = frozenset({2})
         group.begin(cycle)
         hear(group, [0] * 6)
-        words.append([int.from_bytes(data[:2], "little") for _, data in group.frames()])
+        words.append([int.from_bytes(data[:2], "little") for _, data in group.targets.frames()])
     assert words == [[0x0F] * 6] * 3 + [[0x0F, 0x02, 0x0F, 0x0F, 0x0F, 0x0F]]
 
 
@@ -121,13 +121,13 @@ def test_grouped_targets_share_a_frame_and_the_controlword_goes_on_change():
     group = make_group(grouped=True, repeat=3)
     group.begin(0)
     hear(group, [1, 2, 3, 4, 5, -6])
-    frames = dict(group.frames())
+    frames = dict(group.targets.frames())
     assert sorted(frames) == [0x201, 0x202, 0x203, 0x204, 0x205, 0x206, 0x301, 0x303, 0x305]
     assert frames[0x305] == (5).to_bytes(4, "little") + (-6).to_bytes(4, "little", signed=True)
     seen = []
     for cycle in range(1, 5):
         group.begin(cycle)
-        seen.append(sum(1 for can_id, _ in group.frames() if can_id < 0x300))
+        seen.append(sum(1 for can_id, _ in group.targets.frames() if can_id < 0x300))
     assert seen == [0, 0, 6, 0]
 
 
@@ -137,7 +137,7 @@ def test_a_fault_reset_that_did_not_take_gets_a_new_edge():
     for cycle in range(4):
         group.begin(cycle)
         hear(group, [0] * 6, status=DriveState.FAULT.value)
-        words.append(group.frames()[0][1][0] >> 7)
+        words.append(group.targets.frames()[0][1][0] >> 7)
     assert words == [1, 0, 1, 0]
 
 
@@ -170,10 +170,10 @@ def test_feedback_in_two_tpdos_and_values_that_nobody_reads():
     group = one_kind([(STATUS, MODE), (MODE, POSITION, TORQUE)], [(WORD,), (TARGET, SPEED)], constants={(0x6081, 0): 9})
     group.begin(0)
     send(group, 0, ENABLED, 8)
-    assert not group.complete and not group.heard_all and group.frames() == []
+    assert not group.complete and not group.heard_all and group.targets.frames() == []
     send(group, 1, 8, -55, 7)
     assert group.complete and group.enabled and group.torque_permille == [7] * 6
-    assert dict(group.frames())[0x301] == (-55).to_bytes(4, "little", signed=True) + (9).to_bytes(4, "little")
+    assert dict(group.targets.frames())[0x301] == (-55).to_bytes(4, "little", signed=True) + (9).to_bytes(4, "little")
     group.begin(1)
     send(group, 1, 8, -55, 7)
     group.end_collect()
@@ -186,7 +186,7 @@ def test_what_a_frame_has_beyond_its_mapping_is_not_read(beyond):
     group.begin(0)
     group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 77) + beyond)
     assert group.malformed == 0 and group.statuswords[0] == ENABLED
-    assert dict(group.frames())[0x201][2:6] == (77).to_bytes(4, "little")
+    assert dict(group.targets.frames())[0x201][2:6] == (77).to_bytes(4, "little")
     group.push(0x182, group.axes[1].feedback[0].pack(ENABLED, 77)[:-1])
     assert group.malformed == 1
 
@@ -196,10 +196,10 @@ def test_no_rpdo_goes_to_a_drive_that_was_never_heard():
     group = make_group()
     group.begin(0)
     hear(group, [4000] * 6, skip=(2,))
-    assert sorted(can_id for can_id, _ in group.frames()) == [0x201, 0x202, 0x204, 0x205, 0x206]
+    assert sorted(can_id for can_id, _ in group.targets.frames()) == [0x201, 0x202, 0x204, 0x205, 0x206]
     group.begin(1)
     hear(group, [4000] * 6)
-    frames = dict(group.frames())
+    frames = dict(group.targets.frames())
     assert len(frames) == 6 and {data[2:] for data in frames.values()} == {(4000).to_bytes(4, "little")}
 
 
@@ -210,14 +210,14 @@ def test_interpolated_position_sets_bit_4_while_operation_is_enabled():
     for cycle, status in enumerate(states):
         group.begin(cycle)
         send(group, 0, status, 5)
-        frame = group.frames()[0][1]
+        frame = group.targets.frames()[0][1]
         words.append(int.from_bytes(frame[:2], "little"))
         assert frame[2:] == (5).to_bytes(4, "little")
     assert words == [0x06, 0x07, 0x0F, 0x1F, 0x1F]
-    group.goal = DriveState.QUICK_STOP_ACTIVE
-    assert int.from_bytes(group.frames()[0][1][:2], "little") == 0x02
-    group.goal = DriveState.SWITCH_ON_DISABLED
-    assert int.from_bytes(group.frames()[0][1][:2], "little") & 0x10 == 0
+    group.targets.goal = DriveState.QUICK_STOP_ACTIVE
+    assert int.from_bytes(group.targets.frames()[0][1][:2], "little") == 0x02
+    group.targets.goal = DriveState.SWITCH_ON_DISABLED
+    assert int.from_bytes(group.targets.frames()[0][1][:2], "little") & 0x10 == 0
 
 
 # Positions that a motor can and cannot have reached, and where it is when nobody says.
@@ -298,8 +298,8 @@ def test_the_group_takes_the_time_from_its_syncs():
     for cycle in range(20):
         group.begin(cycle, 0, cycle * PERIOD)
         hear(group, [10 * cycle] * 6)
-        group.set_target(units_to_joints(MODEL, np.full(6, 10.0 * (cycle + 1))))
-        group.frames()
+        group.targets.set(units_to_joints(MODEL, np.full(6, 10.0 * (cycle + 1))))
+        group.targets.frames()
     group.begin(20, 0, (19 + 34) * PERIOD)
     hear(group, [190] * 6, skip=(2,))
     group.end_collect()
@@ -313,8 +313,8 @@ def test_a_drive_that_was_missed_while_its_target_moved_is_believed_where_it_wen
         for cycle in range(22):
             group.begin(cycle, 0, (cycle + (late - 1) * (cycle > 20)) * PERIOD)
             hear(group, [10 * cycle] * 6, skip=(2,) if cycle > 19 else ())
-            group.set_target(units_to_joints(MODEL, np.full(6, 10.0 * (cycle + 1))))
-            group.frames()
+            group.targets.set(units_to_joints(MODEL, np.full(6, 10.0 * (cycle + 1))))
+            group.targets.frames()
         group.begin(22, 0, (21 + late) * PERIOD)
         hear(group, [190 + way if i == 2 else 220 for i in range(6)])
         assert (group.ages()[2] == 0) is believed, (late, way)
@@ -331,11 +331,11 @@ def test_a_drive_that_was_missed_while_its_target_moved_is_believed_where_it_wen
 )
 def test_a_drive_in_no_known_state_is_stopped(goal, word):
     group = make_group()
-    group.goal = goal
+    group.targets.goal = goal
     group.begin(0)
     hear(group, [0] * 6, status=0x0601)
     assert group.states == (None,) * 6 and not any(group.enabled_ones()) and not group.enabled
-    assert {int.from_bytes(data[:2], "little") for _, data in group.frames()} == {word}
+    assert {int.from_bytes(data[:2], "little") for _, data in group.targets.frames()} == {word}
 
 
 @pytest.mark.parametrize(
@@ -350,7 +350,7 @@ def test_what_follows_sync_is_sent_in_every_cycle_and_the_rest_on_change(transmi
     for cycle in range(3):
         group.begin(cycle)
         hear(group, [5] * 6)
-        counts.append(len(group.frames()))
+        counts.append(len(group.targets.frames()))
     assert counts == sent
 
 
@@ -384,11 +384,13 @@ def test_drives_that_are_stopped_get_a_quick_stop_and_the_others_go_on():
     group = make_group()
     group.begin(0)
     hear(group, [0] * 6)
-    group.stopped = frozenset({2, 5})
-    words = {can_id - 0x200: int.from_bytes(data[:2], "little") for can_id, data in group.frames()}
+    group.targets.stopped = frozenset({2, 5})
+    words = {can_id - 0x200: int.from_bytes(data[:2], "little") for can_id, data in group.targets.frames()}
     assert words == {1: 0x0F, 2: 0x02, 3: 0x0F, 4: 0x0F, 5: 0x02, 6: 0x0F}
-    group.goal = DriveState.SWITCH_ON_DISABLED
-    assert {int.from_bytes(data[:2], "little") for _, data in group.frames()} == {0x00}, "the way out is for all"
+    group.targets.goal = DriveState.SWITCH_ON_DISABLED
+    assert {int.from_bytes(data[:2], "little") for _, data in group.targets.frames()} == {0x00}, (
+        "the way out is for all"
+    )
 
 
 @pytest.mark.parametrize("sign", [1, -1])

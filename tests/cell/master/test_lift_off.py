@@ -67,22 +67,18 @@ class Drives:
 
     axes = tuple(SimpleNamespace(node_id=i) for i in NODES)
     disbelieved = False
-    stopped = frozenset()
     brakeable = (False,) * 6
 
     def __init__(self):
         self.age, self.on, self.beyond = [0] * 6, [True] * 6, {}
+        aimed = joints_to_units(MODEL, ELBOW_FORM)
+        self.targets = SimpleNamespace(stopped=frozenset(), aimed=aimed, beyond_lag=lambda: self.beyond)
 
     def ages(self):
         return tuple(self.age)
 
     def enabled_ones(self):
         return tuple(self.on)
-
-    def beyond_lag(self):
-        return self.beyond
-
-    aimed = joints_to_units(MODEL, ELBOW_FORM)
 
 
 def a_watch():
@@ -123,14 +119,14 @@ def test_a_drive_in_trouble_is_stopped_and_the_others_lift(trouble):
     going = lift(drives, watch)
     assert going.possible
     going.begin()
-    assert drives.stopped == {2}
+    assert drives.targets.stopped == {2}
 
 
 def test_the_node_that_the_cell_is_stopped_for_does_not_lift_and_others_do():
     for error, still in ((NodeError(3, "lost"), {3}), (NodeError(16, "lost"), set()), (SafetyStop("node 3"), set())):
         drives = Drives()
         lift(drives, error=error).begin()
-        assert drives.stopped == still
+        assert drives.targets.stopped == still
 
 
 def test_a_drive_that_moves_otherwise_than_told_is_braked_by_its_place_and_not_by_its_quick_stop():
@@ -139,7 +135,7 @@ def test_a_drive_that_moves_otherwise_than_told_is_braked_by_its_place_and_not_b
     drives.brakeable = tuple(i == 3 for i in NODES)
     way = lift(drives, error=NodeError(3, "does not follow its targets"))
     way.begin()
-    assert drives.stopped == set()
+    assert drives.targets.stopped == set()
     assert not way._free[NODES.index(3)]
 
 

@@ -143,7 +143,8 @@ def test_the_preload_is_the_highest_force_before_the_drives_are_enabled():
 def test_something_worse_comes_before_a_hold_and_the_first_hold_before_the_second():
     run = Run()
     run.step(q_age=(0, 4), state=ControllerState.PASSIVE)
-    run.seen.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=1), SimpleNamespace(node_id=2)], beyond_lag=dict)
+    axes, targets = [SimpleNamespace(node_id=1), SimpleNamespace(node_id=2)], SimpleNamespace(beyond_lag=dict)
+    run.seen.drives = SimpleNamespace(axes=axes, targets=targets)
     run.seen.measurement = Measurement(9, 0, q_age=(0, 4), enabled=True)
     found = run.supervisor.finding
     assert found().condition.key == "drive_late" and found(enabling=True).condition.key == "error_passive"

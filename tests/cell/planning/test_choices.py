@@ -18,9 +18,7 @@ from canprobe.cell.planning.array import (
 from canprobe.cell.planning.free_parameters import opened, second_channel
 from canprobe.cell.planning.identifiers import order_by_deadline
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.report_json import plan_dict
-from canprobe.cell.plant.elastic_contact import elastic_contact
+from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
@@ -188,12 +186,11 @@ PROBE = resolve(load_scene("cylinder")).probe
 @pytest.mark.parametrize("side, off", [(4, 0.0), (4, 0.75), (6, 0.0), (6, 0.75), (8, 0.75)])
 @pytest.mark.parametrize("force", [0.5, 2.0, 4.5])
 def test_share_against_points_on_a_grid(side, off, force):
-    """The plant's own patch and pressure, summed over a million points."""
+    """The patch of the plant and its pressure, summed over a million points."""
     radius = patch_radius_m(force, PROBE)
-    contact = elastic_contact(radius**2 / 0.08, (0.0, 0.0), 0.04, PROBE.stiffness)
     x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 1001)] * 2)
     pressure = np.clip(1.0 - x**2 - y**2, 0.0, None)
-    half, middle = side / 2 * PITCH / contact.a, off * PITCH / contact.a
+    half, middle = side / 2 * PITCH / radius, off * PITCH / radius
     inside = pressure[(np.abs(x - middle) <= half) & (np.abs(y) <= half)].sum() / pressure.sum()
     assert measured_share(force, PROBE, side, PITCH, off) == pytest.approx(inside, abs=5e-3)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.planning.first_touch import blind_s, depth_at, first_shown_n, force_at
+from canprobe.cell.planning.contact import blind_s, depth_at, first_shown_n, force_at
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.pressure import PressureField
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig

@@ -13,8 +13,7 @@ from scenes import change
 import canprobe
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.report_json import plan_dict
+from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.scene.load import load_scene, packaged
 from canprobe.cell.scene.resolve import resolve
 

@@ -129,7 +129,7 @@ def test_without_an_object_the_expected_plane_is_checked(cylinder):
         change(cylinder, arm={"emulated": False}, sensor={"emulated": False}), object=None, plant=None
     )
     plan = canprobe.plan(real)
-    assert plan.setup.emulated_node_ids == ()
+    assert not plan.setup.emulates and plan.scene.emulated_node_ids == ()
     assert plan.joint_speeds.needed[0] > 0
     path = surface_path(resolve(real).task, None)
     np.testing.assert_allclose(path.normals, np.tile([0, 0, 1], (len(path.normals), 1)))

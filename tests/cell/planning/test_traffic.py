@@ -15,7 +15,7 @@ from canprobe.cell.planning.identifiers import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages
 from canprobe.cell.planning.model import Interpolation, PlannedPdo
-from canprobe.cell.planning.report_json import plan_dict
+from canprobe.cell.planning.report import plan_dict
 from canprobe.cell.planning.traffic import controller_starts
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve

@@ -8,8 +8,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.planning import traffic
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.report_json import plan_dict
+from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.scene.load import load_scene
 
 HEARTBEAT, SYNC, FULL = 65, 65, 135

@@ -1,8 +1,7 @@
 """What the plan says of the witnesses of the force, by what the cell has."""
 
 import canprobe
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.report_json import plan_dict
+from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.planning.witnesses import reports_torque, witness_rows
 
 

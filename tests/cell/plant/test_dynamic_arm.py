@@ -8,14 +8,12 @@ import pytest
 from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
 from scipy.integrate import solve_ivp
 
-from canprobe.cell.plant.arms import make_arm, make_equations
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping
+from canprobe.cell.plant.dynamic_arm import DynamicArm, Reference, Stepping, make_arm, make_equations
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.equations import Effects
-from canprobe.cell.plant.ideal_arm import IdealArm
+from canprobe.cell.plant.ideal_arm import NEVER, IdealArm
 from canprobe.cell.plant.plant import Plant
-from canprobe.cell.plant.ramps import NEVER, Reference
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian

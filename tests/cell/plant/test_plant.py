@@ -8,10 +8,9 @@ from puma_arm import BODIES, ELBOW_FORM, UPENN
 from scipy.spatial.transform import Rotation
 
 from canprobe.cell.plant.config import PlantConfig, PressMotion
-from canprobe.cell.plant.elastic_contact import depth_for_force
+from canprobe.cell.plant.elastic_contact import depth_for_force, total_force
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.pressure import pad_direction
-from canprobe.cell.plant.several_contacts import total_force
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from puma_arm import BODIES, ELBOW_FORM, UPENN
 
-from canprobe.cell.plant.arms import make_equations
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.elastic_contact import elastic_contact
+from canprobe.cell.plant.dynamic_arm import make_equations
+from canprobe.cell.plant.elastic_contact import elastic_contact, force_laws, total_force
 from canprobe.cell.plant.equations import Effects
 from canprobe.cell.plant.integrators import rosenbrock2
 from canprobe.cell.plant.plant import Plant
-from canprobe.cell.plant.several_contacts import force_laws, total_force
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE

@@ -15,7 +15,7 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.emulated.truth_columns import with_units
+from canprobe.cell.emulated.world import with_units
 from canprobe.cell.npz import read_npz
 from canprobe.cli import main
 from canprobe.errors import UsageError

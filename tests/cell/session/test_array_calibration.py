@@ -15,7 +15,7 @@ from canprobe.cell.scene.load import load_scene, packaged_files
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session import array_calibration
 from canprobe.cell.session.array_calibration import KnownObject, Visit, touch_object, visits
-from canprobe.cell.tasks.roll import Press
+from canprobe.cell.tasks.calibrate import Press
 from canprobe.cli import main
 
 AT = (-120.0, -122.5, 374.0)

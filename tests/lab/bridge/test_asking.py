@@ -11,8 +11,7 @@ from patience import patience_s
 
 import canprobe
 from canprobe.cell.planning.bridges import BRIDGES, BridgeInfo, check_bridges
-from canprobe.cell.planning.report import plan_text
-from canprobe.cell.planning.report_json import plan_dict
+from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.scene.model import BridgeName
 from canprobe.cli import main
