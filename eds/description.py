@@ -20,6 +20,7 @@ from canprobe.fieldbus.eds.values import (
     UNSIGNED_BITS,
     Value,
 )
+from canprobe.fieldbus.protocol.pdo import RPDOS, TPDOS
 
 LAST_DUMMY = 0x0007
 """Last index of a data type; DummyUsage lists those that an RPDO may map to fill room."""
@@ -145,12 +146,12 @@ class Description:
     @property
     def rpdos(self) -> tuple[int, ...]:
         """Numbers of the RPDOs, 1 for 1400h."""
-        return tuple(sorted(index - 0x13FF for index in self.od.indices if 0x1400 <= index < 0x1600))
+        return _numbers(self.od, RPDOS)
 
     @property
     def tpdos(self) -> tuple[int, ...]:
         """Numbers of the TPDOs, 1 for 1800h."""
-        return tuple(sorted(index - 0x17FF for index in self.od.indices if 0x1800 <= index < 0x1A00))
+        return _numbers(self.od, TPDOS)
 
     @property
     def modes(self) -> frozenset[int] | None:
@@ -173,6 +174,10 @@ def variable_at(od: ObjectDictionary, index: int, subindex: int) -> ODVariable |
         return found if subindex == 0 else None
     variable: ODVariable | None = found.subindices.get(subindex) if found is not None else None
     return variable
+
+
+def _numbers(od: ObjectDictionary, area: range) -> tuple[int, ...]:
+    return tuple(sorted(area.index(index) + 1 for index in od.indices if index in area))
 
 
 def _array_length(array: ODArray) -> int:

@@ -53,6 +53,7 @@ from canprobe.fieldbus.eds.packaged import (
 from canprobe.fieldbus.eds.values import name_of
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
+from canprobe.fieldbus.protocol.pdo import MAX_SYNC_TYPE
 from canprobe.fieldbus.protocol.si_unit import ACCELERATION_UNIT_INDEX, VELOCITY_UNIT_INDEX
 from canprobe.fieldbus.protocol.tactile import TactileMode
 from canprobe.mechanics.robot.model import coupled_joints, drive_position_at, joints_to_units
@@ -174,7 +175,7 @@ def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> list[Write]:
     if pdo.event_timer_ms:
         absence = "the device does not notice that its controlword stays away"
         writes.append(Write(communication, 5, pdo.event_timer_ms, f"event timer of {name}", absence))
-    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= 240 and device.has(communication, 6):
+    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= MAX_SYNC_TYPE and device.has(communication, 6):
         writes.append(Write(communication, 6, SYNC_START_VALUE, f"first SYNC of {name}"))
     if device.capacity(pdo.direction, pdo.number):
         entries = enumerate(pdo.entries, start=1)

@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
 from canprobe.cell.planning.operation import TARGETS, Place, choose_mode
-from canprobe.cell.planning.traffic import SYNCHRONOUS
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import has_long_pdos, has_window_size
 from canprobe.fieldbus.protocol.frames import is_restricted
-from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, PdoEntry, PdoLayout
+from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, MAX_SYNC_TYPE, PdoEntry, PdoLayout
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW, image_words, window_words
 
 STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
@@ -295,11 +294,11 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
         cob_id = device.fixed_cob_id("tpdo", number)
         communication = COMMUNICATION["tpdo"] + number - 1
         kind = device.number(communication, 2) or EVERY_SYNC
-        if cob_id is None or number in used or SYNCHRONOUS < kind < ON_EVENT - 1:
+        if cob_id is None or number in used or MAX_SYNC_TYPE < kind < ON_EVENT - 1:
             continue
         entries = tuple(map(device.mapped_entry, device.fixed_mapping("tpdo", number)))
         inhibit_100us = device.number(communication, 3) or 0
-        on_event = kind > SYNCHRONOUS
+        on_event = kind > MAX_SYNC_TYPE
         rate = sync.rate_hz / kind
         if on_event:
             seldom = all(entry.index in STATES for entry in entries)

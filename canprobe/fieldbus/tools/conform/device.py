@@ -10,12 +10,12 @@ from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.reading import is_drive
 from canprobe.fieldbus.protocol.cia402 import STATUSWORD
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import RPDOS, TO_MAPPING, TPDOS, is_mapping
 from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.conform.outcome import Deviation
 from canprobe.fieldbus.tools.conform.permits import WriteList
 from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
 
-RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
 DRIVE_PROFILE = 402
 _AXIS_STEP = 0x800
 _VARIABLES = (*range(0x1000, 0x1003), *range(0x1005, 0x100B), 0x100C, 0x100D, 0x1012, 0x1014, 0x1015, 0x1017, 0x1019)
@@ -70,15 +70,15 @@ class ExaminedDevice:
 
     def _pdo_indices(self) -> list[int]:
         if self.description is not None:
-            comm = [0x13FF + n for n in self.description.rpdos] + [0x17FF + n for n in self.description.tpdos]
+            comm = [RPDOS[n - 1] for n in self.description.rpdos] + [TPDOS[n - 1] for n in self.description.tpdos]
         else:
             comm = [area[n] for area in (RPDOS, TPDOS) for n in range(_UNDESCRIBED_PDOS)]
-        return [index for pdo in comm for index in (pdo, pdo + 0x200)]
+        return [index for pdo in comm for index in (pdo, pdo + TO_MAPPING)]
 
     def _read_record(self, bench: SdoClient, index: int) -> None:
         if not (count := self._read(bench, (index, 0))):
             return
-        if 0x1600 <= index < 0x1800 or index >= 0x1A00:  # its sub-index 0 counts the entries in use only
+        if is_mapping(index):  # its sub-index 0 counts the entries in use only
             for subindex in range(1, _MAX_ENTRIES + 1):
                 if self._read(bench, (index, subindex)) is None:
                     return
@@ -144,7 +144,7 @@ class ExaminedDevice:
 
     def mapping(self, pdo: int) -> list[int]:
         """Mapped entries of a PDO, each index << 16 | subindex << 8 | bits."""
-        return [self.number(pdo + 0x200, n) for n in range(1, self.number(pdo + 0x200) + 1)]
+        return [self.number(pdo + TO_MAPPING, n) for n in range(1, self.number(pdo + TO_MAPPING) + 1)]
 
     def cob_id(self, pdo: int) -> int | None:
         """Identifier of a PDO; None while it is not valid."""

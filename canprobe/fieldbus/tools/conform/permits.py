@@ -36,6 +36,7 @@ from canprobe.fieldbus.protocol.frames import (
     is_restricted,
 )
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS
 from canprobe.fieldbus.protocol.sdo import Place, place_of, place_text
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.surroundings import Surroundings
@@ -71,7 +72,7 @@ _RULES: dict[int, WriteRule] = {
     **dict.fromkeys((0x1005, 0x1012, 0x1014), WriteRule.IDENTIFIER),
     **dict.fromkeys((0x1020, *range(0x1200, 0x1280)), WriteRule.SAME),
     **dict.fromkeys((0x1006, 0x1007, 0x100C, 0x100D, 0x1015, 0x1016, 0x1017, 0x1019), WriteRule.CHANGED),
-    **dict.fromkeys((0x1028, 0x1029, *range(0x1400, 0x1C00)), WriteRule.CHANGED),
+    **dict.fromkeys((0x1028, 0x1029, *PDO_OBJECTS), WriteRule.CHANGED),
 }
 
 

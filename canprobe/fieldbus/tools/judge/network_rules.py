@@ -164,7 +164,7 @@ def interpolation_time(case: Case, node: SeenNode) -> Watch[TargetSeen]:
     while event := (yield):
         cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == cia402.TARGET_POSITION
         cyclic = cyclic and command_of(node.number(cia402.CONTROLWORD) or 0) is DriveCommand.ENABLE_OPERATION
-        synchronous = event.pdo is not None and event.pdo.synchronous
+        synchronous = event.pdo is not None and event.pdo.layout.synchronous
         if judged or not (cyclic and synchronous) or node.syncs < _ENOUGH_SYNCS:
             continue
         value, power = (node.value(cia402.INTERPOLATION_TIME, sub) for sub in (1, 2))

@@ -16,9 +16,9 @@ from canprobe.fieldbus.protocol.frames import (
     NmtState,
 )
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
+from canprobe.fieldbus.protocol.pdo import RPDOS, TPDOS
 from canprobe.fieldbus.protocol.sdo import pack_read, pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("hostile")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.frames import NMT_ID, RTR_FLAG, NmtCommand, NmtState
+from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, TPDOS
 from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import QUEUED_NS, Bench
-from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.point import PointGroup

@@ -5,10 +5,9 @@ from __future__ import annotations
 from itertools import pairwise
 
 from canprobe.fieldbus.eds.description import DescribedEntry
-from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
+from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, TPDOS
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.pdo_setup import (
     EVENT_TYPE,
     changeable_pdo,
