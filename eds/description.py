@@ -11,15 +11,8 @@ from dataclasses import dataclass, replace
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable, datatypes
 
-from canprobe.fieldbus.eds.values import (
-    OCTET_TYPES,
-    SIGNED_BITS,
-    TEXT_TYPES,
-    TIME_BITS,
-    TIME_TYPES,
-    UNSIGNED_BITS,
-    Value,
-)
+from canprobe.fieldbus.eds import values
+from canprobe.fieldbus.eds.values import Value
 from canprobe.fieldbus.protocol.pdo import RPDOS, TPDOS
 
 LAST_DUMMY = 0x0007
@@ -70,7 +63,7 @@ class DescribedEntry:
     @property
     def is_integer(self) -> bool:
         """Whether it holds an integer, and not a real number, text or octets."""
-        return self.data_type in SIGNED_BITS or self.data_type in UNSIGNED_BITS
+        return self.data_type in values.SIGNED_BITS or self.data_type in values.UNSIGNED_BITS
 
     @property
     def readable(self) -> bool:
@@ -187,9 +180,9 @@ def _array_length(array: ODArray) -> int:
 
 
 def _bits(variable: ODVariable, data_type: int) -> int:
-    if data_type in TEXT_TYPES | OCTET_TYPES:
+    if data_type in values.TEXT_TYPES | values.OCTET_TYPES:
         return 0
-    return TIME_BITS if data_type in TIME_TYPES else len(variable)
+    return values.TIME_BITS if data_type in values.TIME_TYPES else len(variable)
 
 
 def described_entry(variable: ODVariable) -> DescribedEntry:
@@ -201,7 +194,7 @@ def described_entry(variable: ODVariable) -> DescribedEntry:
         name=variable.name,
         data_type=data_type,
         bits=_bits(variable, data_type),
-        signed=data_type in SIGNED_BITS,
+        signed=data_type in values.SIGNED_BITS,
         access=variable.access_type,
         mappable=variable.pdo_mappable,
         low=variable.min,

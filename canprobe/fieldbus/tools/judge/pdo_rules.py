@@ -10,8 +10,8 @@ from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, RPDOS, TO_MAPPING, is_mapping
 from canprobe.fieldbus.protocol.sdo import place_text
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.events import BusEvent, RequestSeen, RpdoSeen, StatusSeen, SyncSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import TARGETS, SeenNode
 
@@ -30,11 +30,11 @@ _BURST_FRAMES = 3
 
 
 @rule(6)
-def zero_filled(case: Case, node: SeenNode) -> Watch[RpdoSeen | StatusSeen]:
+def zero_filled(case: Case, node: SeenNode) -> Watch[events.RpdoSeen | events.StatusSeen]:
     """The first RPDO has zeros in objects that were something else."""
     unjudged: BusFrame | None = None  # a target of 0, which is compared with the position once that is seen
     while event := (yield):
-        if isinstance(event, StatusSeen):
+        if isinstance(event, events.StatusSeen):
             if unjudged is not None and node.known(cia402.POSITION) is not None:
                 _judge_target(case, node, unjudged)
                 unjudged = None
@@ -65,7 +65,7 @@ def _judge_target(case: Case, node: SeenNode, first: BusFrame) -> None:
 
 
 @rule(7)
-def never_sent(case: Case, node: SeenNode) -> Watch[BusEvent]:
+def never_sent(case: Case, node: SeenNode) -> Watch[events.BusEvent]:
     """An RPDO that the master prepared is never sent."""
     yield  # the end of the bus: it hears no event
     started_ns = node.started_ns
@@ -83,7 +83,7 @@ def never_sent(case: Case, node: SeenNode) -> Watch[BusEvent]:
 
 
 @rule(23)
-def written_while_operational(case: Case, node: SeenNode) -> Watch[RequestSeen]:
+def written_while_operational(case: Case, node: SeenNode) -> Watch[events.RequestSeen]:
     """PDO parameters are written after the NMT start."""
     while event := (yield):
         if not event.writes or event.place[0] not in PDO_OBJECTS or node.nmt is None:
@@ -93,7 +93,7 @@ def written_while_operational(case: Case, node: SeenNode) -> Watch[RequestSeen]:
 
 
 @rule(25)
-def remapped_while_valid(case: Case, node: SeenNode) -> Watch[RequestSeen]:
+def remapped_while_valid(case: Case, node: SeenNode) -> Watch[events.RequestSeen]:
     """A mapping is changed while the PDO is valid or sub-index 0 is not 0."""
     while event := (yield):
         index, subindex = event.place
@@ -108,7 +108,7 @@ def remapped_while_valid(case: Case, node: SeenNode) -> Watch[RequestSeen]:
 
 
 @rule(27)
-def length_not_mapping(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
+def length_not_mapping(case: Case, node: SeenNode) -> Watch[events.RpdoSeen]:
     """RPDOs have another length than their mapping."""
     while event := (yield):
         if not event.pdo.certain:
@@ -119,13 +119,13 @@ def length_not_mapping(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
 
 
 @rule(34)
-def not_one_each_sync(case: Case, node: SeenNode) -> Watch[RpdoSeen | SyncSeen]:
+def not_one_each_sync(case: Case, node: SeenNode) -> Watch[events.RpdoSeen | events.SyncSeen]:
     """Two RPDOs, or none, come between two SYNCs."""
     between: dict[int, list[BusFrame]] = {}  # frames since the last SYNC, by number of the RPDO
     cyclic: dict[int, int] = {}
     last: dict[int, deque[int]] = {}
     while event := (yield):
-        if isinstance(event, RpdoSeen):
+        if isinstance(event, events.RpdoSeen):
             if event.pdo.layout.synchronous and node.settled and event.pdo.maps(*TARGETS):
                 between.setdefault(event.pdo.number, []).append(event.frame)
             continue
@@ -148,7 +148,7 @@ def not_one_each_sync(case: Case, node: SeenNode) -> Watch[RpdoSeen | SyncSeen]:
 
 
 @rule(35)
-def outside_window(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
+def outside_window(case: Case, node: SeenNode) -> Watch[events.RpdoSeen]:
     """Synchronous RPDOs come after the window of 1007h."""
     while event := (yield):
         window_us = node.number(0x1007)
@@ -162,7 +162,7 @@ def outside_window(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
 
 
 @rule(37)
-def cyclic_without_sync(case: Case, node: SeenNode) -> Watch[TargetSeen]:
+def cyclic_without_sync(case: Case, node: SeenNode) -> Watch[events.TargetSeen]:
     """Targets of CSP are not bound to SYNC."""
     while event := (yield):
         pdo = event.pdo
@@ -180,7 +180,7 @@ def cyclic_without_sync(case: Case, node: SeenNode) -> Watch[TargetSeen]:
 
 
 @rule(45)
-def backlog_sent(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
+def backlog_sent(case: Case, node: SeenNode) -> Watch[events.RpdoSeen]:
     """After a silence, old RPDOs come all at once."""
     last: dict[int, deque[BusFrame]] = {}  # frames by number of the RPDO
     bursts: dict[int, int] = {}  # frames closer than half the usual interval, after a gap of four

@@ -10,14 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from canprobe.fieldbus.protocol import cia402
-from canprobe.fieldbus.protocol.cia402 import (
-    TRANSITIONS,
-    DriveCommand,
-    DriveState,
-    OperationMode,
-    describe_state,
-    known_state,
-)
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, OperationMode
 from canprobe.fieldbus.protocol.sdo import Abort, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -38,8 +31,9 @@ _PRESENT_POSITION = (37, 35)
 def _reach(bench: Bench, state: DriveState, what: str) -> None:
     """Wait for a state of the drive. Raises Deviation."""
     until_ns = bench.now_ns + round(_REACH_S * 1e9)
-    while known_state(word := bench.number(cia402.STATUSWORD)) is not state:
-        bench.expect(bench.now_ns < until_ns, f"{what}: the drive is {describe_state(word)}, expected {state.name}")
+    while cia402.known_state(word := bench.number(cia402.STATUSWORD)) is not state:
+        found = cia402.describe_state(word)
+        bench.expect(bench.now_ns < until_ns, f"{what}: the drive is {found}, expected {state.name}")
         bench.pass_time(0.01)
 
 
@@ -73,7 +67,7 @@ def _supported(bench: Bench) -> int:
 def _off(bench: Bench) -> None:
     """Disable the voltage, and reset a fault that is there."""
     bench.put(cia402.CONTROLWORD, 0, 0, 2)
-    if known_state(bench.number(cia402.STATUSWORD)) is DriveState.FAULT:
+    if cia402.known_state(bench.number(cia402.STATUSWORD)) is DriveState.FAULT:
         bench.does_not_apply("the drive is in FAULT; reset it first")
     _reach(bench, DriveState.SWITCH_ON_DISABLED, "disable voltage")
 
@@ -89,7 +83,7 @@ def _go(bench: Bench, state: DriveState) -> None:
 def statusword(bench: Bench) -> None:
     """The bits of 6041h are those of a state."""
     word = bench.number(cia402.STATUSWORD)
-    bench.expect(known_state(word) is not None, f"6041h is {word:04X}h, which is no state")
+    bench.expect(cia402.known_state(word) is not None, f"6041h is {word:04X}h, which is no state")
 
 
 @point(
@@ -136,7 +130,7 @@ def mode_display(bench: Bench) -> None:
 def transitions(bench: Bench) -> None:
     """Every command that does something, in every state up to operation enabled; quick stop is point 51."""
     with _at_rest(bench):
-        for (source, command), goal in TRANSITIONS.items():
+        for (source, command), goal in cia402.TRANSITIONS.items():
             if source not in _STATES or command not in _WORDS or goal is DriveState.QUICK_STOP_ACTIVE:
                 continue
             _go(bench, source)
@@ -152,7 +146,7 @@ def illegal_commands(bench: Bench) -> None:
     with _at_rest(bench):
         for source in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON):
             for command in _WORDS:
-                if (source, command) in TRANSITIONS:
+                if (source, command) in cia402.TRANSITIONS:
                     continue
                 _go(bench, source)
                 _command(bench, command)

@@ -5,16 +5,7 @@ Source: CiA 301, "Service data object" (eight bytes), "Restricted CAN-IDs"; ISO 
 
 from __future__ import annotations
 
-from canprobe.fieldbus.protocol.frames import (
-    EFF_FLAG,
-    EMCY_BASE,
-    HEARTBEAT_BASE,
-    NMT_ID,
-    RTR_FLAG,
-    SDO_RX_BASE,
-    NmtCommand,
-    NmtState,
-)
+from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
 from canprobe.fieldbus.protocol.pdo import RPDOS, TPDOS
 from canprobe.fieldbus.protocol.sdo import pack_read, pack_request
@@ -40,8 +31,8 @@ def sdo_lengths(bench: Bench) -> None:
 @point(94, "remote requests", "CiA 301, CAN data frames", "remote requests for SDO and EMCY are ignored")
 def remote_requests(bench: Bench) -> None:
     """Remote requests under every identifier of the device but guarding and TPDOs."""
-    for can_id in (bench.request_id, bench.answer_id, EMCY_BASE + bench.node_id):
-        bench.expect(bench.ignores(can_id | RTR_FLAG), f"a remote request for {can_id:03X}h is answered")
+    for can_id in (bench.request_id, bench.answer_id, frames.EMCY_BASE + bench.node_id):
+        bench.expect(bench.ignores(can_id | frames.RTR_FLAG), f"a remote request for {can_id:03X}h is answered")
     bench.serves("remote requests")
 
 
@@ -50,11 +41,11 @@ def extended_frames(bench: Bench) -> None:
     """The identifiers of SDO and NMT in 29 bits, as they are and above the 11 bits."""
     bench.watch_state()
     for shift in (0, 18):
-        can_id = bench.request_id << shift | EFF_FLAG
+        can_id = bench.request_id << shift | frames.EFF_FLAG
         if not bench.ignores(can_id, _READ_TYPE):
-            bench.deviates(f"an SDO request with identifier {can_id & ~EFF_FLAG:08X}h is answered")
-        bench.send(NMT_ID << shift | EFF_FLAG, bytes((NmtCommand.STOP, bench.node_id)))
-        if (state := bench.state()) != NmtState.PRE_OPERATIONAL:
+            bench.deviates(f"an SDO request with identifier {can_id & ~frames.EFF_FLAG:08X}h is answered")
+        bench.send(frames.NMT_ID << shift | frames.EFF_FLAG, bytes((frames.NmtCommand.STOP, bench.node_id)))
+        if (state := bench.state()) != frames.NmtState.PRE_OPERATIONAL:
             bench.deviates(f"an NMT command in 29 bits leads to state {state:02X}h")
     bench.serves("29-bit frames")
 
@@ -107,14 +98,14 @@ def other_identifiers(bench: Bench) -> None:
     own = {*bench.device.valid_pdos(RPDOS), *bench.device.valid_pdos(TPDOS)}
     lengths = 0
     for can_id in range(0x103, 0x7E0, 16):
-        services = can_id & 0x7F == bench.node_id or HEARTBEAT_BASE <= can_id < HEARTBEAT_BASE + 128 or can_id in own
-        if services or SDO_RX_BASE < can_id < SDO_RX_BASE + 128:
+        is_service = can_id & ~0x7F in (frames.HEARTBEAT_BASE, frames.SDO_RX_BASE)
+        if is_service or can_id & 0x7F == bench.node_id or can_id in own:
             continue
         bench.send(can_id, bytes(range(lengths % 9)))
         lengths += 1
     for length in range(8):
         bench.send(LSS_REQUEST_ID, bytes(length))
     bench.pass_time(0.01)
-    if (state := bench.state()) != NmtState.PRE_OPERATIONAL:
+    if (state := bench.state()) != frames.NmtState.PRE_OPERATIONAL:
         bench.deviates(f"state {state:02X}h after frames under identifiers of nobody")
     bench.serves("frames under identifiers of nobody")
