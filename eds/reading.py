@@ -24,8 +24,7 @@ from canprobe.fieldbus.eds.findings import EdsFinding, EdsFindings
 from canprobe.fieldbus.eds.foreign_files import HEAD_BYTES, XML, file_kind
 from canprobe.fieldbus.eds.numbers import parse_sum
 from canprobe.fieldbus.eds.object_lists import check_lists
-from canprobe.fieldbus.eds.sections import Section, decode, split_sections
-from canprobe.fieldbus.eds.source import Source
+from canprobe.fieldbus.eds.sections import Section, Source, decode, split_sections
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
 from canprobe.fieldbus.protocol.frames import EFF_MASK, INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, RPDOS, TPDOS, is_mapping

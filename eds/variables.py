@@ -12,9 +12,8 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from canprobe.fieldbus.eds import values
 from canprobe.fieldbus.eds.mandatory import CHOICE_INDICES, U8, USUAL_TYPES, decides, standard_access, standard_type
-from canprobe.fieldbus.eds.numbers import parse_flag, parse_integer, parse_sum
-from canprobe.fieldbus.eds.sections import Section
-from canprobe.fieldbus.eds.source import Source
+from canprobe.fieldbus.eds.numbers import Remark, parse_flag, parse_integer, parse_sum
+from canprobe.fieldbus.eds.sections import Section, Source
 
 _OBJECT_DOMAIN = 2
 _OTHER_TYPES = {
@@ -41,7 +40,7 @@ def build_variable(source: Source, section: Section, index: int, subindex: int, 
     variable = ODVariable(_name(source, section, index, subindex), index, subindex)
     variable.data_type = data_type
     variable.access_type = _access(source, section, index, subindex, composite)
-    variable.pdo_mappable = _flag(source, section, "PDOMapping")
+    variable.pdo_mappable = source.read(section, "PDOMapping", parse_flag, False, "is neither 0 nor 1; read as 0")
     _set_limits(source, section, variable, data_type)
     if known is not None:
         set_value(source, section, "DefaultValue", variable)
@@ -98,20 +97,12 @@ def _access(source: Source, section: Section, index: int, subindex: int, composi
     return taken
 
 
-def _flag(source: Source, section: Section, key: str) -> bool:
-    text = section.value(key)
-    if not text:
-        return False  # the default of CiA 306
-    try:
-        return parse_flag(text, source.remark(section, key))
-    except ValueError:
-        source.warn(section, key, f"{text!r} is neither 0 nor 1; read as 0")
-        return False
-
-
 def _set_limits(source: Source, section: Section, variable: ODVariable, data_type: int) -> None:
-    low = _limit(source, section, "LowLimit", data_type)
-    high = _limit(source, section, "HighLimit", data_type)
+    def limit(text: str, remark: Remark) -> int | float | None:
+        return values.convert_limit(text, data_type, source.node_id, remark)
+
+    wrong = f"is not a value of type {values.name_of(data_type)}; not used"
+    low, high = (source.read(section, key, limit, None, wrong) for key in ("LowLimit", "HighLimit"))
     if low == high == 0 and not (source.drive and variable.index in CHOICE_INDICES):
         source.warn(
             section, "LowLimit", "0, and HighLimit 0 too, as editors fill in what nobody stated; neither is used"
@@ -121,17 +112,6 @@ def _set_limits(source: Source, section: Section, variable: ODVariable, data_typ
         source.warn(section, "LowLimit", f"{low} is above HighLimit {high}; neither is used")
         return
     variable.min, variable.max = low, high  # type: ignore[assignment]  # those of a REAL are floats
-
-
-def _limit(source: Source, section: Section, key: str, data_type: int) -> int | float | None:
-    text = section.value(key)
-    if not text:
-        return None
-    try:
-        return values.convert_limit(text, data_type, source.node_id, source.remark(section, key))
-    except (ValueError, OverflowError):
-        source.warn(section, key, f"{text!r} is not a value of type {values.name_of(data_type)}; not used")
-        return None
 
 
 def _data_type_of(source: Source, section: Section, index: int, subindex: int, composite: bool) -> int | None:

@@ -16,8 +16,9 @@ from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.drive.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, InterpolatedPosition
 from canprobe.fieldbus.drive.homing import HomingMode
-from canprobe.fieldbus.drive.mode import DriveMode, DriveParts
+from canprobe.fieldbus.drive.mode import DriveMode
 from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS, DriveParameters, check_among
+from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery

@@ -15,7 +15,8 @@ from math import inf
 from typing import NamedTuple
 
 from canprobe.fieldbus.drive.cyclic_modes import POSITION_TARGET_KEY
-from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, ProfiledMode
+from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
 from canprobe.fieldbus.node.entry import key_of

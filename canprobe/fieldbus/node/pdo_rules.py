@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from canprobe.fieldbus.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
+from canprobe.fieldbus.eds.packaged import LONG_PDOS
 from canprobe.fieldbus.node.core import check_cob_id
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value, key_of
@@ -48,7 +48,7 @@ class PdoRules:
     def long(self) -> bool:
         """Whether the device has PDOs of up to 64 bytes, and they were switched on."""
         dictionary = self.dictionary
-        return self.transmits and dictionary.has_named(LONG_PDOS, LONG_PDOS_NAME) and bool(dictionary.number(LONG_PDOS))
+        return self.transmits and dictionary.has_known(LONG_PDOS) and bool(dictionary.number(LONG_PDOS))
 
     def check_communication(self, subindex: int, value: Value) -> None:
         """Check a communication parameter. Raises SdoAbort for a value that the standard forbids now."""
