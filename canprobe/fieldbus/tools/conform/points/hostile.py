@@ -12,13 +12,14 @@ from canprobe.fieldbus.protocol.sdo import pack_read, pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("hostile")
+point = PointGroup("hostile", "CiA 301")
+format_point = PointGroup("hostile", "ISO 11898-1")
 _READ_TYPE = pack_read(0x1000)
 _FD_BYTES = 12
 _PACE_S = 0.02
 
 
-@point(93, "SDO of every length", "CiA 301, SDO: eight bytes", "0 to 7 bytes are not answered")
+@point(93, "SDO of every length", "SDO: eight bytes", "0 to 7 bytes are not answered")
 def sdo_lengths(bench: Bench) -> None:
     """A request cut to 0 to 7 bytes. Some devices answer shorter requests on purpose, which is noted."""
     answered = [length for length in range(8) if not bench.ignores(bench.request_id, _READ_TYPE[:length])]
@@ -28,7 +29,7 @@ def sdo_lengths(bench: Bench) -> None:
     bench.serves("short requests")
 
 
-@point(94, "remote requests", "CiA 301, CAN data frames", "remote requests for SDO and EMCY are ignored")
+@point(94, "remote requests", "CAN data frames", "remote requests for SDO and EMCY are ignored")
 def remote_requests(bench: Bench) -> None:
     """Remote requests under every identifier of the device but guarding and TPDOs."""
     for can_id in (bench.request_id, bench.answer_id, frames.EMCY_BASE + bench.node_id):
@@ -36,7 +37,7 @@ def remote_requests(bench: Bench) -> None:
     bench.serves("remote requests")
 
 
-@point(95, "29-bit frames", "CiA 301, CAN base frames", "frames with 29 bits are another device's", needs="alone nmt")
+@point(95, "29-bit frames", "CAN base frames", "frames with 29 bits are another device's", needs="alone nmt")
 def extended_frames(bench: Bench) -> None:
     """The identifiers of SDO and NMT in 29 bits, as they are and above the 11 bits."""
     bench.watch_state()
@@ -50,7 +51,7 @@ def extended_frames(bench: Bench) -> None:
     bench.serves("29-bit frames")
 
 
-@point(96, "every SDO command", "CiA 301, SDO command specifiers", "an answer of eight bytes or none; then it serves")
+@point(96, "every SDO command", "SDO command specifiers", "an answer of eight bytes or none; then it serves")
 def every_command(bench: Bench) -> None:
     """All 256 command bytes with 1000h, which cannot be written; what may begin a transfer is aborted."""
     value = bench.device.values.get((0x1000, 0), bytes(4))
@@ -68,7 +69,7 @@ def every_command(bench: Bench) -> None:
     bench.serves("all command bytes")
 
 
-@point(97, "CAN FD frames", "ISO 11898-1, FD format", "an FD frame is no SDO request", needs="alone")
+@format_point(97, "CAN FD frames", "FD format", "an FD frame is no SDO request", needs="alone")
 def fd_frames(bench: Bench) -> None:
     """A request in a frame of twelve bytes, where the bus carries such frames."""
     bench.require(bench.fd, "the bus carries no CAN FD frames")
@@ -77,7 +78,7 @@ def fd_frames(bench: Bench) -> None:
     bench.serves("CAN FD frames")
 
 
-@point(99, "own frames", "CiA 301, CAN base frames", "data frames with 11 bits only", needs="alone")
+@point(99, "own frames", "CAN base frames", "data frames with 11 bits only", needs="alone")
 def own_frames(bench: Bench) -> None:
     """What came so far, where nobody else is on the bus."""
     if bench.odd_ids:
@@ -88,7 +89,7 @@ def own_frames(bench: Bench) -> None:
 @point(
     98,
     "identifiers of nobody",
-    "CiA 301, CAN identifiers",
+    "CAN identifiers",
     "frames of every length under other identifiers are ignored",
     needs="alone nmt",
 )

@@ -10,13 +10,13 @@ from canprobe.fieldbus.tools.conform.frame_link import CameFrame
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("nmt")
+point = PointGroup("nmt", "CiA 301", needs="nmt")
 _STATES = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
 _READ_TYPE = pack_read(0x1000)
 _PACE_S = 0.02
 
 
-@point(1, "boot-up", "CiA 301, NMT boot-up", "700h+id with 00h, then pre-operational", needs="nmt")
+@point(1, "boot-up", "NMT boot-up", "700h+id with 00h, then pre-operational")
 def boot_up(bench: Bench) -> None:
     """After a reset the device announces itself once, and is pre-operational."""
     before = bench.boots
@@ -30,7 +30,7 @@ def boot_up(bench: Bench) -> None:
     bench.expect(bench.boots == before + 1, f"{bench.boots - before} boot-up messages after one reset")
 
 
-@point(1, "power on", "CiA 301, NMT boot-up", "700h+id with 00h after the power came back", needs="nmt")
+@point(1, "power on", "NMT boot-up", "700h+id with 00h after the power came back")
 def power_on(bench: Bench) -> None:
     """The device announces itself when it gets its power, which a person switches."""
     before = bench.boots
@@ -40,13 +40,7 @@ def power_on(bench: Bench) -> None:
     bench.expect(bench.boots != before, "no boot-up message after the power came back")
 
 
-@point(
-    2,
-    "reset communication",
-    "CiA 301, NMT node control",
-    "82h boots again from every state, and 1017h has its power-on value",
-    needs="nmt",
-)
+@point(2, "reset communication", "NMT node control", "82h boots again from every state; 1017h has its power-on value")
 def reset_communication(bench: Bench) -> None:
     """82h from pre-operational, operational and stopped."""
     bench.reset()
@@ -59,7 +53,7 @@ def reset_communication(bench: Bench) -> None:
             bench.deviates(f"1017h is {found} after the reset, {default} after the one before")
 
 
-@point(2, "reset node", "CiA 301, NMT node control", "81h boots again from every state", needs="nmt")
+@point(2, "reset node", "NMT node control", "81h boots again from every state")
 def reset_node(bench: Bench) -> None:
     """81h, where the user permits that application objects are reset."""
     for state in _STATES:
@@ -69,13 +63,7 @@ def reset_node(bench: Bench) -> None:
         bench.reset(NmtCommand.RESET_NODE)
 
 
-@point(
-    3,
-    "wrong commands",
-    "CiA 301, NMT node control",
-    "commands that do not exist, or of another length, change nothing",
-    needs="nmt",
-)
+@point(3, "wrong commands", "NMT node control", "commands that do not exist, or of another length, change nothing")
 def wrong_commands(bench: Bench) -> None:
     """In each state: unknown specifiers, and valid ones with a byte too many or too few."""
     wrong = [bytes((specifier, bench.node_id)) for specifier in (0x00, 0x03, 0x7F, 0x83, 0xFF)]
@@ -91,7 +79,7 @@ def wrong_commands(bench: Bench) -> None:
             bench.deviates(f"state {found:02X}h after wrong commands in state {state:02X}h")
 
 
-@point(4, "initialisation", "CiA 301, NMT initialisation", "nothing is served before the boot-up", needs="nmt")
+@point(4, "initialisation", "NMT initialisation", "nothing is served before the boot-up")
 def initialisation(bench: Bench) -> None:
     """SDO requests from the reset on: none is answered before the boot-up message."""
     beat_id, answer_id = bench.beat_id, bench.answer_id
@@ -117,7 +105,7 @@ def initialisation(bench: Bench) -> None:
         )
 
 
-@point(5, "stopped", "CiA 301, NMT stopped", "SDO requests are not answered in stopped", needs="nmt")
+@point(5, "stopped", "NMT stopped", "SDO requests are not answered in stopped")
 def stopped(bench: Bench) -> None:
     """SDO is silent in stopped, and served again in pre-operational."""
     bench.watch_state()
@@ -127,13 +115,7 @@ def stopped(bench: Bench) -> None:
     bench.serves("the return to pre-operational")
 
 
-@point(
-    6,
-    "PDOs",
-    "CiA 301, NMT states",
-    "TPDOs come in operational only: neither SYNC nor a remote request brings one elsewhere",
-    needs="nmt",
-)
+@point(6, "PDOs", "NMT states", "TPDOs come in operational only: neither SYNC nor remote request brings one elsewhere")
 def pdos_in_operational(bench: Bench) -> None:
     """SYNC and remote requests in pre-operational and stopped; frames that were queued before may still come."""
     tpdos = bench.device.valid_pdos(TPDOS)
@@ -163,9 +145,7 @@ def request_pdo(bench: Bench, cob_id: int) -> None:
         bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
 
 
-@point(
-    7, "operational", "CiA 301, NMT state machine", "01h leads to operational, and the device stays there", needs="nmt"
-)
+@point(7, "operational", "NMT state machine", "01h leads to operational, and the device stays there")
 def reaches_operational(bench: Bench) -> None:
     """What was seen before the first point; points that need operational do not apply where it is not reached."""
     bench.expect(not bench.kept_out, f"{bench.kept_out}; end this error, and examine the device again")
@@ -174,9 +154,8 @@ def reaches_operational(bench: Bench) -> None:
 @point(
     7,
     "transitions",
-    "CiA 301, NMT state machine",
+    "NMT state machine",
     "01h, 02h and 80h lead to their states from every state, and error control reports them",
-    needs="nmt",
 )
 def transitions(bench: Bench) -> None:
     """Every transition between the three states."""

@@ -23,8 +23,8 @@ from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
-point = PointGroup("pdo")
-MAPPING = "CiA 301, PDO mapping"
+point = PointGroup("pdo", "CiA 301")
+MAPPING = "PDO mapping"
 _ABSENT_WORD, _IDENTITY_WORD, _DUMMY_WORD = 0x1FF00020, 0x10180120, 0x00070020
 _RESERVED_TYPES = {"RPDO": (0xF1, 0xF8, 0xFD), "TPDO": (0xF1, 0xF6, 0xFB)}
 _LONG_ENTRIES = 9
@@ -131,7 +131,7 @@ def map_unmappable(bench: Bench) -> None:
     bench.require(tried, "no mapping can be changed, or the EDS lets everything be mapped")
 
 
-@point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
+@point(28, "identifier while valid", "14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
 def identifier_while_valid(bench: Bench) -> None:
     """Another identifier for a PDO in use."""
     for area in (RPDOS, TPDOS):
@@ -142,7 +142,7 @@ def identifier_while_valid(bench: Bench) -> None:
         bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
 
 
-@point(28, "times while valid", "CiA 301, 18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
+@point(28, "times while valid", "18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
 def times_while_valid(bench: Bench) -> None:
     """Inhibit time and SYNC start value of a TPDO in use."""
     pdo, tried = _valid(bench, TPDOS), 0
@@ -154,7 +154,7 @@ def times_while_valid(bench: Bench) -> None:
     bench.require(tried, "the TPDOs have neither inhibit time nor start value")
 
 
-@point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE, needs="nmt")
+@point(28, "restricted identifiers", "restricted CAN-IDs", accepted.VALUE, needs="nmt")
 def restricted_identifiers_of_pdos(bench: Bench) -> None:
     """Restricted identifiers for a PDO out of use."""
     for area in (RPDOS, TPDOS):
@@ -166,7 +166,7 @@ def restricted_identifiers_of_pdos(bench: Bench) -> None:
             bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
 
 
-@point(29, "reserved types", "CiA 301, transmission type", accepted.VALUE, needs="nmt")
+@point(29, "reserved types", "transmission type", accepted.VALUE, needs="nmt")
 def reserved_types(bench: Bench) -> None:
     """Reserved transmission types for a PDO out of use."""
     for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):

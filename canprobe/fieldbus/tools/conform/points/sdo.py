@@ -11,8 +11,8 @@ from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("sdo")
-CODES = "CiA 301, SDO abort codes"
+point = PointGroup("sdo", "CiA 301")
+CODES = "SDO abort codes"
 _ABSENT = (0x1FF0, 0x5FFE, 0x9FFE)
 """Indices that hardly any device has, in three areas; they are read only."""
 
@@ -98,7 +98,7 @@ def limits(bench: Bench) -> None:
     bench.require(found, "no entry that may be written has a limit; --write names more")
 
 
-@point(75, "default channel", "CiA 301, 1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
+@point(75, "default channel", "1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
 def default_channel(bench: Bench) -> None:
     """The identifiers of the default SDO server."""
     bench.need((0x1200, 1), (0x1200, 2), written=False)
@@ -107,7 +107,7 @@ def default_channel(bench: Bench) -> None:
             bench.deviates(f"1200h:{subindex:02X} is {found:08X}h, expected {base + bench.node_id:08X}h")
 
 
-@point(76, "further channels", "CiA 301, 1201h to 127Fh", accepted.NO_OBJECT, needs="eds")
+@point(76, "further channels", "1201h to 127Fh", accepted.NO_OBJECT, needs="eds")
 def further_channels(bench: Bench) -> None:
     """Channels that the EDS does not describe are not there."""
     for index in (0x1201, 0x1202, 0x1240, 0x127F):
@@ -115,7 +115,7 @@ def further_channels(bench: Bench) -> None:
             bench.must_refuse(pack_read(index), accepted.NO_OBJECT, f"read of {index:04X}h")
 
 
-@point(24, "two channels", "CiA 301, 1200h to 127Fh", "transfers on two channels do not disturb each other")
+@point(24, "two channels", "1200h to 127Fh", "transfers on two channels do not disturb each other")
 def two_channels(bench: Bench) -> None:
     """A segmented upload on the default channel, and an expedited one on 1201h within it."""
     bench.need((0x1201, 1), (0x1201, 2), written=False)

@@ -13,9 +13,9 @@ from canprobe.fieldbus.tools.conform.accepted import AbortSet
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("sdo")
-SEGMENTS = "CiA 301, SDO segmented transfer"
-BLOCKS = "CiA 301, SDO block transfer"
+point = PointGroup("sdo", "CiA 301")
+SEGMENTS = "SDO segmented transfer"
+BLOCKS = "SDO block transfer"
 _SERVER_TIMEOUT_S = 5.0
 _HEARTBEAT = 0x1017
 
@@ -62,7 +62,7 @@ def toggle_up(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(19, "time-out", "CiA 301, SDO abort codes", "05040000h, or no time-out at all; then it serves again")
+@point(19, "time-out", "SDO abort codes", "05040000h, or no time-out at all; then it serves again")
 def server_timeout(bench: Bench) -> None:
     """A download that is not continued: an abort, if one comes, is the time-out, and the server is free afterwards."""
     _segmented_download(bench)
@@ -81,7 +81,7 @@ def no_transfer(bench: Bench) -> None:
         bench.must_refuse(bytes((command,)) + bytes(7), accepted.UNKNOWN_COMMAND, f"{what} without a transfer")
 
 
-@point(21, "client's abort", "CiA 301, SDO abort", "no answer; the transfer is over")
+@point(21, "client's abort", "SDO abort", "no answer; the transfer is over")
 def client_abort(bench: Bench) -> None:
     """The client aborts a download."""
     _segmented_download(bench)
@@ -108,7 +108,7 @@ def more_than_announced(bench: Bench) -> None:
     bench.serves("the transfer")
 
 
-@point(23, "expedited", "CiA 301, SDO expedited transfer", "1000h in four bytes; 1017h takes its own value")
+@point(23, "expedited", "SDO expedited transfer", "1000h in four bytes; 1017h takes its own value")
 def expedited(bench: Bench) -> None:
     """An upload, and a download that is read back."""
     bench.need((0x1000, 0), written=False)

@@ -10,7 +10,7 @@ from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS, Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("timing")
+point = PointGroup("timing", "CiA 301")
 SDO_TIME, SYNC_TIME, HEARTBEAT_TIME = "SDO answer", "SYNC to TPDO", "heartbeat period"
 """Names of the distributions."""
 _SDO_COUNT, _SYNC_COUNT, _BEAT_COUNT = 100, 50, 20
@@ -36,19 +36,13 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     return tuple(times)
 
 
-@point(100, "SDO", "CiA 301, SDO time-out of the client", "each of 100 reads of 1000h is answered in time")
+@point(100, "SDO", "SDO time-out of the client", "each of 100 reads of 1000h is answered in time")
 def sdo_time(bench: Bench) -> None:
     """Times of 100 reads, one after another."""
     bench.distributions[SDO_TIME] = _sdo_times(bench, _SDO_COUNT)
 
 
-@point(
-    101,
-    "SYNC to TPDO",
-    "CiA 301, synchronous TPDO",
-    "one TPDO for each of 50 SYNCs, within 10 ms",
-    needs="nmt sync stamps",
-)
+@point(101, "SYNC to TPDO", "synchronous TPDO", "one TPDO for each of 50 SYNCs, within 10 ms", needs="nmt sync stamps")
 def sync_time(bench: Bench) -> None:
     """Times from SYNC to a TPDO of type 1, at 100 Hz."""
     cob_id = synchronous_tpdo(bench)
@@ -64,7 +58,7 @@ def sync_time(bench: Bench) -> None:
     bench.distributions[SYNC_TIME] = tuple(times)
 
 
-@point(102, "heartbeat", "CiA 301, 1017h", "no period differs by more than 20 % from 1017h", needs="stamps")
+@point(102, "heartbeat", "1017h", "no period differs by more than 20 % from 1017h", needs="stamps")
 def heartbeat_time(bench: Bench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
@@ -79,13 +73,7 @@ def heartbeat_time(bench: Bench) -> None:
         )
 
 
-@point(
-    103,
-    "under load",
-    "CiA 301, SDO, heartbeat",
-    "reads are answered and heartbeats come under half load",
-    needs="alone",
-)
+@point(103, "under load", "SDO, heartbeat", "reads are answered and heartbeats come under half load", needs="alone")
 def under_load(bench: Bench) -> None:
     """Frames of higher priority take half the bus, while 1000h is read and the heartbeat runs."""
     bench.need((0x1017, 0))
