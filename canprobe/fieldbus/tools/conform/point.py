@@ -66,17 +66,9 @@ class PointGroup:
         """Make a `Point` of the function below; `expected` are words or codes, `needs` are words with blanks."""
         text = expected if isinstance(expected, str) else accepted.text(expected)
         source = f"{self.standard}, {clause}" if self.standard else clause
+        all_needs, hint = frozenset(f"{self.needs} {needs}".split()), HINTS[str(number)]
 
         def make(run: Callable[[Bench], None]) -> Point:
-            return Point(
-                number,
-                self.name,
-                name,
-                source,
-                text,
-                run,
-                frozenset(f"{self.needs} {needs}".split()),
-                HINTS[str(number)],
-            )
+            return Point(number, self.name, name, source, text, run, all_needs, hint)
 
         return make

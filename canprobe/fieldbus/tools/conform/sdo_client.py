@@ -43,9 +43,9 @@ class SdoClient(FrameLink):
         """
         answer = None
         self.taken(self.answer_id)
-        until_ns = self.send(self.request_id, request) + round(self.times.sdo_s * 1e9)
+        self.send(self.request_id, request)
         named = request[0] >> 5 in (1, 2) or request[0] & 0xE1 == 0xC0 or request[0] & 0xE3 == 0xA0
-        while (frame := self.next(self.answer_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+        for frame in self.coming(self.answer_id, self.times.sdo_s):
             answer = frame.data
             if len(answer) != 8 or not named or sdo.place_of(answer) == sdo.place_of(request):
                 break
