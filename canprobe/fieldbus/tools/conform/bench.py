@@ -13,7 +13,7 @@ from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import Permits
-from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE, SdoClient, SdoRefused
 
 HEARTBEAT_MS = 50
 """Period of the heartbeat by which points see the NMT state."""
@@ -93,7 +93,7 @@ class Bench(SdoClient):
 
     def serves(self, what: str) -> None:
         """Check that a read of 1000h is answered as ever. Raises Deviation."""
-        if (answer := self.request(0x40, 0x1000)) != self.first_answer:
+        if (answer := self.ask(READ_TYPE)) != self.first_answer:
             self.deviates(f"1000h is answered with {answer.hex(' ')} after {what}")
 
     def expect(self, holds: object, text: str) -> None:

@@ -15,23 +15,18 @@ from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.conform.outcome import Deviation
 from canprobe.fieldbus.tools.conform.permits import WriteList
 from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
+from canprobe.fieldbus.tools.reports.report import IDENTITY
 
 DRIVE_PROFILE = 402
 _AXIS_STEP = 0x800
 _VARIABLES = (*range(0x1000, 0x1003), *range(0x1005, 0x100B), 0x100C, 0x100D, 0x1012, 0x1014, 0x1015, 0x1017, 0x1019)
 _RECORDS = (0x1003, 0x1016, 0x1018, 0x1020, 0x1028, 0x1029, 0x1200, 0x1201)
+TEXTS = (0x1008, 0x1009, 0x100A)
+"""Device name, hardware version and software version."""
 _MAX_ENTRIES = 64
 _UNDESCRIBED_PDOS = 32
 """PDOs of each direction that are looked for where no EDS names them."""
-_FACTS = {
-    "vendor": (0x1018, 1),
-    "product": (0x1018, 2),
-    "revision": (0x1018, 3),
-    "serial": (0x1018, 4),
-    "device name": (0x1008, 0),
-    "hardware version": (0x1009, 0),
-    "firmware": (0x100A, 0),
-}
+_FACTS = dict(zip(IDENTITY, (*((0x1018, n) for n in range(1, 5)), *((index, 0) for index in TEXTS)), strict=True))
 
 
 @dataclass(slots=True)

@@ -39,7 +39,7 @@ from canprobe.fieldbus.tools.conform.outcome import (
 from canprobe.fieldbus.tools.conform.permits import Permits, WriteList, is_object
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
-from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE, SdoRefused
 from canprobe.fieldbus.tools.conform.surroundings import hear
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
@@ -157,7 +157,7 @@ class Examination:
         self.bench = bench = Bench(self._port, device, permits, settings.times)
         bench.bitrate, bench.fd, bench.by_hand = settings.bitrate, settings.fd, self._by_hand
         try:
-            bench.first_answer = bench.request(0x40, 0x1000)
+            bench.first_answer = bench.ask(READ_TYPE)
         except CanprobeError as error:
             raise NodeError(self._node_id, f"it cannot be examined: {error}") from error
         device.read_all(bench, written)
@@ -309,7 +309,7 @@ class Examination:
         bench.forget()
         bench.emergencies.clear()
         try:
-            bench.request(0x40, 0x1000)
+            bench.ask(READ_TYPE)
         except CanprobeError as error:
             raise BenchFailure(f"the device does not answer before the point begins: {error}") from error
         self._check_power()

@@ -10,6 +10,8 @@ from canprobe.fieldbus.tools.conform.frame_text import sdo_text
 from canprobe.fieldbus.tools.conform.outcome import Deviation
 
 MAX_VALUE_BYTES = 1 << 16
+READ_TYPE = sdo.pack_read(0x1000)
+"""Request for 1000h, which every device answers."""
 
 
 class SdoRefused(CanprobeError):  # noqa: N818 - what a server does

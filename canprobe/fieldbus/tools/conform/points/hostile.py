@@ -8,13 +8,13 @@ from __future__ import annotations
 from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
 from canprobe.fieldbus.protocol.pdo import RPDOS, TPDOS
-from canprobe.fieldbus.protocol.sdo import pack_read, pack_request
+from canprobe.fieldbus.protocol.sdo import pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
 point = PointGroup("hostile", "CiA 301")
 format_point = PointGroup("hostile", "ISO 11898-1")
-_READ_TYPE = pack_read(0x1000)
 _FD_BYTES = 12
 _PACE_S = 0.02
 
@@ -22,7 +22,7 @@ _PACE_S = 0.02
 @point(93, "SDO of every length", "SDO: eight bytes", "0 to 7 bytes are not answered")
 def sdo_lengths(bench: Bench) -> None:
     """A request cut to 0 to 7 bytes. Some devices answer shorter requests on purpose, which is noted."""
-    answered = [length for length in range(8) if not bench.ignores(bench.request_id, _READ_TYPE[:length])]
+    answered = [length for length in range(8) if not bench.ignores(bench.request_id, READ_TYPE[:length])]
     bench.expect(not any(length < 4 for length in answered), f"requests of {answered} bytes are answered")
     if answered:
         bench.notes.append(f"requests of {answered} bytes are answered, as for old PLCs")
@@ -43,7 +43,7 @@ def extended_frames(bench: Bench) -> None:
     bench.watch_state()
     for shift in (0, 18):
         can_id = bench.request_id << shift | frames.EFF_FLAG
-        if not bench.ignores(can_id, _READ_TYPE):
+        if not bench.ignores(can_id, READ_TYPE):
             bench.deviates(f"an SDO request with identifier {can_id & ~frames.EFF_FLAG:08X}h is answered")
         bench.send(frames.NMT_ID << shift | frames.EFF_FLAG, bytes((frames.NmtCommand.STOP, bench.node_id)))
         if (state := bench.state()) != frames.NmtState.PRE_OPERATIONAL:
@@ -73,7 +73,7 @@ def every_command(bench: Bench) -> None:
 def fd_frames(bench: Bench) -> None:
     """A request in a frame of twelve bytes, where the bus carries such frames."""
     bench.require(bench.fd, "the bus carries no CAN FD frames")
-    if not bench.ignores(bench.request_id, _READ_TYPE.ljust(_FD_BYTES, b"\0")):
+    if not bench.ignores(bench.request_id, READ_TYPE.ljust(_FD_BYTES, b"\0")):
         bench.deviates("an SDO request of twelve bytes is answered")
     bench.serves("CAN FD frames")
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from canprobe.fieldbus.protocol.frames import NMT_ID, RTR_FLAG, NmtCommand, NmtState
 from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, TPDOS
-from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import QUEUED_NS, Bench
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
 point = PointGroup("nmt", "CiA 301", needs="nmt")
 _STATES = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
-_READ_TYPE = pack_read(0x1000)
 _PACE_S = 0.02
 
 
@@ -89,7 +90,7 @@ def initialisation(bench: Bench) -> None:
     frames: list[CameFrame] = []
     until_ns = started_ns + round(bench.times.boot_s * 1e9)
     while not any(frame.can_id == beat_id for frame in frames) and bench.now_ns < until_ns:
-        bench.send(bench.request_id, _READ_TYPE)
+        bench.send(bench.request_id, READ_TYPE)
         bench.pass_time(_PACE_S)
         frames += [*bench.taken(answer_id), *(frame for frame in bench.taken(beat_id) if frame.data == b"\0")]
     booted_ns = next((frame.t_ns for frame in frames if frame.can_id == beat_id), None)
@@ -110,7 +111,7 @@ def stopped(bench: Bench) -> None:
     """SDO is silent in stopped, and served again in pre-operational."""
     bench.watch_state()
     bench.go(NmtState.STOPPED)
-    bench.expect(bench.ignores(bench.request_id, _READ_TYPE), "an SDO request is answered in stopped")
+    bench.expect(bench.ignores(bench.request_id, READ_TYPE), "an SDO request is answered in stopped")
     bench.go(NmtState.PRE_OPERATIONAL)
     bench.serves("the return to pre-operational")
 
@@ -127,9 +128,7 @@ def pdos_in_operational(bench: Bench) -> None:
         for _ in range(2):
             if with_sync:
                 bench.sync()
-            for cob_id, pdo in tpdos.items():
-                if not bench.device.number(pdo, 1) & NO_RTR_FLAG:
-                    request_pdo(bench, cob_id)
+            request_pdos(bench, tpdos)
         bench.pass_time(bench.times.silence_s)
         frames = [frame for can_id in tpdos for frame in bench.taken(can_id) if frame.t_ns > changed_ns + QUEUED_NS]
         if frames:
@@ -137,12 +136,15 @@ def pdos_in_operational(bench: Bench) -> None:
     bench.nmt(NmtCommand.PRE_OPERATIONAL)
 
 
-def request_pdo(bench: Bench, cob_id: int) -> None:
-    """Send a remote request for a TPDO, where it may be sent."""
-    try:
-        bench.send(cob_id | RTR_FLAG)
-    except NotPermitted:
-        bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
+def request_pdos(bench: Bench, pdos: Mapping[int, int]) -> None:
+    """Send a remote request for each TPDO whose bit 30 allows it, where it may be sent."""
+    for cob_id, pdo in pdos.items():
+        if bench.device.number(pdo, 1) & NO_RTR_FLAG:
+            continue
+        try:
+            bench.send(cob_id | RTR_FLAG)
+        except NotPermitted:
+            bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
 
 
 @point(7, "operational", "NMT state machine", "01h leads to operational, and the device stays there")

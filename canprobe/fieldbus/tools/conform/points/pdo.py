@@ -23,7 +23,7 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
     word_of,
 )
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
+from canprobe.fieldbus.tools.conform.points.nmt import request_pdos
 
 point = PointGroup("pdo", "CiA 301")
 TRANSMISSION = "PDO transmission types"
@@ -109,7 +109,7 @@ def remote_request(bench: Bench) -> None:
     cob_id = put_to_work(bench, pdo, 253)
     bench.start()
     bench.taken(cob_id)
-    request_pdo(bench, cob_id)
+    request_pdos(bench, {cob_id: pdo})
     if bench.next(cob_id, bench.times.slack_s) is None:
         bench.deviates("a remote request for a TPDO of type 253 is not answered")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from canprobe.fieldbus.protocol.frames import RESTRICTED_IDS
-from canprobe.fieldbus.protocol.pdo import MAX_SYNC_TYPE, NO_RTR_FLAG, RPDOS, TO_MAPPING, TPDOS, PdoSub
+from canprobe.fieldbus.protocol.pdo import MAX_SYNC_TYPE, RPDOS, TO_MAPPING, TPDOS, PdoSub
 from canprobe.fieldbus.protocol.sdo import ABORT, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -20,13 +20,13 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
     word_of,
 )
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
+from canprobe.fieldbus.tools.conform.points.nmt import request_pdos
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
 point = PointGroup("pdo", "CiA 301")
 MAPPING = "PDO mapping"
 _ABSENT_WORD, _IDENTITY_WORD, _DUMMY_WORD = 0x1FF00020, 0x10180120, 0x00070020
-_RESERVED_TYPES = {"RPDO": (0xF1, 0xF8, 0xFD), "TPDO": (0xF1, 0xF6, 0xFB)}
+_RESERVED_TYPES = {RPDOS: (0xF1, 0xF8, 0xFD), TPDOS: (0xF1, 0xF6, 0xFB)}
 _LONG_ENTRIES = 9
 _CHANGED_BIT = 0x08
 _SYNC_PACE_S = 0.005
@@ -134,9 +134,7 @@ def map_unmappable(bench: Bench) -> None:
 @point(28, "identifier while valid", "14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
 def identifier_while_valid(bench: Bench) -> None:
     """Another identifier for a PDO in use."""
-    for area in (RPDOS, TPDOS):
-        if not bench.device.pdos(area):
-            continue
+    for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = _valid(bench, area)
         word = bench.number(pdo, 1) ^ _CHANGED_BIT
         bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
@@ -157,9 +155,7 @@ def times_while_valid(bench: Bench) -> None:
 @point(28, "restricted identifiers", "restricted CAN-IDs", accepted.VALUE, needs="nmt")
 def restricted_identifiers_of_pdos(bench: Bench) -> None:
     """Restricted identifiers for a PDO out of use."""
-    for area in (RPDOS, TPDOS):
-        if not bench.device.pdos(area):
-            continue
+    for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = idle_pdo(bench, area)
         for cob_id in RESTRICTED_IDS:
             request = pack_write(pdo, 1, cob_id.to_bytes(4, "little"))
@@ -169,12 +165,10 @@ def restricted_identifiers_of_pdos(bench: Bench) -> None:
 @point(29, "reserved types", "transmission type", accepted.VALUE, needs="nmt")
 def reserved_types(bench: Bench) -> None:
     """Reserved transmission types for a PDO out of use."""
-    for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):
-        if not bench.device.pdos(area):
-            continue
+    for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = idle_pdo(bench, area)
         bench.need((pdo, 2))
-        for kind in _RESERVED_TYPES[what]:
+        for kind in _RESERVED_TYPES[area]:
             bench.must_refuse(pack_write(pdo, 2, bytes((kind,))), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
 
 
@@ -251,9 +245,7 @@ def _ask_for_tpdos(bench: Bench, pdos: Mapping[int, int]) -> None:
         for number in range(max(kinds) + max(starts) + 1):
             bench.sync(number % overflow + 1 if overflow else None)
             bench.pass_time(_SYNC_PACE_S)
-    for cob_id, pdo in pdos.items():
-        if not bench.device.number(pdo, 1) & NO_RTR_FLAG:
-            request_pdo(bench, cob_id)
+    request_pdos(bench, pdos)
 
 
 @point(84, "mapped anew", MAPPING, "out of use, 0, entries, count, in use: all writes are accepted", needs="nmt")

@@ -10,6 +10,7 @@ from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
 point = PointGroup("sdo", "CiA 301")
 CODES = "SDO abort codes"
@@ -123,7 +124,7 @@ def two_channels(bench: Bench) -> None:
     bench.require(not (request_id | answer_id) >> 11, "channel 1201h is not in use")
     name = bench.device.values.get((0x1008, 0), b"")
     answer = bench.request(0x40, 0x1008)
-    bench.send(request_id, pack_read(0x1000))
+    bench.send(request_id, READ_TYPE)
     frame = bench.next(answer_id, bench.times.sdo_s)
     bench.expect(frame and frame.data == bench.first_answer, "no answer with 1000h on the channel of 1201h")
     segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]

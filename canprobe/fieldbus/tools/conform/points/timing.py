@@ -5,10 +5,10 @@ from __future__ import annotations
 from itertools import pairwise
 
 from canprobe.fieldbus.protocol.frame_bits import NS_PER_S
-from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS, Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
 point = PointGroup("timing", "CiA 301")
 SDO_TIME, SYNC_TIME, HEARTBEAT_TIME = "SDO answer", "SYNC to TPDO", "heartbeat period"
@@ -28,7 +28,7 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     times: list[float] = []
     for _ in range(count):
         bench.taken(bench.answer_id)
-        t_ns = bench.send(bench.request_id, pack_read(0x1000))
+        t_ns = bench.send(bench.request_id, READ_TYPE)
         frame = bench.next(bench.answer_id, bench.times.sdo_s)
         if frame is None or frame.data != bench.first_answer:
             bench.deviates(f"read {len(times) + 1} of {count} of 1000h is not answered within {bench.times.sdo_s:g} s")
