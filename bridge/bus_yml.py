@@ -187,7 +187,7 @@ def _pdos(plan: Plan, node: PlannedNode, setup: NodeConfiguration, direction: Di
 
 def _pdo(pdo: PlannedPdo, written: set[int]) -> dict[str, Any]:
     found: dict[str, Any] = {"enabled": True, "cob_id": _Hex(pdo.cob_id), "transmission": pdo.transmission_type}
-    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= 240:
+    if pdo.direction == "tpdo" and pdo.transmission_type > 1 and pdo.layout.synchronous:
         found["sync_start"] = SYNC_START_VALUE
     if MAPPING[pdo.direction] + pdo.number - 1 in written:  # a fixed mapping cannot be written
         found["mapping"] = [{"index": _Hex(entry.index), "sub_index": entry.subindex} for entry in pdo.entries]
