@@ -24,7 +24,7 @@ from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
 from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
-from canprobe.mechanics.robot.motors import position_per_unit
+from canprobe.mechanics.robot.model import position_per_unit
 from canprobe.mechanics.touch.stops import MAX_FORCE_SPREAD, OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS
 from canprobe.mechanics.types import Floats
 

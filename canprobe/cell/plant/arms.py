@@ -12,7 +12,7 @@ from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.pushing import Neighbourhood, Rubbing
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
-from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.model import joints_per_motor
 
 
 def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:

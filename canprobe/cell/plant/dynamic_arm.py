@@ -16,8 +16,7 @@ from canprobe.cell.plant.equations import ArmEquations
 from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE
 from canprobe.cell.plant.integrators import STEPS
 from canprobe.cell.plant.ramps import Reference
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_per_motor
 from canprobe.mechanics.types import Floats
 
 

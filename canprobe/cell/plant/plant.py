@@ -29,8 +29,7 @@ from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
-from canprobe.mechanics.robot.model import ArmModel, units_to_joints
-from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.model import ArmModel, joints_per_motor, units_to_joints
 from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, TouchedPlaces
 from canprobe.mechanics.types import Floats
 

@@ -7,9 +7,9 @@ import pytest
 
 from canprobe.mechanics.touch import Correlation, Prior
 from canprobe.mechanics.touch.estimate.information import InformationFilter
-from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
 from canprobe.mechanics.touch.estimate.noise import Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
+from canprobe.mechanics.touch.estimate.observed import curvature_covariance
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, OmittedTerms
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
 from canprobe.mechanics.touch.estimate.sandwich import Score

@@ -31,7 +31,7 @@ from canprobe.mechanics.touch import (
     indentation_from_force,
     make_estimator,
 )
-from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.estimate.observed import CurvatureInformation
 from canprobe.mechanics.touch.online.patch_curvature import MIN_FRAMES
 from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
