@@ -22,7 +22,6 @@ from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.tasks.requested import Request, RequestedTask
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.lab.bridge.commands import refuse, trajectory_of
 from canprobe.lab.bridge.dds_types import DdsTypes, dds_name
 from canprobe.lab.bridge.description import robot_description
 from canprobe.lab.bridge.messages import (
@@ -51,6 +50,8 @@ from canprobe.lab.bridge.ros2_dds import (
     Ros2Node,
     Ros2Sink,
     domain_of,
+    refuse,
+    trajectory_of,
 )
 from canprobe.lab.bridge.sample import Context, Sample
 from canprobe.lab.bridge.sampling import SampleSource

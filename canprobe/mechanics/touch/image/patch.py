@@ -21,7 +21,7 @@ from scipy.linalg.lapack import dposv
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors, ForceSigma
-from canprobe.mechanics.touch.image.silent_taxels import may_be_dead, mended
+from canprobe.mechanics.touch.image.silent_taxels import mended
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
 from canprobe.mechanics.touch.stops import OFF_PAD_ACROSS_SHARE, OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
@@ -242,10 +242,10 @@ def compute_patch(
     pad = calibration.pad
     if taxels.shape != pad.shape or taxels.dtype != np.uint8:
         raise UsageError(f"taxels: expected {pad.shape} uint8, got {taxels.shape} {taxels.dtype}")
-    counts, dead = taxels.tobytes(), 0
-    if pad.is_grid and may_be_dead(counts):  # the taxels of a list have no neighbours
+    dead = 0
+    if pad.is_grid:  # the taxels of a list have no neighbours
         taxels, dead = mended(taxels)
-        counts = taxels.tobytes()
+    counts = taxels.tobytes()
     active = counts.translate(None, _ALL_COUNTS[: max(calibration.threshold_counts, 1)])
     if not active:
         return _nothing(0.0)._replace(dead=dead)
