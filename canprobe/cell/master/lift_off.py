@@ -22,9 +22,8 @@ from canprobe.cell.planning.model import Plan
 from canprobe.errors import NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
-from canprobe.mechanics.robot.inverse_step import lifting_step
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.inverse import lifting_step
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
 from canprobe.mechanics.types import Floats
 
 LEAP_RAD = 10e-3

@@ -21,8 +21,7 @@ from canprobe.cell.plant.elastic_contact import (
 from canprobe.cell.plant.pressure import Directions, Vec, pad_basis, pad_coordinates
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
-from canprobe.mechanics.robot.model import units_to_joints
-from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.model import joints_per_motor, units_to_joints
 from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, TouchedPlaces
 from canprobe.mechanics.types import Floats
 
