@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from canprobe.cell.scene.hardware import DIRECT
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.real.adapters import SOCKETCAN, check_interface_name
 
 if TYPE_CHECKING:
     from canprobe.cell.scene.model import Scene
 
-LOCKSTEP = "lockstep"
+LOCKSTEP, DIRECT = "lockstep", "direct"
 VIRTUAL = (LOCKSTEP, DIRECT)
 """Interfaces in this process, in virtual time."""
 
