@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import gc
 import importlib
 import io
 import os
@@ -108,6 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     if "_ARGCOMPLETE" in os.environ:
         complete(parser_of, COMMANDS)
     _prepare_streams()
+    gc.set_threshold(max(10_000, gc.get_threshold()[0]))  # at Python's 700 a tenth of a start looks for garbage
     for name in BLAS_THREADS:  # before numpy is loaded
         os.environ.setdefault(name, "1")
     report, args = StepReport(), argparse.Namespace()

@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
-import select
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from canprobe.cli.hands import ROWS
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
-from canprobe.cli.stdin import typed
 from canprobe.cli.target import scene_of
+from canprobe.fieldbus.bus.system import system
 
 if TYPE_CHECKING:
     from canprobe.cell.master.observers import Observation
@@ -36,8 +34,6 @@ PATIENCE_S = 2.0
 """Longest time without a reader at the end, s."""
 _MOST_WAITING = 100_000
 """Bytes that wait for a reader; what comes then is left out."""
-_WRITTEN = 2048
-"""Bytes that a stream takes at once where it takes any."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -73,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     session = HandSession(cell, output.show, Path(args.cell or args.scene))
 
     def lines() -> tuple[bytes, bool]:
-        return (b"", False) if output.gone else typed(sys.stdin.fileno())
+        return (b"", False) if output.gone else system.typed(sys.stdin.fileno())
 
     session.take = Words(session, lines, output.show).take
     with left_by_ctrl_c(), cell:
@@ -107,8 +103,10 @@ class WaitingOutput:
 
     def flush(self, patience_s: float = 0.0) -> None:
         """Write as much as the reader takes, without waiting for it any longer than that."""
-        while self._waiting and not self.gone and select.select([], [self._descriptor], [], patience_s)[1]:
+        taken = 1
+        while taken and not self.gone:
             try:
-                self._waiting = self._waiting[os.write(self._descriptor, self._waiting[:_WRITTEN]) :]
+                taken = system.write_some(self._descriptor, self._waiting, patience_s)
             except OSError:
                 self.gone = True
+            self._waiting = self._waiting[taken:]

@@ -25,7 +25,7 @@ from textual.widgets import Footer, Input, RichLog, Static
 
 from canprobe.cell.session.child_process import with_our_imports
 from canprobe.cli.console_words import STEPS
-from canprobe.cli.stdin import LOOK_S, typed
+from canprobe.cli.stdin import LOOK_S
 from canprobe.fieldbus.bus.system import system
 
 AXES = {"x": "x", "y": "y", "z": "z", "X": "rx", "Y": "ry", "Z": "rz"}
@@ -132,7 +132,7 @@ class ConsoleScreen(App[int]):
         assert self._cell.stdout is not None
         if not self.screen.is_running:  # it is being closed
             return
-        text, self._open = typed(self._cell.stdout.fileno())
+        text, self._open = system.typed(self._cell.stdout.fileno())
         *lines, self._text = (self._text + text).split(b"\n")
         documents = [json.loads(line) for line in lines]
         for document in documents:
@@ -171,8 +171,7 @@ class ConsoleScreen(App[int]):
         if self._open:
             try:
                 self._cell.stdin.write(line.encode() + b"\n")
-                self._cell.stdin.flush()
-            except BrokenPipeError:  # it has ended, which its stdout says too
+            except OSError:  # it has ended, which its stdout says too
                 self._open = False
 
     def action_jog(self, sign: str) -> None:
@@ -298,6 +297,7 @@ def run_screen(arguments: Sequence[str]) -> int:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
+            bufsize=0,
             **system.OWN_SESSION,
         )
         try:

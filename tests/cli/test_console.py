@@ -15,10 +15,10 @@ import pytest
 import canprobe
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.tasks.guided_arm import LIFETIME_S
-from canprobe.cli import stdin
 from canprobe.cli.console_words import Words
 from canprobe.cli.hand_session import HandSession
 from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.system import system
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 READY = [70.0, 65.0, 10.0, 0.0, 100.0, 0.0]
@@ -392,7 +392,7 @@ class Cell:
         self._says.write(json.dumps(document).encode() + b"\n")
 
     def typed(self):
-        return stdin.typed(self._typed.fileno())[0].decode().splitlines()
+        return system.typed(self._typed.fileno())[0].decode().splitlines()
 
     def wait(self):
         return 7

@@ -25,8 +25,6 @@ Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as i
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 
-DIRECT = "direct"
-"""The interface that is no bus."""
 MM = 1e-3
 """A millimetre in metres."""
 REVOLUTE_ONLY = Only("kind", ("revolute",))
@@ -76,12 +74,12 @@ class BusSettings:
     @property
     def direct(self) -> bool:
         """There is no bus."""
-        return self.interface == DIRECT
+        return self.interface == "direct"
 
     @property
     def virtual(self) -> bool:
         """Time is virtual, and no node is real."""
-        return self.interface in ("lockstep", DIRECT)
+        return self.interface in ("lockstep", "direct")
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from statistics import median
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol import cia402, frames
@@ -42,7 +41,7 @@ class BusState:
         self.nodes = {node_id: SeenNode(node_id, what, served=served) for node_id, what in nodes.items()}
         self._channels = {node_id: SdoChannel(node) for node_id, node in self.nodes.items()}
         self.now_ns = 0
-        self.syncs_ns: deque[int] = deque(maxlen=33)
+        self.syncs_ns: deque[int] = deque(maxlen=34)
         self.sync_count = 0
         self.others_ns: dict[int, int] = {}
         self.arbitration_ns = _ARBITRATION_BITS * 1_000_000_000 // bitrate
@@ -56,7 +55,7 @@ class BusState:
         if len(self.syncs_ns) < 3:
             return 0
         times = list(self.syncs_ns)
-        return round(median(b - a for a, b in pairwise(times)))
+        return sorted(b - a for a, b in pairwise(times))[(len(times) - 1) // 2]
 
     def take(self, frame: BusFrame) -> Iterator[BusEvent]:
         """Take a frame and yield what it means, all of which must be consumed before the next one.
