@@ -65,12 +65,15 @@ class GuidedMotions:
         Raises:
             SafetyStop, NodeError: the cell was stopped.
         """
-        self.arm = GuidedArm(self._plan, self._attend)
+        self.arm = GuidedArm(self._plan, self._attend, self._read)
         self.enabled = True
         try:
             self._cell.run(self.arm)
         finally:
             self.enabled = self._moved = self.arm.moves = False
+
+    def _read(self) -> None:
+        self._cell.cell.readings.serve(begins=not self.arm.leaves)
 
     def look(self) -> None:
         """Look further at a way, and report the end of a motion; called in each cycle.

@@ -71,6 +71,7 @@ class HandSession:
                 while not self.ended and (waiting := errands.waiting or errands.writes):
                     self.attempt(waiting.pop(0))
                 self._attend(cell.idle(LOOK_S))
+                cell.readings.serve(begins=not (self.questions.enables or errands.waiting))
                 if session.observers is not None:
                     session.observers.frames_alone(cell.port.clock.now_ns())
         finally:
@@ -131,6 +132,8 @@ class HandSession:
         self.view.look(measurement)
         self.take()
         self.attempt(self.motions.look)
+        while remarks := self._cell.cell.readings.remarks:
+            self._show(remarks.pop(0))
         state = self._state
         if state != self._shown or measurement.t_ns >= self._shown_ns:
             self._shown, self._shown_ns = state, measurement.t_ns + round(1e9 * SHOWN_S)

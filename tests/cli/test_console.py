@@ -4,6 +4,7 @@ import asyncio
 import json
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
@@ -13,12 +14,14 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cell.master.readings import READ_EVERY_NS
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.tasks.guided_arm import LIFETIME_S
 from canprobe.cli import stdin
 from canprobe.cli.console_words import Words
 from canprobe.cli.hand_session import HandSession
 from canprobe.errors import UsageError
+from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 READY = [70.0, 65.0, 10.0, 0.0, 100.0, 0.0]
@@ -378,6 +381,35 @@ def test_what_cannot_be_is_one_clear_line():
     assert (q == q[0]).all(), "nothing has moved"
     with pytest.raises(UsageError, match="listen has no arm; `canprobe listen` shows an array"):
         Typist("listen")
+
+
+def test_voltage_and_temperature_are_read_beside_the_cycle(tmp_path):
+    """A drive has 6079h and an entry of its maker's; the others have the latter not: that is said, and asked once."""
+    text = eds_path("puma260_joint.eds").read_text()
+    count = int(re.search(r"\[OptionalObjects\]\s+SupportedObjects=(\d+)", text)[1])
+    listed = f"SupportedObjects={count + 1}\n{count + 1}=0x6079"
+    text = text.replace(f"[OptionalObjects]\nSupportedObjects={count}", f"[OptionalObjects]\n{listed}")
+    text += "\n[6079]\nParameterName=DC link circuit voltage\nDataType=0x0007\nAccessType=ro\nDefaultValue=48100\n"
+    (tmp_path / "drive.eds").write_text(text)
+    keys = {"arm.temperature_object": "6079h:00", "arm.temperature_unit_c": 0.001}
+    typist = Typist(**keys, **{"joints.joint_2.eds": str(tmp_path / "drive.eds")})
+
+    def script():
+        yield from typist.wait(0.5)
+        yield from typist.enabled()
+        yield from typist.wait(4.0, every=0.04, line="jog 1 -")
+        yield "quit"
+
+    frames = []
+    typist.session.view.observe = lambda seen: frames.extend(seen.frames)
+    typist.run(script())
+    node = next(node for node in typist.states[-1]["nodes"] if node["node_id"] == 2)
+    assert (node["voltage_v"], node["temperature_c"]) == (48.1, 48.1)
+    assert len(typist.heard("6079h:00 is not in puma260_joint.eds; it is not read again")) == 5
+    asked = [i for i, (can_id, data, _) in enumerate(frames) if can_id == 0x602 and data[:3] == b"\x40\x79\x60"]
+    assert len(asked) > 10 and min(np.diff([frames[i][2] for i in asked])) >= READ_EVERY_NS
+    in_cycle = [can_id for i in asked for can_id in [c for c, _, _ in frames[:i] if c in (0x80, 0x201)][-1:]]
+    assert set(in_cycle[2:]) == {0x201}, "behind the commands of a cycle"
 
 
 class Cell:

@@ -88,7 +88,7 @@ class Plant:
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
             self._pressed = PressedProbe(config)
-        self._tightest = (MIN_CURVATURE_SHARE - 1.0) / config.radius_m
+        self._tightest = -inf if config.object is None else (MIN_CURVATURE_SHARE - 1.0) / config.radius_m
         self.array: TaxelArray | None = None
         if config.taxels is not None:
             rng = np.random.default_rng(config.seed)

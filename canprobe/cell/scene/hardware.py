@@ -142,6 +142,10 @@ class ArmSettings:
     """Put two targets into one RPDO by dummy mapping."""
     torque: bool = True
     """Map the motor torque (6077h) into the TPDO of each drive, where the drive has it and the bus has room for it."""
+    temperature_object: Annotated[str | None, Pattern(r"[0-9A-Fa-f]{4}h(:[0-9A-Fa-f]{2})?", "such as 3201h:01")] = None
+    """Entry of the drives that has their temperature, as their manual names it, for `canprobe console`."""
+    temperature_unit_c: Annotated[float, Range(0, 100, open_low=True)] = 1.0
+    """Unit of `temperature_object`, °C."""
 
 
 @dataclass(frozen=True, slots=True)

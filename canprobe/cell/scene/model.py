@@ -361,9 +361,9 @@ class LimitSettings:
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0
     """Share of the cycles of the last second that may be late by half a period. 100: no limit."""
     workspace_min_mm: Vec3 | None = None
-    """Lowest coordinates of the tip of the probe in the base frame. Left out: no limit."""
+    """Lowest coordinates of the tip of the probe, or of a flange without one, in the base frame. Left out: no limit."""
     workspace_max_mm: Vec3 | None = None
-    """Highest coordinates of the tip of the probe in the base frame. Left out: no limit."""
+    """Highest coordinates of the same in the base frame. Left out: no limit."""
 
 
 @dataclass(frozen=True, slots=True)

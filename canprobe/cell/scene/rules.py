@@ -49,7 +49,7 @@ _BESIDES = {
     "free": {
         "arm": ("must", "free motion moves the arm"),
         "wire": ("may", ""),
-        "probe": ("may", ""),
+        "probe": ("mounted", ""),
         "object": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
         "servo": ("never", "there is no touch to control"),
@@ -58,7 +58,8 @@ _BESIDES = {
 SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
     task: {**_USUALLY, "joints": besides["arm"], **besides} for task, besides in _BESIDES.items()
 }
-"""For each task and section (need, why). Need: "must" be given, "default" when left out, "may" be given, "never"."""
+"""For each task and section (need, why). Need: "must" be given, "default" when left out, "may" be given, "never", and
+"mounted": there where the cell has it."""
 
 START = "start"
 """Name of the posture that the joints' start keys describe."""

@@ -108,6 +108,7 @@ class Arm:
         torque: the drives send their torque where they can; the plan gives it up where the bus has no room for it.
         warnings: values of its URDF that are hardly meant.
         postures: (n,) rad or m by name, that of the start among them.
+        temperature: entry of the drives' temperature (index, sub-index), and its unit, °C; None: not stated.
     """
 
     model: ArmModel
@@ -118,6 +119,7 @@ class Arm:
     torque: bool = True
     warnings: tuple[str, ...] = ()
     postures: Mapping[str, Floats] = field(default_factory=dict)
+    temperature: tuple[int, int, float] | None = None
 
     @property
     def node_ids(self) -> tuple[int, ...]:
@@ -188,11 +190,11 @@ class Array(Node):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Probe:
-    """The sphere that carries the array, with its elastic layer.
+    """The sphere that carries the array, with its elastic layer; the middle of the flange where the arm carries none.
 
     Attributes:
         T_flange_probe: (4, 4) of its centre on the flange; z is the pole.
-        radius: radius of the sphere, m.
+        radius: radius of the sphere, m; 0 without a probe.
         stiffness: stiffness K/h of the layer, N/m³.
         mass: mass of the probe, kg.
     """
@@ -201,6 +203,11 @@ class Probe:
     radius: float
     stiffness: float
     mass: float
+
+    @property
+    def tip(self) -> str:
+        """What the arm ends in, in words."""
+        return "the probe's tip" if self.radius > 0.0 else "the flange"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

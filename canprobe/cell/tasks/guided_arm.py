@@ -11,6 +11,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import lag_s
 from canprobe.cell.tasks.hand_motion import HandMotion
 from canprobe.cell.tasks.hand_way import HandWay
+from canprobe.fieldbus.bus.port import nothing
 from canprobe.mechanics.types import Floats
 
 LIFETIME_S = 0.15
@@ -25,6 +26,7 @@ class GuidedArm(Controller):
     Args:
         plan: plan of a cell with an arm.
         attend: called in each cycle before the motion goes on, such as to take what a person asks for.
+        update: called in each cycle once its commands are on the bus.
 
     Attributes:
         target: joint positions (n,), rad or m, that the drives have; None before they are enabled.
@@ -34,8 +36,8 @@ class GuidedArm(Controller):
         stop_reason: why it is stopped at once; None where it is not.
     """
 
-    def __init__(self, plan: Plan, attend: Callable[[Measurement], None]) -> None:
-        self._plan, self._attend = plan, attend
+    def __init__(self, plan: Plan, attend: Callable[[Measurement], None], update: Callable[[], None] = nothing) -> None:
+        self._plan, self._attend, self._update = plan, attend, update
         self.reader, self._settle_ns = make_patch_reader(plan.setup), round(1e9 * SETTLE_LAGS * lag_s(plan.setup))
         self._now_ns = self._renewed_ns = 0
         self.target: Floats | None = None
@@ -71,6 +73,9 @@ class GuidedArm(Controller):
         command = self.motion.step(measurement)
         self.target, self.moves = command.q_target, not command.done
         return replace(command, done=False)
+
+    def update(self) -> None:
+        self._update()
 
     def _wanted(self) -> bool:
         """Whether the motion is renewed so recently that it comes to rest in time, if it brakes in the next cycle."""
