@@ -72,7 +72,8 @@ class Errands:
             self.waiting.append(errand)
             self._motions.arm.leaves = True
 
-        self._questions.ask(question, leave)
+        arm = self._cell.plan.setup.needed_arm()
+        self._questions.ask(f"{arm.left_alone}\n{question}" if self._motions.enabled else question, leave)
 
     def _tare(self) -> None:
         self._cell.tare()

@@ -48,9 +48,9 @@ class HandSession:
     def __init__(
         self, cell: OpenCell, show: Callable[[str | dict[str, Any]], None], cell_file: Path, *, paced: bool = True
     ) -> None:
-        if cell.plan.setup.arm is None:
+        if (arm := cell.plan.setup.arm) is None:
             raise UsageError(f"console: {cell.plan.setup.name} has no arm; `canprobe listen` shows an array")
-        self.view, self.questions = ConsoleView(cell), Questions(show, self._resume)
+        self.view, self.questions = ConsoleView(cell), Questions(arm.left_alone, show, self._resume)
         self.motions = GuidedMotions(cell, self.view, self.questions, self._attend)
         self.errands = Errands(cell, self.motions, self._attend_homing, cell_file)
         self.take: Callable[[], None] = nothing

@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     with opened(args) as cell:
         found = cell.way_to(_goal(args, cell), args.speed)
         print(described(cell.plan, found, args.speed))
+        args.report.say(f"{cell.plan.setup.needed_arm().left_alone}; they are at the end")
         if args.dry_run or not agreed(args, cell, "move?"):
             args.report.say("nothing was moved")
             return 0

@@ -219,7 +219,7 @@ def test_a_contact_stops_a_jog_and_a_typed_yes_alone_goes_on():
 @pytest.mark.parametrize("fault", ["sto", "drive-fault"])
 def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault):
     """An emergency stop shows as a drive's state, and lasts; a fault is reset as the drives are enabled."""
-    typist = Typist()
+    typist = Typist(**{"arm.when_disabled": "sinks"})
     faulty = typist.cell.session.buses.world.make_faulty()
 
     def script():
@@ -231,9 +231,12 @@ def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault
         yield "yes"  # it does not come to that
         yield from typist.wait(0.5, every=0.02)
         assert typist.states[-1]["state"] == "stopped" and typist.heard("stopped: node 2")
-        assert not typist.heard("tared")
+        assert not typist.heard("tared") and (fault == "sto") == bool(typist.heard("as with STO or an emergency stop"))
         yield "reset"
         yield from typist.wait(0.2)
+        assert len(typist.heard("when its drives are disabled, it sinks: hold it")) == 3, (
+            "at the first yes, tare, reset"
+        )
         assert typist.states[-1]["state"] == "stopped" and "may the arm move again?" in typist.states[-1]["asks"]
         yield "yes"
         yield from typist.wait(3.0)

@@ -33,6 +33,8 @@ def test_a_dry_run_shows_the_way_and_moves_nothing(capsys):
     out = told(capsys, "move", "puma260", "-90,65,15,0,100,0", "--dry-run").out
     assert "joint 1: 90.00 to -90.00 deg (-180.00)" in out and "the way: 8.7 s at 10 % of the speed limits" in out
     assert "the arm stands at" not in out
+    err = told(capsys, "move", "puma260", "start", "--dry-run", "--set", "arm.when_disabled=brakes").err
+    assert "when its drives are disabled, its brakes hold it; they are at the end" in err
     words = ("move", "puma260", "--joint", 2, "--by", "-5deg", "--speed", "50%", "--dry-run")
     assert "joint 2: 65.00 to 60.00 deg (-5.00)" in told(capsys, *words).out
 

@@ -138,14 +138,16 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
         )
         for number, ((node_id, emulated), joint) in enumerate(each, start=1)
     )
-    q_start = per_joint(joints, "start")
-    postures = {START: q_start} | {name: posture_in_si(joints, posture) for name, posture in scene.postures.items()}
+    named = {name: posture_in_si(joints, posture) for name, posture in scene.postures.items()}
+    q_start = per_joint(joints, "start") if scene.task.start_posture is None else named[scene.task.start_posture]
+    postures = {START: q_start} | named
     waits, grouped, torque = settings.missed_syncs, settings.grouped_rpdo, settings.torque
     temperature = None
     if settings.temperature_object is not None:
         index, _, subindex = settings.temperature_object.partition("h:")
         temperature = int(index, 16), int(subindex or "0", 16), settings.temperature_unit_c
-    return Arm(model, drives, q_start, waits, grouped, torque, warnings, postures, temperature), bodies
+    arm = Arm(model, drives, q_start, waits, grouped, torque, warnings, postures, temperature, settings.when_disabled)
+    return arm, bodies
 
 
 def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:

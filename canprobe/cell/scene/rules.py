@@ -95,6 +95,13 @@ def _posture_of_other_joints(joints: Mapping[str, JointSettings], postures: Mapp
             yield f"postures.{name}", f"expected a position of each of the {len(joints)} joints, got {len(posture)}"
 
 
+@_across("task.start_posture", "postures?")
+def _no_such_posture(name: str, postures: Mapping[str, Posture] | None) -> _Complaint:
+    if name not in (postures or {}):
+        known = ", ".join(postures or {}) or "none"
+        yield "task.start_posture", f"expected a posture of [postures] ({known}), got {name}"
+
+
 @_across("joints", "arm.urdf?")
 def _joint_incomplete(joints: Mapping[str, JointSettings], urdf: str | None) -> _Complaint:
     for name, joint in joints.items():

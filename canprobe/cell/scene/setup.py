@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
+from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName, WhenDisabled
 from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
 from canprobe.errors import UsageError
 from canprobe.fieldbus.node.quirks import Quirks
@@ -109,6 +109,7 @@ class Arm:
         warnings: values of its URDF that are hardly meant.
         postures: (n,) rad or m by name, that of the start among them.
         temperature: entry of the drives' temperature (index, sub-index), and its unit, °C; None: not stated.
+        when_disabled: what it does when its drives are disabled, as the cell file says.
     """
 
     model: ArmModel
@@ -120,6 +121,16 @@ class Arm:
     warnings: tuple[str, ...] = ()
     postures: Mapping[str, Floats] = field(default_factory=dict)
     temperature: tuple[int, int, float] | None = None
+    when_disabled: WhenDisabled = "unknown"
+
+    @property
+    def left_alone(self) -> str:
+        """What it does when its drives are disabled, in words."""
+        return {
+            "brakes": "when its drives are disabled, its brakes hold it",
+            "sinks": "when its drives are disabled, it sinks: hold it",
+            "unknown": "whether it sinks when its drives are disabled is not stated (arm.when_disabled)",
+        }[self.when_disabled]
 
     @property
     def node_ids(self) -> tuple[int, ...]:
