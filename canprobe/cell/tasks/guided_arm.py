@@ -18,6 +18,10 @@ LIFETIME_S = 0.15
 """Time from the last renewal of a motion until the arm stands, s."""
 SETTLE_LAGS = 3.0
 """Time from the last motion of the targets until the joints stand, in lags of the drives."""
+USUAL_LAG_S = 6.8e-3
+"""Lag of real drives for which nothing is stated, s, as `servo.drive_lag_ms` has it by default."""
+CYCLES = 3
+"""Cycles from a renewal to the one that takes it, to the one of the last target, and to the SYNC that brings that."""
 
 
 class GuidedArm(Controller):
@@ -38,7 +42,9 @@ class GuidedArm(Controller):
 
     def __init__(self, plan: Plan, attend: Callable[[Measurement], None], update: Callable[[], None] = nothing) -> None:
         self._plan, self._attend, self._update = plan, attend, update
-        self.reader, self._settle_ns = make_patch_reader(plan.setup), round(1e9 * SETTLE_LAGS * lag_s(plan.setup))
+        self.reader = make_patch_reader(plan.setup)
+        settle_ns = round(1e9 * SETTLE_LAGS * (lag_s(plan.setup) or USUAL_LAG_S))
+        self._standing_ns = settle_ns + CYCLES * plan.sync.period_ns
         self._now_ns = self._renewed_ns = 0
         self.target: Floats | None = None
         self.motion: HandMotion | None = None
@@ -80,5 +86,5 @@ class GuidedArm(Controller):
     def _wanted(self) -> bool:
         """Whether the motion is renewed so recently that it comes to rest in time, if it brakes in the next cycle."""
         assert self.motion is not None
-        stop_ns = round(1e9 * self.motion.stop_s) + self._settle_ns + self._plan.sync.period_ns
+        stop_ns = round(1e9 * self.motion.stop_s) + self._standing_ns
         return not self.leaves and self._now_ns + stop_ns < self._renewed_ns + round(1e9 * LIFETIME_S)
