@@ -12,6 +12,7 @@ import sys
 
 import numpy as np
 import pytest
+from makes import write_eds
 
 import canprobe
 from canprobe.cell.master.readings import READ_EVERY_NS
@@ -20,7 +21,7 @@ from canprobe.cell.tasks.guided_arm import LIFETIME_S
 from canprobe.cli import stdin
 from canprobe.cli.console_words import Words
 from canprobe.cli.hand_session import HandSession
-from canprobe.errors import UsageError
+from canprobe.errors import PlanError, UsageError
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
@@ -384,6 +385,76 @@ def test_what_cannot_be_is_one_clear_line():
     assert (q == q[0]).all(), "nothing has moved"
     with pytest.raises(UsageError, match="listen has no arm; `canprobe listen` shows an array"):
         Typist("listen")
+
+
+def without_home_offset(folder):
+    path = folder / "no_607c.eds"
+    path.write_text(eds_path("puma260_joint.eds").read_text().replace("607C", "5FFC"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("cell", "make"),
+    [
+        ("gantry", None),
+        ("seven-axis", None),
+        ("prbt", None),  # interpolated position every 10 ms, units of 1/1000 degree
+        ("puma260", "milliseconds_only"),  # as EPOS4: no 1006h, no 1019h
+        ("puma260", "interpolated"),
+        ("puma260", "fixed_mapping"),
+        ("puma260", "bare"),
+        ("puma260", without_home_offset),
+    ],
+)
+def test_other_arms_and_drives_are_jogged_and_moved_in_the_same_way(cell, make, tmp_path):
+    keys = {}
+    if make is not None:
+        eds = make(tmp_path) if callable(make) else write_eds(make, tmp_path)
+        keys = {"arm.eds": str(eds), "cycle.rate_hz": 200.0, "sensor.rate_hz": 100.0}
+    typist, seen = Typist(cell, **keys), {}
+    joints = typist.cell.plan.setup.arm.model.joints
+
+    def q():
+        return np.array([its.shown(value) for its, value in zip(joints, typist.session.view.seen.q, strict=True)])
+
+    def stepped(line):
+        yield line
+        yield from typist.wait(0.2, every=0.02)
+        while typist.states[-1]["state"] == "moves":
+            yield "renew"
+
+    def script():
+        yield from typist.enabled()
+        seen["start"] = q()
+        yield from stepped("jog 2 +")
+        seen["step"] = q()
+        before = typist.cell.probe(typist.session.view.seen.q)[0]
+        yield from stepped("jog z +")
+        seen["way"] = typist.cell.probe(typist.session.view.seen.q)[0][:3, 3] - before[:3, 3]
+        yield "jog 1 -"
+        yield from typist.wait(0.5, every=0.03, line="jog 1 -")
+        last = typist.t_s
+        while typist.states[-1]["state"] != "holds":
+            yield None
+        assert typist.t_s - last <= LIFETIME_S
+        yield "move start"
+        yield from typist.wait(0.5)
+        yield "yes"
+        while not typist.heard("the arm stands at"):
+            yield "renew"
+        yield "quit"
+
+    typist.run(script())
+    step = seen["step"] - seen["start"]
+    np.testing.assert_allclose(step, np.eye(len(joints))[1], atol=0.03)
+    np.testing.assert_allclose(1e3 * seen["way"], [0, 0, 1], atol=0.1)
+    np.testing.assert_allclose(q(), seen["start"], atol=0.03)
+    assert not powered(typist.cell)
+
+
+def test_a_drive_without_a_cyclic_mode_is_refused_by_the_plan(tmp_path):
+    with pytest.raises(PlanError, match="6502h"):
+        Typist(**{"arm.eds": str(write_eds("no_cyclic_mode", tmp_path))})
 
 
 def test_voltage_and_temperature_are_read_beside_the_cycle(tmp_path):

@@ -11,11 +11,14 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import lag_s
 from canprobe.cell.tasks.hand_motion import HandMotion
 from canprobe.cell.tasks.hand_way import HandWay
+from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.port import nothing
 from canprobe.mechanics.types import Floats
 
 LIFETIME_S = 0.15
 """Time from the last renewal of a motion until the arm stands, s."""
+RENEWED_S = 0.02
+"""Time in which a screen renews a motion."""
 SETTLE_LAGS = 3.0
 """Time from the last motion of the targets until the joints stand, in lags of the drives."""
 USUAL_LAG_S = 6.8e-3
@@ -45,6 +48,11 @@ class GuidedArm(Controller):
         self.reader = make_patch_reader(plan.setup)
         settle_ns = round(1e9 * SETTLE_LAGS * (lag_s(plan.setup) or USUAL_LAG_S))
         self._standing_ns = settle_ns + CYCLES * plan.sync.period_ns
+        if 1e-9 * self._standing_ns + RENEWED_S >= LIFETIME_S:
+            raise UsageError(
+                f"at cycle.rate_hz = {plan.setup.rate_hz:g} and with this lag of the drives the arm cannot stand within"
+                f" {1e3 * LIFETIME_S:.0f} ms: expected a higher rate; `canprobe move` goes by this one"
+            )
         self._now_ns = self._renewed_ns = 0
         self.target: Floats | None = None
         self.motion: HandMotion | None = None
