@@ -9,6 +9,7 @@ import select
 import signal
 import subprocess
 import sys
+import urllib.request
 
 import numpy as np
 import pytest
@@ -340,6 +341,17 @@ def test_a_closed_terminal_ends_the_session_with_the_drives_disabled():
     os.close(master)
     assert b"stop and disable the drives" in process.communicate(timeout=30)[1]
     assert process.returncode == 0
+
+
+@pytest.mark.slow(reason="a browser's page takes seconds to come up")
+def test_the_view_is_beside_the_console():
+    process = start("--json", "--view", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    said = ""
+    while "http" not in said:
+        said = json.loads(process.stdout.readline()).get("says", "")
+    with urllib.request.urlopen(said.removeprefix("bridge view: ")) as page:
+        assert page.status == 200
+    assert not process.communicate(b"quit\n", timeout=60)[1] and process.returncode == 0
 
 
 def test_nobody_has_to_read_what_a_session_prints():
