@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 HELP = "jog the arm and watch the cell on a screen"
 EXAMPLE = """\
 examples:
-  canprobe console puma260
+  canprobe console puma260 --view
   canprobe console cell.toml --bus socketcan --channel can0
   canprobe console cell.toml --plain --bus socketcan --channel can0
 """
@@ -37,7 +37,10 @@ _MOST_WAITING = 100_000
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
+    parser.add_shared("SCENE", "BUS", "--realtime", "--patient", "--bridge")
+    parser.add_argument(
+        "--view", action="append_const", dest="bridge", const="view", help="show the arm in a browser; --bridge view"
+    )
     parser.add_argument("--plain", action="store_true", help="commands and answers as lines, without a screen")
     parser.add_argument(
         "--json", action="store_true", help="as --plain, with answers and, ten times a second, the state as JSON lines"
@@ -65,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         session.view.observe(observation)
 
     say = output.show if args.json else args.report.say
-    cell = api.open_cell(scene, say=say, rows_kept=ROWS, to_home=homes, observers=[observe])
+    cell = api.open_cell(scene, say=say, rows_kept=ROWS, to_home=homes, observers=[observe], bridge=args.bridge)
     session = HandSession(cell, output.show, Path(args.cell or args.scene))
 
     def lines() -> tuple[bytes, bool]:

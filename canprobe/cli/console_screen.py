@@ -55,6 +55,8 @@ DIM_COUNTS = 32
 """Counts of a taxel that are shown at full brightness where none has more."""
 CHANGES = 4
 """Changes of nodes and drives that are shown."""
+READ = {"voltage_v": "V", "temperature_c": "°C"}
+"""Units of what is read of a drive, by its name."""
 BAR = 12
 """Width of the bar of a joint's range, characters."""
 
@@ -255,12 +257,14 @@ class ConsoleScreen(App[int]):
 
 
 def _nodes(state: dict[str, Any]) -> Table:
-    table = Table(*("node", "", "state", "drive", "EMCY"), box=None, header_style="dim")
+    table = Table(*("node", "", "state", "drive", "EMCY", ""), box=None, header_style="dim")
     for node in state["nodes"]:
         silent = node["heard_s"] is not None and node["heard_s"] > 0.5
         words = f"silent for {node['heard_s']:.1f} s" if silent else node["state"] or "not heard"
         style = "red" if silent or node["emcy"] else ""
-        table.add_row(str(node["node_id"]), node["role"], words, node["drive"] or "", node["emcy"] or "", style=style)
+        read = [f"{node[key]:.1f} {unit}" for key, unit in READ.items() if node[key] is not None]
+        cells = str(node["node_id"]), node["role"], words, node["drive"] or "", node["emcy"] or "", ", ".join(read)
+        table.add_row(*cells, style=style)
     return table
 
 

@@ -15,6 +15,7 @@ from canprobe.cell.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Ra
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
 Convention = Literal["standard", "modified"]
+WhenDisabled = Literal["unknown", "brakes", "sinks"]
 TactileModeName = Literal["window", "image", "features", "auto"]
 CobIds = Literal["default", "by_deadline", "auto"]
 Fidelity = Literal["ideal", "dynamic"]
@@ -140,6 +141,13 @@ class ArmSettings:
     """Put two targets into one RPDO by dummy mapping."""
     torque: bool = True
     """Map the motor torque (6077h) into the TPDO of each drive, where the drive has it and the bus has room for it."""
+    when_disabled: WhenDisabled = "unknown"
+    """What the arm does when its drives are disabled: its brakes hold it, or it sinks. It is said before a person
+    lets it move by hand."""
+    temperature_object: Annotated[str | None, Pattern(r"[0-9A-Fa-f]{4}h(:[0-9A-Fa-f]{2})?", "such as 3201h:01")] = None
+    """Entry of the drives that has their temperature, as their manual names it, for `canprobe console`."""
+    temperature_unit_c: Annotated[float, Range(0, 100, open_low=True)] = 1.0
+    """Unit of `temperature_object`, °C."""
 
 
 @dataclass(frozen=True, slots=True)
