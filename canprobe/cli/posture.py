@@ -91,9 +91,10 @@ def _check(plan: Plan) -> int:
 
 def _save(args: argparse.Namespace) -> int:
     """Read where the arm stands, and write it into the cell file."""
-    from canprobe.cli.posture_file import save_posture
+    from canprobe.cli.posture_file import postures_file, save_posture
 
     path = Path(args.cell or args.scene)
+    postures_file(path, args.name)  # what is wrong in it is told before anything is sent
     with opened(args) as cell:
         arm, measurement = cell.plan.setup.arm, cell.read()
         q = measurement.q

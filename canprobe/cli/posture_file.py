@@ -6,6 +6,7 @@ import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.rules import START
@@ -17,18 +18,12 @@ _HEADER = re.compile(r"\s*\[postures\]\s*(#.*)?")
 _SECTION = re.compile(r"\s*\[")
 
 
-def save_posture(path: Path, name: str, posture: Sequence[float]) -> None:
-    """Write a posture into a cell file, in the place of one of that name; comments and order stay.
-
-    Args:
-        path: the file.
-        name: name of the posture.
-        posture: position of each joint, deg or mm.
+def postures_file(path: Path, name: str) -> dict[str, Any]:
+    """The document of a cell file that a posture of this name can be written into.
 
     Raises:
         UsageError: the file has no joints, the name is that of the start, or the file is packaged.
         SceneError: the file cannot be read.
-        ResultsError: it cannot be written, or only by a change of more than this line.
     """
     if not path.is_file():
         raise UsageError(
@@ -39,6 +34,22 @@ def save_posture(path: Path, name: str, posture: Sequence[float]) -> None:
     wanted = read_toml(path, str(path))
     if "joints" not in wanted:
         raise UsageError(f"{path}: has no [joints.NAME]; save into the cell file that it names")
+    return wanted
+
+
+def save_posture(path: Path, name: str, posture: Sequence[float]) -> None:
+    """Write a posture into a cell file, in the place of one of that name; comments and order stay.
+
+    Args:
+        path: the file.
+        name: name of the posture.
+        posture: position of each joint, deg or mm.
+
+    Raises:
+        UsageError, SceneError: as for `postures_file`.
+        ResultsError: it cannot be written, or only by a change of more than this line.
+    """
+    wanted = postures_file(path, name)
     wanted.setdefault("postures", {})[name] = list(posture)
     text = path.read_text(encoding="utf-8-sig")
     changed = _with_line(text, name, f"{toml_key(name)} = {toml_value(list(posture))}")
