@@ -50,8 +50,7 @@ class Errands:
             packaged = f"{self._cell_file} is packaged, `canprobe init` makes a file of it"
             return self._show(f"{text}, until the end of this session: {packaged}")
         joints = self._cell.plan.setup.needed_arm().model.joints
-        posture = [round(its.shown(value), 4) for its, value in zip(joints, q, strict=True)]
-        self.writes.append(partial(save_posture, self._cell_file, name, posture))
+        self.writes.append(partial(save_posture, self._cell_file, name, joints, q))
         self._show(f"{text}; it is written into {self._cell_file} when the drives are disabled")
 
     def tare(self) -> None:

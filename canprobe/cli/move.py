@@ -96,10 +96,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _goal(args: argparse.Namespace, cell: OpenCell) -> str | npt.ArrayLike:
     """The posture of the command line: a name, or joint positions, rad or m."""
-    arm = cell.plan.setup.arm
-    if arm is None:
-        raise UsageError(f"move: {cell.plan.setup.name} has no arm")
-    joints = arm.model.joints
+    joints = cell.plan.setup.needed_arm("move").model.joints
     if args.joint is not None:
         if not 1 <= args.joint <= len(joints):
             raise UsageError(f"move: --joint {args.joint}: the arm has joints 1 to {len(joints)}")
@@ -120,9 +117,7 @@ def positions_of(plan: Plan, text: str) -> str | list[float]:
     Raises:
         UsageError: they are not as many as the joints.
     """
-    arm = plan.setup.arm
-    assert arm is not None
-    joints = arm.model.joints
+    joints = plan.setup.needed_arm().model.joints
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -134,15 +129,13 @@ def positions_of(plan: Plan, text: str) -> str | list[float]:
 
 def described(plan: Plan, found: HandWay, speed: float) -> str:
     """The way in words: what each joint does, and how long it takes."""
-    arm = plan.setup.arm
-    assert arm is not None
+    joints = plan.setup.needed_arm().model.joints
     start, end, duration_s = found.q[0], found.q[-1], found.profile().duration_s
     lines = [
         f"  joint {i + 1}: {its.shown(start[i]):.2f} to {its.text(end[i], '.2f')} ({its.shown(end[i] - start[i]):+.2f})"
-        for i, its in enumerate(arm.model.joints)
+        for i, its in enumerate(joints)
     ]
-    tip = found.tip[-1]
-    places = ", ".join(f"{1e3 * value:.0f}" for value in tip)
+    places = ", ".join(f"{1e3 * value:.0f}" for value in found.tip[-1])
     slowed = f"; {found.slowed_by}" if found.slowed_by else ""
     head = f"the way: {duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
     return "\n".join([head, *lines, f"  {plan.setup.probe.tip} comes to {places} mm"])
@@ -150,6 +143,6 @@ def described(plan: Plan, found: HandWay, speed: float) -> str:
 
 def standing(plan: Plan, measurement: Measurement) -> str:
     """Where the arm stands, in deg or mm."""
-    arm, q = plan.setup.arm, measurement.q
-    assert arm is not None and q is not None
-    return ", ".join(its.text(value, ".2f") for its, value in zip(arm.model.joints, q, strict=True))
+    joints, q = plan.setup.needed_arm().model.joints, measurement.q
+    assert q is not None
+    return ", ".join(its.text(value, ".2f") for its, value in zip(joints, q, strict=True))

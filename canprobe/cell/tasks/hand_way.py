@@ -298,8 +298,7 @@ def _probe_places(plan: Plan, start: Floats, way: Floats, turn: Floats) -> Itera
     Raises:
         UsageError: the arm cannot go there, as at the end of its reach.
     """
-    arm, guard, q = plan.setup.arm, JointGuard(plan), start
-    assert arm is not None
+    arm, guard, q = plan.setup.needed_arm(), JointGuard(plan), start
     T = guard.T_base_tip(start)
     for place in count(1):
         pose = np.eye(4)
