@@ -71,8 +71,8 @@ class Errands:
             self.waiting.append(errand)
             self._motions.arm.leaves = True
 
-        arm = self._cell.plan.setup.needed_arm()
-        self._questions.ask(f"{arm.left_alone}\n{question}" if self._motions.enabled else question, leave)
+        disables = f"{self._questions.left_alone}\n" if self._motions.enabled else ""
+        self._questions.ask(f"{disables}{question}", leave)
 
     def _tare(self) -> None:
         self._cell.tare()
