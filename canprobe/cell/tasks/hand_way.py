@@ -192,11 +192,8 @@ class HandWay:
     def _time_at(self, place: float) -> float:
         """Time from the start at which a place is reached, s."""
         profile = self.profile()
-        low, high = 0.0, profile.duration_s
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if profile.at(middle)[0] < place else (low, middle)
-        return high
+        t = np.linspace(0.0, profile.duration_s, 1001)
+        return float(np.interp(place, [profile.at(one)[0] for one in t.tolist()], t))
 
 
 def goal_of(plan: Plan, to: str | npt.ArrayLike) -> Floats:
