@@ -104,7 +104,7 @@ def _goal(args: argparse.Namespace, plan: Plan) -> Callable[[Floats], npt.ArrayL
     """The posture of the command line: where the joints (n,), rad or m, go from where they stand."""
     from canprobe.cell.tasks.hand_way import goal_of
 
-    joints = plan.setup.needed_arm().model.joints
+    joints = plan.setup.needed_arm("move").model.joints
     if args.joint is None:
         posture = goal_of(plan, positions_of(plan, args.to))
         return lambda _: posture
@@ -123,9 +123,7 @@ def positions_of(plan: Plan, text: str) -> str | list[float]:
     Raises:
         UsageError: they are not as many as the joints.
     """
-    arm = plan.setup.arm
-    assert arm is not None
-    joints = arm.model.joints
+    joints = plan.setup.needed_arm().model.joints
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -137,15 +135,13 @@ def positions_of(plan: Plan, text: str) -> str | list[float]:
 
 def described(plan: Plan, found: HandWay, speed: float) -> str:
     """The way in words: what each joint does, and how long it takes."""
-    arm = plan.setup.arm
-    assert arm is not None
+    joints = plan.setup.needed_arm().model.joints
     start, end, duration_s = found.q[0], found.q[-1], found.profile().duration_s
     lines = [
         f"  joint {i + 1}: {its.shown(start[i]):.2f} to {its.text(end[i], '.2f')} ({its.shown(end[i] - start[i]):+.2f})"
-        for i, its in enumerate(arm.model.joints)
+        for i, its in enumerate(joints)
     ]
-    tip = found.tip[-1]
-    places = ", ".join(f"{1e3 * value:.0f}" for value in tip)
+    places = ", ".join(f"{1e3 * value:.0f}" for value in found.tip[-1])
     slowed = f"; {found.slowed_by}" if found.slowed_by else ""
     head = f"the way: {duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
     return "\n".join([head, *lines, f"  {plan.setup.probe.tip} comes to {places} mm"])
@@ -153,6 +149,6 @@ def described(plan: Plan, found: HandWay, speed: float) -> str:
 
 def standing(plan: Plan, measurement: Measurement) -> str:
     """Where the arm stands, in deg or mm."""
-    arm, q = plan.setup.arm, measurement.q
-    assert arm is not None and q is not None
-    return ", ".join(its.text(value, ".2f") for its, value in zip(arm.model.joints, q, strict=True))
+    joints, q = plan.setup.needed_arm().model.joints, measurement.q
+    assert q is not None
+    return ", ".join(its.text(value, ".2f") for its, value in zip(joints, q, strict=True))

@@ -13,6 +13,8 @@ from canprobe.cell.scene.rules import START
 from canprobe.cell.scene.toml_files import read_toml, toml_key, toml_value
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.files import whole_file, writing
+from canprobe.mechanics.robot.model import Joint
+from canprobe.mechanics.types import Floats
 
 _HEADER = re.compile(r"\s*\[postures\]\s*(#.*)?")
 _SECTION = re.compile(r"\s*\[")
@@ -37,28 +39,30 @@ def postures_file(path: Path, name: str) -> dict[str, Any]:
     return wanted
 
 
-def save_posture(path: Path, name: str, posture: Sequence[float]) -> None:
+def save_posture(path: Path, name: str, joints: Sequence[Joint], q: Floats) -> None:
     """Write a posture into a cell file, in the place of one of that name; comments and order stay.
 
     Args:
         path: the file.
         name: name of the posture.
-        posture: position of each joint, deg or mm.
+        joints: the joints of the arm.
+        q: (n,) their positions, rad or m.
 
     Raises:
         UsageError, SceneError: as for `postures_file`.
         ResultsError: it cannot be written, or only by a change of more than this line.
     """
     wanted = postures_file(path, name)
-    wanted.setdefault("postures", {})[name] = list(posture)
+    posture = [round(its.shown(value), 4) for its, value in zip(joints, q.tolist(), strict=True)]
+    wanted.setdefault("postures", {})[name] = posture
     text = path.read_text(encoding="utf-8-sig")
-    changed = _with_line(text, name, f"{toml_key(name)} = {toml_value(list(posture))}")
+    changed = _with_line(text, name, f"{toml_key(name)} = {toml_value(posture)}")
     if tomllib.loads(changed) != wanted:
         raise ResultsError(
             f"{path}: [postures] is written in a way that this cannot change; put it there yourself:"
-            f" {toml_key(name)} = {toml_value(list(posture))}"
+            f" {toml_key(name)} = {toml_value(posture)}"
         )
-    load_scene(path, {f"postures.{toml_key(name)}": list(posture)})
+    load_scene(path, {f"postures.{toml_key(name)}": posture})
     with writing(path), whole_file(path) as part:
         part.write_text(changed, encoding="utf-8")
 
