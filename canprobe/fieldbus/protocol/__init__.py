@@ -3,8 +3,7 @@
 Bytes come in and values go out, or the reverse. Master and emulated nodes read the same tables, so that a mistake in
 one of them shows on both sides of the bus.
 
-    frames                identifiers of CiA 301, NMT and heartbeat, flags of long identifiers and remote requests
-    sync                  the SYNC object and its counter
+    frames                identifiers of CiA 301, NMT, heartbeat and SYNC, flags of long identifiers and remote requests
     pdo                   PDO mappings, compiled once to struct formats
     sdo                   SDO requests, and what stands where in requests and answers
     emcy                  emergency messages and the words for their codes
