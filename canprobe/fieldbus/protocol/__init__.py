@@ -10,8 +10,7 @@ one of them shows on both sides of the bus.
     lss                   layer setting services
     cia402                the state machine of a drive as one table, which the drive and its master both read
     si_unit               units of velocity and acceleration (60A9h, 60AAh)
-    tactile               tactile frames in PDOs: header, CRC, window and features
-    tactile_assembler     the PDOs of one tactile frame put together again; losses are noticed
+    tactile               tactile frames in PDOs: header, CRC, window and features; put together again, losses noticed
     raw_image             images in raw CAN frames, of arrays without CANopen
     period                the sampling instants of a free-running device
     frame_bits            bits of a frame on the wire: exact for given contents, best case and worst case

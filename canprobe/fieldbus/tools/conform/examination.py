@@ -345,15 +345,11 @@ class Examination:
             except outcome.Deviation:
                 raise error from None
             written = self.journal.restore(bench, all_of_it=True)
-        if commanded and bench.asked and not self._is_well():
+        if commanded and bench.asked and bench.number(0x1001) & ~bench.device.number(0x1001):
             bench.reset()  # an error that was provoked and stays would fail the points that follow
             written += self.journal.restore(bench, all_of_it=True)
         self._boots = bench.boots
         return written
-
-    def _is_well(self) -> bool:
-        """Whether 1001h shows no error that was not there before."""
-        return not self.bench.number(0x1001) & ~self.bench.device.number(0x1001)
 
     def _leave(self) -> None:
         """Put back everything, and bring the device into the state that it had; nothing is sent to an axis with power.
