@@ -11,8 +11,8 @@ import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from canprobe.errors import UsageError, check_schema, regular_file
-from canprobe.fieldbus.bus.files import write_text
+from canprobe.errors import UsageError, check_schema
+from canprobe.fieldbus.bus.files import read_document, write_text
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, TO_MAPPING
 from canprobe.fieldbus.protocol.sdo import Place, place_text
@@ -74,20 +74,18 @@ class Journal:
         Raises:
             UsageError: the file cannot be read, or is no snapshot.
         """
-        try:
-            document = json.loads(regular_file(path, _MAX_BYTES).read_text(encoding="utf-8"))
+
+        def parse(text: str) -> Journal:
+            document = json.loads(text)
             if document["kind"] != _KIND:
                 raise ValueError("another kind of file")
             check_schema(path, document.get("schema", 1), SCHEMA, "put the device back with the canprobe that wrote it")
-            values = {
-                (int(name[:4], 16), int(name[6:], 16)): bytes.fromhex(text) for name, text in document["values"].items()
-            }
-            journal = cls(values, None, str(document["identity"]))
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from error
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise UsageError(f"{path}: expected a snapshot that canprobe conform wrote: {error}") from error
-        journal.touched.update(values)
+            entries = document["values"].items()
+            values = {(int(name[:4], 16), int(name[6:], 16)): bytes.fromhex(value) for name, value in entries}
+            return cls(values, None, str(document["identity"]))
+
+        journal = read_document(path, _MAX_BYTES, parse, "a snapshot that canprobe conform wrote")
+        journal.touched.update(journal.values)
         return journal
 
     def restore(self, bench: SdoClient, *, all_of_it: bool = False) -> list[str]:
