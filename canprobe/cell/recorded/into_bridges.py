@@ -25,7 +25,7 @@ from canprobe.cell.session.children import Bridges
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame
-from canprobe.fieldbus.protocol.sync import is_sync
+from canprobe.fieldbus.protocol.frames import is_sync
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 TASK_COLUMNS = ("phase", "depth_at_1n_mm")

@@ -26,8 +26,7 @@ from canprobe.errors import ProtocolError, UsageError
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame, is_bus_error
 from canprobe.fieldbus.protocol.cia402 import known_state
-from canprobe.fieldbus.protocol.frames import SYNC_ID
-from canprobe.fieldbus.protocol.sync import is_sync, long_syncs_text
+from canprobe.fieldbus.protocol.frames import SYNC_ID, is_sync, long_syncs_text
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 RATE_TOLERANCE = 0.2
