@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from itertools import chain, repeat
+from itertools import repeat
 from pathlib import Path
 
 from canprobe.cell.master.arm_power import ArmPower
@@ -17,7 +17,7 @@ from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.held_arm import HeldArm
 from canprobe.cell.master.homing import Homing
-from canprobe.cell.master.lift_off import LiftOff
+from canprobe.cell.master.lift_off import lift_off
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
@@ -32,8 +32,6 @@ from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
-REST_S = 0.05
-"""Time in which drives come to rest at their last targets before a quick stop, s: the longest usual lag."""
 TARE_S = 0.3
 """Time in which an array takes the images of a tare, s."""
 STUCK_NS = 1_000_000_000
@@ -174,14 +172,14 @@ class Cell:
             self.stop()
             if not self._options.recover:
                 self.close()
-            self._name_another_master(error)
+            self.cycles.name_another_master(error)
             raise
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self.close()
         if error is not None:
-            self._name_another_master(error)
+            self.cycles.name_another_master(error)
 
     def run(
         self,
@@ -241,7 +239,11 @@ class Cell:
         measurement = cycles.begin()  # SYNC, collect
         held = self._supervise(measurement)
         with self._lifting_off_on_error():
-            self._take(interrupts)
+            try:
+                interrupts.take()
+            except KeyboardInterrupt as interrupt:  # a controller that brakes by itself raises it when it has
+                if not controller.brake(interrupt):
+                    raise
             command = self._held.freeze(measurement) if held else controller.step(measurement)
             check_command(command, arm=self.drives is not None)
         command, finding = self.supervisor.guard_target(command if held else self._held.thaw(command, measurement))
@@ -257,14 +259,6 @@ class Cell:
             found = self._retreats_for
             raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
         return bool(command.done)
-
-    def _take(self, interrupts: Interrupts) -> None:
-        """Raise an interrupt that came; a controller that brakes by itself raises it when it has."""
-        try:
-            interrupts.take()
-        except KeyboardInterrupt as interrupt:
-            if not self.cycles.controller.brake(interrupt):
-                raise
 
     def tare(self) -> None:
         """Take what the array shows for zero.
@@ -312,20 +306,10 @@ class Cell:
         try:
             yield
         except BaseException as error:
-            self._name_another_master(error)
+            self.cycles.name_another_master(error)
             raise
         finally:
             self._running = False
-
-    def _name_another_master(self, error: BaseException) -> None:
-        """Add another master that was heard to an error that ends the cell: it may be the cause."""
-        words = self.watch.another_master
-        if words is None or str(self.watch.foreign) in str(error):
-            return
-        if isinstance(error, CanprobeError):
-            error.args = (f"{error}; {words}",)
-        elif words not in self.notes.lines():
-            self.notes.add(words)
 
     @contextmanager
     def _lifting_off_on_error(self) -> Iterator[None]:
@@ -333,7 +317,7 @@ class Cell:
         try:
             yield
         except BaseException as error:
-            self._lift_off(error)
+            lift_off(self._plan, self.cycles, error)
             raise
 
     # supervision
@@ -375,38 +359,8 @@ class Cell:
             controller.retreat(str(finding.error))
             return
         if reaction in (Reaction.RETREAT, Reaction.LIFT):
-            self._lift_off(finding.error)
+            lift_off(self._plan, self.cycles, finding.error)
         raise finding.error
-
-    def _lift_off(self, error: BaseException) -> None:
-        """Lift the probe off before the cell is stopped for ``error``; where that is not possible, let it rest."""
-        supervisor = self.supervisor
-        if self.drives is None or self.tactile is None or not supervisor.pressing() or supervisor.must_stop():
-            return
-        lift = LiftOff(self._plan, self.drives, self.watch, error, self.cycles.controller.trail)
-        t_s = self.cycles.run_s(supervisor.seen.measurement)
-        commands: Iterator[Command] = iter(())
-        if lift.possible:
-            self._say("lift off with the drives that obey")
-            self.notes.add("lift off", t_s=t_s)
-            lift.begin()
-            commands = iter(lambda: lift.command(supervisor), None)
-        else:
-            self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
-        # In a quick stop each drive brakes on a ramp of its own, from the speed of its targets: off the path, and after
-        # a step of the target the wrong way (45 N at 25 mm/s). So all come to rest at their last targets before.
-        rest = repeat(Command(), round(REST_S * 1e9 / self._plan.sync.period_ns))
-        try:
-            if not self.cycles.cycle.begun:  # the controller's update failed: the commands of this cycle are out
-                self.cycles.begin()
-            for command in chain(commands, rest):
-                self.cycles.cycle.end(command)
-                self.cycles.record(supervisor.seen.measurement, command)
-                self.cycles.begin()
-                if supervisor.must_stop():
-                    break
-        except CanprobeError as failure:
-            self.notes.add(f"while lifting off: {failure}")
 
     # the way out
 

@@ -10,16 +10,20 @@ position it cannot have reached may be moving: then nothing is moved.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import chain, repeat
+
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.drives import DriveGroup
+from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, Retrace, TakenWay, way_gone
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
-from canprobe.errors import NodeError
+from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.inverse_step import lifting_step
@@ -27,6 +31,8 @@ from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_j
 from canprobe.mechanics.robot.motors import units_per_motor
 from canprobe.mechanics.types import Floats
 
+REST_S = 0.05
+"""Time in which drives come to rest at their last targets before a quick stop, s: the longest usual lag."""
 LEAP_RAD = 10e-3
 """Distance of a joint from its target, rad, beyond which it does not lag: at 25 mm/s the joints lag by 7 mrad."""
 
@@ -142,6 +148,38 @@ class LiftOff:
         late = np.array(self._drives.ages()) >= 3
         beyond = self._drives.targets.beyond_lag()
         return not bool((self._free & (~enabled | late)).any()) and not any(self._free[i] for i in beyond)
+
+
+def lift_off(plan: Plan, cycles: SupervisedCycle, error: BaseException) -> None:
+    """Lift the probe off before the cell is stopped for an error; where that is not possible, let it rest."""
+    supervisor = cycles.supervisor
+    seen = supervisor.seen
+    if seen.drives is None or seen.tactile is None or not supervisor.pressing() or supervisor.must_stop():
+        return
+    lift = LiftOff(plan, seen.drives, seen.watch, error, cycles.controller.trail)
+    t_s = cycles.run_s(seen.measurement)
+    commands: Iterator[Command] = iter(())
+    if lift.possible:
+        cycles.say("lift off with the drives that obey")
+        cycles.notes.add("lift off", t_s=t_s)
+        lift.begin()
+        commands = iter(lambda: lift.command(supervisor), None)
+    else:
+        cycles.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
+    # In a quick stop each drive brakes on a ramp of its own, from the speed of its targets: off the path, and after
+    # a step of the target the wrong way (45 N at 25 mm/s). So all come to rest at their last targets before.
+    rest = repeat(Command(), round(REST_S * 1e9 / plan.sync.period_ns))
+    try:
+        if not cycles.cycle.begun:  # the controller's update failed: the commands of this cycle are out
+            cycles.begin()
+        for command in chain(commands, rest):
+            cycles.cycle.end(command)
+            cycles.record(seen.measurement, command)
+            cycles.begin()
+            if supervisor.must_stop():
+                break
+    except CanprobeError as failure:
+        cycles.notes.add(f"while lifting off: {failure}")
 
 
 def _obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:
