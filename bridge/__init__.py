@@ -8,8 +8,7 @@ units of each observation, with the states of the nodes. It goes into:
     view/                                three dimensions in a browser
     export                               a plan as `dcf`, `database` (DBC, KCD) and `bus_yml`, without any run
 
-`sample` has the methods of a sink too, `description` the arm's frames and its URDF, and `commands` checks the requests
-of other tools.
+`sample` has the methods of a sink too, and `description` the arm's frames and its URDF.
 
 `canprobe.cell.planning.bridges` lists the bridges, their packages and how to install them. To add one: a module
 with `open_sink(context)`, a line in that table, an extra.

@@ -187,7 +187,7 @@ def _pdos(plan: Plan, node: PlannedNode, setup: NodeConfiguration, direction: Di
 
 def _pdo(pdo: PlannedPdo, written: set[int]) -> dict[str, Any]:
     found: dict[str, Any] = {"enabled": True, "cob_id": _Hex(pdo.cob_id), "transmission": pdo.transmission_type}
-    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= 240:
+    if pdo.direction == "tpdo" and pdo.transmission_type > 1 and pdo.layout.synchronous:
         found["sync_start"] = SYNC_START_VALUE
     if MAPPING[pdo.direction] + pdo.number - 1 in written:  # a fixed mapping cannot be written
         found["mapping"] = [{"index": _Hex(entry.index), "sub_index": entry.subindex} for entry in pdo.entries]
@@ -212,8 +212,7 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     path = Path(path)
     try:
         text = regular_file(path, MAX_BYTES).read_text(encoding="utf-8")
-        document = yaml.safe_load(text)
-        _refuse_twice(path, yaml.compose(text, Loader=yaml.SafeLoader))
+        document = yaml.load(text, _loader(yaml, path))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
@@ -245,21 +244,19 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     return nodes
 
 
-def _refuse_twice(path: Path, root: Any) -> None:
-    """Refuse a key that stands twice in a table of a YAML tree: of two nodes of one name only the last would count."""
-    left, known = [root], set[int]()
-    while left:
-        node = left.pop()
-        if node is None or isinstance(node.value, str) or id(node) in known:
-            continue
-        known.add(id(node))
-        pairs = [item if isinstance(item, tuple) else (None, item) for item in node.value]
-        keys = [key for key, _ in pairs if key is not None and isinstance(key.value, str)]
-        for key in keys:
-            if [other.value for other in keys].count(key.value) > 1:
-                line = max(other.start_mark.line for other in keys if other.value == key.value) + 1
-                raise UsageError(f"{path}:{line}: {key.value}: stands twice; remove one of them")
-        left += [value for _, value in pairs]
+def _loader(yaml: Any, path: Path) -> type:
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        """PyYAML's loader that refuses a key that stands twice: of two nodes of one name only the last would count."""
+
+        def compose_mapping_node(self, anchor: str | None) -> Any:
+            node, known = super().compose_mapping_node(anchor), set[str]()
+            for key in [key for key, _ in node.value if isinstance(key.value, str)]:
+                if key.value in known:
+                    raise UsageError(f"{path}:{key.start_mark.line + 1}: {key.value}: stands twice; remove one of them")
+                known.add(key.value)
+            return node
+
+    return Loader
 
 
 def _mapping(path: Path, document: Mapping[Any, Any], name: str) -> Mapping[str, Any]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
-from canprobe.cell.planning.traffic import SYNCHRONOUS
 from canprobe.errors import needed_module
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
@@ -145,7 +144,7 @@ class _Describer:
             first.node_id if first.direction == "tpdo" else MASTER_NODE_ID,
             signals,
             comment=f"transmission type {first.transmission_type}, {first.rate_hz:g} a second",
-            period_ms=1000 / first.rate_hz if first.transmission_type <= SYNCHRONOUS else None,
+            period_ms=1000 / first.rate_hz if first.layout.synchronous else None,
             bus_name=identifier(first.channel),
         )
 

@@ -22,7 +22,7 @@ import errno
 import os
 import stat
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from pathlib import Path
 from typing import Any
@@ -238,6 +238,28 @@ def needed_module(module: str, extra: str, need: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise UsageError(f"{need} {install_line(extra)}") from error
+
+
+def door(
+    package: str, modules: Mapping[str, Sequence[str]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package whose names are imported on first use (PEP 562).
+
+    Args:
+        package: the package.
+        modules: names by the module that has them, below the package's wing, or below canprobe itself.
+    """
+    import importlib
+
+    wing = ".".join(package.split(".")[:2])
+    module_of = {name: module for module, names in modules.items() for name in names}
+
+    def load(name: str) -> Any:
+        if name not in module_of:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{wing}.{module_of[name]}"), name)
+
+    return load, lambda: sorted({*vars(sys.modules[package]), *module_of}), [*module_of]
 
 
 def _tool() -> str:

@@ -2,11 +2,11 @@
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `whole_cell`, `vcan0`, `pace`,
 `side_by_side`, `growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `canopen_node_vcan`,
-`pictures`, `screens`, one of `FORMS`, or one of `PRINTED`, what a page shows of a command that the tests
-repeat. Without names everything is measured but what takes more than half an hour or needs clones (`LONG`). Measure on
-a machine that does nothing else: computing time is among the figures. Every entry has its own command, date, commit and
-machine, so that one can be measured anew without the others; an entry whose study is gone stays with its commit. Then
-`python docs/generate.py` writes the pages.
+`hard_cases`, `test_lines`, `pictures`, `screens`, one of `FORMS`, or one of `PRINTED`, what a page shows of a command
+that the tests repeat. Without names everything is measured but what takes more than half an hour or needs clones
+(`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has its own
+command, date, commit and machine, so that one can be measured anew without the others; an entry whose study is gone
+stays with its commit. Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
@@ -25,11 +25,13 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import hard_cases
 from gallery import draw_panel
 from moving_picture import draw_moving
 from PIL import Image
@@ -53,7 +55,7 @@ SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
 IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
-LONG = ("faults", "soak", "growth", "held", "canopen_node", "canopen_node_vcan")
+LONG = ("faults", "test_lines", "soak", "growth", "held", "canopen_node", "canopen_node_vcan")
 FORMS = {
     "bound": "estimators",
     "calibrations": "calibration",
@@ -359,6 +361,21 @@ def canopen_node_vcan() -> Entry:
     return {"command": f"{script} CANopenNode CANopenDemo CANopenLinux"} | entry
 
 
+def test_lines() -> Entry:
+    """How long the README's lines of tests take, and what they end with."""
+    entry: Entry = {"command": "python -m pytest && python -m pytest -m ''", "minutes": [], "findings": []}
+    for line in entry["command"].split(" && "):
+        begun_s = time.monotonic()
+        entry["findings"].append(f"`{line}`: {printed(f'{line} -q').splitlines()[-1].strip('= ')}")
+        entry["minutes"].append(round((time.monotonic() - begun_s) / 60.0, 1))
+    return entry
+
+
+def hard_runs() -> Entry:
+    """The runs that press hardest."""
+    return {"command": "python docs/hard_cases.py", "table": hard_cases.table()}
+
+
 def local_node() -> Entry:
     """What `canprobe conform` finds in canopen-python's LocalNode."""
     command = "python tests/support/local_node.py"
@@ -470,6 +487,8 @@ def drawing_code(name: str) -> str:
 
 OTHERS: Mapping[str, Callable[[], Entry]] = {
     "local_node": local_node,
+    "hard_cases": hard_runs,
+    "test_lines": test_lines,
     "canopen_node": canopen_node,
     "canopen_node_vcan": canopen_node_vcan,
     "one_scan": one_scan,

@@ -19,7 +19,7 @@ from canprobe.cell.scene.rules import SECTIONS_OF_TASK
 from canprobe.cell.scene.toml_files import toml_value
 from canprobe.cell.scene.units import unit_of
 
-NEEDS = {"must": "required", "default": "default", "may": "optional", "never": "–"}
+NEEDS = {"must": "required", "default": "default", "may": "optional", "mounted": "as in the cell", "never": "–"}
 INTRODUCTION = """\
 # Scene keys
 

@@ -4,9 +4,8 @@ The bytes of a file come in; an object dictionary of canopen and a list of findi
 the meaning is clear or the standard decides it; it prevents serving where it is unknown what the device is.
 The stages, each in its module:
 
-    sections      bytes → sections and keys, each with its line
+    sections      bytes → sections and keys, each with its line; one file while it is read, with its findings
     xml_sections  the same from an XDD or XDC file
-    source        one file while it is read: its sections, and the findings so far
     numbers       texts → numbers, sums with $NODEID, flags
     structure     sections → objects: the order of everything below; arrays and records, also in the compact form
     values        default, parameter value and limits by data type

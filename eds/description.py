@@ -11,15 +11,9 @@ from dataclasses import dataclass, replace
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable, datatypes
 
-from canprobe.fieldbus.eds.values import (
-    OCTET_TYPES,
-    SIGNED_BITS,
-    TEXT_TYPES,
-    TIME_BITS,
-    TIME_TYPES,
-    UNSIGNED_BITS,
-    Value,
-)
+from canprobe.fieldbus.eds import values
+from canprobe.fieldbus.eds.values import Value
+from canprobe.fieldbus.protocol.pdo import RPDOS, TPDOS
 
 LAST_DUMMY = 0x0007
 """Last index of a data type; DummyUsage lists those that an RPDO may map to fill room."""
@@ -69,7 +63,7 @@ class DescribedEntry:
     @property
     def is_integer(self) -> bool:
         """Whether it holds an integer, and not a real number, text or octets."""
-        return self.data_type in SIGNED_BITS or self.data_type in UNSIGNED_BITS
+        return self.data_type in values.SIGNED_BITS or self.data_type in values.UNSIGNED_BITS
 
     @property
     def readable(self) -> bool:
@@ -145,12 +139,12 @@ class Description:
     @property
     def rpdos(self) -> tuple[int, ...]:
         """Numbers of the RPDOs, 1 for 1400h."""
-        return tuple(sorted(index - 0x13FF for index in self.od.indices if 0x1400 <= index < 0x1600))
+        return _numbers(self.od, RPDOS)
 
     @property
     def tpdos(self) -> tuple[int, ...]:
         """Numbers of the TPDOs, 1 for 1800h."""
-        return tuple(sorted(index - 0x17FF for index in self.od.indices if 0x1800 <= index < 0x1A00))
+        return _numbers(self.od, TPDOS)
 
     @property
     def modes(self) -> frozenset[int] | None:
@@ -175,6 +169,10 @@ def variable_at(od: ObjectDictionary, index: int, subindex: int) -> ODVariable |
     return variable
 
 
+def _numbers(od: ObjectDictionary, area: range) -> tuple[int, ...]:
+    return tuple(sorted(area.index(index) + 1 for index in od.indices if index in area))
+
+
 def _array_length(array: ODArray) -> int:
     """Highest sub-index by the default of sub-index 0."""
     count = array.subindices[0].default if 0 in array.subindices and 1 in array.subindices else 0
@@ -182,9 +180,9 @@ def _array_length(array: ODArray) -> int:
 
 
 def _bits(variable: ODVariable, data_type: int) -> int:
-    if data_type in TEXT_TYPES | OCTET_TYPES:
+    if data_type in values.TEXT_TYPES | values.OCTET_TYPES:
         return 0
-    return TIME_BITS if data_type in TIME_TYPES else len(variable)
+    return values.TIME_BITS if data_type in values.TIME_TYPES else len(variable)
 
 
 def described_entry(variable: ODVariable) -> DescribedEntry:
@@ -196,7 +194,7 @@ def described_entry(variable: ODVariable) -> DescribedEntry:
         name=variable.name,
         data_type=data_type,
         bits=_bits(variable, data_type),
-        signed=data_type in SIGNED_BITS,
+        signed=data_type in values.SIGNED_BITS,
         access=variable.access_type,
         mappable=variable.pdo_mappable,
         low=variable.min,

@@ -8,8 +8,7 @@ from __future__ import annotations
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.eds.numbers import parse_integer
-from canprobe.fieldbus.eds.sections import Section, Sections
-from canprobe.fieldbus.eds.source import Source
+from canprobe.fieldbus.eds.sections import Section, Sections, Source
 
 _RATES_KBIT_S = (10, 20, 50, 125, 250, 500, 800, 1000)
 _TEXT_FIELDS = {"VendorName": "vendor_name", "ProductName": "product_name", "OrderCode": "order_code"}

@@ -5,6 +5,8 @@ Source: CiA 301, "Communication profile area"; CiA 402-2, object descriptions.
 
 from __future__ import annotations
 
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, is_mapping
+
 U8, _U16, _U32, _I8, _I16, _I32 = 0x05, 0x06, 0x07, 0x02, 0x03, 0x04
 _VARIABLE_TYPES = {
     **dict.fromkeys((0x1000, 0x1002, 0x1005, 0x1006, 0x1007, 0x1012, 0x1013, 0x1014, 0x6502), _U32),
@@ -32,7 +34,7 @@ USUAL_TYPES = {
 _COMMUNICATION_TYPES = {1: _U32, 2: U8, 3: _U16, 5: _U16, 6: U8}
 CHOICE_INDICES = frozenset({0x6007, *range(0x605A, 0x605F), 0x6086, 0x6098, 0x60C0})
 """Objects of a drive whose value 0 is a choice, maybe the only one, such as a linear ramp."""
-COUNTING_INDICES = frozenset({0x1003, *range(0x1600, 0x1800), *range(0x1A00, 0x1C00)})
+COUNTING_INDICES = frozenset({0x1003, *filter(is_mapping, PDO_OBJECTS)})
 """Objects whose sub-index 0 is the number of entries in use, and can be written."""
 _FIRST_PROFILE_INDEX = 0x6000
 """First index of the profile area, where CiA 402 describes drives; other profiles are not known here."""
@@ -45,7 +47,7 @@ def is_variable(index: int, drive: bool) -> bool:
 
 def decides(index: int) -> bool:
     """Whether values of an object decide what the device is and which PDOs it has: the profile, the identity, PDOs."""
-    return index in (0x1000, 0x1018) or 0x1400 <= index < 0x1C00
+    return index in (0x1000, 0x1018) or index in PDO_OBJECTS
 
 
 def standard_type(index: int, subindex: int, drive: bool) -> int | None:
@@ -53,12 +55,10 @@ def standard_type(index: int, subindex: int, drive: bool) -> int | None:
     if index >= _FIRST_PROFILE_INDEX and not drive:
         return None
     if subindex == 0:
-        fixed = index in _ARRAY_TYPES or 0x1400 <= index < 0x1C00 or 0x1200 <= index < 0x1300
+        fixed = index in _ARRAY_TYPES or index in PDO_OBJECTS or 0x1200 <= index < 0x1300
         return U8 if fixed else _VARIABLE_TYPES.get(index)
-    if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
-        return _COMMUNICATION_TYPES.get(subindex)
-    if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
-        return _U32
+    if index in PDO_OBJECTS:
+        return _U32 if is_mapping(index) else _COMMUNICATION_TYPES.get(subindex)
     return _U32 if 0x1200 <= index < 0x1300 and subindex < 3 else _ARRAY_TYPES.get(index)
 
 

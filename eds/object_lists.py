@@ -8,8 +8,7 @@ from __future__ import annotations
 import re
 
 from canprobe.fieldbus.eds.numbers import parse_integer
-from canprobe.fieldbus.eds.sections import Section
-from canprobe.fieldbus.eds.source import Source
+from canprobe.fieldbus.eds.sections import Section, Source
 
 _LISTED_AREAS = {
     "MandatoryObjects": (range(0x1000, 0x1002), range(0x1018, 0x1019)),

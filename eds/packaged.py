@@ -24,19 +24,22 @@ if TYPE_CHECKING:
 
 MISSED_SYNCS = 0x2000
 """Manufacturer's object of our drives: number of missed SYNCs after which the master counts as lost."""
-MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
 SYNC_FACTOR = 0x200E
 """The like object of PRBT joints, and of others with these drives: number of SYNC periods without a SYNC."""
-SYNC_FACTOR_NAME = "SYNC time-out factor"
 LONG_PDOS = 0x2007
 """Manufacturer's object of our CAN FD array: 1 lets its TPDOs map up to 64 bytes; SDO stays classical."""
-LONG_PDOS_NAME = "Long PDOs (CAN FD)"
 FULL_SCALE = 0x2004
 """Manufacturer's object of our arrays: pressure of the largest count, Pa."""
-FULL_SCALE_NAME = "Full scale pressure"
 WINDOW_SIZE = 0x2008
-"""Manufacturer's object of our arrays: number of taxels along the window that follows the contact."""
-WINDOW_SIZE_NAME = "Window size"
+"""Manufacturer's object of our arrays: number of taxels along the window that follows the contact; without it 8."""
+KNOWN_NAMES = {
+    MISSED_SYNCS: "Missed SYNCs tolerated",
+    SYNC_FACTOR: "SYNC time-out factor",
+    LONG_PDOS: "Long PDOs (CAN FD)",
+    FULL_SCALE: "Full scale pressure",
+    WINDOW_SIZE: "Window size",
+}
+"""Names by which these objects are known, as other makers use their indices for something else."""
 _FOLDER = Path(__file__).resolve().parent
 
 
@@ -64,30 +67,14 @@ def eds_path(name: str) -> Path:
     )
 
 
-def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
-    """Whether 2000h is that object here; drives of other makers use the index for something else."""
-    return MISSED_SYNCS in od and od[MISSED_SYNCS].name == MISSED_SYNCS_NAME
+def has_known(od: canopen.ObjectDictionary, index: int) -> bool:
+    """Whether a device has the object of `KNOWN_NAMES` at this index."""
+    return index in od and od[index].name == KNOWN_NAMES[index]
 
 
 def sync_patience(od: canopen.ObjectDictionary) -> int | None:
     """Index of the object for the number of missed SYNCs after which a drive stops by itself; None without one."""
-    named = ((MISSED_SYNCS, MISSED_SYNCS_NAME), (SYNC_FACTOR, SYNC_FACTOR_NAME))
-    return next((index for index, name in named if index in od and od[index].name == name), None)
-
-
-def has_long_pdos(od: canopen.ObjectDictionary) -> bool:
-    """Whether 2007h is that object here: the device can send PDOs in CAN FD frames."""
-    return LONG_PDOS in od and od[LONG_PDOS].name == LONG_PDOS_NAME
-
-
-def has_window_size(od: canopen.ObjectDictionary) -> bool:
-    """Whether 2008h is that object here; without it the window has 8×8 taxels."""
-    return WINDOW_SIZE in od and od[WINDOW_SIZE].name == WINDOW_SIZE_NAME
-
-
-def has_full_scale(od: canopen.ObjectDictionary) -> bool:
-    """Whether 2004h is that object here; without it the device does not state the pressure of its largest count."""
-    return FULL_SCALE in od and od[FULL_SCALE].name == FULL_SCALE_NAME
+    return next((index for index in (MISSED_SYNCS, SYNC_FACTOR) if has_known(od, index)), None)
 
 
 def eds_file(source: str | os.PathLike[str]) -> Path:

@@ -24,11 +24,10 @@ from canprobe.fieldbus.eds.findings import EdsFinding, EdsFindings
 from canprobe.fieldbus.eds.foreign_files import HEAD_BYTES, XML, file_kind
 from canprobe.fieldbus.eds.numbers import parse_sum
 from canprobe.fieldbus.eds.object_lists import check_lists
-from canprobe.fieldbus.eds.sections import Section, decode, split_sections
-from canprobe.fieldbus.eds.source import Source
+from canprobe.fieldbus.eds.sections import Section, Source, decode, split_sections
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
 from canprobe.fieldbus.protocol.frames import EFF_MASK, INVALID_FLAG
-from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS
+from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, RPDOS, TPDOS, is_mapping
 
 _MAX_U32 = 0xFFFFFFFF
 _PROFILE_MASK = 0xFFFF
@@ -42,11 +41,11 @@ _IDENTITY_NAMES = {1: "vendor", 2: "product", 3: "revision"}
 """Names of the numbers in 1018h, by sub-index, as [DeviceInfo] and canopen have them."""
 _PREDEFINED_COB_IDS = (
     (0x1014, 0, 0x80),
-    *((0x1400 + n, 1, 0x200 + 0x100 * n) for n in range(4)),
-    *((0x1800 + n, 1, 0x180 + 0x100 * n) for n in range(4)),
+    *((RPDOS[n], 1, 0x200 + 0x100 * n) for n in range(4)),
+    *((TPDOS[n], 1, 0x180 + 0x100 * n) for n in range(4)),
 )
 """Index, sub-index and COB-ID without the node-ID, of the pre-defined connection set."""
-_FURTHER_PDOS = frozenset((*range(0x1404, 0x1600), *range(0x1804, 0x1A00)))
+_FURTHER_PDOS = frozenset((*RPDOS[4:], *TPDOS[4:]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +192,7 @@ class _Repair:
         self._repair_sdo_server()
         self._repair_identifiers()
         for index in self._od:
-            if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
+            if is_mapping(index):
                 self._check_mapping(index, serving)
         self._check_pdo_counts()
 
@@ -288,8 +287,8 @@ class _Repair:
 
     def _check_pdo_counts(self) -> None:
         section = self._source.sections.get("deviceinfo")
-        for key, first, name in (("NrOfRXPDO", 0x1400, "RPDOs"), ("NrOfTXPDO", 0x1800, "TPDOs")):
-            described = sum(first <= index < first + 0x200 for index in self._od)
+        for key, area, name in (("NrOfRXPDO", RPDOS, "RPDOs"), ("NrOfTXPDO", TPDOS, "TPDOs")):
+            described = sum(index in area for index in self._od)
             if (
                 section is not None
                 and section.value(key)

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from canprobe.fieldbus.eds.findings import EdsFindings
+from canprobe.fieldbus.eds.numbers import Remark, parse_integer
 
+T = TypeVar("T")
 LINE_END_PATTERN = re.compile(r"\r\n|\n|\r")
 _COMMENT_PATTERN = re.compile(r"\s;.*")
 _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
@@ -53,6 +57,50 @@ class Section:
 
 Sections = dict[str, Section]
 """Sections by name in lower case, in the order of the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One EDS file while it is read: its sections, and the findings so far. All builders of a dictionary share it.
+
+    Attributes:
+        sections: sections of the file.
+        node_id: value of $NODEID.
+        faults: findings so far.
+        drive: whether the device is a drive of CiA 402.
+    """
+
+    sections: Sections
+    node_id: int
+    faults: EdsFindings
+    drive: bool = False
+
+    def warn(self, section: Section, key: str, text: str) -> None:
+        """Add a warning at a key, or at its section where the key is missing."""
+        self.faults.warn(section.line_of(key), section.name, key, text)
+
+    def fault(self, section: Section, key: str, text: str) -> None:
+        """Add a fault at a key, or at its section where the key is missing."""
+        self.faults.fault(section.line_of(key), section.name, key, text)
+
+    def remark(self, section: Section, key: str) -> Remark:
+        """The function that a parser calls with a remark on the value of a key."""
+        return lambda text: self.warn(section, key, text)
+
+    def read(self, section: Section, key: str, parse: Callable[[str, Remark], T], default: T, wrong: str) -> T:
+        """Value that does no harm when it is wrong; `default` where it is missing, empty or, with a warning, wrong."""
+        text = section.value(key)
+        if not text:
+            return default
+        try:
+            return parse(text, self.remark(section, key))
+        except (ValueError, OverflowError):
+            self.warn(section, key, f"{text!r} {wrong}")
+            return default
+
+    def number(self, section: Section, key: str, default: int = 0) -> int:
+        """Integer; `default` where it is missing, empty or not a number."""
+        return self.read(section, key, parse_integer, default, f"is not a number; read as {default}")
 
 
 def decode(data: bytes, faults: EdsFindings) -> str:

@@ -12,8 +12,7 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 
 from canprobe.fieldbus.eds.mandatory import COUNTING_INDICES, is_variable
 from canprobe.fieldbus.eds.numbers import parse_integer
-from canprobe.fieldbus.eds.sections import Section
-from canprobe.fieldbus.eds.source import Source
+from canprobe.fieldbus.eds.sections import Section, Source
 from canprobe.fieldbus.eds.variables import build_variable, set_value
 
 _OBJECT_PATTERN = re.compile(r"(?:0x)?([0-9a-f]{4})")

@@ -10,19 +10,10 @@ from contextlib import suppress
 
 from canopen.objectdictionary import ODVariable, datatypes
 
+from canprobe.fieldbus.eds import values
 from canprobe.fieldbus.eds.mandatory import CHOICE_INDICES, U8, USUAL_TYPES, decides, standard_access, standard_type
-from canprobe.fieldbus.eds.numbers import parse_flag, parse_integer, parse_sum
-from canprobe.fieldbus.eds.sections import Section
-from canprobe.fieldbus.eds.source import Source
-from canprobe.fieldbus.eds.values import (
-    FOREIGN_TYPE_NUMBERS,
-    KNOWN_TYPES,
-    TEXT_TYPES,
-    TYPE_NUMBERS,
-    convert,
-    convert_limit,
-    name_of,
-)
+from canprobe.fieldbus.eds.numbers import Remark, parse_flag, parse_integer, parse_sum
+from canprobe.fieldbus.eds.sections import Section, Source
 
 _OBJECT_DOMAIN = 2
 _OTHER_TYPES = {
@@ -49,7 +40,7 @@ def build_variable(source: Source, section: Section, index: int, subindex: int, 
     variable = ODVariable(_name(source, section, index, subindex), index, subindex)
     variable.data_type = data_type
     variable.access_type = _access(source, section, index, subindex, composite)
-    variable.pdo_mappable = _flag(source, section, "PDOMapping")
+    variable.pdo_mappable = source.read(section, "PDOMapping", parse_flag, False, "is neither 0 nor 1; read as 0")
     _set_limits(source, section, variable, data_type)
     if known is not None:
         set_value(source, section, "DefaultValue", variable)
@@ -70,18 +61,18 @@ def set_value(source: Source, section: Section, key: str, variable: ODVariable, 
     text = section.value(where)
     field = "default" if key == "DefaultValue" else "value"
     setattr(variable, f"{field}_raw", text)
-    if not text and data_type not in TEXT_TYPES:
+    if not text and data_type not in values.TEXT_TYPES:
         return
     try:
-        setattr(variable, field, convert(text, data_type, source.node_id, source.remark(section, where)))
+        setattr(variable, field, values.convert(text, data_type, source.node_id, source.remark(section, where)))
     except (ValueError, OverflowError):
-        wrong = f"{text!r} is not a value of type {name_of(data_type)}"
+        wrong = f"{text!r} is not a value of type {values.name_of(data_type)}"
         if decides(variable.index):
             source.fault(section, where, wrong)
         else:
             source.warn(section, where, f"{wrong}; left out, as if the file had none")
         return
-    if field == "default" and "$" in text and data_type not in TEXT_TYPES:
+    if field == "default" and "$" in text and data_type not in values.TEXT_TYPES:
         with suppress(ValueError):
             variable.relative = parse_sum(text, source.node_id, lambda _: None)[1]
 
@@ -106,20 +97,12 @@ def _access(source: Source, section: Section, index: int, subindex: int, composi
     return taken
 
 
-def _flag(source: Source, section: Section, key: str) -> bool:
-    text = section.value(key)
-    if not text:
-        return False  # the default of CiA 306
-    try:
-        return parse_flag(text, source.remark(section, key))
-    except ValueError:
-        source.warn(section, key, f"{text!r} is neither 0 nor 1; read as 0")
-        return False
-
-
 def _set_limits(source: Source, section: Section, variable: ODVariable, data_type: int) -> None:
-    low = _limit(source, section, "LowLimit", data_type)
-    high = _limit(source, section, "HighLimit", data_type)
+    def limit(text: str, remark: Remark) -> int | float | None:
+        return values.convert_limit(text, data_type, source.node_id, remark)
+
+    wrong = f"is not a value of type {values.name_of(data_type)}; not used"
+    low, high = (source.read(section, key, limit, None, wrong) for key in ("LowLimit", "HighLimit"))
     if low == high == 0 and not (source.drive and variable.index in CHOICE_INDICES):
         source.warn(
             section, "LowLimit", "0, and HighLimit 0 too, as editors fill in what nobody stated; neither is used"
@@ -129,17 +112,6 @@ def _set_limits(source: Source, section: Section, variable: ODVariable, data_typ
         source.warn(section, "LowLimit", f"{low} is above HighLimit {high}; neither is used")
         return
     variable.min, variable.max = low, high  # type: ignore[assignment]  # those of a REAL are floats
-
-
-def _limit(source: Source, section: Section, key: str, data_type: int) -> int | float | None:
-    text = section.value(key)
-    if not text:
-        return None
-    try:
-        return convert_limit(text, data_type, source.node_id, source.remark(section, key))
-    except (ValueError, OverflowError):
-        source.warn(section, key, f"{text!r} is not a value of type {name_of(data_type)}; not used")
-        return None
 
 
 def _data_type_of(source: Source, section: Section, index: int, subindex: int, composite: bool) -> int | None:
@@ -157,25 +129,26 @@ def _data_type_of(source: Source, section: Section, index: int, subindex: int, c
             data_type = parse_integer(text, source.remark(section, "DataType"))
         except ValueError:
             return _untyped(source, section, demanded or usual, f"{text!r} is not a data type")
-    if data_type not in KNOWN_TYPES:
+    if data_type not in values.KNOWN_TYPES:
         data_type = _foreign(source, section, data_type)
     if demanded is not None and data_type != demanded:
-        source.warn(section, "DataType", f"{name_of(data_type)}, but the standard demands {name_of(demanded)}; taken")
+        stated, right = values.name_of(data_type), values.name_of(demanded)
+        source.warn(section, "DataType", f"{stated}, but the standard demands {right}; taken")
         return demanded
     return data_type
 
 
 def _named_type(text: str) -> int | None:
     word = re.sub(r"[\s_]", "", text.upper())
-    named = TYPE_NUMBERS.get(
-        text.upper(), FOREIGN_TYPE_NUMBERS.get(word.removesuffix("T") if word[-2:-1].isdigit() else word)
+    named = values.TYPE_NUMBERS.get(
+        text.upper(), values.FOREIGN_TYPE_NUMBERS.get(word.removesuffix("T") if word[-2:-1].isdigit() else word)
     )
-    return named if named in KNOWN_TYPES else None
+    return named if named in values.KNOWN_TYPES else None
 
 
 def _untyped(source: Source, section: Section, demanded: int | None, why: str) -> int | None:
     if demanded is not None:
-        source.warn(section, "DataType", f"{why}; the standard demands {name_of(demanded)}; taken")
+        source.warn(section, "DataType", f"{why}; the standard demands {values.name_of(demanded)}; taken")
     elif section.value("ObjectType") and source.number(section, "ObjectType") == _OBJECT_DOMAIN:
         return int(datatypes.DOMAIN)
     else:
@@ -187,7 +160,7 @@ def _foreign(source: Source, section: Section, data_type: int) -> int:
     """A type of the maker, which some editors define in a section such as [A0]; else it is served as octets."""
     definition = source.sections.get(f"{data_type:x}sub1")
     base = source.number(definition, "DefaultValue") if definition is not None else 0
-    if base in KNOWN_TYPES:
+    if base in values.KNOWN_TYPES:
         return base
     what = next((what for numbers, what in _OTHER_TYPES.items() if data_type in numbers), "is not a type of CiA 301")
     source.warn(section, "DataType", f"{data_type:#06x} {what}; the object is served as octets")

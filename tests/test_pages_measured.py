@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from canprobe.cell.emulated.array_faults import CELL_FAULTS
+from canprobe.fieldbus.tools.judge import RULES
+
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 sys.path.append(str(DOCS))  # as for `python docs/measure.py`
 measure = importlib.import_module("measure")
@@ -53,3 +56,36 @@ def test_prose_beside_a_table_of_measurements_repeats_its_figure():
     lockstep, direct = (float(table[name].split()[0]) for name in ("lockstep", "direct"))
     said = re.search(r"([\d.]+) times as fast \(\[cost\]", TEXTS["docs/python.md"])
     assert said is not None and float(said[1]) == pytest.approx(lockstep / direct, abs=0.05)
+
+
+REPEATED = ("blind-0.5mm", "stuck-sphere-2-1.5s")
+"""Runs of the table that the default tests repeat."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *REPEATED,
+        *(
+            pytest.param(name, marks=pytest.mark.slow(reason="the other runs of the table"))
+            for name in measure.hard_cases.CASES
+            if name not in REPEATED
+        ),
+    ],
+)
+def test_a_run_that_presses_hardest_is_the_one_of_the_table(name):
+    assert measure.hard_cases.row(name) in MEASURED["hard_cases"]["table"], "type: python docs/measure.py hard_cases"
+
+
+def test_prose_that_names_a_number_has_the_present_one():
+    said = {
+        ("README.md", r"any of (\d+) faults"): len(CELL_FAULTS),
+        ("README.md", r"knows (\d+) faults of masters"): len(RULES),
+        ("docs/hardware.md", r"1 Mbit/s ends at (\d+) Hz"): int(
+            re.search(r"ends at (\d+) Hz", " ".join(MEASURED["realtime"]["findings"]))[1]
+        ),
+        ("README.md", r"tests take (\d+) minutes"): round(MEASURED["test_lines"]["minutes"][0]),
+        ("README.md", r"-m ''`, (\d+)\)"): round(MEASURED["test_lines"]["minutes"][1]),
+    }
+    found = {key: re.search(key[1], TEXTS[key[0]]) for key in said}
+    assert {key: match and int(match[1]) for key, match in found.items()} == said

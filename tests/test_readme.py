@@ -81,7 +81,7 @@ def test_python_block_runs(block, tmp_path, monkeypatch, capsys):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("canprobe.api.load_scene", load_quick)
-    monkeypatch.setattr("canprobe.lab.studies.executors.system.processors", lambda: 1)  # each would import anew
+    monkeypatch.setattr("canprobe.lab.studies.sweep.system.processors", lambda: 1)  # each would import anew
     exec(compile(block, "page", "exec"), {"__name__": "page"})
     out = capsys.readouterr().out
     if "607A" in block:  # the drive of docs/fieldbus.md has moved

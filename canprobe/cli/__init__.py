@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import gc
 import importlib
 import io
 import os
@@ -61,6 +62,14 @@ COMMANDS = (
     "eds",
 )
 
+ELSEWHERE = {
+    "jog": "canprobe console CELL, and jog there",
+    "goto": "canprobe move CELL POSTURE",
+    "teach": "canprobe posture save CELL NAME",
+    "zero": "canprobe tare CELL for the array, canprobe home CELL for joints",
+    "enable": "canprobe up CELL",
+}
+"""What people call a command that has another name here, and what to type."""
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 _RAISING = ("strict", "surrogateescape")
 """Handlers of a stream that raise an error on a character that its encoding does not have."""
@@ -100,6 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     if "_ARGCOMPLETE" in os.environ:
         complete(parser_of, COMMANDS)
     _prepare_streams()
+    gc.set_threshold(max(10_000, gc.get_threshold()[0]))  # at Python's 700 a tenth of a start looks for garbage
     for name in BLAS_THREADS:  # before numpy is loaded
         os.environ.setdefault(name, "1")
     report, args = StepReport(), argparse.Namespace()
@@ -165,7 +175,8 @@ def parser_of(arguments: Sequence[str]) -> Parser:
     )
     named = next((word for word in arguments if not word.startswith("-")), None)
     if named is not None and named not in COMMANDS:
-        parser.error(f"unknown command {named!r}{did_you_mean(named, COMMANDS)}; commands: {', '.join(COMMANDS)}")
+        hint = f"; type {typed}" if (typed := ELSEWHERE.get(named)) else did_you_mean(named, COMMANDS)
+        parser.error(f"unknown command {named!r}{hint}; commands: {', '.join(COMMANDS)}")
     if named is None and (unknown := [word for word in arguments if word not in parser._option_string_actions]):
         parser.refuse_unknown(unknown)
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)

@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
-import select
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from canprobe.cli.hands import ROWS
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
-from canprobe.cli.stdin import typed
 from canprobe.cli.target import scene_of
+from canprobe.fieldbus.bus.system import system
 
 if TYPE_CHECKING:
     from canprobe.cell.master.observers import Observation
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
 HELP = "jog the arm and watch the cell on a screen"
 EXAMPLE = """\
 examples:
-  canprobe console puma260
+  canprobe console puma260 --view
   canprobe console cell.toml --bus socketcan --channel can0
   canprobe console cell.toml --plain --bus socketcan --channel can0
 """
@@ -36,12 +34,13 @@ PATIENCE_S = 2.0
 """Longest time without a reader at the end, s."""
 _MOST_WAITING = 100_000
 """Bytes that wait for a reader; what comes then is left out."""
-_WRITTEN = 2048
-"""Bytes that a stream takes at once where it takes any."""
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
+    parser.add_shared("SCENE", "BUS", "--realtime", "--patient", "--bridge")
+    parser.add_argument(
+        "--view", action="append_const", dest="bridge", const="view", help="show the arm in a browser; --bridge view"
+    )
     parser.add_argument("--plain", action="store_true", help="commands and answers as lines, without a screen")
     parser.add_argument(
         "--json", action="store_true", help="as --plain, with answers and, ten times a second, the state as JSON lines"
@@ -69,11 +68,11 @@ def run(args: argparse.Namespace) -> int:
         session.view.observe(observation)
 
     say = output.show if args.json else args.report.say
-    cell = api.open_cell(scene, say=say, rows_kept=ROWS, to_home=homes, observers=[observe])
+    cell = api.open_cell(scene, say=say, rows_kept=ROWS, to_home=homes, observers=[observe], bridge=args.bridge)
     session = HandSession(cell, output.show, Path(args.cell or args.scene))
 
     def lines() -> tuple[bytes, bool]:
-        return (b"", False) if output.gone else typed(sys.stdin.fileno())
+        return (b"", False) if output.gone else system.typed(sys.stdin.fileno())
 
     session.take = Words(session, lines, output.show).take
     with left_by_ctrl_c(), cell:
@@ -107,8 +106,10 @@ class WaitingOutput:
 
     def flush(self, patience_s: float = 0.0) -> None:
         """Write as much as the reader takes, without waiting for it any longer than that."""
-        while self._waiting and not self.gone and select.select([], [self._descriptor], [], patience_s)[1]:
+        taken = 1
+        while taken and not self.gone:
             try:
-                self._waiting = self._waiting[os.write(self._descriptor, self._waiting[:_WRITTEN]) :]
+                taken = system.write_some(self._descriptor, self._waiting, patience_s)
             except OSError:
                 self.gone = True
+            self._waiting = self._waiting[taken:]

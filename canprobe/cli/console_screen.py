@@ -25,7 +25,7 @@ from textual.widgets import Footer, Input, RichLog, Static
 
 from canprobe.cell.session.child_process import with_our_imports
 from canprobe.cli.console_words import STEPS
-from canprobe.cli.stdin import LOOK_S, typed
+from canprobe.cli.stdin import LOOK_S
 from canprobe.fieldbus.bus.system import system
 
 AXES = {"x": "x", "y": "y", "z": "z", "X": "rx", "Y": "ry", "Z": "rz"}
@@ -55,6 +55,8 @@ DIM_COUNTS = 32
 """Counts of a taxel that are shown at full brightness where none has more."""
 CHANGES = 4
 """Changes of nodes and drives that are shown."""
+READ = {"voltage_v": "V", "temperature_c": "°C"}
+"""Units of what is read of a drive, by its name."""
 BAR = 12
 """Width of the bar of a joint's range, characters."""
 
@@ -132,7 +134,7 @@ class ConsoleScreen(App[int]):
         assert self._cell.stdout is not None
         if not self.screen.is_running:  # it is being closed
             return
-        text, self._open = typed(self._cell.stdout.fileno())
+        text, self._open = system.typed(self._cell.stdout.fileno())
         *lines, self._text = (self._text + text).split(b"\n")
         documents = [json.loads(line) for line in lines]
         for document in documents:
@@ -171,8 +173,7 @@ class ConsoleScreen(App[int]):
         if self._open:
             try:
                 self._cell.stdin.write(line.encode() + b"\n")
-                self._cell.stdin.flush()
-            except BrokenPipeError:  # it has ended, which its stdout says too
+            except OSError:  # it has ended, which its stdout says too
                 self._open = False
 
     def action_jog(self, sign: str) -> None:
@@ -256,12 +257,14 @@ class ConsoleScreen(App[int]):
 
 
 def _nodes(state: dict[str, Any]) -> Table:
-    table = Table(*("node", "", "state", "drive", "EMCY"), box=None, header_style="dim")
+    table = Table(*("node", "", "state", "drive", "EMCY", ""), box=None, header_style="dim")
     for node in state["nodes"]:
         silent = node["heard_s"] is not None and node["heard_s"] > 0.5
         words = f"silent for {node['heard_s']:.1f} s" if silent else node["state"] or "not heard"
         style = "red" if silent or node["emcy"] else ""
-        table.add_row(str(node["node_id"]), node["role"], words, node["drive"] or "", node["emcy"] or "", style=style)
+        read = [f"{node[key]:.1f} {unit}" for key, unit in READ.items() if node[key] is not None]
+        cells = str(node["node_id"]), node["role"], words, node["drive"] or "", node["emcy"] or "", ", ".join(read)
+        table.add_row(*cells, style=style)
     return table
 
 
@@ -298,6 +301,7 @@ def run_screen(arguments: Sequence[str]) -> int:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
+            bufsize=0,
             **system.OWN_SESSION,
         )
         try:

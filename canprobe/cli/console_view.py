@@ -48,6 +48,9 @@ class ConsoleView:
         """
         view = self._monitor.view(round(1e9 * self._cell.cell.cycles.run_s(self.seen))).as_document()
         del view["q"], view["units"]
+        for node in view["nodes"]:
+            read = self._cell.cell.readings.values.get(node["node_id"], {})
+            node |= {name: read.get(name) for name in ("voltage_v", "temperature_c")}
         return view | {"joints": self._joint_values(target), "touch": array_values(self._cell, self.imaged)}
 
     def _joint_values(self, target: Floats | None) -> list[dict[str, Any]]:

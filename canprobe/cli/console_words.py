@@ -50,11 +50,12 @@ class Words:
     ) -> None:
         self._session, self._typed, self._show = session, typed, show
         self._text, self._line, self._line_ns = b"", "", 0
+        questions, errands = session.questions, session.errands
         self._actions: dict[str, Callable[..., object]] = {
             **{name: partial(self._show, "nothing was asked") for name in ("yes", "no")},
             **{"jog": self._jog, "step": self._step, "speed": self._speed, "frame": self._frame},
-            **{"move": session.move, "teach": session.teach, "home": self._home, "tare": session.tare},
-            **{"enable": session.ready, "disable": session.disable, "reset": session.reset, "stop": session.stop},
+            **{"move": session.motions.move, "teach": errands.teach, "home": self._home, "tare": errands.tare},
+            **{"enable": questions.enable, "disable": session.disable, "reset": questions.reset, "stop": session.stop},
             **{"where": session.where, "help": self._help, "quit": session.end},
         }
 
@@ -69,12 +70,12 @@ class Words:
             self._session.end()
 
     def _do(self, line: str) -> None:
-        session = self._session
+        questions, motions = self._session.questions, self._session.motions
         if line in ("", "renew"):
-            return session.renew(goes_on=not line)
+            return motions.renew(goes_on=not line)
         name, *given = line.split()
-        asked, session.asked = session.asked, None
-        session.forget_pause()
+        asked, questions.asked = questions.asked, None
+        motions.forget_pause()
         repeated = line == self._line and self._now_ns - self._line_ns <= 1e9 * LIFETIME_S
         self._line, self._line_ns = line, self._now_ns
         if (form := _FORMS.get(name)) is None:
@@ -95,25 +96,25 @@ class Words:
     def _jog(self, which: str, sign: str, *, repeated: bool) -> None:
         if sign not in ("+", "-"):
             raise UsageError(f"jog {which} {sign}: expected + or -")
-        self._session.jog(which, 1 if sign == "+" else -1, repeated=repeated)
+        self._session.motions.jog(which, 1 if sign == "+" else -1, repeated=repeated)
 
     def _step(self, size: str) -> None:
         if size not in STEPS:
             raise UsageError(f"step {size}: expected one of {', '.join(STEPS)}")
-        self._session.step = float(size)
+        self._session.motions.step = float(size)
 
     def _speed(self, text: str) -> None:
-        self._session.speed = share(text)
+        self._session.motions.speed = share(text)
 
     def _frame(self, frame: str) -> None:
         if frame not in ("base", "probe"):
             raise UsageError(f"frame {frame}: expected base or probe")
-        self._session.in_probe_frame = frame == "probe"
+        self._session.motions.in_probe_frame = frame == "probe"
 
     def _home(self, number: str) -> None:
         if not number.isdecimal():
             raise UsageError(f"home {number}: expected the number of a joint")
-        self._session.home(int(number))
+        self._session.errands.home(int(number))
 
     def _help(self) -> None:
         self._show("\n".join(f"{form:<12} {what}" for form, what in COMMANDS.items()))

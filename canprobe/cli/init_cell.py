@@ -79,6 +79,7 @@ def urdf_cell(args: argparse.Namespace) -> str:
     text += "[arm]\n" + f'urdf = "{args.urdf.name}"\n'
     text += "".join(f'{key} = "{link}"\n' for key, link in (("base", args.base), ("tip", args.tip)) if link)
     text += "mount_mm = [0, 0, 0] # where the arm's base stands; the scene's coordinates count from there\n"
+    text += 'when_disabled = "unknown" # what the arm does without power: "brakes" hold it, or it "sinks"\n'
     text += (
         f"flange_deg = {list(flange_deg)} # turns the frame of the tip: the probe stands along its z"
         f" axis, which is now the tip's {_axis_name(turned)}\n"

@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     with opened(args) as cell:
         found = cell.way_to(_goal(args, cell), args.speed)
         print(described(cell.plan, found, args.speed))
+        args.report.say(f"{cell.plan.setup.needed_arm().left_alone}; they are at the end")
         if args.dry_run or not agreed(args, cell, "move?"):
             args.report.say("nothing was moved")
             return 0
@@ -144,7 +145,7 @@ def described(plan: Plan, found: HandWay, speed: float) -> str:
     places = ", ".join(f"{1e3 * value:.0f}" for value in tip)
     slowed = f"; {found.slowed_by}" if found.slowed_by else ""
     head = f"the way: {duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
-    return "\n".join([head, *lines, f"  the probe's tip comes to {places} mm"])
+    return "\n".join([head, *lines, f"  {plan.setup.probe.tip} comes to {places} mm"])
 
 
 def standing(plan: Plan, measurement: Measurement) -> str:

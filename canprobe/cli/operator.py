@@ -7,7 +7,7 @@ import sys
 
 from canprobe.cell.tasks.joint_check import Answer, SeenWay
 from canprobe.cli.output import say
-from canprobe.cli.stdin import typed
+from canprobe.fieldbus.bus.system import system
 
 _CHOICES = {False: "Enter or y: yes, n: no, q: end", True: "a number, Enter or y: just so, n: otherwise, q: end"}
 """The choices of a question, by whether it asks for a way."""
@@ -28,6 +28,7 @@ class LetterKey:
         self._letter = letter
         self._descriptor = sys.stdin.fileno() if sys.stdin.isatty() else None
         self._left = 0
+        self.pressed()  # what was typed before
 
     def pressed(self) -> bool:
         """Whether a line of this letter was typed since the last look. Called in each cycle."""
@@ -35,7 +36,7 @@ class LetterKey:
         if self._descriptor is None or self._left > 0:
             return False
         self._left = _LOOK_EVERY
-        lines, is_open = typed(self._descriptor)
+        lines, is_open = system.typed(self._descriptor)
         if not is_open:
             self._descriptor = None
         return self._letter in (line.strip().lower() for line in lines.decode(errors="replace").splitlines())
@@ -82,6 +83,6 @@ class TerminalOperator:
 
     def _read(self) -> bool:
         """Read the available text; False at the end of the file."""
-        text, is_open = typed(self._descriptor)
+        text, is_open = system.typed(self._descriptor)
         self._text += text
         return is_open or bool(self._text)

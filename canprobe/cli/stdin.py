@@ -1,15 +1,15 @@
-"""Stdin of a command: somebody who answers, lines that were typed, or a pipe whose end ends a motion. Nothing waits."""
+"""Stdin of a command: somebody who answers, or a pipe whose end ends a motion."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import select
 import stat
 import sys
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns
+from canprobe.fieldbus.bus.system import system
 
 LOOK_S = 0.02
 """Time between two looks at the terminal, s."""
@@ -29,20 +29,6 @@ def need_terminal(yes: bool, asks: str) -> None:
         raise UsageError(f"{asks} and needs a terminal; --yes leaves that out")
 
 
-def typed(descriptor: int) -> tuple[bytes, bool]:
-    """What can be read from a terminal or pipe without waiting, and whether it is still open."""
-    found = b""
-    while select.select([descriptor], [], [], 0)[0]:
-        try:
-            data = os.read(descriptor, 4096)
-        except OSError:  # EIO: the terminal has been closed
-            data = b""
-        if not data:
-            return found, False
-        found += data
-    return found, True
-
-
 class InputOpen:
     """Whether stdin is open, for a script whose end ends its motion.
 
@@ -56,11 +42,11 @@ class InputOpen:
         with contextlib.suppress(OSError):  # no stdin at all
             self._descriptor = sys.stdin.fileno()
             mode = os.fstat(self._descriptor).st_mode
-            self.watched = (stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)) and typed(self._descriptor)[1]
+            self.watched = (stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)) and system.typed(self._descriptor)[1]
 
     def __call__(self) -> bool:
         if self.watched and (now_ns := elapsed_ns()) >= self._look_ns:
             self._look_ns = now_ns + round(1e9 * LOOK_S)
-            self.watched = typed(self._descriptor)[1]
+            self.watched = system.typed(self._descriptor)[1]
             return self.watched
         return True

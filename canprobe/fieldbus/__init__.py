@@ -29,10 +29,9 @@ is seen. Start reading at `protocol.frames`, then `bus.port`, then `node.slave_n
 
 from __future__ import annotations
 
-import importlib
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from canprobe.errors import door
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.bus.candump import CandumpWriter as CandumpWriter
@@ -51,26 +50,6 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.eds.packaged import load_eds as load_eds
     from canprobe.fieldbus.node.serve import serve as serve
     from canprobe.fieldbus.node.slave_node import SlaveNode as SlaveNode
-
-
-def door(
-    package: str, modules: Mapping[str, Sequence[str]]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package here whose names are imported on first use (PEP 562).
-
-    Args:
-        package: the package.
-        modules: names by the module that has them, below `canprobe.fieldbus`.
-    """
-    module_of = {name: module for module, names in modules.items() for name in names}
-
-    def load(name: str) -> Any:
-        if name not in module_of:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{__name__}.{module_of[name]}"), name)
-
-    return load, lambda: sorted({*vars(sys.modules[package]), *module_of}), [*module_of]
-
 
 __getattr__, __dir__, __all__ = door(
     __name__,

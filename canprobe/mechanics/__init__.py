@@ -24,8 +24,9 @@ contact.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from canprobe.errors import door
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.mechanics.robot.chain import Chain as Chain
@@ -43,25 +44,15 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.mechanics.touch import fit_surface as fit_surface
     from canprobe.mechanics.touch import make_object as make_object
 
-_NAMES = {
-    "robot.chain": ("Chain", "forward"),
-    "robot.denavit_hartenberg": ("from_dh",),
-    "robot.model": ("ArmModel", "Joint"),
-    "touch": (
-        *("ContactSample", "Prior", "SurfaceEstimate", "SurfaceMap", "SurfaceMatrix"),
-        *("cramer_rao", "fit_map", "fit_surface", "make_object"),
-    ),
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names}
-__all__ = [*_MODULES]  # noqa: PLE0604 - they are strings
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562)."""
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+__getattr__, __dir__, __all__ = door(
+    __name__,
+    {
+        "robot.chain": ("Chain", "forward"),
+        "robot.denavit_hartenberg": ("from_dh",),
+        "robot.model": ("ArmModel", "Joint"),
+        "touch": (
+            *("ContactSample", "Prior", "SurfaceEstimate", "SurfaceMap", "SurfaceMatrix"),
+            *("cramer_rao", "fit_map", "fit_surface", "make_object"),
+        ),
+    },
+)

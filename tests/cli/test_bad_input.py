@@ -78,13 +78,13 @@ def test_a_complaint_of_a_process_is_one_line_and_a_status(tmp_path):
     process = start(tmp_path, "run", "cylindre")
     out, err = process.communicate()
     assert (process.returncode, out) == (2, "")
-    assert err.startswith("canprobe: cylindre: no such scene or file") and err.count("\n") == 1
+    assert err.startswith("canprobe: cylindre: no such scene, cell or file") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", ["run", "plan", "up", "emulate"])
 def test_unknown_scene(command, tmp_path):
     (line,) = lines_of(tmp_path, 2, command, "cylindre")
-    assert line.startswith("canprobe: cylindre: no such scene or file; did you mean cylinder?")
+    assert line.startswith("canprobe: cylindre: no such scene, cell or file; did you mean cylinder?")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -97,7 +97,7 @@ def test_a_folder_in_the_place_of_a_scene_is_told_with_the_files_in_it(tmp_path)
 
 def test_view_says_that_a_folder_was_possible_too(tmp_path):
     (line,) = lines_of(tmp_path, 2, "view", "nope", "--no-open")
-    assert "no such scene or file" in line and line.endswith("nor is there a folder of a run of that name")
+    assert "no such scene, cell or file" in line and line.endswith("nor is there a folder of a run of that name")
     (line,) = lines_of(tmp_path, 2, "view", "press", "--set", "task.forc_n=3")
     assert "folder" not in line
 

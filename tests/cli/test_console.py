@@ -4,21 +4,26 @@ import asyncio
 import json
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
 import sys
+import urllib.request
 
 import numpy as np
 import pytest
+from makes import write_eds
 
 import canprobe
+from canprobe.cell.master.readings import READ_EVERY_NS
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.tasks.guided_arm import LIFETIME_S
-from canprobe.cli import stdin
 from canprobe.cli.console_words import Words
 from canprobe.cli.hand_session import HandSession
-from canprobe.errors import UsageError
+from canprobe.errors import PlanError, UsageError
+from canprobe.fieldbus.bus.system import system
+from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 READY = [70.0, 65.0, 10.0, 0.0, 100.0, 0.0]
@@ -216,7 +221,7 @@ def test_a_contact_stops_a_jog_and_a_typed_yes_alone_goes_on():
 @pytest.mark.parametrize("fault", ["sto", "drive-fault"])
 def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault):
     """An emergency stop shows as a drive's state, and lasts; a fault is reset as the drives are enabled."""
-    typist = Typist()
+    typist = Typist(**{"arm.when_disabled": "sinks"})
     faulty = typist.cell.session.buses.world.make_faulty()
 
     def script():
@@ -228,9 +233,12 @@ def test_a_drive_that_stops_by_itself_is_a_stop_and_no_key_alone_clears_it(fault
         yield "yes"  # it does not come to that
         yield from typist.wait(0.5, every=0.02)
         assert typist.states[-1]["state"] == "stopped" and typist.heard("stopped: node 2")
-        assert not typist.heard("tared")
+        assert not typist.heard("tared") and (fault == "sto") == bool(typist.heard("as with STO or an emergency stop"))
         yield "reset"
         yield from typist.wait(0.2)
+        assert len(typist.heard("when its drives are disabled, it sinks: hold it")) == 3, (
+            "at the first yes, tare, reset"
+        )
         assert typist.states[-1]["state"] == "stopped" and "may the arm move again?" in typist.states[-1]["asks"]
         yield "yes"
         yield from typist.wait(3.0)
@@ -335,6 +343,17 @@ def test_a_closed_terminal_ends_the_session_with_the_drives_disabled():
     assert process.returncode == 0
 
 
+@pytest.mark.slow(reason="a browser's page takes seconds to come up")
+def test_the_view_is_beside_the_console():
+    process = start("--json", "--view", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    said = ""
+    while "http" not in said:
+        said = json.loads(process.stdout.readline()).get("says", "")
+    with urllib.request.urlopen(said.removeprefix("bridge view: ")) as page:
+        assert page.status == 200
+    assert not process.communicate(b"quit\n", timeout=60)[1] and process.returncode == 0
+
+
 def test_nobody_has_to_read_what_a_session_prints():
     process = start("--json", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     process.stdin.write(b"help\n" * 50 + b"enable\nyes\n")
@@ -380,6 +399,105 @@ def test_what_cannot_be_is_one_clear_line():
         Typist("listen")
 
 
+def without_home_offset(folder):
+    path = folder / "no_607c.eds"
+    path.write_text(eds_path("puma260_joint.eds").read_text().replace("607C", "5FFC"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("cell", "make"),
+    [
+        ("gantry", None),
+        ("seven-axis", None),
+        ("prbt", None),  # interpolated position every 10 ms, units of 1/1000 degree
+        ("puma260", "milliseconds_only"),  # as EPOS4: no 1006h, no 1019h
+        ("puma260", "interpolated"),
+        ("puma260", "fixed_mapping"),
+        ("puma260", "bare"),
+        ("puma260", without_home_offset),
+    ],
+)
+def test_other_arms_and_drives_are_jogged_and_moved_in_the_same_way(cell, make, tmp_path):
+    keys = {}
+    if make is not None:
+        eds = make(tmp_path) if callable(make) else write_eds(make, tmp_path)
+        keys = {"arm.eds": str(eds), "cycle.rate_hz": 200.0, "sensor.rate_hz": 100.0}
+    typist, seen = Typist(cell, **keys), {}
+    joints = typist.cell.plan.setup.arm.model.joints
+
+    def q():
+        return np.array([its.shown(value) for its, value in zip(joints, typist.session.view.seen.q, strict=True)])
+
+    def stepped(line):
+        yield line
+        yield from typist.wait(0.2, every=0.02)
+        while typist.states[-1]["state"] == "moves":
+            yield "renew"
+
+    def script():
+        yield from typist.enabled()
+        seen["start"] = q()
+        yield from stepped("jog 2 +")
+        seen["step"] = q()
+        before = typist.cell.probe(typist.session.view.seen.q)[0]
+        yield from stepped("jog z +")
+        seen["way"] = typist.cell.probe(typist.session.view.seen.q)[0][:3, 3] - before[:3, 3]
+        yield "jog 1 -"
+        yield from typist.wait(0.5, every=0.03, line="jog 1 -")
+        last = typist.t_s
+        while typist.states[-1]["state"] != "holds":
+            yield None
+        assert typist.t_s - last <= LIFETIME_S
+        yield "move start"
+        yield from typist.wait(0.5)
+        yield "yes"
+        while not typist.heard("the arm stands at"):
+            yield "renew"
+        yield "quit"
+
+    typist.run(script())
+    step = seen["step"] - seen["start"]
+    np.testing.assert_allclose(step, np.eye(len(joints))[1], atol=0.03)
+    np.testing.assert_allclose(1e3 * seen["way"], [0, 0, 1], atol=0.1)
+    np.testing.assert_allclose(q(), seen["start"], atol=0.03)
+    assert not powered(typist.cell)
+
+
+def test_a_drive_without_a_cyclic_mode_is_refused_by_the_plan(tmp_path):
+    with pytest.raises(PlanError, match="6502h"):
+        Typist(**{"arm.eds": str(write_eds("no_cyclic_mode", tmp_path))})
+
+
+def test_voltage_and_temperature_are_read_beside_the_cycle(tmp_path):
+    """A drive has 6079h and an entry of its maker's; the others have the latter not: that is said, and asked once."""
+    text = eds_path("puma260_joint.eds").read_text()
+    count = int(re.search(r"\[OptionalObjects\]\s+SupportedObjects=(\d+)", text)[1])
+    listed = f"SupportedObjects={count + 1}\n{count + 1}=0x6079"
+    text = text.replace(f"[OptionalObjects]\nSupportedObjects={count}", f"[OptionalObjects]\n{listed}")
+    text += "\n[6079]\nParameterName=DC link circuit voltage\nDataType=0x0007\nAccessType=ro\nDefaultValue=48100\n"
+    (tmp_path / "drive.eds").write_text(text)
+    keys = {"arm.temperature_object": "6079h:00", "arm.temperature_unit_c": 0.001}
+    typist = Typist(**keys, **{"joints.joint_2.eds": str(tmp_path / "drive.eds")})
+
+    def script():
+        yield from typist.wait(0.5)
+        yield from typist.enabled()
+        yield from typist.wait(4.0, every=0.04, line="jog 1 -")
+        yield "quit"
+
+    frames = []
+    typist.session.view.observe = lambda seen: frames.extend(seen.frames)
+    typist.run(script())
+    node = next(node for node in typist.states[-1]["nodes"] if node["node_id"] == 2)
+    assert (node["voltage_v"], node["temperature_c"]) == (48.1, 48.1)
+    assert len(typist.heard("6079h:00 is not in puma260_joint.eds; it is not read again")) == 5
+    asked = [i for i, (can_id, data, _) in enumerate(frames) if can_id == 0x602 and data[:3] == b"\x40\x79\x60"]
+    assert len(asked) > 10 and min(np.diff([frames[i][2] for i in asked])) >= READ_EVERY_NS
+    in_cycle = [can_id for i in asked for can_id in [c for c, _, _ in frames[:i] if c in (0x80, 0x201)][-1:]]
+    assert set(in_cycle[2:]) == {0x201}, "behind the commands of a cycle"
+
+
 class Cell:
     """The cell behind a screen: what the screen writes can be read, and it shows what is said."""
 
@@ -392,7 +510,7 @@ class Cell:
         self._says.write(json.dumps(document).encode() + b"\n")
 
     def typed(self):
-        return stdin.typed(self._typed.fileno())[0].decode().splitlines()
+        return system.typed(self._typed.fileno())[0].decode().splitlines()
 
     def wait(self):
         return 7

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from canprobe.cell.scene.load import packaged_files
@@ -32,8 +33,22 @@ def test_a_dry_run_shows_the_way_and_moves_nothing(capsys):
     out = told(capsys, "move", "puma260", "-90,65,15,0,100,0", "--dry-run").out
     assert "joint 1: 90.00 to -90.00 deg (-180.00)" in out and "the way: 8.7 s at 10 % of the speed limits" in out
     assert "the arm stands at" not in out
+    err = told(capsys, "move", "puma260", "start", "--dry-run", "--set", "arm.when_disabled=brakes").err
+    assert "when its drives are disabled, its brakes hold it; they are at the end" in err
     words = ("move", "puma260", "--joint", 2, "--by", "-5deg", "--speed", "50%", "--dry-run")
     assert "joint 2: 65.00 to 60.00 deg (-5.00)" in told(capsys, *words).out
+
+
+def test_an_arm_without_a_probe_ends_in_its_flange(mine, capsys):
+    carries = told(capsys, "move", "free", "90,65,16,0,100,0", "--dry-run").out
+    mine.write_text(re.sub(r"\[sensor\]\n.*\n\n\[probe\]\n", "", mine.read_text()))
+    bare = told(capsys, "move", mine, "90,65,16,0,100,0", "--dry-run").out
+    places = [re.search(rf"{name} comes to (.*) mm", out)[1] for name, out in (("flange", bare), ("tip", carries))]
+    flange, tip = (np.array(place.split(", "), dtype=float) for place in places)
+    assert np.linalg.norm(tip - flange) == pytest.approx(120.0, abs=1.0)
+    limit = ("--set", f"limits.workspace_min_mm=[-999, -999, {flange[2] + 1:g}]")
+    err = told(capsys, "move", mine, "90,65,16,0,100,0", "--dry-run", *limit, status=2).err
+    assert f"the flange at z = {flange[2]:.0f}." in err or f"the flange at z = {flange[2] - 1:.0f}." in err
 
 
 def test_a_move_in_millimetres(capsys):

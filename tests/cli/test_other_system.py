@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -17,12 +18,17 @@ IMITATION = Path(__file__).parents[1] / "support" / "other_system"
 FAULT = "this is a fault of canprobe itself"
 
 
-def typed(folder: Path, *words: str, program: tuple[str, ...] = ("-m", "canprobe")) -> tuple[int, str]:
-    """Status and output of a command on the imitated system."""
+def environment() -> dict[str, str]:
+    """Environment of a process on the imitated system."""
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(IMITATION), *sys.path]), "PYTHONIOENCODING": "cp1252"}
     env.pop("PYTEST_VERSION", None)
+    return env
+
+
+def typed(folder: Path, *words: str, program: tuple[str, ...] = ("-m", "canprobe")) -> tuple[int, str]:
+    """Status and output of a command on the imitated system."""
     done = subprocess.run(
-        [sys.executable, *program, *words], cwd=folder, env=env, capture_output=True, check=False, timeout=120
+        [sys.executable, *program, *words], cwd=folder, env=environment(), capture_output=True, check=False, timeout=120
     )
     return done.returncode, (done.stdout + done.stderr).decode("cp1252")
 
@@ -91,6 +97,59 @@ def test_what_is_missing_is_named(folder):
     for says, answer in zip(MISSING, answers.splitlines(), strict=True):
         status, said = json.loads(answer)
         assert status in (2, 3) and says in said and FAULT not in said
+
+
+class Console:
+    """`canprobe console` on the imitated system, with pipes."""
+
+    def __init__(self, *words: str) -> None:
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        command = [sys.executable, "-m", "canprobe", "console", "puma260", *words]
+        self.process = subprocess.Popen(command, env=environment(), **pipes)
+
+    def type(self, line: str) -> None:
+        self.process.stdin.write(line.encode() + b"\n")
+        self.process.stdin.flush()
+
+    def until(self, word: str) -> str:
+        """The line with this word, which the console prints."""
+        for line in self.process.stdout:
+            if word.encode() in line:
+                return line.decode()
+        pytest.fail(f"no {word}: {self.process.stderr.read().decode()}")
+
+    def moves(self) -> None:
+        """Let joint 1 move."""
+        self.type("enable")
+        self.until("[yes, no]")
+        self.type("yes")
+        self.until('"state":"holds"')
+        self.type("jog 1 +")
+        self.until('"state":"moves"')
+
+
+@pytest.mark.parametrize(("ends", "status"), [("quit", 0), ("input", 0), ("break", 143)])
+def test_a_console_needs_no_posix(ends, status):
+    """It ends by a word, by the end of its input, and by CTRL_BREAK, which stands for SIGWINCH in the imitation."""
+    console = Console("--json")
+    console.moves()
+    if ends == "quit":
+        console.type("quit")
+    elif ends == "break":
+        console.process.send_signal(signal.SIGWINCH)
+    out, errors = console.process.communicate(timeout=60)
+    assert (console.process.returncode, errors) == (status, b"")
+    assert json.loads(out.splitlines()[-1]) == {"says": "stop and disable the drives"}
+
+
+def test_a_console_that_nobody_reads_does_what_is_typed_and_ends():
+    """Its answers are more than a pipe holds."""
+    console = Console("--json")
+    for line in (*["help"] * 100, "enable", "yes", "jog 1 +", "quit"):
+        console.type(line)
+    assert console.process.wait(timeout=60) == 0
+    out, errors = console.process.communicate()
+    assert out.count(b"print this list") < 100 and not errors
 
 
 def test_a_plan_says_what_its_system_cannot_do(folder):

@@ -14,7 +14,7 @@ SYNCS = "".join(f"({k // 400:010d}.{k % 400 * 2500:06d}) can0 080#\n" for k in r
         ({}, [], "no bus.log in this folder"),
         ({"bus.log": SYNCS}, [], "no scene.toml in this folder: name the scene (--scene)"),
         ({"bus.log": SYNCS, "scene.toml": "[scen]\n"}, [], "scene.toml: scen: unknown section; did you mean scene?"),
-        ({"bus.log": SYNCS}, ["--scene", "cylindr"], "cylindr: no such scene or file; did you mean cylinder?"),
+        ({"bus.log": SYNCS}, ["--scene", "cylindr"], "cylindr: no such scene, cell or file; did you mean cylinder?"),
         ({"bus.log": SYNCS}, ["--scene", "press"], "scene press: task press estimates no shape"),
         ({"bus.log": SYNCS}, ["--scene", "cylinder", "--method", "recursiv"], 'did you mean "recursive"?'),
         ({"bus.log": SYNCS}, ["--scene", "cylinder"], "node 1 (joint 1) was never heard: no TPDO 181h"),

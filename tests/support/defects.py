@@ -16,8 +16,8 @@ from makes import Entry, Make, eds_text, pdo, word
 
 from canprobe.fieldbus.bus.virtual.lockstep import ALL_IDS
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.node.wrapped import WrappedNode
 from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.tools.faults import FaultyNode
 
 MS = 1_000_000
 REQUEST, ANSWER = 0x605, 0x585
@@ -28,7 +28,7 @@ class Changed(NamedTuple):
     text: str
 
 
-class DefectiveNode(WrappedNode):
+class DefectiveNode(FaultyNode):
     """The node and its defect.
 
     Attributes:
@@ -44,7 +44,7 @@ class DefectiveNode(WrappedNode):
         self.before: tuple[int, str] = (0, "")
         self._heard = self.before
         self.count = self.t_ns = self.starts = 0
-        self._later: list[tuple[int, Frame]] = []
+        self._delayed: list[tuple[int, Frame]] = []
 
     @property
     def listens(self) -> Any:
@@ -52,14 +52,14 @@ class DefectiveNode(WrappedNode):
 
     @property
     def next_deadline_ns(self) -> int | None:
-        due = [t for t in (self.node.next_deadline_ns, self._later[0][0] if self._later else None) if t is not None]
+        due = [t for t in (self.node.next_deadline_ns, self._delayed[0][0] if self._delayed else None) if t is not None]
         return min(due, default=None)
 
     def number(self, index: int, subindex: int = 0) -> int:
         return self.node.dictionary.number(index, subindex)
 
     def later(self, after_ms: float, can_id: int, text: str) -> None:
-        heapq.heappush(self._later, (self.t_ns + round(after_ms * MS), (can_id, bytes.fromhex(text))))
+        heapq.heappush(self._delayed, (self.t_ns + round(after_ms * MS), (can_id, bytes.fromhex(text))))
 
     def take(self, can_id: int, text: str) -> list[tuple[int, str]]:
         """Let the node take a frame; what it answers."""
@@ -67,7 +67,7 @@ class DefectiveNode(WrappedNode):
 
     def start(self, t_ns: int) -> list[Frame]:
         self.t_ns, self.starts = t_ns, self.starts + 1
-        return self._said(self.node.start(t_ns))
+        return self._changed(self.node.start(t_ns))
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         self.t_ns = t_ns
@@ -78,18 +78,18 @@ class DefectiveNode(WrappedNode):
             can_id, data = heard.can_id, bytes.fromhex(heard.text)
         elif heard is not None:
             return [(answer_id, bytes.fromhex(text)) for answer_id, text in heard]
-        return self._said(self.node.receive(can_id, data, t_ns))
+        return self._changed(self.node.receive(can_id, data, t_ns))
 
     def advance(self, t_ns: int) -> list[Frame]:
         self.t_ns = t_ns
         self.last = (0, "")
         out = list(self.node.advance(t_ns)) if (self.node.next_deadline_ns or t_ns + 1) <= t_ns else []
-        out = self._said(out)
-        while self._later and self._later[0][0] <= t_ns:
-            out.append(heapq.heappop(self._later)[1])
+        out = self._changed(out)
+        while self._delayed and self._delayed[0][0] <= t_ns:
+            out.append(heapq.heappop(self._delayed)[1])
         return out
 
-    def _said(self, frames: Any) -> list[Frame]:
+    def _changed(self, frames: Any) -> list[Frame]:
         if self._say is None:
             return list(frames)
         return [

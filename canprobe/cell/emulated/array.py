@@ -23,7 +23,7 @@ from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Array
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.eds.packaged import WINDOW_SIZE, WINDOW_SIZE_NAME
+from canprobe.fieldbus.eds.packaged import WINDOW_SIZE
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.slave_node import Application, SlaveNode
@@ -196,7 +196,7 @@ class TactileApplication(Application):
         node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
         node.dictionary.on_change(self._read_settings, MODE, THRESHOLD, GAIN, FULL_SCALE_PA)
         self._content = {mode: _members(node.dictionary, index) for mode, index in _CONTENT.items()}
-        self._sized = node.dictionary.has_named(WINDOW_SIZE, WINDOW_SIZE_NAME)
+        self._sized = node.dictionary.has_known(WINDOW_SIZE)
         if self._sized:
             node.dictionary.on_check(WINDOW_SIZE, self._check_window)
             node.dictionary.on_write(WINDOW_SIZE, self._begin_window)

@@ -26,7 +26,7 @@ from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.drive.from_eds import set_serial_number
 from canprobe.fieldbus.drive.units import Delivery
-from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_full_scale, load_eds
+from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_known, load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
@@ -238,7 +238,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
     else:
         assert setup.array is not None
         node = SlaveNode(dictionary, node_id, TactileApplication(plant, pad=setup.array.pad), od_of=od_of)
-        if has_full_scale(dictionary):
+        if has_known(dictionary, FULL_SCALE):
             node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.pad.full_scale_pa))
     serial = planned.identity.serial_number
     set_serial_number(node, planned.node_id if serial is None else serial)

@@ -20,6 +20,7 @@ from canprobe.cell.master.homing import Homing
 from canprobe.cell.master.lift_off import lift_off
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
+from canprobe.cell.master.readings import Readings
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.master.supervision import Condition, CycleState, Finding, Reaction, limits_of
 from canprobe.cell.master.watch import NodeWatch
@@ -63,6 +64,7 @@ class Cell:
         cycles: the supervised cycle, which has `log`, `tactile_log` and `notes`.
         cycle: the cycle on the bus; None before bring-up is done.
         homing: homing of the drives without an absolute encoder; None where there are none.
+        readings: voltages and temperatures of the drives, for who serves them.
         bring_up: the steps of bring-up.
         found: the nodes as a check found them; None of another cell.
         stopped_by: condition that stopped the cell; None where something else did.
@@ -97,6 +99,7 @@ class Cell:
         self.cycle: Cycle | None = None
         self._plan, self._options, self._say = plan, options, self.cycles.say
         self._network = PumpedNetwork(port, other=self._other)
+        self.readings = Readings(self._network, plan)
         self._make_cycle = direct or Cycle
         setups = plan.configurations if direct is None else ()  # without setups, bring-up only takes its time
         settings, check = setup.bring_up, options.to_check

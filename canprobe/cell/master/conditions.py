@@ -133,8 +133,10 @@ def _drive_fault(seen: CycleState) -> NodeError | None:
         return None
     i, instead = drives.first_not_in(DriveState.OPERATION_ENABLED)
     node_id = drives.axes[i].node_id
-    words = seen.watch.last_words(node_id)
-    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {instead}{words}{_held_up(seen)}")
+    words = seen.watch.last_words(node_id) + _held_up(seen)
+    if not words and instead == DriveState.SWITCH_ON_DISABLED.name:
+        words = "; it gave no reason, as with STO or an emergency stop"
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {instead}{words}")
 
 
 def _held_up(seen: CycleState) -> str:

@@ -31,8 +31,6 @@ from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.types import Floats
 
-SYNCHRONOUS_MAX = 240
-"""Highest transmission type that follows SYNC; above it an RPDO is sent on change and repeated at intervals."""
 COMMAND_REPEAT_NS = 100_000_000
 _FEEDBACK: tuple[Place, ...] = ((0x6041, 0), (0x6064, 0), (0x6077, 0))
 _TARGETS = frozenset(TARGETS.values())
@@ -338,7 +336,7 @@ class DriveTargets:
         self._plan = [
             (
                 cob_id,
-                parts[0][1].transmission_type <= SYNCHRONOUS_MAX,  # in every cycle, else on change
+                parts[0][1].synchronous,  # in every cycle, else on change
                 [layout.pack for _, layout in parts],
                 [_fetcher(self._places_of(axes[i], i, layout)) for i, layout in parts],
                 tuple(i for i, _ in parts),

@@ -17,8 +17,7 @@ from itertools import pairwise
 import numpy as np
 
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.model import ArmModel, units_per_motor
 
 LAGS = 4.0
 """Stated lags before which a drive may have begun a motion: with 1.5 times the lag it has then followed to 97 %."""

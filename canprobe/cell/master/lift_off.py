@@ -26,9 +26,8 @@ from canprobe.cell.planning.model import Plan
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
-from canprobe.mechanics.robot.inverse_step import lifting_step
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.inverse import lifting_step
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
 from canprobe.mechanics.types import Floats
 
 REST_S = 0.05
@@ -107,7 +106,7 @@ class LiftOff:
         self._retrace: Retrace | None = None
         self._begun = False
         booted = any(watch.states.get(axis.node_id) is NmtState.INITIALISING for axis in drives.axes)
-        self._all_there = not booted and not any(ages)
+        self._all_there = not booted and not any(ages) and not drives.targets.beyond_lag()
 
     @property
     def possible(self) -> bool:
@@ -133,7 +132,7 @@ class LiftOff:
             supervisor.begin_way_back()
             self._retrace = self._trail.back(measurement.q, self._step_max) if self._trail is not None else None
         retrace = self._retrace
-        # a drive that is silent or has booted stands where it lost its power: the others do not go on without it
+        # a drive that is silent, has booted or does not follow stands: the others do not go on without it
         targets = self._drives.targets.aimed if self._all_there else joints_to_units(self._model, measurement.q)
         q = self._way.step(measurement.q, targets) if retrace is None else retrace.step(self._period_s)
         if q is None:

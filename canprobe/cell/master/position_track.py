@@ -6,8 +6,7 @@ from math import copysign
 
 import numpy as np
 
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.model import ArmModel, units_per_motor
 
 REST_NS = 12_500_000
 """Time without a motion after which a drive is at rest."""

@@ -11,8 +11,7 @@ from collections import deque
 import numpy as np
 
 from canprobe.cell.master.controller import Measurement
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.model import ArmModel, units_per_motor
 from canprobe.mechanics.robot.tool_push import PushGeometry, TorqueMean, push_since
 from canprobe.mechanics.types import Floats
 

@@ -39,14 +39,14 @@ class GuardedTarget:
     limit: str | None = None
 
 
-def outside_workspace(tip: Floats, workspace: Floats) -> str | None:
-    """A message that the tip, at a position (3,), m, is outside of a box (2, 3), m; None where it is inside."""
+def outside_workspace(tip: Floats, workspace: Floats, name: str = "the probe's tip") -> str | None:
+    """A message that a tip of this name, at a position (3,), m, is outside of a box (2, 3), m; None inside."""
     below, above = tip < workspace[0], tip > workspace[1]
     if not (below | above).any():
         return None
     axis = int(np.flatnonzero(below | above)[0])
     border = workspace[int(above[axis]), axis]
-    return f"the probe's tip at {'xyz'[axis]} = {1e3 * tip[axis]:.1f} mm, workspace ends at {1e3 * border:.1f} mm"
+    return f"{name} at {'xyz'[axis]} = {1e3 * tip[axis]:.1f} mm, workspace ends at {1e3 * border:.1f} mm"
 
 
 class JointGuard:
@@ -72,7 +72,7 @@ class JointGuard:
         self._si = "angles, rad" if slides == {False} else "positions, m" if slides == {True} else "positions, rad or m"
         self.slowed = 0
         self.model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
-        self.T_flange_tip = probe.T_flange_probe.copy()
+        self._tip, self.T_flange_tip = probe.tip, probe.T_flange_probe.copy()
         self.T_flange_tip[:3, 3] += probe.radius * self.T_flange_tip[:3, 2]
         # plain floats: a handful is compared before numpy has begun
         self._speed: list[float] = (model.qd_max * safety.speed_share).tolist()
@@ -87,8 +87,10 @@ class JointGuard:
         return forward(self.model.chain, q) @ self.T_flange_tip
 
     def outside(self, q: Floats) -> str | None:
-        """A message that the probe's tip is outside of the workspace at joint positions (n,), rad or m; None inside."""
-        return None if self._workspace is None else outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace)
+        """A message that the tip is outside of the workspace at joint positions (n,), rad or m; None inside."""
+        if self._workspace is None:
+            return None
+        return outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace, self._tip)
 
     def measure(self, measurement: Measurement) -> str | None:
         """A motion since the last cycle that no joint can make; None without one, or where nothing new is known."""

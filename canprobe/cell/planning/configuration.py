@@ -45,14 +45,12 @@ from canprobe.fieldbus.eds.packaged import (
     LONG_PDOS,
     MISSED_SYNCS,
     WINDOW_SIZE,
-    has_full_scale,
-    has_long_pdos,
-    has_missed_syncs,
-    has_window_size,
+    has_known,
 )
 from canprobe.fieldbus.eds.values import name_of
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
+from canprobe.fieldbus.protocol.pdo import MAX_SYNC_TYPE
 from canprobe.fieldbus.protocol.si_unit import ACCELERATION_UNIT_INDEX, VELOCITY_UNIT_INDEX
 from canprobe.fieldbus.protocol.tactile import TactileMode
 from canprobe.mechanics.robot.model import coupled_joints, drive_position_at, joints_to_units
@@ -128,7 +126,7 @@ def _possible(device: DeviceCapabilities, writes: Iterable[Write]) -> tuple[list
 def _excluded(device: DeviceCapabilities, write: Write) -> str | None:
     """Why a device cannot take a write; empty where the entry always holds the value, None where it can."""
     entry = device.description.entry(write.index, write.subindex)
-    if entry is None or (write.purpose == _MISSED_SYNCS and not has_missed_syncs(device.od)):
+    if entry is None or (write.purpose == _MISSED_SYNCS and not has_known(device.od, MISSED_SYNCS)):
         return "no such object"
     if not entry.is_integer:
         return f"its data type is {name_of(entry.data_type)}, not an integer"
@@ -148,7 +146,7 @@ def _ends(entry: DescribedEntry) -> str:
 
 def _pdo_writes(plan: Plan, node: PlannedNode, device: DeviceCapabilities) -> list[Write]:
     writes = []
-    if has_long_pdos(device.od):
+    if has_known(device.od, LONG_PDOS):
         long = any(pdo.layout.length > CLASSIC_BYTES for pdo in plan.pdos_of(node.node_id, "tpdo"))
         writes.append(Write(LONG_PDOS, 0, int(long), "PDOs of up to 64 bytes"))
     for direction, number in node.switched_off:
@@ -174,7 +172,7 @@ def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> list[Write]:
     if pdo.event_timer_ms:
         absence = "the device does not notice that its controlword stays away"
         writes.append(Write(communication, 5, pdo.event_timer_ms, f"event timer of {name}", absence))
-    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= 240 and device.has(communication, 6):
+    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= MAX_SYNC_TYPE and device.has(communication, 6):
         writes.append(Write(communication, 6, SYNC_START_VALUE, f"first SYNC of {name}"))
     if device.capacity(pdo.direction, pdo.number):
         entries = enumerate(pdo.entries, start=1)
@@ -301,7 +299,7 @@ def _array_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
     array = plan.setup.array
     assert array is not None
     writes = [Write(0x2000, 0, TactileMode[array.mode.upper()], "what the array sends")]
-    if array.mode == "window" and has_window_size(device.od):
+    if array.mode == "window" and has_known(device.od, WINDOW_SIZE):
         writes.append(Write(WINDOW_SIZE, 0, int(array.window), "taxels along the window"))
     if plan.setup.tares:
         writes.append(Write(TARE_COMMAND, 0, TARE, "tare", read_back=False))
@@ -326,7 +324,7 @@ def _array_given(plan: Plan, dictionary: Any) -> tuple[FixedEntry, ...]:
     """The full scale that the array must hold: with another one the force would be wrong by their ratio."""
     array = plan.setup.array
     assert array is not None
-    if not has_full_scale(dictionary):
+    if not has_known(dictionary, FULL_SCALE):
         return ()
     pascals = round(array.pad.full_scale_pa)
     key = "sensor.full_scale_kpa"

@@ -37,7 +37,7 @@ from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
 from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
-from canprobe.mechanics.robot.motors import position_per_unit
+from canprobe.mechanics.robot.model import position_per_unit
 from canprobe.mechanics.touch.depth_witness import CERTAIN_SIGMAS, SUSPECT_S, sigma_ahead
 from canprobe.mechanics.touch.image.force_creep import decades_after, late_decades_after
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma, upper_end

@@ -21,7 +21,7 @@ from canprobe.cell.planning.model import (
     PlannedFrames,
     PlannedPdo,
 )
-from canprobe.cell.planning.traffic import SYNC_BITS, SYNC_BITS_LEAST, SYNCHRONOUS, on_the_wire
+from canprobe.cell.planning.traffic import SYNC_BITS, SYNC_BITS_LEAST, on_the_wire
 from canprobe.cell.planning.wire_time import exact_frame_bits, unstuffed_frame_bits
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS, worst_case_bits
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
@@ -219,7 +219,7 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
     shortest_ns = SYNC_BITS_LEAST * 1_000_000_000 // plan.setup.bus.bitrate
     found = [Expected(SYNC_ID, "SYNC", plan.sync.rate_hz, SYNC_BITS), Expected(NMT_ID, "NMT")]
     for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.node_id in bus.node_ids]):
-        triggered = pdo.transmission_type <= SYNCHRONOUS
+        triggered = pdo.layout.synchronous
         latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
         found.append(Expected(pdo.cob_id, _kind(pdo), pdo.rate_hz, pdo.bits_worst, latest))
     raw: dict[int, list[PlannedFrames]] = {}
@@ -240,7 +240,7 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
 
 
 def _kind(pdo: PlannedPdo) -> Kind:
-    if pdo.transmission_type > SYNCHRONOUS:
+    if not pdo.layout.synchronous:
         return "event PDO"
     if pdo.kind == "tactile":
         return "tactile PDO"

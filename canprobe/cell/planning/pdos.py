@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
 from canprobe.cell.planning.sync import TARGETS, Place, choose_mode
-from canprobe.cell.planning.traffic import SYNCHRONOUS
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
-from canprobe.fieldbus.eds.packaged import has_long_pdos, has_window_size
+from canprobe.fieldbus.eds.packaged import LONG_PDOS, WINDOW_SIZE, has_known
 from canprobe.fieldbus.protocol.frames import is_restricted
-from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, PdoEntry, PdoLayout
+from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, MAX_SYNC_TYPE, PdoEntry, PdoLayout
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW, image_words, window_words
 
 STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
@@ -295,11 +294,11 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
         cob_id = device.fixed_cob_id("tpdo", number)
         communication = COMMUNICATION["tpdo"] + number - 1
         kind = device.number(communication, 2) or EVERY_SYNC
-        if cob_id is None or number in used or SYNCHRONOUS < kind < ON_EVENT - 1:
+        if cob_id is None or number in used or MAX_SYNC_TYPE < kind < ON_EVENT - 1:
             continue
         entries = tuple(map(device.mapped_entry, device.fixed_mapping("tpdo", number)))
         inhibit_100us = device.number(communication, 3) or 0
-        on_event = kind > SYNCHRONOUS
+        on_event = kind > MAX_SYNC_TYPE
         rate = sync.rate_hz / kind
         if on_event:
             seldom = all(entry.index in STATES for entry in entries)
@@ -317,11 +316,11 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
     if array is None or array.raw is not None:
         return
     device = planning.devices[array.node_id]
-    long = fd and has_long_pdos(device.od)
+    long = fd and has_known(device.od, LONG_PDOS)
     if fd and not long:
         why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
         planning.not_available.append(("CAN FD frames from the sensor", why))
-    if array.mode == "window" and not has_window_size(device.od):
+    if array.mode == "window" and not has_known(device.od, WINDOW_SIZE):
         why = f"{device.eds} has no window size (2008h), so the window keeps {DEFAULT_WINDOW}×{DEFAULT_WINDOW} taxels"
         planning.not_available.append(("another window", why))
         if array.window != DEFAULT_WINDOW:

@@ -13,7 +13,7 @@ from heapq import heappop, heappush
 from typing import Literal
 
 from canprobe.cell.planning.model import Plan, PlannedBus, PlannedPdo
-from canprobe.cell.planning.traffic import SYNC_BITS, SYNCHRONOUS, on_the_wire, wire_ns
+from canprobe.cell.planning.traffic import SYNC_BITS, on_the_wire, wire_ns
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 
 Part = Literal["SYNC", "feedback", "controller", "command", "tactile", "other"]
@@ -49,7 +49,7 @@ def timeline(plan: Plan) -> tuple[Slot, ...]:
     Returns:
         Frames and controller by start; the last ones may end behind the last cycle.
     """
-    cyclic = [pdo for pdo in plan.pdos if pdo.transmission_type <= SYNCHRONOUS]
+    cyclic = [pdo for pdo in plan.pdos if pdo.layout.synchronous]
     cycles = max((pdo.transmission_type for pdo in cyclic), default=1)
     period, compute = plan.sync.period_ns, plan.traffic.budget.compute_ns
     starts: list[int | None] = [None] * cycles

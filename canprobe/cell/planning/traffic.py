@@ -40,8 +40,6 @@ from canprobe.fieldbus.protocol.response_times import (
 
 FIRST_LOOK, LAST_LOOK = 0.25, 0.6
 """Shares of the period at which the cell looks for TPDOs besides the planned time; after the last one they are late."""
-SYNCHRONOUS = 240
-"""The highest transmission type that SYNC triggers (CiA 301)."""
 MAX_ROUNDS = 20
 """Most rounds of the analysis; where times still change after them there is no bound."""
 _SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
@@ -176,7 +174,7 @@ def _messages(
     cyclic: dict[str, list[Message]] = {"feedback": [], "commands": [], "other": []}
     strangers, feedback_bits = [], SYNC_BITS_LEAST
     for pdo in wire:
-        triggered = pdo.transmission_type <= SYNCHRONOUS
+        triggered = pdo.layout.synchronous
         message = Message(
             f"{pdo.direction.upper()} {pdo.cob_id:03X}h",
             pdo.cob_id,
@@ -315,7 +313,7 @@ def _last(analyses: Sequence[BusAnalysis], messages: Sequence[Message]) -> int |
 
 def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterator[Demand]:
     """Demand of the frames that one SYNC releases, and of those for which a tactile frame waits."""
-    cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
+    cyclic = [pdo for pdo in wire if pdo.layout.synchronous]
     drives = SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
     tactile = [pdo for pdo in cyclic if pdo.kind == "tactile"]
     what = "SYNC and drive PDOs" if drives > SYNC_BITS else "SYNC"

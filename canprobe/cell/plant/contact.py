@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, pi, sin, sqrt
+from math import cos, inf, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +21,7 @@ from canprobe.cell.plant.elastic_contact import (
 from canprobe.cell.plant.pressure import Directions, Vec, pad_basis, pad_coordinates
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
-from canprobe.mechanics.robot.model import units_to_joints
-from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.model import joints_per_motor, units_to_joints
 from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, TouchedPlaces
 from canprobe.mechanics.types import Floats
 
@@ -177,7 +176,7 @@ class ContactSolver:
 
     def __init__(self, config: PlantConfig) -> None:
         model, self._config = config.model, config
-        self._tightest = (MIN_CURVATURE_SHARE - 1.0) / config.radius_m
+        self._tightest = -inf if config.object is None else (MIN_CURVATURE_SHARE - 1.0) / config.radius_m
         self._base: Vec = tuple(config.base_offset_m.tolist())
         self._chain: Chain | None = None
         self._shares: list[list[tuple[int, float]]] = []

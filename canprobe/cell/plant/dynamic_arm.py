@@ -20,8 +20,7 @@ from canprobe.cell.plant.integrators import STEPS
 from canprobe.cell.plant.pushing import Neighbourhood, Rubbing
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units
-from canprobe.mechanics.robot.motors import joints_per_motor, units_per_motor
+from canprobe.mechanics.robot.model import ArmModel, joints_per_motor, joints_to_units, units_per_motor
 from canprobe.mechanics.types import Floats
 
 

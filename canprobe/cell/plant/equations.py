@@ -25,8 +25,7 @@ from canprobe.cell.plant.integrators import Linearised
 from canprobe.cell.plant.pushing import HeldContact
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.mechanics.robot.dynamics import RigidBody
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.model import ArmModel, joints_per_motor
 from canprobe.mechanics.types import Floats
 
 

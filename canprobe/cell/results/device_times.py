@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, Plan, PlannedNode
-from canprobe.cell.planning.traffic import SYNCHRONOUS
 from canprobe.errors import UsageError
 from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS
 from canprobe.fieldbus.tools.conform.points.timing import HEARTBEAT_TIME, SDO_TIME, SYNC_TIME
@@ -105,7 +104,7 @@ def _rows(node: PlannedNode, report: Report, plan: Plan) -> list[DeviceTime]:
     deadlines = [
         pdo.deadline_ns * 1e-6
         for pdo in plan.pdos
-        if pdo.node_id == node.node_id and pdo.direction == "tpdo" and pdo.transmission_type <= SYNCHRONOUS
+        if pdo.node_id == node.node_id and pdo.direction == "tpdo" and pdo.layout.synchronous
     ]
     if (times := report.distributions.get(SYNC_TIME, ())) and deadlines:
         rows.append(DeviceTime(node.node_id, SYNC_TIME, max(times), min(deadlines), len(times)))

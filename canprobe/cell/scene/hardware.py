@@ -15,6 +15,7 @@ from canprobe.cell.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Ra
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
 Convention = Literal["standard", "modified"]
+WhenDisabled = Literal["unknown", "brakes", "sinks"]
 TactileModeName = Literal["window", "image", "features", "auto"]
 CobIds = Literal["default", "by_deadline", "auto"]
 Fidelity = Literal["ideal", "dynamic"]
@@ -25,8 +26,6 @@ Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as i
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 
-DIRECT = "direct"
-"""The interface that is no bus."""
 MM = 1e-3
 """A millimetre in metres."""
 REVOLUTE_ONLY = Only("kind", ("revolute",))
@@ -76,12 +75,12 @@ class BusSettings:
     @property
     def direct(self) -> bool:
         """There is no bus."""
-        return self.interface == DIRECT
+        return self.interface == "direct"
 
     @property
     def virtual(self) -> bool:
         """Time is virtual, and no node is real."""
-        return self.interface in ("lockstep", DIRECT)
+        return self.interface in ("lockstep", "direct")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +141,13 @@ class ArmSettings:
     """Put two targets into one RPDO by dummy mapping."""
     torque: bool = True
     """Map the motor torque (6077h) into the TPDO of each drive, where the drive has it and the bus has room for it."""
+    when_disabled: WhenDisabled = "unknown"
+    """What the arm does when its drives are disabled: its brakes hold it, or it sinks. It is said before a person
+    lets it move by hand."""
+    temperature_object: Annotated[str | None, Pattern(r"[0-9A-Fa-f]{4}h(:[0-9A-Fa-f]{2})?", "such as 3201h:01")] = None
+    """Entry of the drives that has their temperature, as their manual names it, for `canprobe console`."""
+    temperature_unit_c: Annotated[float, Range(0, 100, open_low=True)] = 1.0
+    """Unit of `temperature_object`, °C."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -274,8 +274,7 @@ def find_file(name: str, *kinds: str) -> tuple[Path, str]:
 
     Args:
         name: name or path.
-        kinds: kinds of file that it may be: ``scene``, ``cell``, ``array``, ``calibration``; the first one is that of
-            messages.
+        kinds: kinds of file that it may be: ``scene``, ``cell``, ``array``, ``calibration``; of a folder the first one.
 
     Returns:
         Path of the file, and its name in messages.
@@ -293,12 +292,10 @@ def find_file(name: str, *kinds: str) -> tuple[Path, str]:
     for kind in kinds:
         if (plugin := find_plugin(kind, name)) is not None:
             return plugin.path(), name
-    packaged, others = [*packaged_files(f"{kinds[0]}s")], [plugin.name for plugin in plugins(kinds[0])]
-    hint = did_you_mean(name, packaged + others)
-    of_others = f"; of other packages: {', '.join(others)}" if others else ""
-    raise SceneError(
-        [f"{name}: no such {kinds[0]} or file{hint}; packaged {kinds[0]}s: {', '.join(packaged)}{of_others}"]
-    )
+    known = {kind: [*packaged_files(f"{kind}s"), *(plugin.name for plugin in plugins(kind))] for kind in kinds}
+    hint = did_you_mean(name, [one for names in known.values() for one in names])
+    listed = "; ".join(f"{kind}s: {', '.join(names)}" for kind, names in known.items())
+    raise SceneError([f"{name}: no such {', '.join(kinds)} or file{hint}; {listed}"])
 
 
 def scenes_folder() -> Path:

@@ -60,6 +60,7 @@ Posture = tuple[float, ...]
 TOUCH_KINDS: tuple[TaskKind, ...] = ("scan", "press", "calibrate")
 """Tasks that touch an object."""
 TOUCH_ONLY = Only("kind", TOUCH_KINDS)
+MOVING_ONLY = Only("kind", (*TOUCH_KINDS, "free"))
 SCAN_ONLY = Only("kind", ("scan",))
 CALIBRATE_ONLY = Only("kind", ("calibrate",))
 FREE_ONLY = Only("kind", ("free",))
@@ -279,6 +280,8 @@ class TaskSettings:
     """Kind of task."""
     duration_s: Annotated[float, Range(0, 86_400, open_low=True)] = 20.0
     """Length of the scan, press, listen or free phase."""
+    start_posture: Annotated[str | None, MOVING_ONLY] = None
+    """Name of the posture in `[postures]` that is the start, in the place of the joints' `start_deg` and `start_mm`."""
     force_n: Annotated[float, Range(0, 20, open_low=True), TOUCH_ONLY] = 2.0
     """Target of the contact force."""
     approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCH_ONLY] = 4.0
@@ -361,9 +364,9 @@ class LimitSettings:
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0
     """Share of the cycles of the last second that may be late by half a period. 100: no limit."""
     workspace_min_mm: Vec3 | None = None
-    """Lowest coordinates of the tip of the probe in the base frame. Left out: no limit."""
+    """Lowest coordinates of the tip of the probe, or of a flange without one, in the base frame. Left out: no limit."""
     workspace_max_mm: Vec3 | None = None
-    """Highest coordinates of the tip of the probe in the base frame. Left out: no limit."""
+    """Highest coordinates of the same in the base frame. Left out: no limit."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint, posture_in_si
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, refuse_narrow, scan_axes, true_object
-from canprobe.cell.scene.hardware import MM, EmulateSettings
+from canprobe.cell.scene.hardware import MM, EmulateSettings, KeepOutSettings
 from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -89,7 +89,8 @@ def resolve(scene: Scene) -> Setup:
         T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
         radius = FLAT_RADIUS_M
     stiffness = array.calibration.image.stiffness if array is not None else LAYER_STIFFNESS
-    probe = Probe(T, radius, stiffness, settings.mass_kg)
+    bare = scene.probe is None and scene.sensor is None
+    probe = Probe(np.eye(4), 0.0, stiffness, 0.0) if bare else Probe(T, radius, stiffness, settings.mass_kg)
     return Setup(
         scene=scene,
         saved=saved,
@@ -102,7 +103,7 @@ def resolve(scene: Scene) -> Setup:
         rate_hz=scene.cycle.rate_hz,
         realtime=scene.cycle.realtime,
         compute_ns=round(scene.cycle.compute_us * 1000),
-        limits=_limits(scene.limits, arm, _keep_out(scene, settings)),
+        limits=_limits(scene.limits, arm, _keep_out(scene.keep_out, None if bare else settings)),
         bring_up=scene.bring_up,
         bridge=scene.bridge or BridgeSettings(),
         arm=arm,
@@ -136,10 +137,16 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
         )
         for number, ((node_id, emulated), joint) in enumerate(each, start=1)
     )
-    q_start = per_joint(joints, "start")
-    postures = {START: q_start} | {name: posture_in_si(joints, posture) for name, posture in scene.postures.items()}
+    named = {name: posture_in_si(joints, posture) for name, posture in scene.postures.items()}
+    q_start = per_joint(joints, "start") if scene.task.start_posture is None else named[scene.task.start_posture]
+    postures = {START: q_start} | named
     waits, grouped, torque = settings.missed_syncs, settings.grouped_rpdo, settings.torque
-    return Arm(model, drives, q_start, waits, grouped, torque, warnings, postures), bodies
+    temperature = None
+    if settings.temperature_object is not None:
+        index, _, subindex = settings.temperature_object.partition("h:")
+        temperature = int(index, 16), int(subindex or "0", 16), settings.temperature_unit_c
+    arm = Arm(model, drives, q_start, waits, grouped, torque, warnings, postures, temperature, settings.when_disabled)
+    return arm, bodies
 
 
 def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:
@@ -243,14 +250,13 @@ def _frame(text: str) -> Frame:
     return int(can_id, 16), bytes.fromhex(data)
 
 
-def _keep_out(scene: Scene, probe: ProbeSettings) -> KeepOut | None:
-    settings = scene.keep_out
+def _keep_out(settings: KeepOutSettings | None, probe: ProbeSettings | None) -> KeepOut | None:
     if settings is None or (settings.floor_mm is None and not settings.boxes_mm):
         return None
     floor = -math.inf if settings.floor_mm is None else settings.floor_mm * MM
     boxes = np.array(settings.boxes_mm, dtype=float).reshape(-1, 2, 3) * MM
     radius = settings.link_radius_mm * MM
-    if scene.probe is None and scene.sensor is None:
+    if probe is None:
         return KeepOut(floor, boxes, radius, np.zeros(3), radius)
     return KeepOut(floor, boxes, radius, T_flange_probe(probe)[:3, 3], probe.radius_mm * MM)
 

@@ -49,7 +49,7 @@ _BESIDES = {
     "free": {
         "arm": ("must", "free motion moves the arm"),
         "wire": ("may", ""),
-        "probe": ("may", ""),
+        "probe": ("mounted", ""),
         "object": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
         "servo": ("never", "there is no touch to control"),
@@ -58,7 +58,8 @@ _BESIDES = {
 SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
     task: {**_USUALLY, "joints": besides["arm"], **besides} for task, besides in _BESIDES.items()
 }
-"""For each task and section (need, why). Need: "must" be given, "default" when left out, "may" be given, "never"."""
+"""For each task and section (need, why). Need: "must" be given, "default" when left out, "may" be given, "never", and
+"mounted": there where the cell has it."""
 
 START = "start"
 """Name of the posture that the joints' start keys describe."""
@@ -92,6 +93,13 @@ def _posture_of_other_joints(joints: Mapping[str, JointSettings], postures: Mapp
             yield f"postures.{name}", "it is what the joints have as start_deg or start_mm; choose another name"
         elif joints and len(posture) != len(joints):
             yield f"postures.{name}", f"expected a position of each of the {len(joints)} joints, got {len(posture)}"
+
+
+@_across("task.start_posture", "postures?")
+def _no_such_posture(name: str, postures: Mapping[str, Posture] | None) -> _Complaint:
+    if name not in (postures or {}):
+        known = ", ".join(postures or {}) or "none"
+        yield "task.start_posture", f"expected a posture of [postures] ({known}), got {name}"
 
 
 @_across("joints", "arm.urdf?")

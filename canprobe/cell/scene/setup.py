@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
+from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName, WhenDisabled
 from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
 from canprobe.errors import UsageError
 from canprobe.fieldbus.node.quirks import Quirks
@@ -108,6 +108,8 @@ class Arm:
         torque: the drives send their torque where they can; the plan gives it up where the bus has no room for it.
         warnings: values of its URDF that are hardly meant.
         postures: (n,) rad or m by name, that of the start among them.
+        temperature: entry of the drives' temperature (index, sub-index), and its unit, °C; None: not stated.
+        when_disabled: what it does when its drives are disabled, as the cell file says.
     """
 
     model: ArmModel
@@ -118,6 +120,17 @@ class Arm:
     torque: bool = True
     warnings: tuple[str, ...] = ()
     postures: Mapping[str, Floats] = field(default_factory=dict)
+    temperature: tuple[int, int, float] | None = None
+    when_disabled: WhenDisabled = "unknown"
+
+    @property
+    def left_alone(self) -> str:
+        """What it does when its drives are disabled, in words."""
+        return {
+            "brakes": "when its drives are disabled, its brakes hold it",
+            "sinks": "when its drives are disabled, it sinks: hold it",
+            "unknown": "whether it sinks when its drives are disabled is not stated (arm.when_disabled)",
+        }[self.when_disabled]
 
     @property
     def node_ids(self) -> tuple[int, ...]:
@@ -188,11 +201,11 @@ class Array(Node):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Probe:
-    """The sphere that carries the array, with its elastic layer.
+    """The sphere that carries the array, with its elastic layer; the middle of the flange where the arm carries none.
 
     Attributes:
         T_flange_probe: (4, 4) of its centre on the flange; z is the pole.
-        radius: radius of the sphere, m.
+        radius: radius of the sphere, m; 0 without a probe.
         stiffness: stiffness K/h of the layer, N/m³.
         mass: mass of the probe, kg.
     """
@@ -201,6 +214,11 @@ class Probe:
     radius: float
     stiffness: float
     mass: float
+
+    @property
+    def tip(self) -> str:
+        """What the arm ends in, in words."""
+        return "the probe's tip" if self.radius > 0.0 else "the flange"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,12 +18,12 @@ from canprobe.cell.master.options import RunOptions, quiet
 from canprobe.cell.planning.measured import TrafficMeter
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.wire_time import exact_frame_bits, unstuffed_frame_bits
-from canprobe.cell.scene.hardware import DIRECT, BusSettings
+from canprobe.cell.scene.hardware import BusSettings
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.cell.session.folder import KeptFiles, prepare_folder
 from canprobe.cell.session.links import check_links, data_bitrate, expected_of
-from canprobe.cell.session.target import LOCKSTEP
+from canprobe.cell.session.target import DIRECT, LOCKSTEP
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
 from canprobe.fieldbus.bus.clock import Clock, MonotonicClock, VirtualClock

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from canprobe.cell.scene.hardware import DIRECT
 from canprobe.cell.session.links import ExpectedLink, check_links, need_controllers
 from canprobe.errors import BusError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from canprobe.cell.master.options import Say
     from canprobe.cell.scene.model import Scene
 
-LOCKSTEP = "lockstep"
+LOCKSTEP, DIRECT = "lockstep", "direct"
 VIRTUAL = (LOCKSTEP, DIRECT)
 """Interfaces in this process, in virtual time."""
 

@@ -23,18 +23,11 @@ go. A task reads its setup (`canprobe.cell.scene.setup`) and nothing of a scene.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from canprobe.cell.tasks.trajectory import Trajectory
+from canprobe.errors import door
 
-__all__ = ["Trajectory"]
+if TYPE_CHECKING:  # for type checkers, which do not read the table
+    from canprobe.cell.tasks.trajectory import Trajectory as Trajectory
 
-
-def __getattr__(name: str) -> Any:
-    """Import the public name on first use (PEP 562): no task imports another one."""
-    if name != "Trajectory":
-        raise AttributeError(f"module 'canprobe.cell.tasks' has no attribute {name!r}")
-    from canprobe.cell.tasks.trajectory import Trajectory
-
-    return Trajectory
+__getattr__, __dir__, __all__ = door(__name__, {"tasks.trajectory": ("Trajectory",)})  # no task imports another one

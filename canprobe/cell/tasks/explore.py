@@ -23,7 +23,7 @@ from canprobe.cell.tasks.touch import RAMP_S, SEARCH_SPEED, Search, TouchTask
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
 from canprobe.mechanics.touch.explore.ground import UNKNOWN_M, GroundCells
-from canprobe.mechanics.touch.explore.spacing import LaneForecast
+from canprobe.mechanics.touch.explore.lanes import LaneForecast
 from canprobe.mechanics.touch.explore.stretches import STEP_M
 from canprobe.mechanics.touch.map.cells import STATED_STIFFNESS_SIGMA
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA

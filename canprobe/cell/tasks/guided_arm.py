@@ -11,12 +11,20 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import lag_s
 from canprobe.cell.tasks.hand_motion import HandMotion
 from canprobe.cell.tasks.hand_way import HandWay
+from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.port import nothing
 from canprobe.mechanics.types import Floats
 
 LIFETIME_S = 0.15
 """Time from the last renewal of a motion until the arm stands, s."""
+RENEWED_S = 0.02
+"""Time in which a screen renews a motion."""
 SETTLE_LAGS = 3.0
 """Time from the last motion of the targets until the joints stand, in lags of the drives."""
+USUAL_LAG_S = 6.8e-3
+"""Lag of real drives for which nothing is stated, s, as `servo.drive_lag_ms` has it by default."""
+CYCLES = 3
+"""Cycles from a renewal to the one that takes it, to the one of the last target, and to the SYNC that brings that."""
 
 
 class GuidedArm(Controller):
@@ -25,6 +33,7 @@ class GuidedArm(Controller):
     Args:
         plan: plan of a cell with an arm.
         attend: called in each cycle before the motion goes on, such as to take what a person asks for.
+        update: called in each cycle once its commands are on the bus.
 
     Attributes:
         target: joint positions (n,), rad or m, that the drives have; None before they are enabled.
@@ -34,9 +43,16 @@ class GuidedArm(Controller):
         stop_reason: why it is stopped at once; None where it is not.
     """
 
-    def __init__(self, plan: Plan, attend: Callable[[Measurement], None]) -> None:
-        self._plan, self._attend = plan, attend
-        self.reader, self._settle_ns = make_patch_reader(plan.setup), round(1e9 * SETTLE_LAGS * lag_s(plan.setup))
+    def __init__(self, plan: Plan, attend: Callable[[Measurement], None], update: Callable[[], None] = nothing) -> None:
+        self._plan, self._attend, self._update = plan, attend, update
+        self.reader = make_patch_reader(plan.setup)
+        settle_ns = round(1e9 * SETTLE_LAGS * (lag_s(plan.setup) or USUAL_LAG_S))
+        self._standing_ns = settle_ns + CYCLES * plan.sync.period_ns
+        if 1e-9 * self._standing_ns + RENEWED_S >= LIFETIME_S:
+            raise UsageError(
+                f"at cycle.rate_hz = {plan.setup.rate_hz:g} and with this lag of the drives the arm cannot stand within"
+                f" {1e3 * LIFETIME_S:.0f} ms: expected a higher rate; `canprobe move` goes by this one"
+            )
         self._now_ns = self._renewed_ns = 0
         self.target: Floats | None = None
         self.motion: HandMotion | None = None
@@ -72,8 +88,11 @@ class GuidedArm(Controller):
         self.target, self.moves = command.q_target, not command.done
         return replace(command, done=False)
 
+    def update(self) -> None:
+        self._update()
+
     def _wanted(self) -> bool:
         """Whether the motion is renewed so recently that it comes to rest in time, if it brakes in the next cycle."""
         assert self.motion is not None
-        stop_ns = round(1e9 * self.motion.stop_s) + self._settle_ns + self._plan.sync.period_ns
+        stop_ns = round(1e9 * self.motion.stop_s) + self._standing_ns
         return not self.leaves and self._now_ns + stop_ns < self._renewed_ns + round(1e9 * LIFETIME_S)

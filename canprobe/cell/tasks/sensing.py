@@ -14,8 +14,7 @@ from canprobe.cell.master.array import PatchReader
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.mechanics.robot.chain import ending_in, forward
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.robot.motors import position_sigma
+from canprobe.mechanics.robot.model import ArmModel, position_sigma
 from canprobe.mechanics.touch import (
     ContactSample,
     MomentImage,

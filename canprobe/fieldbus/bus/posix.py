@@ -7,7 +7,9 @@ import ctypes
 import fcntl
 import os
 import resource
+import select
 import signal
+import time
 from collections.abc import Iterator
 from subprocess import Popen
 from typing import IO, Any
@@ -17,11 +19,32 @@ END_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGKILL)  # SIGINT is ignor
 KILL = signal.SIGKILL
 OWN_SESSION: dict[str, Any] = {"start_new_session": True}
 NON_BLOCKING_PIPES = True
+monotonic_ns = time.monotonic_ns
 _PR_SET_PDEATHSIG = 1
+_WRITTEN = 2048
+"""Bytes that a stream takes at once where it takes any."""
 
 
 def lock(file: IO[Any]) -> None:
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def typed(descriptor: int) -> tuple[bytes, bool]:
+    found = b""
+    while select.select([descriptor], [], [], 0)[0]:
+        try:
+            data = os.read(descriptor, 4096)
+        except OSError:  # EIO: the terminal has been closed
+            data = b""
+        if not data:
+            return found, False
+        found += data
+    return found, True
+
+
+def write_some(descriptor: int, data: bytes, patience_s: float) -> int:
+    takes = data and select.select([], [descriptor], [], patience_s)[1]
+    return os.write(descriptor, data[:_WRITTEN]) if takes else 0
 
 
 def enlarge_pipe(fd: int, size: int) -> None:

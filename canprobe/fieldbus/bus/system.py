@@ -5,6 +5,10 @@
 - `OWN_SESSION`: arguments of `subprocess.Popen` for a child that Ctrl-C does not reach.
 - `NON_BLOCKING_PIPES`: whether a pipe can be written without waiting.
 - `lock(file)`: lock an open file until it is closed; `BlockingIOError` where another process has it.
+- `monotonic_ns()`: a clock that all processes share, never set, finer than 1 µs.
+- `typed(descriptor)`: what a terminal or pipe has to read, without waiting, and whether more may come.
+- `write_some(descriptor, data, patience_s)`: write as much as a reader takes within that time; how many bytes it took,
+  `OSError` where nobody reads any more.
 - `enlarge_pipe(fd, size)`: ask for a pipe of so many bytes.
 - `interrupts_blocked()`: a block in which SIGINT is not received; processes that it starts never receive one.
 - `end_process(process, number)`, `end_session(process, number)`: send a signal to a child; to all of its session.

@@ -8,9 +8,7 @@ table of states in `protocol.cia402` and runs one mode at a time.
     from_eds                a node from an EDS alone; where the file describes a drive, on an axis without a plant
     parameters              limits, ramps and options, read from the dictionary whenever one is written
     units                   position units of the master ↔ counts of the axis
-    feedback                actual and demand values that the drive reports
-    loop                    torque limit and feed-forwards, given to the plant's position loop
-    self_stop               what makes a drive stop by itself
+    parts                   what the modes share: actual values, the plant's position loop, the watch on the master
     mode                    what all modes share
     cyclic_modes            modes with a target for every SYNC: position, velocity, torque, interpolated position
     profile_position        set-points by handshake, each a trapezoidal move
@@ -26,7 +24,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from canprobe.fieldbus import door
+from canprobe.errors import door
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.drive.drive import make_drive_node as make_drive_node

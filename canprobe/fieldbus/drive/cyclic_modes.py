@@ -6,8 +6,9 @@ mode", "Interpolated position mode".
 
 from __future__ import annotations
 
-from canprobe.fieldbus.drive.mode import REACHED_FLAG, CyclicMode, DriveParts
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, CyclicMode
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
+from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile import torque_run, uniform
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.cia402 import ENABLE_INTERPOLATION_BIT, INTERPOLATION_ACTIVE_BIT, OperationMode

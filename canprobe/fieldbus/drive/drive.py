@@ -16,8 +16,9 @@ from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.drive.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, InterpolatedPosition
 from canprobe.fieldbus.drive.homing import HomingMode
-from canprobe.fieldbus.drive.mode import DriveMode, DriveParts
+from canprobe.fieldbus.drive.mode import DriveMode
 from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS, DriveParameters, check_among
+from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
@@ -25,16 +26,7 @@ from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.fieldbus.protocol import cia402
-from canprobe.fieldbus.protocol.cia402 import (
-    AUTOMATIC_TRANSITIONS,
-    INITIAL_STATE,
-    POWERED_STATES,
-    TRANSITIONS,
-    DriveCommand,
-    DriveState,
-    Event,
-    command_of,
-)
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, Event
 from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE, HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
@@ -81,7 +73,7 @@ class DriveApplication(Application):
         """
         self._axis, self._plant, self._incremental, self._noise = axis, plant, incremental, noise
         self._delivery = delivery
-        self.state = INITIAL_STATE
+        self.state = cia402.INITIAL_STATE
         self._command: DriveCommand | None = None  # the present command
         self._word = 0  # the last controlword
         self._idle_word: int | None = None  # the same, if it had no effect and nothing has happened since
@@ -123,7 +115,7 @@ class DriveApplication(Application):
         for mode in self._modes.values():
             mode.reset()
         self._node.dictionary.put(0x6502, 0, sum(1 << mode - 1 for mode in self._modes if mode))
-        self._word, self._command, self.state = 0, None, INITIAL_STATE
+        self._word, self._command, self.state = 0, None, cia402.INITIAL_STATE
         self._show_mode(self._node.dictionary.number(0x6060))
         self._happen(Event.INITIALISED, t_ns)
 
@@ -164,9 +156,9 @@ class DriveApplication(Application):
 
     def _obey(self, word: int, previous: int, t_ns: int) -> None:
         """Change the state as the controlword commands."""
-        command = command_of(word, previous)
+        command = cia402.command_of(word, previous)
         repeated, self._command = command is self._command, command
-        goal = None if command is None else TRANSITIONS.get((self.state, command))
+        goal = None if command is None else cia402.TRANSITIONS.get((self.state, command))
         resumes = self.state is DriveState.QUICK_STOP_ACTIVE and goal is _ENABLED_STATE
         if goal is None or (resumes and (repeated or self._parameters.quick_stop not in STAYING_QUICK_STOP_OPTIONS)):
             self._idle_word = word
@@ -208,12 +200,12 @@ class DriveApplication(Application):
         self._mode.start(self._word, t_ns)
 
     def _check_not_moving(self, subindex: int, value: Value) -> None:
-        if self.state in POWERED_STATES:
+        if self.state in cia402.POWERED_STATES:
             raise SdoAbort(Abort.DEVICE_STATE)
 
     def _happen(self, event: Event, t_ns: int) -> None:
         """Change the state by an event in the drive."""
-        goal = AUTOMATIC_TRANSITIONS.get((self.state, event))
+        goal = cia402.AUTOMATIC_TRANSITIONS.get((self.state, event))
         if goal is not None:
             self._go(goal, t_ns)
 
@@ -269,7 +261,7 @@ class DriveApplication(Application):
         if option == 1:
             self._find_fault(code, t_ns)
         elif option in _ABORT_COMMANDS:
-            self._go(TRANSITIONS[_ENABLED_STATE, _ABORT_COMMANDS[option]], t_ns)
+            self._go(cia402.TRANSITIONS[_ENABLED_STATE, _ABORT_COMMANDS[option]], t_ns)
 
     def _show(self) -> None:
         """Compose the statusword; a change is an event for the PDOs that carry it."""

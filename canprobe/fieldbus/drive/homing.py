@@ -22,9 +22,9 @@ from enum import Enum, auto
 from functools import partial
 from math import ceil, floor
 
-from canprobe.fieldbus.drive.feedback import NEGATIVE_SWITCH_FLAG, POSITIVE_SWITCH_FLAG
-from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, ProfiledMode
 from canprobe.fieldbus.drive.parameters import check_among
+from canprobe.fieldbus.drive.parts import NEGATIVE_SWITCH_FLAG, POSITIVE_SWITCH_FLAG, DriveParts
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
 from canprobe.fieldbus.node.entry import key_of

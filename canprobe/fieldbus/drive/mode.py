@@ -1,4 +1,4 @@
-"""Base classes of the modes of operation: parts of the drive, halt, and the bits of controlword and statusword.
+"""Base classes of the modes of operation: halt, and the bits of controlword and statusword.
 
 A mode is active between `start` and `leave`, in operation enabled only. A new mode is a class that derives from
 `CyclicMode` if it has a target for every SYNC, or from `ProfiledMode` if it makes its own profile; `modes.MODES` lists
@@ -8,51 +8,16 @@ Source: CiA 402-2, controlword bits 4–6, 8 and 9, statusword bits 10–13, hal
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from canprobe.fieldbus.drive.feedback import DriveFeedback
-from canprobe.fieldbus.drive.loop import DriveLoop
-from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, DriveParameters
-from canprobe.fieldbus.drive.reference import STEP_NS, Motion
-from canprobe.fieldbus.drive.self_stop import Supervision
+from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
+from canprobe.fieldbus.drive.parts import DriveParts
+from canprobe.fieldbus.drive.reference import STEP_NS
 from canprobe.fieldbus.node.entry import Value
-from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE
 
 REACHED_FLAG = 1 << cia402.TARGET_REACHED_BIT
 FOLLOWS_FLAG = 1 << cia402.DRIVE_FOLLOWS_BIT
-
-
-class DriveParts:
-    """The parts of one drive, which its application and its modes share.
-
-    Args:
-        node: node of the drive.
-        motion: reference of the axis.
-        parameters: parameters of the drive.
-        noise: function for the noise of the encoder, counts; None: there is none.
-        fault: function that is called as `fault(code, t_ns)` when a mode has found a fault.
-        on_loss: function that is called as `on_loss(code, t_ns)` when the master counts as lost.
-        show: function that is called when the mode's part of the statusword may have changed.
-    """
-
-    def __init__(
-        self,
-        node: SlaveNode,
-        motion: Motion,
-        parameters: DriveParameters,
-        noise: Callable[[], float] | None,
-        *,
-        fault: Callable[[int, int], None],
-        on_loss: Callable[[int, int], None],
-        show: Callable[[], None],
-    ) -> None:
-        self.node, self.motion, self.parameters, self.fault, self.show = node, motion, parameters, fault, show
-        self.feedback = DriveFeedback(node, motion, parameters.units, noise)
-        self.supervision = Supervision(node, parameters, on_loss)
-        self.loop = DriveLoop(node, motion, parameters)
 
 
 class DriveMode:

@@ -10,7 +10,7 @@ from functools import partial
 from math import inf
 
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery, Units
-from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME, SYNC_FACTOR, SYNC_FACTOR_NAME
+from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, SYNC_FACTOR
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
@@ -56,8 +56,7 @@ class DriveParameters:
     def __init__(self, dictionary: Dictionary, delivery: Delivery) -> None:
         self._dictionary = dictionary
         self._delivered_misses = delivery.misses
-        named = ((MISSED_SYNCS, MISSED_SYNCS_NAME), (SYNC_FACTOR, SYNC_FACTOR_NAME))
-        self._misses = [index for index, name in named if dictionary.has_named(index, name)]
+        self._misses = [index for index in (MISSED_SYNCS, SYNC_FACTOR) if dictionary.has_known(index)]
         self.units = Units(dictionary, delivery)
         self.read()
         dictionary.on_change(self.read, *_INDICES)

@@ -15,17 +15,12 @@ from math import inf
 from typing import NamedTuple
 
 from canprobe.fieldbus.drive.cyclic_modes import POSITION_TARGET_KEY
-from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, ProfiledMode
+from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.protocol.cia402 import (
-    CHANGE_IMMEDIATELY_BIT,
-    NEW_SETPOINT_BIT,
-    RELATIVE_BIT,
-    SETPOINT_ACKNOWLEDGE_BIT,
-    OperationMode,
-)
+from canprobe.fieldbus.protocol import cia402
 
 _PROFILE_SPEED_KEY = key_of(0x6081)
 
@@ -47,7 +42,7 @@ class SetPoint(NamedTuple):
 class ProfilePosition(ProfiledMode):
     """Mode 1."""
 
-    number = OperationMode.PROFILE_POSITION
+    number = cia402.OperationMode.PROFILE_POSITION
     needs = (key_of(0x607A), key_of(0x6081))
 
     def __init__(self, parts: DriveParts) -> None:
@@ -70,18 +65,18 @@ class ProfilePosition(ProfiledMode):
         """Bits for target reached, with halt for standstill, and for set-point acknowledge."""
         acknowledged = self._offered or self._next is not None
         reached = super().status() if self.halted else REACHED_FLAG * self._reached
-        return reached | acknowledged << SETPOINT_ACKNOWLEDGE_BIT
+        return reached | acknowledged << cia402.SETPOINT_ACKNOWLEDGE_BIT
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
         """Take a set-point that is offered, or the end of the offer."""
-        offers = word >> NEW_SETPOINT_BIT & 1
+        offers = word >> cia402.NEW_SETPOINT_BIT & 1
         if not offers:
             self._offered = False
-        elif changed >> NEW_SETPOINT_BIT & 1:
-            at_once = bool(word >> CHANGE_IMMEDIATELY_BIT & 1)
+        elif changed >> cia402.NEW_SETPOINT_BIT & 1:
+            at_once = bool(word >> cia402.CHANGE_IMMEDIATELY_BIT & 1)
             if at_once or self._next is None:
                 self._offered = True
-                point = self._set_point(relative=bool(word >> RELATIVE_BIT & 1))
+                point = self._set_point(relative=bool(word >> cia402.RELATIVE_BIT & 1))
                 if at_once or self._active is None or self._reached:
                     self._next = None
                     self._begin(point, t_ns)

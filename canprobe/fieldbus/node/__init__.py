@@ -20,7 +20,6 @@ Each service of the standard is one module:
     lss                 node ids over the bus, and how a node without one is found
     store, stored_file  stored parameters, in memory and in a file
     quirks              what makes a node difficult
-    wrapped             what stands in a node's place on a lockstep bus
     serve               nodes on a real interface, in real time
 
 An application (`canprobe.fieldbus.drive`) hooks onto entries of the dictionary and gets every SYNC. Invariants: a node
@@ -33,7 +32,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from canprobe.fieldbus import door
+from canprobe.errors import door
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.node.quirks import Quirks as Quirks

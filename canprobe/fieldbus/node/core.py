@@ -12,6 +12,7 @@ from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.timers import Holder, Timers
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, Frame, NmtState, is_restricted
+from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, PDO_OBJECTS, TPDOS, is_mapping
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 Route = Callable[[bytes, int], None]
@@ -65,9 +66,9 @@ def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
 
     for index in quirks.refuse:
         dictionary.on_check(index, partial(refuse, Abort.UNSUPPORTED_ACCESS, None))
-    for index in dictionary.indices_in(range(0x1400, 0x1C00)) if quirks.fixed_mapping else ():
-        dictionary.on_check(index, partial(refuse, Abort.READ_ONLY, None if index & 0x200 else 1))
-    for index in dictionary.indices_in(range(0x1800, 0x1A00)) if quirks.keep_bit30 else ():
+    for index in dictionary.indices_in(PDO_OBJECTS) if quirks.fixed_mapping else ():
+        dictionary.on_check(index, partial(refuse, Abort.READ_ONLY, None if is_mapping(index) else 1))
+    for index in dictionary.indices_in(TPDOS) if quirks.keep_bit30 else ():
         dictionary.on_check(index, partial(keep_bit30, index))
 
 
@@ -116,10 +117,6 @@ class Service:
     def routes(self) -> Mapping[int, Route]:
         """Receivers by CAN-ID, in the present NMT state."""
         return NO_ROUTES
-
-
-NO_RTR_FLAG = 1 << 30
-"""Bit 30 of the COB-ID of a TPDO: a remote request is not answered."""
 
 
 def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.eds.packaged import KNOWN_NAMES
 from canprobe.fieldbus.node.entry import Entry, Value, key_of, read_entries
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
@@ -76,10 +77,10 @@ class Dictionary:
         """Indices in an area, ascending."""
         return sorted(index for index in self._indices if index in area)
 
-    def has_named(self, index: int, name: str) -> bool:
-        """Whether the object at this index has this name; other makers use the index for something else."""
+    def has_known(self, index: int) -> bool:
+        """Whether the device has the object of `KNOWN_NAMES` at this index."""
         entry = self.entries.get(key_of(index))
-        return entry is not None and entry.name == name
+        return entry is not None and entry.name == KNOWN_NAMES[index]
 
     def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """An integer value, or `default` where the EDS has no such entry."""

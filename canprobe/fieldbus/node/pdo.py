@@ -17,7 +17,7 @@ from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.node.rpdo import Rpdo
 from canprobe.fieldbus.node.tpdo import BUFFERED_TYPE, Packing, Sampler, Tpdo
 from canprobe.fieldbus.protocol.frames import Frame, NmtState
-from canprobe.fieldbus.protocol.pdo import PdoLayout
+from canprobe.fieldbus.protocol.pdo import MAX_SYNC_TYPE, RPDOS, TPDOS, PdoLayout
 
 
 class _Group:
@@ -58,10 +58,12 @@ class PdoEngine(Service):
         self._delay_ns = core.quirks.tpdo_delay_ns
         self._late = DelayedFrames(core, self._delay_ns)
         self._count = self._sync_ns = self._window_ns = 0
-        for rules in _discover(core, 0x1400, transmits=False):
+        for index in core.dictionary.indices_in(RPDOS):
+            rules = PdoRules(core.dictionary, index, transmits=False)
             self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
             self._watch(rules, rpdo)
-        for rules in _discover(core, 0x1800, transmits=True):
+        for index in core.dictionary.indices_in(TPDOS):
+            rules = PdoRules(core.dictionary, index, transmits=True)
             self._tpdos.append(tpdo := Tpdo(core, rules))
             self._watch(rules, tpdo)
         core.dictionary.written = self._written
@@ -225,7 +227,7 @@ class PdoEngine(Service):
         counted = bool(dictionary.number(0x1019))
         groups: dict[tuple[int, int], _Group] = {}
         for tpdo in active:
-            if 1 <= tpdo.type <= 240:
+            if 1 <= tpdo.type <= MAX_SYNC_TYPE:
                 key = tpdo.type, tpdo.start if counted else 0
                 groups.setdefault(key, _Group(*key)).tpdos.append(tpdo)
             else:
@@ -240,11 +242,6 @@ class PdoEngine(Service):
     def _samplers_of(self, tpdos: list[Tpdo]) -> list[Sampler]:
         indices = dict.fromkeys(key >> 8 for tpdo in tpdos for key in tpdo.keys)
         return list(dict.fromkeys(self._samplers[index] for index in indices if index in self._samplers))
-
-
-def _discover(core: NodeCore, first: int, transmits: bool) -> list[PdoRules]:
-    indices = range(first, first + 0x200)
-    return [PdoRules(core.dictionary, i, i + 0x200, transmits) for i in indices if core.dictionary.has_index(i)]
 
 
 def _both(first: Route | None, second: Route) -> Route:

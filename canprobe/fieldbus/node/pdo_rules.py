@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from canprobe.fieldbus.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
+from canprobe.fieldbus.eds.packaged import LONG_PDOS
 from canprobe.fieldbus.node.core import check_cob_id
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
-from canprobe.fieldbus.protocol.pdo import MAX_FD_PDO_BITS, MAX_PDO_BITS, PdoEntry
+from canprobe.fieldbus.protocol.pdo import MAX_FD_PDO_BITS, MAX_PDO_BITS, TO_MAPPING, PdoEntry, PdoSub
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
+from canprobe.fieldbus.protocol.sync import MAX_SYNC_COUNT
 
-COB_ID_SUB, TYPE_SUB, INHIBIT_SUB, EVENT_SUB, START_SUB = 1, 2, 3, 5, 6
 _RESERVED_RPDO_TYPES = range(0xF1, 0xFE)
 _RESERVED_TPDO_TYPES = range(0xF1, 0xFC)
 
@@ -26,36 +26,40 @@ class PdoRules:
 
     Attributes:
         dictionary: dictionary of the node.
-        communication, mapping: indices of the two parameter records.
+        communication: index of the communication parameters.
         transmits: whether it is a TPDO; else it is an RPDO.
     """
 
     dictionary: Dictionary
     communication: int
-    mapping: int
     transmits: bool
+
+    @property
+    def mapping(self) -> int:
+        """Index of the mapping parameters."""
+        return self.communication + TO_MAPPING
 
     @property
     def valid(self) -> bool:
         """Whether the PDO exists now: bit 31 of its COB-ID is 0."""
-        return not self.dictionary.number(self.communication, COB_ID_SUB, INVALID_FLAG) & INVALID_FLAG
+        return not self.dictionary.number(self.communication, PdoSub.COB_ID, INVALID_FLAG) & INVALID_FLAG
 
     @property
     def long(self) -> bool:
         """Whether the device has PDOs of up to 64 bytes, and they were switched on."""
         dictionary = self.dictionary
-        return self.transmits and dictionary.has_named(LONG_PDOS, LONG_PDOS_NAME) and bool(dictionary.number(LONG_PDOS))
+        return self.transmits and dictionary.has_known(LONG_PDOS) and bool(dictionary.number(LONG_PDOS))
 
     def check_communication(self, subindex: int, value: Value) -> None:
         """Check a communication parameter. Raises SdoAbort for a value that the standard forbids now."""
         new, old = int(value), self.dictionary.number(self.communication, subindex)
-        if subindex == COB_ID_SUB:
+        if subindex == PdoSub.COB_ID:
             check_cob_id(new, old)
-        elif subindex == TYPE_SUB:
+        elif subindex == PdoSub.TYPE:
             if new in (_RESERVED_TPDO_TYPES if self.transmits else _RESERVED_RPDO_TYPES):
                 raise SdoAbort(Abort.VALUE)
-        elif subindex in (INHIBIT_SUB, START_SUB):
-            too_big = subindex == START_SUB and new > 240
+        elif subindex in (PdoSub.INHIBIT_TIME, PdoSub.SYNC_START):
+            too_big = subindex == PdoSub.SYNC_START and new > MAX_SYNC_COUNT
             if too_big or (self.valid and new != old):
                 raise SdoAbort(Abort.VALUE)
 

@@ -9,9 +9,9 @@ from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.dictionary import Slot
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.node.pdo_rules import COB_ID_SUB, EVENT_SUB, TYPE_SUB, PdoRules
+from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
-from canprobe.fieldbus.protocol.pdo import PdoLayout
+from canprobe.fieldbus.protocol.pdo import PdoLayout, PdoSub
 from canprobe.fieldbus.protocol.sdo import SdoAbort
 
 
@@ -43,13 +43,13 @@ class Rpdo:
         self.stop()
         if self._emcy.any:
             self._forgive()  # the errors of the old parameters
-        self.cob_id = dictionary.number(index, COB_ID_SUB) & 0x7FF if self._rules.valid else None
-        self._layout = PdoLayout(self.cob_id or 0, self._rules.present())
+        self.cob_id = dictionary.number(index, PdoSub.COB_ID) & 0x7FF if self._rules.valid else None
+        self._layout = PdoLayout(self.cob_id or 0, self._rules.present(), dictionary.number(index, PdoSub.TYPE))
         self._unpack = self._layout.raw_unpack  # the length is checked before
         self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
         self._slots = tuple(dictionary.slot(key) for key in self.keys)
-        self.synchronous = dictionary.number(index, TYPE_SUB) <= 240
-        self._event_ns = dictionary.number(index, EVENT_SUB) * 1_000_000
+        self.synchronous = self._layout.synchronous
+        self._event_ns = dictionary.number(index, PdoSub.EVENT_TIMER) * 1_000_000
 
     @property
     def patient(self) -> bool:

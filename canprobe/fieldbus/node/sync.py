@@ -13,6 +13,7 @@ from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
 from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtState, is_restricted
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
+from canprobe.fieldbus.protocol.sync import MAX_SYNC_COUNT
 
 _PRODUCER_FLAG = 1 << 30
 
@@ -77,7 +78,7 @@ class SyncConsumer(Service):
             raise SdoAbort(Abort.VALUE)
 
     def _check_overflow(self, subindex: int, value: Value) -> None:
-        if int(value) == 1 or int(value) > 240:
+        if int(value) == 1 or int(value) > MAX_SYNC_COUNT:
             raise SdoAbort(Abort.VALUE)
         if self._core.dictionary.number(0x1006):
             raise SdoAbort(Abort.DEVICE_STATE)

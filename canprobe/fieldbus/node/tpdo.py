@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any
 
-from canprobe.fieldbus.node.core import NO_RTR_FLAG, NodeCore
+from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.node.pdo_rules import COB_ID_SUB, EVENT_SUB, INHIBIT_SUB, START_SUB, TYPE_SUB, PdoRules
+from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.protocol.frames import RTR_FLAG
-from canprobe.fieldbus.protocol.pdo import PdoLayout
+from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, PdoLayout, PdoSub
 
 BUFFERED_TYPE, ON_REQUEST_TYPE = 252, 253
 
@@ -63,14 +63,14 @@ class Tpdo:
         """Read the parameters. A PDO with an impossible mapping stays silent."""
         number, index, entries = self._core.dictionary.number, self._rules.communication, self._rules.present()
         self.stop()
-        cob_id = number(index, COB_ID_SUB)
+        cob_id = number(index, PdoSub.COB_ID)
         self._cob_id = cob_id & 0x7FF
         self.active = self._rules.valid and bool(entries)
         self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & NO_RTR_FLAG else None
         self.keys = tuple(key_of(entry.index, entry.subindex) for entry in entries)
-        self.type, self.start = number(index, TYPE_SUB), number(index, START_SUB)
-        self._inhibit_ns = number(index, INHIBIT_SUB) * 100_000
-        self._event_ns = number(index, EVENT_SUB) * 1_000_000
+        self.type, self.start = number(index, PdoSub.TYPE), number(index, PdoSub.SYNC_START)
+        self._inhibit_ns = number(index, PdoSub.INHIBIT_TIME) * 100_000
+        self._event_ns = number(index, PdoSub.EVENT_TIMER) * 1_000_000
         if self.active:
             self.layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
             self.packing = self._cob_id, self.layout.raw_pack, _fetcher(self.keys)

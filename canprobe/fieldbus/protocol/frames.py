@@ -42,6 +42,8 @@ _RESTRICTED_RANGES = (
     (0x701, 0x77F),  # NMT error control
     (0x780, 0x7FF),
 )
+RESTRICTED_IDS = sorted({end for ends in _RESTRICTED_RANGES for end in ends})
+"""The first and the last identifier of each restricted range: those to try."""
 
 
 class NmtCommand(IntEnum):

@@ -5,14 +5,34 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 
+RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
+"""Indices of the communication parameters of PDOs; the mapping of each lies `TO_MAPPING` above."""
+TO_MAPPING = 0x200
+PDO_OBJECTS = range(0x1400, 0x1C00)
+"""Indices of the communication and mapping parameters of all PDOs."""
+NO_RTR_FLAG = 1 << 30
+"""Bit 30 of the COB-ID of a TPDO: a remote request is not answered."""
+MAX_SYNC_TYPE = 240
+"""Highest transmission type that goes by SYNC; a TPDO of a type from 1 on is sent at each SYNC of that number."""
 MAX_PDO_BITS = 64
 MAX_FD_PDO_BITS = 512
 """Most bits of a PDO in a CAN FD frame. Source: CiA 1301."""
 _STRUCT_CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
+
+
+class PdoSub(IntEnum):
+    """Sub-indices of the communication parameters. Source: CiA 301, objects 1400h, 1800h."""
+
+    COB_ID = 1
+    TYPE = 2
+    INHIBIT_TIME = 3
+    EVENT_TIMER = 5
+    SYNC_START = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +101,11 @@ class _BitCodec:
         return tuple(((word >> shift & mask) ^ sign) - sign for shift, mask, sign, _ in self._fields)
 
 
+def is_mapping(index: int) -> bool:
+    """Whether an index is that of the mapping parameters of a PDO."""
+    return index in PDO_OBJECTS and bool(index & TO_MAPPING)
+
+
 def _struct_format(entries: tuple[PdoEntry, ...], length: int) -> str | None:
     """The struct format of a byte-aligned mapping, filled up to `length`, or None where bits have to be moved."""
     codes = ["<"]
@@ -144,6 +169,11 @@ class PdoLayout:
         object.__setattr__(self, "length", length)
         object.__setattr__(self, "raw_pack", codec.pack)
         object.__setattr__(self, "raw_unpack", codec.unpack)
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether its content acts, or is sampled, at a SYNC."""
+        return self.transmission_type <= MAX_SYNC_TYPE
 
     @property
     def signals(self) -> tuple[PdoEntry, ...]:

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 
+MAX_SYNC_COUNT = 240
+"""Highest counter of a SYNC. Source: CiA 301, object 1019h."""
+
 
 class SyncCounter:
     """Counts SYNC messages 1, 2, … overflow, 1, … as its producer sends them.
@@ -23,8 +26,8 @@ class SyncCounter:
         Raises:
             ProtocolError: the overflow is not 0 or 2..240.
         """
-        if overflow != 0 and not 2 <= overflow <= 240:
-            raise ProtocolError(f"SYNC counter overflow {overflow}: must be 0 or 2..240 (1019h)")
+        if overflow != 0 and not 2 <= overflow <= MAX_SYNC_COUNT:
+            raise ProtocolError(f"SYNC counter overflow {overflow}: must be 0 or 2..{MAX_SYNC_COUNT} (1019h)")
         self.overflow = overflow
         self._value = 0
 
@@ -63,6 +66,6 @@ def pack_sync(counter: int | None = None) -> Frame:
     """
     if counter is None:
         return SYNC_ID, b""
-    if not 1 <= counter <= 240:
-        raise ProtocolError(f"SYNC counter {counter}: must be 1..240")
+    if not 1 <= counter <= MAX_SYNC_COUNT:
+        raise ProtocolError(f"SYNC counter {counter}: must be 1..{MAX_SYNC_COUNT}")
     return SYNC_ID, bytes((counter,))

@@ -6,18 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.tactile import (
-    DEFAULT_WINDOW,
-    MAX_SIDE,
-    Features,
-    Shape,
-    TactileHeader,
-    TactileMode,
-    check_origin,
-    crc16_ccitt,
-    image_words,
-    window_words,
-)
+from canprobe.fieldbus.protocol import tactile
+from canprobe.fieldbus.protocol.tactile import Features, Shape, TactileHeader, TactileMode
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +60,8 @@ class FrameAssembler:
         deadline_ns: int,
         sizes: Sequence[int] | None = None,
         *,
-        window: int = DEFAULT_WINDOW,
-        shape: Shape = (MAX_SIDE, MAX_SIDE),
+        window: int = tactile.DEFAULT_WINDOW,
+        shape: Shape = (tactile.MAX_SIDE, tactile.MAX_SIDE),
     ) -> None:
         """Make an assembler for the given identifiers.
 
@@ -88,8 +78,8 @@ class FrameAssembler:
         """
         self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
         self._sizes = tuple(sizes) if sizes is not None else (8,) * len(cob_ids)
-        whole = image_words(shape[0] * shape[1])
-        payloads = {TactileMode.FEATURES: 1, TactileMode.WINDOW: window_words(window), TactileMode.IMAGE: whole}
+        whole = tactile.image_words(shape[0] * shape[1])
+        payloads = {TactileMode.FEATURES: 1, TactileMode.WINDOW: tactile.window_words(window), TactileMode.IMAGE: whole}
         needed = 8 * (1 + payloads[mode])
         if len(self._slots) != len(cob_ids) or self._sizes[:1] != (8,) or sum(self._sizes) != needed:
             raise ProtocolError(
@@ -155,11 +145,11 @@ class FrameAssembler:
         body = b"".join(rest)  # type: ignore[arg-type]  # complete: no None is left
         try:
             header = TactileHeader.unpack(start)
-            check_origin(header, self.shape)
+            tactile.check_origin(header, self.shape)
         except ProtocolError:
             self.malformed += 1
             return None
-        if crc16_ccitt(body, crc16_ccitt(start[:6])) != header.crc:
+        if tactile.crc16_ccitt(body, tactile.crc16_ccitt(start[:6])) != header.crc:
             self.crc_errors += 1
             return None
         if header.mode is not self._mode or (header.mode is TactileMode.WINDOW and header.window != self._window):

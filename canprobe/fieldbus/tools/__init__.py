@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from canprobe.fieldbus import door
+from canprobe.errors import door
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.fieldbus.tools.conform import Examination as Examination

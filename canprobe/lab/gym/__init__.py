@@ -8,8 +8,8 @@ Out goes an observation, the reward of the step, and the truth in `info`.
 
 Between two actions the whole cell runs: drives, array, supervision and the tactile servo, 16 cycles at 400 Hz,
 in virtual time without a bus. `env` is the environment; start reading there. `episode` is one cell that is led step by
-step, `led` the touch task whose path and force are set from outside. `observations` makes an agent's vectors, `region`
-the touched part of the surface. `randomise` draws the values that differ between episodes, with the keys of
+step, with the touched part of the surface, `led` the touch task whose path and force are set from outside.
+`observations` makes an agent's vectors. `randomise` draws the values that differ between episodes, with the keys of
 a scene file, and has the objects to train on and those that are held out.
 
 An episode begins in contact: approach, touch-down and settling are part of `reset`. It ends by itself (`terminated`)

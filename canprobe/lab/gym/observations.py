@@ -10,8 +10,8 @@ from gymnasium import spaces
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
+from canprobe.lab.gym.episode import SECTORS, Coverage
 from canprobe.lab.gym.led import LedTask
-from canprobe.lab.gym.region import SECTORS, Coverage
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.types import Floats
 

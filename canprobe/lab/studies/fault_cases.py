@@ -212,7 +212,7 @@ class WrongFile:
         return (Fault(CELL_FAULTS["gain-lost"], array, values={"gain": 0.7}),) if self.what == FOREIGN else ()
 
 
-def wrong_files(joints: int, plants: tuple[str, ...] = PLANTS) -> list[WrongFile]:
+def wrong_files(joints: int) -> list[WrongFile]:
     """All wrong files of an arm with so many joints."""
-    arms = [WrongFile(what, joint, plant) for what in ARM_FILES for joint in range(1, joints + 1) for plant in plants]
-    return [*arms, *(WrongFile(what, 0, plant) for what in OTHER_FILES for plant in plants)]
+    arms = [WrongFile(what, joint, plant) for what in ARM_FILES for joint in range(1, joints + 1) for plant in PLANTS]
+    return [*arms, *(WrongFile(what, 0, plant) for what in OTHER_FILES for plant in PLANTS)]

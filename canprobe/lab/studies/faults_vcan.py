@@ -51,7 +51,7 @@ from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
-from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
+from canprobe.lab.studies.realtime_cases import ON_VCAN, patient, vcan_facts, with_real_nodes
 from canprobe.lab.studies.recover_score import forces_of
 from canprobe.lab.studies.result import CHANNEL, Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
@@ -60,8 +60,7 @@ from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
 RUNS, QUICK_THROWN = 40, 1
 HOLD_S = 3.0
 SERVED: Mapping[str, Any] = {
-    "bus.interface": "socketcan",
-    "bus.channel": CHANNEL,
+    **ON_VCAN,
     "cycle.rate_hz": 100.0,
     "sensor.rate_hz": 100.0,
     "sensor.mode": "features",
@@ -140,8 +139,6 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     for seed in range(total):
         rows.append(row_of(draw_process_case(seed)))
         sweep.say(f"{seed + 1} of {total}: {rows[-1]['fault']}: {rows[-1]['failures'] or 'no failure'}")
-    patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
-    facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
     thrown = _throw_all(quick)
     drawn = partial(
         draw_by_name, [row | {"failed": bool(row["failures"])} for row in rows], "fault",
@@ -149,6 +146,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         title="How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"
         "failed: it hung, or nodes moved or were enabled afterwards",
     )  # fmt: skip
+    facts = vcan_facts(quick, total, MISSED_SYNCS)
     return StudyResult("faults_vcan", COLUMNS, rows, findings(rows), facts, drawn, (thrown,))
 
 
@@ -185,7 +183,7 @@ def _throw_all(quick: bool) -> StudyResult:
 
 def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
     """Run a task, throw a fault in a phase of it, and score the true force."""
-    scene = load_scene(task_scene(task, "ideal"), {"bus.interface": "socketcan", "bus.channel": CHANNEL})
+    scene = load_scene(task_scene(task, "ideal"), ON_VCAN)
     session = Session(patient(scene, MISSED_SYNCS) if is_patient else scene)
     work = make_task(session.plan)
     with ThreadPoolExecutor(1) as others:

@@ -171,12 +171,12 @@ def run_many(
 
 
 def _combinations(vary: Mapping[str, Sequence[Any]]) -> tuple[list[str], list[tuple[Any, ...]]]:
+    plain = []
     for key, values in vary.items():
         if not _is_list(values):
             raise UsageError(f"vary: {key}: expected a list of values, got {values!r}")
-    plain = [[value.item() if isinstance(value, np.generic) else value for value in values] for values in vary.values()]
-    for key, values in zip(vary, plain, strict=True):
-        if not values:
+        plain.append([value.item() if isinstance(value, np.generic) else value for value in values])
+        if not plain[-1]:
             raise UsageError(f"vary: {key}: expected at least one value, got an empty list")
     return list(vary), list(product(*plain))
 

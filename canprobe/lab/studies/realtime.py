@@ -22,15 +22,15 @@ from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
 from canprobe.lab.studies.realtime_cases import (
-    PATIENCE,
     CycleTimes,
     Measured,
     Times,
     measure_bare,
     measure_hold,
     measure_scan,
+    vcan_facts,
 )
-from canprobe.lab.studies.result import CHANNEL, Row, Say, StudyResult, measuring_facts
+from canprobe.lab.studies.result import CHANNEL, Row, Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
 
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
@@ -56,8 +56,8 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     measured.append(measure_bare(bare_s))
     for mode in MODES:
         measured += _climb(mode, hold_s, (400,) if quick else RATES_HZ, say)
-    what = {"interface": CHANNEL, "controller": "scan of cylinder; hold elsewhere", **PATIENCE}
-    facts, draw = measuring_facts(quick, 1) | what, partial(draw_realtime, measured)
+    facts = vcan_facts(quick, 1) | {"controller": "scan of cylinder; hold elsewhere"}
+    draw = partial(draw_realtime, measured)
     return StudyResult("realtime", COLUMNS, [_row(m) for m in measured], findings(measured), facts, draw)
 
 

@@ -9,7 +9,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,12 +36,13 @@ from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.protocol.frames import SYNC_ID
-from canprobe.lab.studies.result import CHANNEL
+from canprobe.lab.studies.result import CHANNEL, measuring_facts
 
 RATE_HZ = 400.0
 MISSED_SYNCS, LATE_PERCENT = 250, 100
-PATIENCE = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
 """Limits in the scenes of the cases: neither a drop-out nor late cycles end a run at a rate that cannot be held."""
+ON_VCAN: Mapping[str, Any] = {"bus.interface": "socketcan", "bus.channel": CHANNEL}
+"""Changes that bring a scene to the interface."""
 WIRE_BITRATE = 50_000_000
 """Bit rate of the plans at any rate: a virtual bus has none."""
 
@@ -187,13 +188,19 @@ def with_real_nodes(scene: Scene) -> Scene:
 
 def _scene(seconds: float | None = None) -> Scene:
     """The scene `cylinder`, patient; with real-time priority and locked memory where they are permitted."""
-    on_bus = {"bus.interface": "socketcan", "bus.channel": CHANNEL, "cycle.realtime": True}
+    on_bus = {**ON_VCAN, "cycle.realtime": True}
     return patient(load_scene("cylinder", on_bus if seconds is None else {**on_bus, "task.duration_s": seconds}))
 
 
 def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:
     """The scene with drives that tolerate missed SYNCs, and a master that no late cycles stop."""
     return load_scene(scene, {"arm.missed_syncs": missed_syncs, "limits.late_cycles_max_percent": float(LATE_PERCENT)})
+
+
+def vcan_facts(quick: bool, runs: int, missed_syncs: int = MISSED_SYNCS) -> dict[str, Any]:
+    """Machine, versions and settings of a study on the interface, whose cells are `patient`."""
+    limits = {"missed_syncs": missed_syncs, "late_cycles_max_percent": LATE_PERCENT}
+    return measuring_facts(quick, runs) | {"interface": CHANNEL, **limits}
 
 
 class Hold(Controller):

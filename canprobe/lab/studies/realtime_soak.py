@@ -30,8 +30,8 @@ from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.lab.studies.realtime_cases import PATIENCE, Hold, patient, served, with_real_nodes
-from canprobe.lab.studies.result import CHANNEL, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.realtime_cases import Hold, patient, served, vcan_facts, with_real_nodes
+from canprobe.lab.studies.result import CHANNEL, Row, StudyResult
 from canprobe.lab.studies.sweep import Sweep
 
 SOAK_S = 1800.0
@@ -90,7 +90,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     seconds = 10.0 if quick else SOAK_S
     sweep.say(f"hold the cell for {seconds:g} s")
     rows, ended = soak(seconds)
-    facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds, **PATIENCE}
+    facts = vcan_facts(quick, 1) | {"seconds": seconds}
     return StudyResult("soak", COLUMNS, rows, findings(rows, ended), facts, partial(draw_soak, rows))
 
 

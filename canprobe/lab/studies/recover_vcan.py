@@ -22,10 +22,10 @@ from canprobe.cell.session.session import Session
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.lab.studies.faults_vcan import link, sleep
-from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient
+from canprobe.lab.studies.realtime_cases import ON_VCAN, patient, vcan_facts
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
 from canprobe.lab.studies.recover_score import END_S, REPLUG, SCENES, STALL, RecoverCase, RecoverScore, draw_case
-from canprobe.lab.studies.result import CHANNEL, StudyResult, measuring_facts
+from canprobe.lab.studies.result import CHANNEL, StudyResult
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS, QUICK_RUNS = 50, 2
@@ -43,8 +43,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         with tempfile.TemporaryDirectory(prefix="canprobe-recover-") as folder:
             runs.append({**ServedRun(case, sweep.say, Path(folder)).outcome, "shrunk": str(case)})
         sweep.say(f"{seed + 1} of {total}: {case}: {'; '.join(runs[-1]['failures']) or 'no failure'}")
-    patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
-    facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
+    facts = vcan_facts(quick, total, MISSED_SYNCS)
     return StudyResult("recover_vcan", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_runs, runs))
 
 
@@ -61,8 +60,7 @@ class ServedRun:
     """
 
     def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path) -> None:
-        on_bus = {"bus.interface": "socketcan", "bus.channel": CHANNEL}
-        changes = {**on_bus, "scene.figures": False, "task.duration_s": END_S + 2.0}
+        changes = {**ON_VCAN, "scene.figures": False, "task.duration_s": END_S + 2.0}
         plan = make_plan(resolve(patient(load_scene(SCENES[case.work], changes), MISSED_SYNCS)))
         self._case, self._score = case, RecoverScore(case, plan, say)
         self._session = Session(plan, RunOptions(out, lambda text: self._score.say(self._now_s(), text), recover=True))

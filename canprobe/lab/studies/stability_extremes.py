@@ -142,12 +142,12 @@ def _touched_at(scene: Scene, place: tuple[float, float, float]) -> Scene:
 
 
 def touch_in_posture(
-    posture_deg: tuple[float, ...], above_mm: float = 10.0
+    posture_deg: tuple[float, ...],
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
     """A touch with the pole of the default probe and these joint angles, deg.
 
     Returns:
-        Its place, mm; the outward normal there; joint angles (n,) at `above_mm` above it, deg.
+        Its place, mm; the outward normal there; joint angles (n,) 10 mm above it, deg.
     """
     arm, probe = resolve(load_scene("press")).arm, ProbeSettings()
     assert arm is not None
@@ -157,7 +157,7 @@ def touch_in_posture(
     T = forward(model.chain, q) @ T_flange_centre
     pole = T[:3, 2]
     above = T.copy()
-    above[:3, 3] -= above_mm * 1e-3 * pole
+    above[:3, 3] -= 10e-3 * pole
     away = np.degrees(inverse_near(model, above, T_flange_centre, q))
     at = 1e3 * T[:3, 3] + probe.radius_mm * pole
     x, y, z = (float(value) for value in at)

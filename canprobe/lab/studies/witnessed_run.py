@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import groupby
 
 from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.controller import Controller, Measurement
@@ -81,12 +82,5 @@ def reaction_ns(key: str, limits: Limits) -> int:
 
 def longest_above(rows: Sequence[tuple[int, float]], limit: float) -> int:
     """Longest time without a break for which the force of (t_ns, force) rows is above the limit, ns."""
-    longest = 0
-    since: int | None = None
-    for t_ns, force in rows:
-        if force <= limit:
-            since = None
-            continue
-        since = t_ns if since is None else since
-        longest = max(longest, t_ns - since)
-    return longest
+    stretches = [list(some) for within, some in groupby(rows, lambda row: row[1] <= limit) if not within]
+    return max((some[-1][0] - some[0][0] for some in stretches), default=0)

@@ -38,8 +38,7 @@ from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.dynamics import dynamics_problem
 from canprobe.mechanics.robot.inverse import inverse_near
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
-from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.objects import make_object

@@ -6,10 +6,10 @@ Joint positions come in, and poses, Jacobians and torques go out; or poses come 
     denavit_hartenberg   chains from Denavit-Hartenberg rows
     urdf, urdf_tree      an arm from a URDF, and the links and joints of that file
     urdf_visuals         solids and meshes of the links, for a view
-    model                joints of a chain with stops, speeds, motors, friction, bodies; units of its drives
-    motors               motor coordinates, where rotor inertia, friction and drive torque act
-    inverse              from poses to joints: rows of a pose that n joints can hold, and joints near a known posture
-    inverse_step         one step of the inverse Jacobian: damped near singular poses, or with some drives at rest
+    model                joints of a chain with stops, speeds, motors, friction, bodies; units of its drives, and motor
+                         coordinates
+    inverse              from poses to joints: rows of a pose that n joints can hold, joints near a known posture, and
+                         one step of the inverse Jacobian
     probe_poses          poses and postures that put a probe on a surface
     dynamics             mass matrix and bias torques, computed by MuJoCo
     tool_calibration     the probe's centre on the flange, from touches of a ball

@@ -1,7 +1,7 @@
 """Rigid-body dynamics of any arm: mass matrix, Coriolis and centrifugal torques, gravity; computed by MuJoCo.
 
 Equation of motion: ``M(q) q'' + b(q, q') = tau``, all at the joints; b includes gravity. Motors, gears and friction are
-not in it (`motors`). MuJoCo is in the extra `dynamics` and is imported when a `RigidBody` is made.
+not in it (`model`). MuJoCo is in the extra `dynamics` and is imported when a `RigidBody` is made.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 Each drive counts in units such as encoder counts or 1/1000 of a degree. Gears, signs and couplings between the joints
 are one matrix, the drives' zeros one vector: `units = units_per_q @ q + zero_units`.
+
+A motor coordinate is the position of a drive divided by its units per own joint; without coupling it is the position of
+the joint. Rotor inertia, friction and drive torque act there, one motor each; rigid bodies move at the joints.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.robot.chain import Chain, forward_jacobian
 from canprobe.mechanics.types import Floats
 
 SPEED_UP_S = 0.5
@@ -270,3 +273,42 @@ def drive_position_at(model: ArmModel, axis: int, q: float, units: npt.ArrayLike
     rows, right = model.units_per_q.copy(), np.asarray(units, dtype=float) - model.zero_units
     rows[axis], right[axis] = np.eye(model.n)[axis], q
     return float(model.units_per_q[axis] @ np.linalg.solve(rows, right) + model.zero_units[axis])
+
+
+def units_per_motor(model: ArmModel) -> Floats:
+    """(n,) drive units per motor coordinate, negative where a drive counts backwards.
+
+    Args:
+        model: the arm.
+    """
+    return np.diag(model.units_per_q).copy()
+
+
+def joints_per_motor(model: ArmModel) -> Floats:
+    """(n, n) joint positions per motor coordinate.
+
+    Args:
+        model: the arm.
+    """
+    return np.array(model.q_per_unit * units_per_motor(model), dtype=np.float64)
+
+
+def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, direction: npt.ArrayLike) -> float:
+    """Standard deviation of the tool's position along a direction, m, by the rounding of drives to whole units.
+
+    Args:
+        model: the arm.
+        q: (n,) joint positions, rad or m.
+        T_flange_tool: (4, 4) tool in the flange frame, m.
+        direction: (3,) unit vector, base frame.
+
+    Source: a rounding error is uniform over one unit, of variance 1/12, and independent from drive to drive.
+    """
+    return float(np.linalg.norm(position_per_unit(model, q, T_flange_tool, direction))) / math.sqrt(12.0)
+
+
+def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, direction: npt.ArrayLike) -> Floats:
+    """(n,) motion of the tool along a direction by one unit of each drive, m; arguments as for `position_sigma`."""
+    _, J = forward_jacobian(model.chain, q, T_flange_tool)
+    per_unit: Floats = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
+    return per_unit

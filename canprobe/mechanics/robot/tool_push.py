@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from canprobe.mechanics.robot.chain import forward_jacobian
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.robot.motors import joints_per_motor, units_per_motor
+from canprobe.mechanics.robot.model import ArmModel, joints_per_motor, units_per_motor
 from canprobe.mechanics.types import Floats
 
 STICTION_RATE = 0.01

@@ -42,8 +42,9 @@ shows the way. Start reading at `contact`, then `estimate/` and `online/`.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from canprobe.errors import door
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.array_calibration.calibrate import calibrate_array
@@ -75,52 +76,42 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.pad import Pad
     from canprobe.mechanics.touch.surface import SurfaceMatrix
 
-_NAMES = {
-    "array_calibration.calibrate": ("calibrate_array",),
-    "array_calibration.calibration_check": ("CalibrationCheck",),
-    "contact": ("ContactSample", "Doubt", "Slope", "contact_sample", "indentation_from_force"),
-    "estimate.answer": ("SurfaceEstimate",),
-    "estimate.fit": ("fit_surface", "make_estimator"),
-    "estimate.gate": ("Estimator",),
-    "estimate.likelihood": ("cramer_rao",),
-    "estimate.noise": ("Correlation",),
-    "estimate.prior": ("Prior",),
-    "image.calibration": ("ArrayCalibration",),
-    "image.force_reading": ("ForceReading",),
-    "image.image_model": ("ImageModel", "make_image_model", "make_patch_calibration"),
-    "image.moments": ("MomentImage",),
-    "image.patch": ("Patch", "PatchCalibration", "compute_patch"),
-    "map.fit": ("fit_map",),
-    "map.local_fits": ("PadLayer",),
-    "map.noise": ("MapNoise", "PAD_NOISE"),
-    "map.surface_map": ("SurfaceMap",),
-    "meshing": ("Mesh",),
-    "objects": ("make_object",),
-    "online.estimator": ("OnlineEstimator",),
-    "online.map_fusion": ("MapFusion",),
-    "online.noise_level": ("NoiseLevel",),
-    "online.patch_curvature": ("PatchCurvature",),
-    "online.patch_fusion": ("PatchFusion",),
-    "online.systematic_errors": ("SystematicErrors",),
-    "pad": ("Pad",),
-    "surface": ("SurfaceMatrix",),
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names}
-
+__getattr__, __dir__, _ = door(
+    __name__,
+    {
+        "touch.array_calibration.calibrate": ("calibrate_array",),
+        "touch.array_calibration.calibration_check": ("CalibrationCheck",),
+        "touch.contact": ("ContactSample", "Doubt", "Slope", "contact_sample", "indentation_from_force"),
+        "touch.estimate.answer": ("SurfaceEstimate",),
+        "touch.estimate.fit": ("fit_surface", "make_estimator"),
+        "touch.estimate.gate": ("Estimator",),
+        "touch.estimate.likelihood": ("cramer_rao",),
+        "touch.estimate.noise": ("Correlation",),
+        "touch.estimate.prior": ("Prior",),
+        "touch.image.calibration": ("ArrayCalibration",),
+        "touch.image.force_reading": ("ForceReading",),
+        "touch.image.image_model": ("ImageModel", "make_image_model", "make_patch_calibration"),
+        "touch.image.moments": ("MomentImage",),
+        "touch.image.patch": ("Patch", "PatchCalibration", "compute_patch"),
+        "touch.map.fit": ("fit_map",),
+        "touch.map.local_fits": ("PadLayer",),
+        "touch.map.noise": ("MapNoise", "PAD_NOISE"),
+        "touch.map.surface_map": ("SurfaceMap",),
+        "touch.meshing": ("Mesh",),
+        "touch.objects": ("make_object",),
+        "touch.online.estimator": ("OnlineEstimator",),
+        "touch.online.map_fusion": ("MapFusion",),
+        "touch.online.noise_level": ("NoiseLevel",),
+        "touch.online.patch_curvature": ("PatchCurvature",),
+        "touch.online.patch_fusion": ("PatchFusion",),
+        "touch.online.systematic_errors": ("SystematicErrors",),
+        "touch.pad": ("Pad",),
+        "touch.surface": ("SurfaceMatrix",),
+    },
+)
 __all__ = ["ContactSample", "Doubt", "Pad", "Slope", "contact_sample", "indentation_from_force"]
 __all__ += ["ForceReading", "ImageModel", "MomentImage", "Patch", "PatchCalibration", "compute_patch"]
 __all__ += ["ArrayCalibration", "CalibrationCheck", "calibrate_array", "make_image_model", "make_patch_calibration"]
 __all__ += ["Correlation", "Estimator", "Prior", "SurfaceEstimate", "cramer_rao", "fit_surface", "make_estimator"]
 __all__ += ["MapFusion", "NoiseLevel", "OnlineEstimator", "PatchCurvature", "PatchFusion", "SystematicErrors"]
 __all__ += ["PAD_NOISE", "MapNoise", "Mesh", "PadLayer", "SurfaceMap", "SurfaceMatrix", "fit_map", "make_object"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562)."""
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})

@@ -98,7 +98,7 @@ class Spline:
         m, n = self.shape
         s, t = (x - self.corner[0]) / self.spacing, (y - self.corner[1]) / self.spacing
         i, j = np.clip(s.astype(np.intp), 0, m - 2), np.clip(t.astype(np.intp), 0, n - 2)
-        (b, d), (bt, dt) = _weights(s - i), _weights(t - j)
+        (b, d), (bt, dt) = b_splines(s - i), b_splines(t - j)
         first = i * (n + 2) + j
         z, zx, zy = np.zeros((3, len(s)))
         for k in range(4):
@@ -110,7 +110,7 @@ class Spline:
         return z, zx / self.spacing, zy / self.spacing
 
 
-def _weights(t: Floats) -> tuple[list[Floats], list[Floats]]:
+def b_splines(t: Floats) -> tuple[list[Floats], list[Floats]]:
     """The four cubic B-splines over a cell at t in 0 … 1, and their slopes."""
     p = 1.0 - t
     inner = (2.0 / 3.0 - one * one * (1.0 - 0.5 * one) for one in (t, p))

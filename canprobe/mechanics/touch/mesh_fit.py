@@ -21,7 +21,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.mechanics.touch.heights import MIN_NODES, Heights, Spline
+from canprobe.mechanics.touch.heights import MIN_NODES, Heights, Spline, b_splines
 from canprobe.mechanics.touch.mesh_curvature import CurvatureError, VertexCurvature
 from canprobe.mechanics.touch.mesh_repair import Index, MeshState, repaired
 from canprobe.mechanics.touch.shapes import require_positive
@@ -342,7 +342,7 @@ def _fitted(
     m, n = (int(one) + 3 for one in cells)  # coefficients along x and y
     place = (samples[:, :2] - corner) / spacing
     cell = np.clip(place.astype(np.intp), 0, cells - 1)  # those beyond the grid belong to the cubics of its border
-    (bx, by) = (_basis((place - cell)[:, axis]) for axis in (0, 1))
+    bx, by = (np.stack(b_splines((place - cell)[:, axis])[0], axis=1) for axis in (0, 1))
     columns = (cell[:, 0, None] + np.arange(4))[:, :, None] * n + (cell[:, 1, None] + np.arange(4))[:, None, :]
     filled = np.zeros((m - 1, n - 1), dtype=bool)
     filled[cell[:, 0] + 1, cell[:, 1] + 1] = True
@@ -379,10 +379,3 @@ def _fitted(
         edges &= near > 0.0
         heights[edges] = (A.T @ samples[:, 2]).reshape(m, n)[1:-1, 1:-1][edges] / near[edges]
     return heights, 0.5 * (low + high), there
-
-
-def _basis(t: Floats) -> Floats:
-    """(k, 4) cubic B-splines over a cell at t in 0 … 1."""
-    p = 1.0 - t
-    inner = (2.0 / 3.0 - one * one * (1.0 - 0.5 * one) for one in (t, p))
-    return np.stack((p**3 / 6.0, *inner, t**3 / 6.0), axis=1)

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.mechanics.robot.chain import Posture, ending_in, jacobian, pose_of, posture
-from canprobe.mechanics.robot.inverse import in_rows, task_rows
-from canprobe.mechanics.robot.inverse_step import damped_step
+from canprobe.mechanics.robot.inverse import damped_step, in_rows, task_rows
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.tangent_frames import transported

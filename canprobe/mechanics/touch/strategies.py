@@ -13,6 +13,8 @@ from typing import Protocol
 
 TURN_PERIODS = 3.0
 """Time of a turn by a radian over the time constant of the servo's normal."""
+CROSS_TRACK_PER_M = 60.0
+"""Turn of the heading back to the curve, as the tangent of an angle over the distance, 1/m."""
 MIN_PACE = 0.05
 """Share of the speed with which a path turns back."""
 
@@ -141,7 +143,6 @@ class PathFollower:
     Args:
         strategy: the curve.
         brake_m: way on which it brakes before it turns back, and gets faster behind that, m.
-        cross_track_per_m: turn of the heading back to the curve, as the tangent of an angle over the distance, 1/m.
 
     Attributes:
         pace: share of the speed. Why not 1 everywhere: where the path turns back at once, the drives cannot, and the
@@ -150,11 +151,10 @@ class PathFollower:
 
     pace = 1.0
 
-    def __init__(self, strategy: Strategy, brake_m: float = 0.0, cross_track_per_m: float = 60.0) -> None:
+    def __init__(self, strategy: Strategy, brake_m: float = 0.0) -> None:
         self._strategy = strategy
         self._turning = strategy if isinstance(strategy, Straight) else None
         self._brake = brake_m
-        self._gain = cross_track_per_m
         self._phase = 0.0
         self._tangent = strategy.tangent(0.0)
 
@@ -179,7 +179,7 @@ class PathFollower:
         if self._turning is not None and self._brake > 0.0:
             self.pace = min(1.0, max(MIN_PACE, math.sqrt(self._turning.way_to_turn(self._phase) / self._brake)))
         px, py = self._strategy.point(self._phase)
-        hx = tx / max(norm, 1e-9) + self._gain * (px - x)
-        hy = ty / max(norm, 1e-9) + self._gain * (py - y)
+        hx = tx / max(norm, 1e-9) + CROSS_TRACK_PER_M * (px - x)
+        hy = ty / max(norm, 1e-9) + CROSS_TRACK_PER_M * (py - y)
         scale = math.hypot(hx, hy)
         return (hx / scale, hy / scale) if scale > 1e-9 else (1.0, 0.0)

@@ -18,8 +18,15 @@ from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian
 from canprobe.mechanics.robot.denavit_hartenberg import from_dh, tool_z_offset
-from canprobe.mechanics.robot.model import ArmModel, Body, Joint, joints_to_units, units_to_joints
-from canprobe.mechanics.robot.motors import joints_per_motor, units_per_motor
+from canprobe.mechanics.robot.model import (
+    ArmModel,
+    Body,
+    Joint,
+    joints_per_motor,
+    joints_to_units,
+    units_per_motor,
+    units_to_joints,
+)
 from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 

@@ -11,8 +11,7 @@ from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.scene.setup import Probe
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE
-from canprobe.mechanics.touch.image.beyond_window import Continuation
-from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
+from canprobe.mechanics.touch.image.patch import Continuation, PatchCalibration, compute_patch
 
 EXACT = PatchCalibration()
 PITCH = EXACT.pad.pitch_m

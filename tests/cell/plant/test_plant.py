@@ -16,8 +16,7 @@ from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.inverse import inverse_near
-from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
-from canprobe.mechanics.robot.motors import joints_per_motor, units_per_motor
+from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units, units_per_motor, units_to_joints
 from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.shapes import LIP_M

@@ -18,8 +18,7 @@ from canprobe.cell.scene.setup import Dynamics
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
-from canprobe.mechanics.robot.model import joints_to_units
-from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units
 from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.shapes import LIP_M

@@ -75,7 +75,7 @@ def test_minimal_scan_gets_every_default():
             {"shape", "servo"},
         ),
         ("listen", "[sensor]\n", {"arm", "shape", "servo", "object"}),
-        ("free", "[arm]\n", {"sensor", "wire", "probe", "object", "shape", "servo"}),
+        ("free", "[arm]\n", {"sensor", "wire", "object", "shape", "servo"}),
     ],
 )
 def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):

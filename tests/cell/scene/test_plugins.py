@@ -83,7 +83,7 @@ def test_scenes_and_arrays_with_their_files(install, tmp_path):
     install("lab", [("scenes", "lab-free", "lab.rooms"), ("arrays", "lab-pad", "lab")], files)
     assert load_scene("lab-free").scene.title == "As free"
     assert load_array("lab-pad") == load_array("uskin4x4")
-    with pytest.raises(SceneError, match=r"did you mean lab-free\?; packaged scenes: .*; of other packages: lab-free"):
+    with pytest.raises(SceneError, match=r"did you mean lab-free\?; scenes: .*, lab-free"):
         load_scene("lab-fre")
     scene = load_scene("listen", {"sensor.array": "lab-pad"})
     assert scene.sensor.array == str(tmp_path / "site-lab" / "lab" / "lab-pad.toml"), "a saved scene takes it along"

@@ -12,11 +12,11 @@ import pytest
 from scenes import change
 
 import canprobe
-from canprobe.cell.scene.load import load_scene, packaged
+from canprobe.cell.scene.load import load_scene, packaged, packaged_files, parse_scene
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Calibrate, Free, Listen, Touch
-from canprobe.errors import PlanError
+from canprobe.errors import PlanError, SceneError
 
 PACKAGE = Path(canprobe.__file__).parent
 
@@ -95,3 +95,14 @@ def test_nobody_behind_it_reads_the_scene():
                 if isinstance(node, ast.Attribute) and node.attr == "scene":
                     wrong.append(f"{path}:{node.lineno} reads .scene")
     assert not wrong, "; ".join(wrong)
+
+
+def test_a_scene_starts_in_a_posture_of_its_cell(tmp_path):
+    cell = tmp_path / "mine.toml"
+    cell.write_text(packaged_files("cells")["puma260"].read_text() + "\n[postures]\nready = [80, 70, 10, 5, 90, 20]\n")
+    text = 'cell = "mine.toml"\n[scene]\nname = "t"\n[arm]\n[task]\nkind = "free"\nstart_posture = "ready"\n'
+    arm = resolve(parse_scene(text, folder=tmp_path)).arm
+    np.testing.assert_allclose(np.degrees(arm.q_start), [80, 70, 10, 5, 90, 20])
+    assert arm.postures["start"] is arm.q_start
+    with pytest.raises(SceneError, match=r"task.start_posture: expected a posture of \[postures\] \(ready\), got redy"):
+        parse_scene(text.replace('"ready"', '"redy"'), folder=tmp_path)

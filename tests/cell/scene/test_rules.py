@@ -110,7 +110,7 @@ def test_what_is_not_given_stays():
 def test_what_is_no_scene(call):
     with pytest.raises(UsageError, match="scene: expected a packaged name, the path of a TOML file or a Scene, got 3"):
         call(3)
-    with pytest.raises(SceneError, match=r"pres: no such scene or file; did you mean press\?"):
+    with pytest.raises(SceneError, match=r"pres: no such scene, cell or file; did you mean press\?"):
         call("pres")
     with pytest.raises(SceneError, match=r"did you mean force_n\?"):
         call("press", {"task.force": 3})

@@ -129,7 +129,7 @@ def test_a_request_does_not_use_up_an_event_that_waits_for_a_sync(bench):
 def test_mapping_of_512_bits(eds, switch, fits):
     dictionary = Dictionary(load_eds(eds, 16))
     dictionary.put(LONG_PDOS, 0, switch)
-    rules = PdoRules(dictionary, 0x1801, 0x1A01, True)
+    rules = PdoRules(dictionary, 0x1801, transmits=True)
     count = 8 if eds.endswith("fd") else 4
     for subindex in range(1, count + 1):
         dictionary.values[key_of(0x1A01, subindex)] = 0x21000040 | subindex << 8

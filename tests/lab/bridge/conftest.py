@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,9 @@ import canprobe
 from canprobe.cell.master.observers import Observation
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import dump_scene, parse_scene
+from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
+from canprobe.lab.bridge.process import BridgeProcess
+from canprobe.lab.bridge.sampling import SampleSource
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,26 @@ def recorded(tmp_path_factory) -> Recorded:
         parse_scene(text), out=folder, duration_s=0.6, seed=5, bridge=("mcap",), observers=(seen.append,)
     )
     return Recorded(folder, result, seen)
+
+
+@pytest.fixture(scope="session")
+def samples(recorded):
+    """What a bridge's process makes of the observations of that run."""
+    source = SampleSource(recorded.result.plan)
+    return [source.sample(unpack_observation(pack_observation(o))) for o in recorded.observations]
+
+
+@pytest.fixture
+def bridge_of():
+    """A function that starts the process of a bridge, which is killed at the end of the test."""
+    with ExitStack() as stack:
+
+        def start(name, plan, out=None, *, virtual=True):
+            bridge = BridgeProcess(name, plan, out, virtual=virtual)
+            stack.callback(bridge.kill)
+            return bridge
+
+        yield start
 
 
 @pytest.fixture(scope="session")

@@ -26,7 +26,7 @@ from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.lab.bridge.messages import TOPICS
-from canprobe.lab.bridge.process import END_TIMEOUT_S, BridgeProcess
+from canprobe.lab.bridge.process import END_TIMEOUT_S
 
 PROTOCOL = "foxglove.sdk.v1"
 
@@ -36,12 +36,11 @@ def plan_with(scene, section):
 
 
 @pytest.fixture
-def bridge(recorded):
+def bridge(recorded, bridge_of):
     """A server that is given every sample, and its address."""
     text = dump_scene(recorded.result.plan.scene).replace("foxglove_port = 8765", "foxglove_port = 0")
-    one = BridgeProcess("foxglove", canprobe.plan(parse_scene(text)), None, virtual=True)
-    yield one, re.match(r"ws://127\.0\.0\.1:\d+", one.await_ready())[0]
-    one.kill()
+    one = bridge_of("foxglove", canprobe.plan(parse_scene(text)))
+    return one, re.match(r"ws://127\.0\.0\.1:\d+", one.await_ready())[0]
 
 
 def advertised(client):
@@ -139,15 +138,12 @@ def test_a_client_without_the_protocol_is_refused(bridge):
 
 
 @pytest.mark.slow(reason="a second server")
-def test_a_port_that_is_taken_is_named_with_the_way_out(bridge):
+def test_a_port_that_is_taken_is_named_with_the_way_out(bridge, bridge_of):
     port = bridge[1].rpartition(":")[2]
     plan = plan_with(canprobe.load_scene("free"), f"foxglove_port = {port}")
-    second = BridgeProcess("foxglove", plan, None, virtual=False)
-    try:
-        with pytest.raises(UsageError, match=rf"bridge foxglove: 127\.0\.0\.1:{port}: .*bridge\.foxglove_port"):
-            second.await_ready()
-    finally:
-        second.kill()
+    second = bridge_of("foxglove", plan, virtual=False)
+    with pytest.raises(UsageError, match=rf"bridge foxglove: 127\.0\.0\.1:{port}: .*bridge\.foxglove_port"):
+        second.await_ready()
 
 
 def test_the_layout_shows_topics_that_there_are():

@@ -21,7 +21,6 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.requested import Request
 from canprobe.errors import ResultsError
 from canprobe.lab.bridge import process as process_module
-from canprobe.lab.bridge.process import BridgeProcess
 
 
 @pytest.fixture
@@ -30,11 +29,10 @@ def plan():
 
 
 @pytest.fixture
-def bridge(plan, tmp_path):
-    one = BridgeProcess("mcap", plan, tmp_path, virtual=False)
+def bridge(plan, tmp_path, bridge_of):
+    one = bridge_of("mcap", plan, tmp_path, virtual=False)
     one.await_ready()
-    yield one
-    one.kill()
+    return one
 
 
 def pid_of(bridge):
@@ -67,19 +65,16 @@ def test_a_crash_in_the_middle_of_a_run_costs_samples_only(plan, bridge):
 
 
 @pytest.mark.parametrize(("commands", "taken"), [("true", 1), ("false", 0)])
-def test_what_comes_back_counts_as_a_command_only_if_it_is_one_and_only_where_commands_are_allowed(commands, taken):
+def test_what_comes_back_is_a_command_only_if_it_is_one_and_where_commands_are_allowed(commands, taken, bridge_of):
     scene = parse_scene(dump_scene(canprobe.load_scene("free")) + f"[bridge]\nros2_commands = {commands}\n")
-    bridge = BridgeProcess("ros2", canprobe.plan(scene), None, virtual=True)
-    try:
-        bridge._back, back = os.pipe()
-        asked = ['{"kind": "start", "value": 0}', '{"value": null}', '{"kind": ["stop"]}', "7", '{"kind": "stop"}']
-        os.write(back, "".join(f'{{"request": {one}}}\n' for one in asked).encode())
-        assert bridge._listen(0.0)
-        assert list(bridge.requests) == [Request("stop")] * taken
-    finally:
-        bridge.kill()
-        os.close(bridge._back)
-        os.close(back)
+    bridge = bridge_of("ros2", canprobe.plan(scene))
+    bridge._back, back = os.pipe()
+    asked = ['{"kind": "start", "value": 0}', '{"value": null}', '{"kind": ["stop"]}', "7", '{"kind": "stop"}']
+    os.write(back, "".join(f'{{"request": {one}}}\n' for one in asked).encode())
+    assert bridge._listen(0.0)
+    assert list(bridge.requests) == [Request("stop")] * taken
+    os.close(bridge._back)
+    os.close(back)
 
 
 def test_one_that_stands_still_is_left_behind(plan, bridge, monkeypatch):

@@ -22,7 +22,6 @@ from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.tasks.requested import Request, RequestedTask
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.lab.bridge.commands import refuse, trajectory_of
 from canprobe.lab.bridge.dds_types import DdsTypes, dds_name
 from canprobe.lab.bridge.description import robot_description
 from canprobe.lab.bridge.messages import (
@@ -36,8 +35,6 @@ from canprobe.lab.bridge.messages import (
     Messages,
     encode_can_frame,
 )
-from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
-from canprobe.lab.bridge.process import BridgeProcess
 from canprobe.lab.bridge.ros2_dds import (
     EMPTY,
     FLOAT64,
@@ -51,9 +48,10 @@ from canprobe.lab.bridge.ros2_dds import (
     Ros2Node,
     Ros2Sink,
     domain_of,
+    refuse,
+    trajectory_of,
 )
 from canprobe.lab.bridge.sample import Context, Sample
-from canprobe.lab.bridge.sampling import SampleSource
 
 DOMAIN = 90 + os.getpid() % 100  # of this test alone; 232 is the highest
 SINK_DOMAIN = DOMAIN - 90
@@ -71,11 +69,9 @@ def encoder():
 
 
 @pytest.fixture(scope="module")
-def messages(recorded, encoder):
+def messages(recorded, samples, encoder):
     """Every message of the shared run: (topic, CDR)."""
-    plan = recorded.result.plan
-    source, maker = SampleSource(plan), Messages(plan, encoder)
-    samples = (source.sample(unpack_observation(pack_observation(o))) for o in recorded.observations)
+    maker = Messages(recorded.result.plan, encoder)
     return [(topic, data) for sample in samples for topic, _, data in maker.of(sample)]
 
 
@@ -137,58 +133,55 @@ def until(condition, observations, bridge, most=4000):
     pytest.fail("it did not come")
 
 
-def test_another_process_sees_ros_topics_and_commands_the_cell_within_its_limits(recorded, plan, messages):
-    bridge = BridgeProcess("ros2", plan, None, virtual=True)
-    try:
-        bridge.await_ready()
-        encoder = Encoder()
-        node = Ros2Node(DOMAIN, True, encoder)
-        builtin = BuiltinDataReader(node.participant, BuiltinTopicDcpsPublication)
-        joints, static, taxels = (node.reader(topic) for topic in (JOINT_STATES, TF_STATIC, TAXELS))
-        feed = recorded.observations
-        first = until(lambda: next(iter(joints.take(N=1)), None), feed, bridge)
-        logged = recorded.log("q_rad")
-        assert np.abs(logged[np.isfinite(logged).all(axis=1)] - np.array(first.position)).max(axis=1).min() == 0.0
-        fixed = until(lambda: next(iter(static.take(N=1)), None), feed, bridge)  # sent before we were there
-        assert [t.child_frame_id for t in fixed.transforms[:2]] == ["flange", "probe"]
-        image = until(lambda: next(iter(taxels.take(N=1)), None), feed, bridge)
-        assert len(image.data) == 256
+def test_another_process_sees_ros_topics_and_commands_the_cell_within_its_limits(recorded, plan, bridge_of):
+    bridge = bridge_of("ros2", plan)
+    bridge.await_ready()
+    encoder = Encoder()
+    node = Ros2Node(DOMAIN, True, encoder)
+    builtin = BuiltinDataReader(node.participant, BuiltinTopicDcpsPublication)
+    joints, static, taxels = (node.reader(topic) for topic in (JOINT_STATES, TF_STATIC, TAXELS))
+    feed = recorded.observations
+    first = until(lambda: next(iter(joints.take(N=1)), None), feed, bridge)
+    logged = recorded.log("q_rad")
+    assert np.abs(logged[np.isfinite(logged).all(axis=1)] - np.array(first.position)).max(axis=1).min() == 0.0
+    fixed = until(lambda: next(iter(static.take(N=1)), None), feed, bridge)  # sent before we were there
+    assert [t.child_frame_id for t in fixed.transforms[:2]] == ["flange", "probe"]
+    image = until(lambda: next(iter(taxels.take(N=1)), None), feed, bridge)
+    assert len(image.data) == 256
 
-        offered = {one.topic_name: one for one in builtin.take(N=200)}
-        for topic in TOPICS:
-            endpoint = offered[f"rt{topic.name}"]
-            assert endpoint.type_name == dds_name(topic.type_name)
-            assert endpoint.qos[Policy.Userdata].data == f"typehash={encoder.type_hash(topic.type_name)};".encode()
-            assert (endpoint.qos[Policy.Reliability] == Policy.Reliability.BestEffort) == topic.best_effort
-            assert (endpoint.qos[Policy.Durability] == Policy.Durability.TransientLocal) == topic.transient
+    offered = {one.topic_name: one for one in builtin.take(N=200)}
+    for topic in TOPICS:
+        endpoint = offered[f"rt{topic.name}"]
+        assert endpoint.type_name == dds_name(topic.type_name)
+        assert endpoint.qos[Policy.Userdata].data == f"typehash={encoder.type_hash(topic.type_name)};".encode()
+        assert (endpoint.qos[Policy.Reliability] == Policy.Reliability.BestEffort) == topic.best_effort
+        assert (endpoint.qos[Policy.Durability] == Policy.Durability.TransientLocal) == topic.transient
 
-        force, speed, stop = (node.writer(topic) for topic in (FORCE, SPEED, STOP))
-        status = node.reader(STATUS)
-        number, nothing = node.types.of(FLOAT64), node.types.of(EMPTY)
-        said = []
+    force, speed, stop = (node.writer(topic) for topic in (FORCE, SPEED, STOP))
+    status = node.reader(STATUS)
+    number, nothing = node.types.of(FLOAT64), node.types.of(EMPTY)
+    said = []
 
-        def answers(count):
-            said.extend(message.data for message in status.take(N=10))
-            return said if len(said) >= count else None
+    def answers(count):
+        said.extend(message.data for message in status.take(N=10))
+        return said if len(said) >= count else None
 
-        until(lambda: True if all(w.get_matched_subscriptions() for w in (force, speed, stop)) else None, feed, bridge)
-        force.write(number(data=3.0))
-        until(lambda: answers(1), feed, bridge)
-        force.write(number(data=50.0))
-        until(lambda: answers(2), feed, bridge)
-        speed.write(number(data=-0.01))
-        until(lambda: answers(3), feed, bridge)
-        stop.write(nothing(structure_needs_at_least_one_member=0))
-        until(lambda: answers(4), feed, bridge)
-        until(lambda: True if len(bridge.requests) >= 2 else None, feed, bridge)
-        assert said[0] == "target_force_n 3: taken"
-        assert said[1].startswith("target_force_n 50: refused: task.force_n: expected")
-        assert said[2].startswith("speed_m_s -0.01: refused: task.speed_mm_s: expected")
-        assert said[3] == "stop: taken"
-        assert list(bridge.requests) == [Request("target_force_n", 3.0), Request("stop")]
-        assert bridge.end("{}")["error"] is None
-    finally:
-        bridge.kill()
+    until(lambda: True if all(w.get_matched_subscriptions() for w in (force, speed, stop)) else None, feed, bridge)
+    force.write(number(data=3.0))
+    until(lambda: answers(1), feed, bridge)
+    force.write(number(data=50.0))
+    until(lambda: answers(2), feed, bridge)
+    speed.write(number(data=-0.01))
+    until(lambda: answers(3), feed, bridge)
+    stop.write(nothing(structure_needs_at_least_one_member=0))
+    until(lambda: answers(4), feed, bridge)
+    until(lambda: True if len(bridge.requests) >= 2 else None, feed, bridge)
+    assert said[0] == "target_force_n 3: taken"
+    assert said[1].startswith("target_force_n 50: refused: task.force_n: expected")
+    assert said[2].startswith("speed_m_s -0.01: refused: task.speed_mm_s: expected")
+    assert said[3] == "stop: taken"
+    assert list(bridge.requests) == [Request("target_force_n", 3.0), Request("stop")]
+    assert bridge.end("{}")["error"] is None
 
 
 PUBLISHER = """
@@ -402,42 +395,39 @@ def asked_for(node, names, points):
     )
 
 
-def test_a_free_arm_is_described_and_follows_a_trajectory_within_its_limits(free):
+def test_a_free_arm_is_described_and_follows_a_trajectory_within_its_limits(free, bridge_of):
     scene, feed = free
     plan = canprobe.plan(scene)
-    bridge = BridgeProcess("ros2", plan, None, virtual=True)
-    try:
-        bridge.await_ready()
-        node = Ros2Node(DOMAIN, True, Encoder())
-        description, clock, status = (node.reader(topic) for topic in (ROBOT_DESCRIPTION, CLOCK, STATUS))
-        said = until(lambda: next(iter(description.take(N=1)), None), feed, bridge)  # sent before we were there
-        assert said.data == robot_description(plan)
-        now = until(lambda: next(iter(clock.take(N=1)), None), feed, bridge).clock
-        assert now.sec * 10**9 + now.nanosec in {o.t_ns for o in feed}
+    bridge = bridge_of("ros2", plan)
+    bridge.await_ready()
+    node = Ros2Node(DOMAIN, True, Encoder())
+    description, clock, status = (node.reader(topic) for topic in (ROBOT_DESCRIPTION, CLOCK, STATUS))
+    said = until(lambda: next(iter(description.take(N=1)), None), feed, bridge)  # sent before we were there
+    assert said.data == robot_description(plan)
+    now = until(lambda: next(iter(clock.take(N=1)), None), feed, bridge).clock
+    assert now.sec * 10**9 + now.nanosec in {o.t_ns for o in feed}
 
-        names, q0 = plan.setup.arm.model.chain.joints, plan.setup.arm.q_start
-        writer = node.writer(TRAJECTORY)
-        until(lambda: True if writer.get_matched_subscriptions() else None, feed, bridge)
+    names, q0 = plan.setup.arm.model.chain.joints, plan.setup.arm.q_start
+    writer = node.writer(TRAJECTORY)
+    until(lambda: True if writer.get_matched_subscriptions() else None, feed, bridge)
 
-        def answer_to(message):
-            writer.write(message)
-            return until(lambda: next(iter(status.take(N=1)), None), feed, bridge).data
+    def answer_to(message):
+        writer.write(message)
+        return until(lambda: next(iter(status.take(N=1)), None), feed, bridge).data
 
-        goal, still = q0 + 0.1, [()] * 2
-        turned = [(t, q[::-1], qd) for t, q, qd in zip((1.0, 2.0), (q0 + 0.05, goal), still, strict=True)]
-        assert answer_to(asked_for(node, names[::-1], turned)) == "trajectory of 2 points: taken"  # in any order
-        assert "refused: point 1: joint 1 at" in answer_to(asked_for(node, names, [(1.0, q0 + 9.0, ())]))
-        assert "limit" in answer_to(asked_for(node, names, [(0.01, goal, ())]))
-        assert "expected the joints" in answer_to(asked_for(node, names[:3], [(1.0, goal[:3], ())]))
-        assert "expected 6 numbers" in answer_to(asked_for(node, names, [(1.0, goal[:3], ())]))
-        assert "velocities" in answer_to(asked_for(node, names, [(1.0, goal, ()), (2.0, goal, np.zeros(6))]))
-        assert answer_to(asked_for(node, names, [])) == "stop: taken"
-        until(lambda: True if len(bridge.requests) >= 2 else None, feed, bridge)
-        followed, stopped = bridge.requests
-        assert stopped == Request("stop")
-        assert bridge.end("{}")["error"] is None
-    finally:
-        bridge.kill()
+    goal, still = q0 + 0.1, [()] * 2
+    turned = [(t, q[::-1], qd) for t, q, qd in zip((1.0, 2.0), (q0 + 0.05, goal), still, strict=True)]
+    assert answer_to(asked_for(node, names[::-1], turned)) == "trajectory of 2 points: taken"  # in any order
+    assert "refused: point 1: joint 1 at" in answer_to(asked_for(node, names, [(1.0, q0 + 9.0, ())]))
+    assert "limit" in answer_to(asked_for(node, names, [(0.01, goal, ())]))
+    assert "expected the joints" in answer_to(asked_for(node, names[:3], [(1.0, goal[:3], ())]))
+    assert "expected 6 numbers" in answer_to(asked_for(node, names, [(1.0, goal[:3], ())]))
+    assert "velocities" in answer_to(asked_for(node, names, [(1.0, goal, ()), (2.0, goal, np.zeros(6))]))
+    assert answer_to(asked_for(node, names, [])) == "stop: taken"
+    until(lambda: True if len(bridge.requests) >= 2 else None, feed, bridge)
+    followed, stopped = bridge.requests
+    assert stopped == Request("stop")
+    assert bridge.end("{}")["error"] is None
     with canprobe.open_cell(scene, bus="direct") as cell:
         result = cell.run(RequestedTask(None, None, (deque([followed]),), 2.5e-3, cell.plan))
     np.testing.assert_allclose(result.log["q_rad"][-1], goal, atol=1e-3)

@@ -28,7 +28,6 @@ from canprobe.cell.results.result import write_page_of
 from canprobe.cell.scene.model import BridgeSettings
 from canprobe.cli import main
 from canprobe.errors import install_line
-from canprobe.lab.bridge.process import BridgeProcess
 
 ROOT = Path(__file__).parents[3]
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -100,21 +99,18 @@ def test_a_run_is_served_until_it_is_told_to_end(served, number, status):
         os.killpg(process.pid, 0)
 
 
-def test_a_cell_is_shown_while_it_runs(recorded):
+def test_a_cell_is_shown_while_it_runs(recorded, bridge_of):
     """The bridge, fed what an observer saw: a browser finds the path, nothing is dropped, nothing is left."""
     scene = replace(recorded.result.plan.scene, bridge=BridgeSettings(use=("view",), view_port=0))
-    bridge = BridgeProcess("view", canprobe.plan(scene), None, virtual=True)
-    try:
-        address = bridge.await_ready()
-        for observation in recorded.observations:
-            bridge.observe(observation)
-        assert "<title>Viser</title>" in page_at(address)
-        last = recorded.observations[-1]
-        wanted = {"/arm/6", "/path/0000", "/probe/taxels", "GuiUplotMessage"}
-        messages(address, wanted, lambda: bridge.observe(last))
-        status = bridge.end("{}")
-    finally:
-        bridge.kill()
+    bridge = bridge_of("view", canprobe.plan(scene))
+    address = bridge.await_ready()
+    for observation in recorded.observations:
+        bridge.observe(observation)
+    assert "<title>Viser</title>" in page_at(address)
+    last = recorded.observations[-1]
+    wanted = {"/arm/6", "/path/0000", "/probe/taxels", "GuiUplotMessage"}
+    messages(address, wanted, lambda: bridge.observe(last))
+    status = bridge.end("{}")
     assert (status["error"], status["dropped"]) == (None, 0) and status["samples"] >= len(recorded.observations)
     assert port_is_free(address)
 
@@ -140,7 +136,7 @@ def test_without_the_extra_there_is_the_line_that_installs_it(monkeypatch, capsy
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nothing"], "nothing: no such scene or file; packaged scenes: "),
+        (["nothing"], "nothing: no such scene, cell or file; scenes: "),
         (["free", "--port", "70000"], "expected an integer from 0 to 65535"),
         (["{empty}"], "no scene.toml in this folder; expected one that `canprobe run --out DIR` wrote"),
     ],

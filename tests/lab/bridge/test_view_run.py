@@ -11,20 +11,20 @@ import shutil
 import numpy as np
 import pytest
 from msgspec import msgpack
+from puma_arm import UPENN
 from zstandard import ZstdDecompressor
 
 import canprobe
 from canprobe.cell.results.result import write_page_of
 from canprobe.cell.scene.geometry import true_object
 from canprobe.errors import CanprobeError
-from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch
-from canprobe.lab.bridge.sampling import SampleSource
 from canprobe.lab.bridge.view.instants import SILENT_NS, Follower, Moment, curves_of, judge, kappa_sigmas, row_of
 from canprobe.lab.bridge.view.path import GAP_M, LIFT_M, Trail, deviation_scale
 from canprobe.lab.bridge.view.recorded import read_run
 from canprobe.lab.bridge.view.replay import trail_of
 from canprobe.lab.bridge.view.stage import FORCE_HEAD_M, FORCE_M_PER_N
+from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
@@ -32,12 +32,6 @@ from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotatio
 @pytest.fixture(scope="module")
 def run(recorded):
     return read_run(recorded.folder)
-
-
-@pytest.fixture(scope="module")
-def samples(recorded):
-    source = SampleSource(recorded.result.plan)
-    return [source.sample(unpack_observation(pack_observation(o))) for o in recorded.observations]
 
 
 # what is read
@@ -267,25 +261,11 @@ def test_the_page_holds_the_whole_run(page, run):
     assert len(frames) == 256 * len(data["phases"]) and data["truth"] is True
 
 
-def test_the_last_pose_in_the_page_is_the_last_pose_of_the_run(page, run):
-    from puma_arm import UPENN
-
-    from canprobe.mechanics.robot.chain import forward
-
-    places = [
-        m["position"]
-        for _, m in embedded(page)["messages"]
-        if m["type"] == "SetPositionMessage" and m["name"] == "/arm/6"
-    ]
-    flange = forward(UPENN.chain, run.at(run.duration_s).q)
-    assert places[-1] == pytest.approx(flange[:3, 3].tolist(), abs=1e-6)
-
-
 def test_scene_and_panel_of_the_page_have_one_clock(page, run):
     """What viser plays at an instant of its slider is what the panel shows there: the run at that instant."""
-    from puma_arm import UPENN
 
-    from canprobe.mechanics.robot.chain import forward
+    def flange(t):
+        return pytest.approx(forward(UPENN.chain, run.at(t).q)[:3, 3].tolist(), abs=1e-6)
 
     placed = {
         round(t, 6): m["position"]
@@ -295,7 +275,8 @@ def test_scene_and_panel_of_the_page_have_one_clock(page, run):
     assert min(placed) == 0.0
     for t in panel_data(page)["curves"]["t_s"][1::10]:
         shown = placed[max(known for known in placed if known <= t + 1e-4)]
-        assert shown == pytest.approx(forward(UPENN.chain, run.at(t + 1e-4).q)[:3, 3].tolist(), abs=1e-4)
+        assert shown == flange(t + 1e-4)
+    assert placed[max(placed)] == flange(run.duration_s)
 
 
 def test_the_arrow_is_seen_wherever_a_contact_is_known(page, run):

@@ -17,7 +17,7 @@ from canprobe.cell.results.run_files import load_table
 from canprobe.errors import SceneError, UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.lab.examples import learn_touch_scan
-from canprobe.lab.gym.region import SIGHT_RADIUS_M, TOUCH_RADIUS_M, Coverage
+from canprobe.lab.gym.episode import SIGHT_RADIUS_M, TOUCH_RADIUS_M, Coverage
 
 STILL = np.zeros(3, dtype=np.float32)
 

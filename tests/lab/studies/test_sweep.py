@@ -21,8 +21,7 @@ from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 from canprobe.lab.studies import cell_store as sweep_store
 from canprobe.lab.studies import sweep
 from canprobe.lab.studies.cell_store import CellStore, as_json, cell_key, model_digest
-from canprobe.lab.studies.executors import dask_executor, process_pool
-from canprobe.lab.studies.sweep import Sweep, open_sweep
+from canprobe.lab.studies.sweep import Sweep, dask_executor, open_sweep, process_pool
 
 DEMO = '''
 """A study of six cells; what happens in the fourth is set by the environment. Every measurement leaves a line."""

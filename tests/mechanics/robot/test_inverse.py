@@ -11,8 +11,15 @@ from serial_arms import five, gantry, model_of, random_chain, scara, seven
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
-from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, rolls_last, task_rows
-from canprobe.mechanics.robot.inverse_step import damped_step, lifting_step
+from canprobe.mechanics.robot.inverse import (
+    ERROR_LENGTH_M,
+    damped_step,
+    in_rows,
+    inverse_near,
+    lifting_step,
+    rolls_last,
+    task_rows,
+)
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 

@@ -11,8 +11,15 @@ from serial_arms import gantry, scara, seven
 
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward
-from canprobe.mechanics.robot.model import METRES_PER_RADIAN, ArmModel, joints_to_units, units_to_joints
-from canprobe.mechanics.robot.motors import joints_per_motor, position_sigma, units_per_motor
+from canprobe.mechanics.robot.model import (
+    METRES_PER_RADIAN,
+    ArmModel,
+    joints_per_motor,
+    joints_to_units,
+    position_sigma,
+    units_per_motor,
+    units_to_joints,
+)
 
 ALL = {model.name: model for model in (*MODELS.values(), gantry(), scara(), seven())}
 EACH = pytest.mark.parametrize("model", ALL.values(), ids=ALL)

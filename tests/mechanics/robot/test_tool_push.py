@@ -5,7 +5,7 @@ import pytest
 from published_puma import UPENN
 
 from canprobe.mechanics.robot.chain import forward
-from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.model import joints_per_motor
 from canprobe.mechanics.robot.tool_push import PushGeometry, TorqueMean, push_since
 
 Q = np.radians([90.0, 65.0, 15.0, 0.0, 100.0, 10.0])

@@ -36,10 +36,10 @@ class Path:
         normals = self.normals + sigma_normal * rng.normal(size=self.normals.shape)
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
-    def error(self, estimate: object) -> Array:
-        """(K11, K12, K22) of estimate − truth, in the contact frame of the estimate."""
+    def error(self, estimate: object, at: Array | None = None) -> Array:
+        """(K11, K12, K22) of estimate − truth at a place, by default the last, in the contact frame of the estimate."""
         P = estimate.T_frame_contact[:3, :2]  # type: ignore[attr-defined]
-        K, B = self.surface.curvature_at(self.points[-1])
+        K, B = self.surface.curvature_at(self.points[-1] if at is None else at)
         delta = estimate.K - P.T @ (B @ K @ B.T) @ P  # type: ignore[attr-defined]
         return np.array([delta[0, 0], delta[0, 1], delta[1, 1]])
 

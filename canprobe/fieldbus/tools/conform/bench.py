@@ -13,7 +13,7 @@ from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import Permits
-from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE, SdoClient, SdoRefused
 
 HEARTBEAT_MS = 50
 """Period of the heartbeat by which points see the NMT state."""
@@ -93,7 +93,7 @@ class Bench(SdoClient):
 
     def serves(self, what: str) -> None:
         """Check that a read of 1000h is answered as ever. Raises Deviation."""
-        if (answer := self.request(0x40, 0x1000)) != self.first_answer:
+        if (answer := self.ask(READ_TYPE)) != self.first_answer:
             self.deviates(f"1000h is answered with {answer.hex(' ')} after {what}")
 
     def expect(self, holds: object, text: str) -> None:
@@ -143,9 +143,8 @@ class Bench(SdoClient):
         if not period_ms:
             state = self.guarded()
             return self.deviates("no answer to guarding") if state is None else state & 0x7F
-        until_ns = self.now_ns + round((3e-3 * period_ms + self.times.slack_s) * 1e9)
         self.taken(self.beat_id)
-        while (frame := self.next(self.beat_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+        for frame in self.coming(self.beat_id, 3e-3 * period_ms + self.times.slack_s):
             if len(frame.data) == 1 and frame.data[0] and frame.t_ns > self._changed_ns + QUEUED_NS:
                 return frame.data[0]
         self.deviates(f"no heartbeat within three periods of {period_ms} ms")
@@ -172,8 +171,8 @@ class Bench(SdoClient):
     def reset(self, command: NmtCommand = NmtCommand.RESET_COMMUNICATION) -> int:
         """Reset the device, and wait for its boot-up message; return when it came. Raises Deviation."""
         self.taken(self.beat_id)
-        until_ns = self.nmt(command) + round(self.times.boot_s * 1e9)
-        while (frame := self.next(self.beat_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+        self.nmt(command)
+        for frame in self.coming(self.beat_id, self.times.boot_s):
             if frame.data == b"\0":
                 return frame.t_ns
         self.deviates(f"no boot-up message within {self.times.boot_s:g} s of {command.name.lower().replace('_', ' ')}")

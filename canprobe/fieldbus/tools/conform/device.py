@@ -10,28 +10,23 @@ from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.reading import is_drive
 from canprobe.fieldbus.protocol.cia402 import STATUSWORD
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import RPDOS, TO_MAPPING, TPDOS, is_mapping
 from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.conform.outcome import Deviation
 from canprobe.fieldbus.tools.conform.permits import WriteList
 from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
+from canprobe.fieldbus.tools.reports.report import IDENTITY
 
-RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
 DRIVE_PROFILE = 402
 _AXIS_STEP = 0x800
 _VARIABLES = (*range(0x1000, 0x1003), *range(0x1005, 0x100B), 0x100C, 0x100D, 0x1012, 0x1014, 0x1015, 0x1017, 0x1019)
 _RECORDS = (0x1003, 0x1016, 0x1018, 0x1020, 0x1028, 0x1029, 0x1200, 0x1201)
+TEXTS = (0x1008, 0x1009, 0x100A)
+"""Device name, hardware version and software version."""
 _MAX_ENTRIES = 64
 _UNDESCRIBED_PDOS = 32
 """PDOs of each direction that are looked for where no EDS names them."""
-_FACTS = {
-    "vendor": (0x1018, 1),
-    "product": (0x1018, 2),
-    "revision": (0x1018, 3),
-    "serial": (0x1018, 4),
-    "device name": (0x1008, 0),
-    "hardware version": (0x1009, 0),
-    "firmware": (0x100A, 0),
-}
+_FACTS = dict(zip(IDENTITY, (*((0x1018, n) for n in range(1, 5)), *((index, 0) for index in TEXTS)), strict=True))
 
 
 @dataclass(slots=True)
@@ -70,15 +65,15 @@ class ExaminedDevice:
 
     def _pdo_indices(self) -> list[int]:
         if self.description is not None:
-            comm = [0x13FF + n for n in self.description.rpdos] + [0x17FF + n for n in self.description.tpdos]
+            comm = [RPDOS[n - 1] for n in self.description.rpdos] + [TPDOS[n - 1] for n in self.description.tpdos]
         else:
             comm = [area[n] for area in (RPDOS, TPDOS) for n in range(_UNDESCRIBED_PDOS)]
-        return [index for pdo in comm for index in (pdo, pdo + 0x200)]
+        return [index for pdo in comm for index in (pdo, pdo + TO_MAPPING)]
 
     def _read_record(self, bench: SdoClient, index: int) -> None:
         if not (count := self._read(bench, (index, 0))):
             return
-        if 0x1600 <= index < 0x1800 or index >= 0x1A00:  # its sub-index 0 counts the entries in use only
+        if is_mapping(index):  # its sub-index 0 counts the entries in use only
             for subindex in range(1, _MAX_ENTRIES + 1):
                 if self._read(bench, (index, subindex)) is None:
                     return
@@ -144,7 +139,7 @@ class ExaminedDevice:
 
     def mapping(self, pdo: int) -> list[int]:
         """Mapped entries of a PDO, each index << 16 | subindex << 8 | bits."""
-        return [self.number(pdo + 0x200, n) for n in range(1, self.number(pdo + 0x200) + 1)]
+        return [self.number(pdo + TO_MAPPING, n) for n in range(1, self.number(pdo + TO_MAPPING) + 1)]
 
     def cob_id(self, pdo: int) -> int | None:
         """Identifier of a PDO; None while it is not valid."""

@@ -23,8 +23,9 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import CONTROLWORD, POWERED_STATES, describe_state, known_state
 from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
+from canprobe.fieldbus.protocol.pdo import RPDOS
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import RPDOS, ExaminedDevice
+from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
@@ -38,7 +39,7 @@ from canprobe.fieldbus.tools.conform.outcome import (
 from canprobe.fieldbus.tools.conform.permits import Permits, WriteList, is_object
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
-from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE, SdoRefused
 from canprobe.fieldbus.tools.conform.surroundings import hear
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
@@ -156,7 +157,7 @@ class Examination:
         self.bench = bench = Bench(self._port, device, permits, settings.times)
         bench.bitrate, bench.fd, bench.by_hand = settings.bitrate, settings.fd, self._by_hand
         try:
-            bench.first_answer = bench.request(0x40, 0x1000)
+            bench.first_answer = bench.ask(READ_TYPE)
         except CanprobeError as error:
             raise NodeError(self._node_id, f"it cannot be examined: {error}") from error
         device.read_all(bench, written)
@@ -308,7 +309,7 @@ class Examination:
         bench.forget()
         bench.emergencies.clear()
         try:
-            bench.request(0x40, 0x1000)
+            bench.ask(READ_TYPE)
         except CanprobeError as error:
             raise BenchFailure(f"the device does not answer before the point begins: {error}") from error
         self._check_power()

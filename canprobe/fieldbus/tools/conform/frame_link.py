@@ -6,7 +6,7 @@ Nothing else of the examination touches the bus. While somebody waits, the backg
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -126,6 +126,12 @@ class FrameLink:
         while not box and self.now_ns < until_ns:
             self._receive(until_ns, once=True)
         return box.popleft() if box else None
+
+    def coming(self, can_id: int, within_s: float) -> Iterator[CameFrame]:
+        """Frames with an identifier, as they come, until a time is over."""
+        until_ns = self.now_ns + round(within_s * 1e9)
+        while (frame := self.next(can_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+            yield frame
 
     def taken(self, can_id: int) -> list[CameFrame]:
         """Frames with an identifier that came and were not taken yet; they are taken now."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from canprobe.errors import UsageError, check_schema, regular_file
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, TO_MAPPING
 from canprobe.fieldbus.protocol.sdo import Place, place_text
 from canprobe.fieldbus.tools.conform.outcome import BenchFailure, Deviation
 from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
@@ -23,7 +24,6 @@ SCHEMA = 1
 """Version of the snapshot."""
 _KIND = "canprobe conform snapshot"
 _MAX_BYTES = 1 << 24
-_PDOS = range(0x1400, 0x1C00)
 
 
 class Journal:
@@ -105,9 +105,9 @@ class Journal:
         """
         wanted = sorted(self.values if all_of_it else self.touched & self.values.keys())
         differing = [place for place in wanted if _present(bench, place) != self.values[place]]
-        for pdo in sorted({place[0] & ~0x200 for place in differing if place[0] in _PDOS}):
+        for pdo in sorted({place[0] & ~TO_MAPPING for place in differing if place[0] in PDO_OBJECTS}):
             self._restore_pdo(bench, pdo)
-        others = [place for place in differing if place[0] not in _PDOS]
+        others = [place for place in differing if place[0] not in PDO_OBJECTS]
         if any(place[0] in (0x1006, 0x1019) for place in others):
             others = [place for place in others if place[0] not in (0x1006, 0x1019)]
             self._write(bench, (0x1006, 0), bytes(4))
@@ -126,12 +126,12 @@ class Journal:
     def _restore_pdo(self, bench: SdoClient, index: int) -> None:
         cob_id = int.from_bytes(self.values.get((index, 1), b""), "little")
         self._write(bench, (index, 1), (cob_id | INVALID_FLAG).to_bytes(4, "little"))
-        mapping = [self.values[place] for place in _entries(self.values, index + 0x200)]
-        if [_present(bench, place) for place in _entries(self.values, index + 0x200)] != mapping:
-            self._write(bench, (index + 0x200, 0), b"\0")
+        mapping = [self.values[place] for place in _entries(self.values, index + TO_MAPPING)]
+        if [_present(bench, place) for place in _entries(self.values, index + TO_MAPPING)] != mapping:
+            self._write(bench, (index + TO_MAPPING, 0), b"\0")
             for subindex, word in enumerate(mapping[1:], start=1):
-                self._write(bench, (index + 0x200, subindex), word)
-            self._write(bench, (index + 0x200, 0), mapping[0])
+                self._write(bench, (index + TO_MAPPING, subindex), word)
+            self._write(bench, (index + TO_MAPPING, 0), mapping[0])
         for place in _entries(self.values, index):
             if place[1] > 1:
                 self._write(bench, place, self.values[place])

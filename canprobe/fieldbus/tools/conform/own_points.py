@@ -197,8 +197,8 @@ def _send(bench: Bench, send: Frame, emcy: Number, within_ms: float) -> None:
 
 
 def _expect(bench: Bench, expect: int, data: bytes, within_ms: float) -> None:
-    until_ns, seen = bench.now_ns + round(1e6 * within_ms), "none"
-    while (frame := bench.next(expect, max(0, until_ns - bench.now_ns) * 1e-9)) is not None:
+    seen = "none"
+    for frame in bench.coming(expect, 1e-3 * within_ms):
         if frame.data.startswith(data):
             return
         seen = frame.data.hex(" ")

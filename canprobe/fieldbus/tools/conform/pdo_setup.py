@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import RPDOS, TO_MAPPING, TPDOS, PdoSub
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, is_object
 
 EVENT_TYPE = 255
 _DUMMY_WORDS = (0x00070020, 0x00060010, 0x00050008)
 """UNSIGNED32, UNSIGNED16, UNSIGNED8 as dummy entries."""
-_TYPE, _INHIBIT, _EVENT, _START = 2, 3, 5, 6
 
 
 def changeable_pdo(bench: Bench, area: range, *, mapping: bool = False) -> int:
@@ -23,10 +22,8 @@ def changeable_pdo(bench: Bench, area: range, *, mapping: bool = False) -> int:
     """
     what = "TPDO" if area is TPDOS else "RPDO"
     for pdo in bench.device.pdos(area):
-        writable = bench.device.writable(pdo, 1)
-        if mapping:
-            writable = writable and bench.device.writable(pdo + 0x200, 0) and bench.device.writable(pdo + 0x200, 1)
-        if writable and (area is RPDOS or bench.device.mapping(pdo)):
+        places = ((pdo, 1), (pdo + TO_MAPPING, 0), (pdo + TO_MAPPING, 1))[: 3 if mapping else 1]
+        if all(bench.device.writable(*place) for place in places) and (area is RPDOS or bench.device.mapping(pdo)):
             return pdo
     raise PointNotApplicable(f"the device has no {what} {'with a mapping that' if mapping else 'that'} can be changed")
 
@@ -55,10 +52,10 @@ def switch_on(bench: Bench, pdo: int) -> int:
 
 def map_entries(bench: Bench, pdo: int, words: list[int]) -> None:
     """Map entries to a PDO that is out of use. Raises Deviation where the device refuses."""
-    bench.put(pdo + 0x200, 0, 0)
+    bench.put(pdo + TO_MAPPING, 0, 0)
     for subindex, word in enumerate(words, start=1):
-        bench.put(pdo + 0x200, subindex, word, 4)
-    bench.put(pdo + 0x200, 0, len(words))
+        bench.put(pdo + TO_MAPPING, subindex, word, 4)
+    bench.put(pdo + TO_MAPPING, 0, len(words))
 
 
 def put_to_work(
@@ -69,9 +66,9 @@ def put_to_work(
     Raises:
         PointNotApplicable: the device has not all of them, or does not take the transmission type.
     """
-    if bench.device.number(pdo, _TYPE) != kind and not bench.takes(pdo, _TYPE, kind):
+    if bench.device.number(pdo, PdoSub.TYPE) != kind and not bench.takes(pdo, PdoSub.TYPE, kind):
         raise PointNotApplicable(f"the device does not take transmission type {kind}")
-    for subindex, value in ((_INHIBIT, inhibit), (_EVENT, event_ms), (_START, start)):
+    for subindex, value in ((PdoSub.INHIBIT_TIME, inhibit), (PdoSub.EVENT_TIMER, event_ms), (PdoSub.SYNC_START, start)):
         if value is not None and (value or bench.device.number(pdo, subindex)):
             bench.need((pdo, subindex))
             bench.put(pdo, subindex, value)
@@ -122,9 +119,9 @@ def rpdo_of_dummies(bench: Bench) -> tuple[int, int, int]:
         PointNotApplicable: no mapping can be changed, or none takes a dummy.
     """
     pdo = idle_pdo(bench, RPDOS, mapping=True)
-    bench.put(pdo + 0x200, 0, 0)
-    word = next((word for word in _DUMMY_WORDS if bench.takes(pdo + 0x200, 1, word)), 0)
-    if not word or not bench.takes(pdo + 0x200, 0, 1):
+    bench.put(pdo + TO_MAPPING, 0, 0)
+    word = next((word for word in _DUMMY_WORDS if bench.takes(pdo + TO_MAPPING, 1, word)), 0)
+    if not word or not bench.takes(pdo + TO_MAPPING, 0, 1):
         raise PointNotApplicable("no RPDO takes a dummy entry, so none can be sent without changing something")
     return pdo, _harmless(bench, pdo, EVENT_TYPE), (word & 0xFF) // 8
 

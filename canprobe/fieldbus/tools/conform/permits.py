@@ -25,17 +25,9 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.protocol.frames import (
-    EFF_FLAG,
-    HEARTBEAT_BASE,
-    NMT_ID,
-    RTR_FLAG,
-    SDO_RX_BASE,
-    SYNC_ID,
-    NmtCommand,
-    is_restricted,
-)
+from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS
 from canprobe.fieldbus.protocol.sdo import Place, place_of, place_text
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.surroundings import Surroundings
@@ -71,7 +63,7 @@ _RULES: dict[int, WriteRule] = {
     **dict.fromkeys((0x1005, 0x1012, 0x1014), WriteRule.IDENTIFIER),
     **dict.fromkeys((0x1020, *range(0x1200, 0x1280)), WriteRule.SAME),
     **dict.fromkeys((0x1006, 0x1007, 0x100C, 0x100D, 0x1015, 0x1016, 0x1017, 0x1019), WriteRule.CHANGED),
-    **dict.fromkeys((0x1028, 0x1029, *range(0x1400, 0x1C00)), WriteRule.CHANGED),
+    **dict.fromkeys((0x1028, 0x1029, *PDO_OBJECTS), WriteRule.CHANGED),
 }
 
 
@@ -162,20 +154,20 @@ class Permits:
         Raises:
             NotPermitted: it must not be sent here.
         """
-        if can_id & (EFF_FLAG | RTR_FLAG):
-            self._need("alone" if can_id & EFF_FLAG or can_id & 0x7F != self.node_id else "")
-        elif can_id == NMT_ID:
+        if can_id & (frames.EFF_FLAG | frames.RTR_FLAG):
+            self._need("alone" if can_id & frames.EFF_FLAG or can_id & 0x7F != self.node_id else "")
+        elif can_id == frames.NMT_ID:
             self._check_nmt(data)
-        elif can_id == SYNC_ID:
+        elif can_id == frames.SYNC_ID:
             self._need("sync")
-        elif can_id == SDO_RX_BASE + self.node_id:
+        elif can_id == frames.SDO_RX_BASE + self.node_id:
             return self._check_request(data)
-        elif SDO_RX_BASE < can_id < SDO_RX_BASE + 128 or can_id == _TIME_ID:
+        elif frames.SDO_RX_BASE < can_id < frames.SDO_RX_BASE + 128 or can_id == _TIME_ID:
             raise NotPermitted(f"{can_id:03X}h is for other nodes")
         elif can_id in self.rpdo_ids and can_id not in self.harmless:
             raise NotPermitted(f"an RPDO ({can_id:03X}h) of the device carries objects that must not be changed")
-        elif HEARTBEAT_BASE < can_id < HEARTBEAT_BASE + 128:
-            producer = can_id - HEARTBEAT_BASE
+        elif frames.HEARTBEAT_BASE < can_id < frames.HEARTBEAT_BASE + 128:
+            producer = can_id - frames.HEARTBEAT_BASE
             if producer == self.node_id or producer in self.surroundings.others:
                 raise NotPermitted(f"a heartbeat in the name of node {producer}, which is there")
         elif can_id == LSS_REQUEST_ID or can_id not in self.harmless:
@@ -192,7 +184,7 @@ class Permits:
             self._need("alone")
         elif data[1] != self.node_id:
             raise NotPermitted("NMT commands go to the device alone")
-        if data[:1] == bytes((NmtCommand.RESET_NODE,)) and "reset" not in self.written.words:
+        if data[:1] == bytes((frames.NmtCommand.RESET_NODE,)) and "reset" not in self.written.words:
             raise NotPermitted(f"--write reset permits {WORDS['reset']}")
 
     def _check_request(self, data: bytes) -> Place | None:
@@ -215,7 +207,7 @@ class Permits:
             raise NotPermitted(f"--write history permits {WORDS['history']}")
         if rule is WriteRule.IDENTIFIER and not same:
             number = int.from_bytes(value or b"", "little")
-            if not (value and is_restricted(number & 0x7FF)):
+            if not (value and frames.is_restricted(number & 0x7FF)):
                 raise NotPermitted(f"{place_text(*place)} may get its own value or a restricted identifier only")
         if rule is WriteRule.REFUSED and value is None:
             return  # the beginning of a transfer, which must be aborted

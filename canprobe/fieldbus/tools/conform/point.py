@@ -5,12 +5,12 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.resources import files
+from pathlib import Path
 
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 
-HINTS = tomllib.loads(files(__package__).joinpath("hints.toml").read_text(encoding="utf-8"))
+HINTS = tomllib.loads(Path(__file__).with_name("hints.toml").read_text(encoding="utf-8"))
 """What the author of a firmware can look at where a point fails, by its number."""
 
 
@@ -52,17 +52,23 @@ class PointGroup:
 
     Attributes:
         name: name of the group, such as ``sdo``.
+        standard: standard of its clauses, such as ``CiA 301``; empty where each clause names its own.
+        needs: what all its points need.
     """
 
     name: str
+    standard: str = ""
+    needs: str = ""
 
     def __call__(
         self, number: int, name: str, clause: str, expected: str | accepted.AbortSet, *, needs: str = ""
     ) -> Callable[[Callable[[Bench], None]], Point]:
         """Make a `Point` of the function below; `expected` are words or codes, `needs` are words with blanks."""
         text = expected if isinstance(expected, str) else accepted.text(expected)
+        source = f"{self.standard}, {clause}" if self.standard else clause
+        all_needs, hint = frozenset(f"{self.needs} {needs}".split()), HINTS[str(number)]
 
         def make(run: Callable[[Bench], None]) -> Point:
-            return Point(number, self.name, name, clause, text, run, frozenset(needs.split()), HINTS[str(number)])
+            return Point(number, self.name, name, source, text, run, all_needs, hint)
 
         return make

@@ -10,6 +10,8 @@ from canprobe.fieldbus.tools.conform.frame_text import sdo_text
 from canprobe.fieldbus.tools.conform.outcome import Deviation
 
 MAX_VALUE_BYTES = 1 << 16
+READ_TYPE = sdo.pack_read(0x1000)
+"""Request for 1000h, which every device answers."""
 
 
 class SdoRefused(CanprobeError):  # noqa: N818 - what a server does
@@ -43,9 +45,9 @@ class SdoClient(FrameLink):
         """
         answer = None
         self.taken(self.answer_id)
-        until_ns = self.send(self.request_id, request) + round(self.times.sdo_s * 1e9)
+        self.send(self.request_id, request)
         named = request[0] >> 5 in (1, 2) or request[0] & 0xE1 == 0xC0 or request[0] & 0xE3 == 0xA0
-        while (frame := self.next(self.answer_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+        for frame in self.coming(self.answer_id, self.times.sdo_s):
             answer = frame.data
             if len(answer) != 8 or not named or sdo.place_of(answer) == sdo.place_of(request):
                 break

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
+from pathlib import Path
 from random import Random
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
@@ -18,7 +18,7 @@ FOREVER_NS = 1 << 62
 ENDLESS_HITS = 1 << 62
 SHORT_NS = 100_000_000
 """Duration of a power failure and of bus-off where none is given."""
-_FACTS = tomllib.loads(files(__package__).joinpath("kinds.toml").read_text(encoding="utf-8"))
+_FACTS = tomllib.loads(Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, slots=True)

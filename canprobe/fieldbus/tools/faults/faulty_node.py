@@ -6,11 +6,11 @@ fault the node behaves as itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from heapq import heappop, heappush
 
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.node.wrapped import WrappedNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID, Frame, NmtState
 from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Effect, Fault
@@ -19,7 +19,7 @@ EVENTS = ("boot-up", "operational", "enabled", "sync")
 """Events of a node at which a fault may begin: its next boot-up, NMT start, operation enabled, or SYNC."""
 
 
-class FaultyNode(WrappedNode):
+class FaultyNode(Participant):
     """One node and its faults.
 
     Args:
@@ -33,7 +33,7 @@ class FaultyNode(WrappedNode):
     """
 
     def __init__(self, node: SlaveNode, faults: Iterable[Fault] = ()) -> None:
-        super().__init__(node)
+        self.node = node
         self.hits = 0
         self.now_ns = 0
         self.history: list[tuple[int, str, Fault]] = []
@@ -49,6 +49,30 @@ class FaultyNode(WrappedNode):
         for fault in faults:
             if fault.node_id == node.node_id:
                 self.add(fault)
+
+    @property
+    def node_id(self) -> int:
+        """Node id of the node."""
+        return self.node.node_id
+
+    @property
+    def name(self) -> str:
+        return self.node.name
+
+    @property
+    def listens(self) -> Container[int]:
+        return self.node.listens
+
+    @property
+    def kind(self) -> type:
+        return self.node.kind
+
+    @property
+    def patient(self) -> frozenset[int]:
+        return self.node.patient
+
+    def connect(self, rerouted: Callable[[], None]) -> None:
+        self.node.connect(rerouted)
 
     def add(self, fault: Fault) -> None:
         """Add a fault; it happens from its start or event on, or from now on."""

@@ -4,16 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
-from canprobe.fieldbus.protocol.frames import (
-    CLASSIC_BYTES,
-    EMCY_BASE,
-    HEARTBEAT_BASE,
-    NMT_ID,
-    SDO_RX_BASE,
-    SDO_TX_BASE,
-    Frame,
-)
+from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.sdo import Abort, pack_abort, place_of
 from canprobe.fieldbus.tools.faults.fault import Effect, Parameter, error_code, in_ms, numbers
 from canprobe.fieldbus.tools.faults.frame_faults import Babble
@@ -32,7 +25,7 @@ class HeartbeatOff(Effect):
     name = "heartbeat-off"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame[0] == HEARTBEAT_BASE + self.node.node_id and frame[1] != _BOOT_UP else None
+        return () if frame[0] == frames.HEARTBEAT_BASE + self.node.node_id and frame[1] != _BOOT_UP else None
 
 
 class HeartbeatState(Effect):
@@ -42,7 +35,7 @@ class HeartbeatState(Effect):
     parameters = numbers(state=Parameter(4, 0, 127, "state: 4 stopped, 127 pre-operational"))
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        if frame[0] != HEARTBEAT_BASE + self.node.node_id or frame[1] == _BOOT_UP:
+        if frame[0] != frames.HEARTBEAT_BASE + self.node.node_id or frame[1] == _BOOT_UP:
             return None
         return ((frame[0], bytes((int(self.fault.value("state")),))),)
 
@@ -53,7 +46,7 @@ class NoBootUp(Effect):
     name = "no-boot-up"
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame == (HEARTBEAT_BASE + self.node.node_id, _BOOT_UP) else None
+        return () if frame == (frames.HEARTBEAT_BASE + self.node.node_id, _BOOT_UP) else None
 
 
 class Nmt(Effect):
@@ -63,7 +56,7 @@ class Nmt(Effect):
     parameters = numbers(command=Parameter(2, 1, 130, "command: 2 stop, 128 pre-operational, 129 reset"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        return self.node.receive(NMT_ID, bytes((int(self.fault.value("command")), self.node.node_id)), t_ns)
+        return self.node.receive(frames.NMT_ID, bytes((int(self.fault.value("command")), self.node.node_id)), t_ns)
 
 
 class ObjectAborted(Effect):
@@ -78,12 +71,12 @@ class ObjectAborted(Effect):
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         can_id, data = frame
-        if can_id != SDO_RX_BASE + self.node.node_id or len(data) != CLASSIC_BYTES:
+        if can_id != frames.SDO_RX_BASE + self.node.node_id or len(data) != frames.CLASSIC_BYTES:
             return None
         index, subindex = place_of(data)
         if data[0] >> 5 not in _INITIATE_REQUESTS or index != self.index(data):
             return None
-        self.host.say((SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
+        self.host.say((frames.SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
         return ()
 
     def index(self, data: bytes) -> int:
@@ -103,7 +96,7 @@ class SdoSilent(Effect):
     incoming = True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame[0] == SDO_RX_BASE + self.node.node_id else None
+        return () if frame[0] == frames.SDO_RX_BASE + self.node.node_id else None
 
 
 class SdoSlow(Effect):
@@ -113,7 +106,7 @@ class SdoSlow(Effect):
     parameters = numbers(ms=in_ms(100, "delay, ms"))
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        if frame[0] != SDO_TX_BASE + self.node.node_id:
+        if frame[0] != frames.SDO_TX_BASE + self.node.node_id:
             return None
         return self.delayed(frame, t_ns, self.fault.value("ms"))
 
@@ -123,7 +116,7 @@ class SdoAnswer(Effect):
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         can_id, data = frame
-        if can_id != SDO_TX_BASE + self.node.node_id or len(data) != CLASSIC_BYTES:
+        if can_id != frames.SDO_TX_BASE + self.node.node_id or len(data) != frames.CLASSIC_BYTES:
             return None
         changed = self.changed(data)
         return None if changed is None else ((can_id, changed),)
@@ -189,7 +182,7 @@ class EmcyStorm(Babble):
     def made(self) -> Frame:
         self._present = not self._present
         code = int(self.fault.value("code")) if self._present else NO_ERROR_CODE
-        return EMCY_BASE + self.node.node_id, Emcy(code, 0x11 if self._present else 0).pack()
+        return frames.EMCY_BASE + self.node.node_id, Emcy(code, 0x11 if self._present else 0).pack()
 
 
 class Remapped(Effect):

@@ -11,8 +11,8 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
                 work. One module a family: enable (and homing), targets, pdo_rules, sdo_rules, network_rules (NMT,
                 SYNC, watchdogs), reactions
     judging     the table of all rules, and `Judge`: events to rules, findings to a report
-    bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile.
-                It is imported by itself: a log needs no nodes
+    bench       a master on nodes that are served here, started and ended; injections throws faults meanwhile. It is
+                imported by itself: a log needs no nodes
 
 Guards against false alarms: a node is judged after its state was seen; three SYNCs after an NMT start and frames that
 may have waited in a queue are passed over; what is wrong counts when it is wrong twice in a row, but for faults that

@@ -5,22 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from statistics import median
 
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.protocol import cia402
-from canprobe.fieldbus.protocol.frames import (
-    EMCY_BASE,
-    HEARTBEAT_BASE,
-    NMT_GOALS,
-    NMT_ID,
-    RTR_FLAG,
-    SDO_RX_BASE,
-    SDO_TX_BASE,
-    SYNC_ID,
-    NmtCommand,
-    NmtState,
-)
+from canprobe.fieldbus.protocol import cia402, frames
 from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
@@ -54,7 +41,7 @@ class BusState:
         self.nodes = {node_id: SeenNode(node_id, what, served=served) for node_id, what in nodes.items()}
         self._channels = {node_id: SdoChannel(node) for node_id, node in self.nodes.items()}
         self.now_ns = 0
-        self.syncs_ns: deque[int] = deque(maxlen=33)
+        self.syncs_ns: deque[int] = deque(maxlen=34)
         self.sync_count = 0
         self.others_ns: dict[int, int] = {}
         self.arbitration_ns = _ARBITRATION_BITS * 1_000_000_000 // bitrate
@@ -68,7 +55,7 @@ class BusState:
         if len(self.syncs_ns) < 3:
             return 0
         times = list(self.syncs_ns)
-        return round(median(b - a for a, b in pairwise(times)))
+        return sorted(b - a for a, b in pairwise(times))[(len(times) - 1) // 2]
 
     def take(self, frame: BusFrame) -> Iterator[BusEvent]:
         """Take a frame and yield what it means, all of which must be consumed before the next one.
@@ -77,7 +64,7 @@ class BusState:
         """
         self.now_ns = frame.t_ns
         can_id, data = frame.can_id, frame.data
-        if can_id & RTR_FLAG and can_id & 0x3FFFFFFF <= 0x7FF:
+        if can_id & frames.RTR_FLAG and can_id & 0x3FFFFFFF <= 0x7FF:
             yield events.RemoteSeen(frame)
         elif can_id <= 0x7FF:
             yield from self._events(frame, can_id, data)
@@ -85,29 +72,29 @@ class BusState:
     def _events(self, frame: BusFrame, can_id: int, data: bytes) -> Iterator[BusEvent]:
         node = self.nodes.get(can_id & 0x7F)
         base = can_id - (can_id & 0x7F)
-        if can_id == NMT_ID:
+        if can_id == frames.NMT_ID:
             yield from self._nmt(frame)
-        elif can_id == SYNC_ID and len(data) <= 1:
+        elif can_id == frames.SYNC_ID and len(data) <= 1:
             self.syncs_ns.append(frame.t_ns)
             self.sync_count += 1
             for one in self.nodes.values():
                 one.syncs += one.started_ns is not None
             yield events.SyncSeen(frame, data[0] if data else None)
-        elif base == HEARTBEAT_BASE and can_id > base:
+        elif base == frames.HEARTBEAT_BASE and can_id > base:
             yield from self._heartbeat(frame, can_id - base)
-        elif node is not None and base in (EMCY_BASE, SDO_TX_BASE, SDO_RX_BASE):
+        elif node is not None and base in (frames.EMCY_BASE, frames.SDO_TX_BASE, frames.SDO_RX_BASE):
             yield from self._service(frame, node, base)
         else:
             yield from self._pdos(frame)
 
     def _service(self, frame: BusFrame, node: SeenNode, base: int) -> Iterator[BusEvent]:
         """EMCY or SDO of a node."""
-        if base == SDO_RX_BASE:
+        if base == frames.SDO_RX_BASE:
             node.addressed = True
             yield from map(self._requested, self._channels[node.node_id].from_client(frame))
             return
         yield from self._sent_by(node, frame)
-        if base == SDO_TX_BASE:
+        if base == frames.SDO_TX_BASE:
             for event in self._channels[node.node_id].from_server(frame):
                 yield from self._transferred(event)
         elif len(frame.data) == 8:
@@ -125,20 +112,20 @@ class BusState:
 
     def _sent_by(self, node: SeenNode, frame: BusFrame) -> Iterator[BusEvent]:
         node.hear(frame.t_ns)
-        node.answers = node.answers or frame.can_id != HEARTBEAT_BASE + node.node_id or frame.data != b"\0"
+        node.answers = node.answers or frame.can_id != frames.HEARTBEAT_BASE + node.node_id or frame.data != b"\0"
         if frame.from_node is False:
             yield events.ForgedSeen(frame, node)
 
     def _nmt(self, frame: BusFrame) -> Iterator[BusEvent]:
-        if len(frame.data) != 2 or frame.data[0] not in NmtCommand.__members__.values():
+        if len(frame.data) != 2 or frame.data[0] not in frames.NmtCommand.__members__.values():
             return
-        command, node_id = NmtCommand(frame.data[0]), frame.data[1]
+        command, node_id = frames.NmtCommand(frame.data[0]), frame.data[1]
         nodes = tuple(node for node in self.nodes.values() if node_id in (0, node.node_id))
         yield events.NmtSeen(frame, command, nodes, node_id == 0)  # the nodes are as they were before it
         for node in nodes:
             node.addressed = True
-            node.nmt, node.nmt_ns = NMT_GOALS[command], frame.t_ns
-            node.started_ns = frame.t_ns if command is NmtCommand.START else None
+            node.nmt, node.nmt_ns = frames.NMT_GOALS[command], frame.t_ns
+            node.started_ns = frame.t_ns if command is frames.NmtCommand.START else None
             node.syncs = 0
 
     def _heartbeat(self, frame: BusFrame, node_id: int) -> Iterator[BusEvent]:
@@ -149,22 +136,22 @@ class BusState:
             return
         yield from self._sent_by(node, frame)
         state = frame.data[0] & 0x7F if len(frame.data) == 1 else -1
-        if state not in NmtState.__members__.values() or frame.from_node is False:
+        if state not in frames.NmtState.__members__.values() or frame.from_node is False:
             return
-        before, node.nmt = node.nmt, NmtState(state)
+        before, node.nmt = node.nmt, frames.NmtState(state)
         if node.nmt is not before:
             node.nmt_ns = frame.t_ns
-            if node.nmt is not NmtState.OPERATIONAL:
+            if node.nmt is not frames.NmtState.OPERATIONAL:
                 node.started_ns = None
-        if node.nmt is NmtState.INITIALISING:
+        if node.nmt is frames.NmtState.INITIALISING:
             self._channels[node_id].reset()
         yield events.HeartbeatSeen(frame, node, node.nmt, before)  # the values are those before a boot-up
-        if node.nmt is NmtState.INITIALISING:
+        if node.nmt is frames.NmtState.INITIALISING:
             node.boot()
             node.heartbeats_ns.clear()
         else:
             node.heartbeats_ns.append(frame.t_ns)
-            if node.nmt is NmtState.OPERATIONAL and node.started_ns is None:
+            if node.nmt is frames.NmtState.OPERATIONAL and node.started_ns is None:
                 node.started_ns, node.syncs = frame.t_ns, 0
 
     def _requested(self, event: BusEvent) -> BusEvent:

@@ -7,8 +7,8 @@ from collections import deque
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import TRANSITIONS, DriveCommand, DriveState, OperationMode, command_of
 from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.events import ControlSeen, HeartbeatSeen, ModeSeen, StatusSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import TARGET_OF_MODE, SeenNode
 
@@ -38,7 +38,7 @@ _LONGEST_START_NS = 500_000_000
 """Longest time for which bit 4 may be set in the homing mode without an edge."""
 
 
-def enables(event: ControlSeen) -> bool:
+def enables(event: events.ControlSeen) -> bool:
     """Whether a controlword is the first to enable a drive that is not enabled yet."""
     was = command_of(event.before) if event.before is not None else None
     is_first = was is not DriveCommand.ENABLE_OPERATION
@@ -48,11 +48,11 @@ def enables(event: ControlSeen) -> bool:
 
 
 @rule(1)
-def target_at_enable(case: Case, node: SeenNode) -> Watch[ControlSeen | TargetSeen | StatusSeen]:
+def target_at_enable(case: Case, node: SeenNode) -> Watch[events.ControlSeen | events.TargetSeen | events.StatusSeen]:
     """The target position is elsewhere than the axis when the drive is enabled."""
     armed: BusFrame | None = None
     while event := (yield):
-        if isinstance(event, ControlSeen):
+        if isinstance(event, events.ControlSeen):
             if enables(event):
                 armed = event.frame
             elif command_of(event.word) is not DriveCommand.ENABLE_OPERATION:
@@ -71,7 +71,7 @@ def target_at_enable(case: Case, node: SeenNode) -> Watch[ControlSeen | TargetSe
 
 
 @rule(2)
-def speed_at_enable(case: Case, node: SeenNode) -> Watch[ControlSeen]:
+def speed_at_enable(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
     """A velocity or torque is set when the drive is enabled."""
     while event := (yield):
         mode = node.mode
@@ -85,14 +85,14 @@ def speed_at_enable(case: Case, node: SeenNode) -> Watch[ControlSeen]:
 
 
 @rule(3)
-def setpoint_too_early(case: Case, node: SeenNode) -> Watch[ControlSeen | TargetSeen]:
+def setpoint_too_early(case: Case, node: SeenNode) -> Watch[events.ControlSeen | events.TargetSeen]:
     """In profile position bit 4 rises before the new target is there."""
     edge: BusFrame | None = None
     fresh = False
     while event := (yield):
         if node.mode != OperationMode.PROFILE_POSITION or not node.enabled:
             continue
-        if isinstance(event, ControlSeen):
+        if isinstance(event, events.ControlSeen):
             if event.word & 0x10 and not (event.before or 0) & 0x10:
                 case.looked += 1
                 edge, fresh = None if fresh else event.frame, False
@@ -108,13 +108,13 @@ def setpoint_too_early(case: Case, node: SeenNode) -> Watch[ControlSeen | Target
 
 
 @rule(4, answers=True)
-def mode_not_confirmed(case: Case, node: SeenNode) -> Watch[ControlSeen | TargetSeen]:
+def mode_not_confirmed(case: Case, node: SeenNode) -> Watch[events.ControlSeen | events.TargetSeen]:
     """The drive is enabled, or gets targets, before it has confirmed its mode."""
     while event := (yield):
         asked = node.known(cia402.MODE)
         if asked is None:
             continue
-        if isinstance(event, ControlSeen):
+        if isinstance(event, events.ControlSeen):
             begins, does = enables(event), "enables"
         else:
             of_mode = TARGET_OF_MODE.get(asked.value) == event.index
@@ -127,7 +127,7 @@ def mode_not_confirmed(case: Case, node: SeenNode) -> Watch[ControlSeen | Target
 
 
 @rule(8)
-def stepped_blind(case: Case, node: SeenNode) -> Watch[ControlSeen]:
+def stepped_blind(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
     """The next step of the state machine comes before the drive has shown the last one."""
     while event := (yield):
         before = command_of(event.before) if event.before is not None else None
@@ -143,7 +143,7 @@ def stepped_blind(case: Case, node: SeenNode) -> Watch[ControlSeen]:
 
 
 @rule(9, answers=True)
-def reset_held(case: Case, node: SeenNode) -> Watch[ControlSeen]:
+def reset_held(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
     """Bit 7 stays set, so that there is no edge and no other command."""
     first: BusFrame | None = None
     while event := (yield):
@@ -157,7 +157,7 @@ def reset_held(case: Case, node: SeenNode) -> Watch[ControlSeen]:
 
 
 @rule(10, answers=True)
-def resets_again(case: Case, node: SeenNode) -> Watch[ControlSeen]:
+def resets_again(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
     """Faults are reset again and again."""
     resets: deque[BusFrame] = deque(maxlen=4)
     while event := (yield):
@@ -173,11 +173,11 @@ def resets_again(case: Case, node: SeenNode) -> Watch[ControlSeen]:
 
 
 @rule(11, answers=True)
-def leaves_quick_stop(case: Case, node: SeenNode) -> Watch[ControlSeen | StatusSeen]:
+def leaves_quick_stop(case: Case, node: SeenNode) -> Watch[events.ControlSeen | events.StatusSeen]:
     """The master enables a drive that has stopped by itself."""
     first: BusFrame | None = None  # that shows a quick stop which the master has not commanded
     while event := (yield):
-        if isinstance(event, StatusSeen):
+        if isinstance(event, events.StatusSeen):
             word = node.number(cia402.CONTROLWORD)
             by_itself = word is not None and command_of(word) is DriveCommand.ENABLE_OPERATION
             if node.state is not DriveState.QUICK_STOP_ACTIVE:
@@ -193,7 +193,7 @@ def leaves_quick_stop(case: Case, node: SeenNode) -> Watch[ControlSeen | StatusS
 
 
 @rule(41)
-def halt_kept(case: Case, node: SeenNode) -> Watch[TargetSeen | ModeSeen]:
+def halt_kept(case: Case, node: SeenNode) -> Watch[events.TargetSeen | events.ModeSeen]:
     """Targets are sent while halt is set, or the mode is changed under it."""
     first: BusFrame | None = None
     while event := (yield):
@@ -202,7 +202,7 @@ def halt_kept(case: Case, node: SeenNode) -> Watch[TargetSeen | ModeSeen]:
             first = None
             continue
         case.looked += 1
-        if isinstance(event, ModeSeen):
+        if isinstance(event, events.ModeSeen):
             if event.mode != event.before and event.before is not None:
                 case.blame(node, f"mode {event.mode} is asked for while halt is set", word, event)
         elif event.value != event.before:
@@ -213,15 +213,15 @@ def halt_kept(case: Case, node: SeenNode) -> Watch[TargetSeen | ModeSeen]:
 
 
 @rule(13)
-def homes_again(case: Case, node: SeenNode) -> Watch[StatusSeen | ControlSeen | HeartbeatSeen]:
+def homes_again(case: Case, node: SeenNode) -> Watch[events.StatusSeen | events.ControlSeen | events.HeartbeatSeen]:
     """An axis is homed although it has its reference."""
     referenced: BusFrame | None = None
     while event := (yield):
-        if isinstance(event, HeartbeatSeen):
+        if isinstance(event, events.HeartbeatSeen):
             referenced = None if event.state is NmtState.INITIALISING else referenced
         elif node.number(cia402.MODE_DISPLAY) != OperationMode.HOMING:
             continue
-        elif isinstance(event, StatusSeen):
+        elif isinstance(event, events.StatusSeen):
             done, failed = event.word >> cia402.HOMING_ATTAINED_BIT & 1, event.word >> cia402.HOMING_ERROR_BIT & 1
             referenced = (referenced or event.frame) if done and not failed else None
         elif event.word & ~(event.before or 0) & 1 << cia402.HOMING_START_BIT and node.enabled:
@@ -230,7 +230,7 @@ def homes_again(case: Case, node: SeenNode) -> Watch[StatusSeen | ControlSeen | 
 
 
 @rule(14)
-def homing_start(case: Case, node: SeenNode) -> Watch[ControlSeen]:
+def homing_start(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
     """Homing is started in another mode, or without an edge."""
     first: BusFrame | None = None  # with bit 4
     while event := (yield):

@@ -10,8 +10,10 @@ from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.seen_node import PdoView, SeenNode
 
+# One is made for each frame, and frozen they would cost 15 ms of every start: nobody changes or compares them.
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(slots=True, eq=False)
 class BusEvent:
     """Base of all events.
 
@@ -26,7 +28,7 @@ class BusEvent:
         return nodes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class NodeSeen(BusEvent):
     """Base of the events of one node.
 
@@ -40,14 +42,14 @@ class NodeSeen(BusEvent):
         return (self.node,)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class SyncSeen(BusEvent):
     """A SYNC, with its counter, or None."""
 
     counter: int | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class NmtSeen(BusEvent):
     """An NMT command to nodes that are judged; `to_all` where it names node 0."""
 
@@ -59,7 +61,7 @@ class NmtSeen(BusEvent):
         return self.nodes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class HeartbeatSeen(NodeSeen):
     """A heartbeat of a node that is judged; a boot-up is the state INITIALISING."""
 
@@ -67,31 +69,31 @@ class HeartbeatSeen(NodeSeen):
     before: NmtState | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class OtherHeartbeatSeen(BusEvent):
     """A heartbeat of somebody else, as of the master."""
 
     node_id: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class EmcySeen(NodeSeen):
     """An emergency message."""
 
     code: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class RemoteSeen(BusEvent):
     """A remote request."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class ForgedSeen(NodeSeen):
     """A frame from outside under an identifier that belongs to a served node."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class RpdoSeen(NodeSeen):
     """A frame for an RPDO of a node; `before` has what the objects in it were; empty where its length does not fit."""
 
@@ -100,7 +102,7 @@ class RpdoSeen(NodeSeen):
     before: Mapping[Place, int | None]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class ControlSeen(NodeSeen):
     """A controlword, by RPDO or by an SDO write that was confirmed."""
 
@@ -109,7 +111,7 @@ class ControlSeen(NodeSeen):
     pdo: PdoView | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class TargetSeen(NodeSeen):
     """A target: 607Ah, 60C1h:01, 60FFh or 6071h."""
 
@@ -120,7 +122,7 @@ class TargetSeen(NodeSeen):
     pdo: PdoView | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class ModeSeen(NodeSeen):
     """A mode of operation that the master asked for (6060h)."""
 
@@ -128,7 +130,7 @@ class ModeSeen(NodeSeen):
     before: int | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class StatusSeen(NodeSeen):
     """A statusword."""
 
@@ -136,7 +138,7 @@ class StatusSeen(NodeSeen):
     before: int | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class RequestSeen(NodeSeen):
     """The first frame of an SDO transfer; `pending` is a request on this channel that has no answer yet."""
 
@@ -146,7 +148,7 @@ class RequestSeen(NodeSeen):
     pending: BusFrame | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class AnswerSeen(NodeSeen):
     """The end of an SDO transfer without an abort; `late`: after the client had aborted it."""
 
@@ -157,7 +159,7 @@ class AnswerSeen(NodeSeen):
     late: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class AbortSeen(NodeSeen):
     """An SDO abort; `place` is that of the transfer, `named` that in the abort."""
 

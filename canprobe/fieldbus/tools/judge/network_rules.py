@@ -5,19 +5,8 @@ from __future__ import annotations
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, OperationMode, command_of
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtCommand, NmtState
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.events import (
-    ControlSeen,
-    ForgedSeen,
-    HeartbeatSeen,
-    NmtSeen,
-    OtherHeartbeatSeen,
-    RemoteSeen,
-    RpdoSeen,
-    StatusSeen,
-    SyncSeen,
-    TargetSeen,
-)
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
@@ -36,7 +25,7 @@ _ENOUGH_SYNCS, _PERIOD_SHARE = 5, 0.05
 
 
 @rule(22, answers=True)
-def waits_for_boot_up(case: Case, node: SeenNode) -> Watch[OtherHeartbeatSeen | SyncSeen]:
+def waits_for_boot_up(case: Case, node: SeenNode) -> Watch[events.OtherHeartbeatSeen | events.SyncSeen]:
     """The master waits for the boot-up of a node that is running."""
     first: BusFrame | None = None  # sign of the master
     while event := (yield):
@@ -49,7 +38,7 @@ def waits_for_boot_up(case: Case, node: SeenNode) -> Watch[OtherHeartbeatSeen | 
 
 
 @rule(24)
-def resets_enabled(case: Case) -> Watch[NmtSeen]:
+def resets_enabled(case: Case) -> Watch[events.NmtSeen]:
     """A node is reset while its axis is enabled."""
     while event := (yield):
         if event.command not in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
@@ -63,7 +52,7 @@ def resets_enabled(case: Case) -> Watch[NmtSeen]:
 
 
 @rule(42)
-def enables_not_operational(case: Case, node: SeenNode) -> Watch[ControlSeen]:
+def enables_not_operational(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
     """RPDOs enable a drive whose node is not operational."""
     while event := (yield):
         if event.pdo is None or node.nmt is None or command_of(event.word) not in _UP:
@@ -75,12 +64,12 @@ def enables_not_operational(case: Case, node: SeenNode) -> Watch[ControlSeen]:
 
 
 @rule(43)
-def guards_beside_heartbeat(case: Case, node: SeenNode) -> Watch[RemoteSeen | HeartbeatSeen]:
+def guards_beside_heartbeat(case: Case, node: SeenNode) -> Watch[events.RemoteSeen | events.HeartbeatSeen]:
     """Node guarding is used beside the heartbeat."""
     asked: BusFrame | None = None
     unasked = False  # whether a heartbeat came that answers no request
     while event := (yield):
-        if isinstance(event, HeartbeatSeen):
+        if isinstance(event, events.HeartbeatSeen):
             answer = asked is not None and event.frame.t_ns - asked.t_ns < QUEUED_NS
             unasked = unasked or (event.state is not NmtState.INITIALISING and not answer)
         elif event.frame.can_id & 0x7FF == HEARTBEAT_BASE + node.node_id:
@@ -90,11 +79,11 @@ def guards_beside_heartbeat(case: Case, node: SeenNode) -> Watch[RemoteSeen | He
 
 
 @rule(44)
-def second_producer(case: Case) -> Watch[ForgedSeen | SyncSeen]:
+def second_producer(case: Case) -> Watch[events.ForgedSeen | events.SyncSeen]:
     """Somebody else sends what a node or the master sends."""
-    last: SyncSeen | None = None
+    last: events.SyncSeen | None = None
     while event := (yield):
-        if isinstance(event, ForgedSeen):
+        if isinstance(event, events.ForgedSeen):
             if case.in_a_row(event.node, True):
                 what = f"{event.frame.can_id:03X} is sent by somebody else than node {event.node.node_id}"
                 case.blame(event.node, what, event)
@@ -106,7 +95,7 @@ def second_producer(case: Case) -> Watch[ForgedSeen | SyncSeen]:
 
 
 @rule(32)
-def irregular_sync(case: Case) -> Watch[SyncSeen]:
+def irregular_sync(case: Case) -> Watch[events.SyncSeen]:
     """SYNC comes irregularly."""
     last: BusFrame | None = None
     worst: tuple[int, BusFrame | None, BusFrame | None] = (0, None, None)
@@ -131,9 +120,9 @@ def irregular_sync(case: Case) -> Watch[SyncSeen]:
 
 
 @rule(33)
-def sync_gaps(case: Case) -> Watch[SyncSeen]:
+def sync_gaps(case: Case) -> Watch[events.SyncSeen]:
     """SYNCs are missing, double, or out of their count."""
-    last: SyncSeen | None = None
+    last: events.SyncSeen | None = None
     bad: BusFrame | None = None  # two within a second, or within three periods, are blamed
     while event := (yield):
         settled = any(node.settled for node in case.bus.nodes.values())
@@ -158,13 +147,13 @@ def sync_gaps(case: Case) -> Watch[SyncSeen]:
 
 
 @rule(36)
-def interpolation_time(case: Case, node: SeenNode) -> Watch[TargetSeen]:
+def interpolation_time(case: Case, node: SeenNode) -> Watch[events.TargetSeen]:
     """60C2h is not the period of SYNC."""
     judged = False
     while event := (yield):
         cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == cia402.TARGET_POSITION
         cyclic = cyclic and command_of(node.number(cia402.CONTROLWORD) or 0) is DriveCommand.ENABLE_OPERATION
-        synchronous = event.pdo is not None and event.pdo.synchronous
+        synchronous = event.pdo is not None and event.pdo.layout.synchronous
         if judged or not (cyclic and synchronous) or node.syncs < _ENOUGH_SYNCS:
             continue
         value, power = (node.value(cia402.INTERPOLATION_TIME, sub) for sub in (1, 2))
@@ -178,7 +167,7 @@ def interpolation_time(case: Case, node: SeenNode) -> Watch[TargetSeen]:
 
 
 @rule(18)
-def no_watchdog(case: Case, node: SeenNode) -> Watch[StatusSeen]:
+def no_watchdog(case: Case, node: SeenNode) -> Watch[events.StatusSeen]:
     """An enabled drive cannot notice that its master is gone."""
     first: BusFrame | None = None
     judged = False
@@ -203,11 +192,11 @@ def _is_watched(case: Case, node: SeenNode) -> bool:
 
 
 @rule(48)
-def starves_watchdog(case: Case, node: SeenNode) -> Watch[OtherHeartbeatSeen | RpdoSeen]:
+def starves_watchdog(case: Case, node: SeenNode) -> Watch[events.OtherHeartbeatSeen | events.RpdoSeen]:
     """The master is late for the watchdog that it has set up."""
     last: dict[int, BusFrame] = {}  # by number of the RPDO, -1 for the heartbeat
     while event := (yield):
-        if isinstance(event, OtherHeartbeatSeen):
+        if isinstance(event, events.OtherHeartbeatSeen):
             key, allowed_ms = -1, _consumer_ms(node, event.node_id)
             what = f"heartbeat {event.node_id:02X}h; 1016h allows"
         else:

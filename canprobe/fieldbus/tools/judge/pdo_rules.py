@@ -8,9 +8,10 @@ from itertools import pairwise
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, RPDOS, TO_MAPPING, is_mapping
 from canprobe.fieldbus.protocol.sdo import place_text
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.events import BusEvent, RequestSeen, RpdoSeen, StatusSeen, SyncSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import TARGETS, SeenNode
 
@@ -29,11 +30,11 @@ _BURST_FRAMES = 3
 
 
 @rule(6)
-def zero_filled(case: Case, node: SeenNode) -> Watch[RpdoSeen | StatusSeen]:
+def zero_filled(case: Case, node: SeenNode) -> Watch[events.RpdoSeen | events.StatusSeen]:
     """The first RPDO has zeros in objects that were something else."""
     unjudged: BusFrame | None = None  # a target of 0, which is compared with the position once that is seen
     while event := (yield):
-        if isinstance(event, StatusSeen):
+        if isinstance(event, events.StatusSeen):
             if unjudged is not None and node.known(cia402.POSITION) is not None:
                 _judge_target(case, node, unjudged)
                 unjudged = None
@@ -64,7 +65,7 @@ def _judge_target(case: Case, node: SeenNode, first: BusFrame) -> None:
 
 
 @rule(7)
-def never_sent(case: Case, node: SeenNode) -> Watch[BusEvent]:
+def never_sent(case: Case, node: SeenNode) -> Watch[events.BusEvent]:
     """An RPDO that the master prepared is never sent."""
     yield  # the end of the bus: it hears no event
     started_ns = node.started_ns
@@ -78,28 +79,27 @@ def never_sent(case: Case, node: SeenNode) -> Watch[BusEvent]:
         sent = bool(node.rpdo_counts.get(pdo.number)) or (by_sdo and not pdo.maps(*TARGETS))
         seconds, kind = (case.bus.now_ns - started_ns) * 1e-9, f"type {pdo.layout.transmission_type}"
         what = f"RPDO {pdo.number} ({kind}) was not sent in {seconds:.1f} s of operational"
-        case.expect(node, sent, what, node.known(0x13FF + pdo.number, 1))
+        case.expect(node, sent, what, node.known(RPDOS[pdo.number - 1], 1))
 
 
 @rule(23)
-def written_while_operational(case: Case, node: SeenNode) -> Watch[RequestSeen]:
+def written_while_operational(case: Case, node: SeenNode) -> Watch[events.RequestSeen]:
     """PDO parameters are written after the NMT start."""
     while event := (yield):
-        if not event.writes or event.place[0] not in range(0x1400, 0x1C00) or node.nmt is None:
+        if not event.writes or event.place[0] not in PDO_OBJECTS or node.nmt is None:
             continue
         in_time = not node.operational or event.frame.t_ns - node.nmt_ns <= QUEUED_NS
         case.expect(node, in_time, f"{place_text(*event.place)} is written while the node is operational", event)
 
 
 @rule(25)
-def remapped_while_valid(case: Case, node: SeenNode) -> Watch[RequestSeen]:
+def remapped_while_valid(case: Case, node: SeenNode) -> Watch[events.RequestSeen]:
     """A mapping is changed while the PDO is valid or sub-index 0 is not 0."""
     while event := (yield):
         index, subindex = event.place
-        mapping = 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00
-        if not mapping or not event.writes or not subindex or event.value == node.sure_value(index, subindex):
+        if not is_mapping(index) or not event.writes or not subindex or event.value == node.sure_value(index, subindex):
             continue
-        parameters = index - 0x200
+        parameters = index - TO_MAPPING
         cob_id, count = node.sure_value(parameters, 1), node.sure_value(index)
         valid = cob_id is not None and not cob_id & INVALID_FLAG
         why = f"{parameters:04X}h:01 is {cob_id:08X}h, valid" if valid else f"{index:04X}h:00 is {count}, not 0"
@@ -108,7 +108,7 @@ def remapped_while_valid(case: Case, node: SeenNode) -> Watch[RequestSeen]:
 
 
 @rule(27)
-def length_not_mapping(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
+def length_not_mapping(case: Case, node: SeenNode) -> Watch[events.RpdoSeen]:
     """RPDOs have another length than their mapping."""
     while event := (yield):
         if not event.pdo.certain:
@@ -119,14 +119,14 @@ def length_not_mapping(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
 
 
 @rule(34)
-def not_one_each_sync(case: Case, node: SeenNode) -> Watch[RpdoSeen | SyncSeen]:
+def not_one_each_sync(case: Case, node: SeenNode) -> Watch[events.RpdoSeen | events.SyncSeen]:
     """Two RPDOs, or none, come between two SYNCs."""
     between: dict[int, list[BusFrame]] = {}  # frames since the last SYNC, by number of the RPDO
     cyclic: dict[int, int] = {}
     last: dict[int, deque[int]] = {}
     while event := (yield):
-        if isinstance(event, RpdoSeen):
-            if event.pdo.synchronous and node.settled and event.pdo.maps(*TARGETS):
+        if isinstance(event, events.RpdoSeen):
+            if event.pdo.layout.synchronous and node.settled and event.pdo.maps(*TARGETS):
                 between.setdefault(event.pdo.number, []).append(event.frame)
             continue
         for number, frames in between.items():
@@ -148,11 +148,11 @@ def not_one_each_sync(case: Case, node: SeenNode) -> Watch[RpdoSeen | SyncSeen]:
 
 
 @rule(35)
-def outside_window(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
+def outside_window(case: Case, node: SeenNode) -> Watch[events.RpdoSeen]:
     """Synchronous RPDOs come after the window of 1007h."""
     while event := (yield):
         window_us = node.number(0x1007)
-        if not window_us or not event.pdo.synchronous or not node.settled or not case.bus.syncs_ns:
+        if not window_us or not event.pdo.layout.synchronous or not node.settled or not case.bus.syncs_ns:
             continue
         late_ns = event.frame.t_ns - case.bus.syncs_ns[-1]
         late = late_ns > window_us * 1000 + case.bus.arbitration_ns
@@ -162,7 +162,7 @@ def outside_window(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
 
 
 @rule(37)
-def cyclic_without_sync(case: Case, node: SeenNode) -> Watch[TargetSeen]:
+def cyclic_without_sync(case: Case, node: SeenNode) -> Watch[events.TargetSeen]:
     """Targets of CSP are not bound to SYNC."""
     while event := (yield):
         pdo = event.pdo
@@ -173,14 +173,14 @@ def cyclic_without_sync(case: Case, node: SeenNode) -> Watch[TargetSeen]:
         since_ns = event.frame.t_ns - max(case.bus.syncs_ns[-1] if case.bus.syncs_ns else 0, node.started_ns or 0)
         if case.in_a_row((node, "type"), kind >= 254, _WANTED_TARGETS):
             what = f"RPDO {pdo.number} with 607Ah has the transmission type {kind}: the drive takes it at any time"
-            case.blame(node, what, node.known(0x13FF + pdo.number, 2), event)
-        if case.in_a_row((node, "sync"), pdo.synchronous and since_ns > _SECOND_NS, _WANTED_TARGETS):
+            case.blame(node, what, node.known(RPDOS[pdo.number - 1], 2), event)
+        if case.in_a_row((node, "sync"), pdo.layout.synchronous and since_ns > _SECOND_NS, _WANTED_TARGETS):
             what = f"RPDO {pdo.number} of type {kind} is sent without a SYNC: the drive never takes it"
             case.blame(node, what, event)
 
 
 @rule(45)
-def backlog_sent(case: Case, node: SeenNode) -> Watch[RpdoSeen]:
+def backlog_sent(case: Case, node: SeenNode) -> Watch[events.RpdoSeen]:
     """After a silence, old RPDOs come all at once."""
     last: dict[int, deque[BusFrame]] = {}  # frames by number of the RPDO
     bursts: dict[int, int] = {}  # frames closer than half the usual interval, after a gap of four

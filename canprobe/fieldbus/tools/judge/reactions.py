@@ -7,18 +7,9 @@ from itertools import pairwise
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, command_of
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.enable import enables
-from canprobe.fieldbus.tools.judge.events import (
-    AnswerSeen,
-    ControlSeen,
-    EmcySeen,
-    HeartbeatSeen,
-    NmtSeen,
-    StatusSeen,
-    SyncSeen,
-    TargetSeen,
-)
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.judge.targets import Onward
@@ -28,7 +19,9 @@ _COMMUNICATION = (0x81, 0x82)
 _FAULTY = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
 _DOWN = (DriveCommand.DISABLE_VOLTAGE, DriveCommand.QUICK_STOP, DriveCommand.SHUTDOWN, DriveCommand.DISABLE_OPERATION)
 _SECOND_NS = 1_000_000_000
-LossEvent = SyncSeen | HeartbeatSeen | TargetSeen | ControlSeen | StatusSeen
+StopEvent = events.EmcySeen | events.StatusSeen | events.ControlSeen | events.NmtSeen
+BootEvent = events.HeartbeatSeen | events.TargetSeen | events.ControlSeen | events.AnswerSeen
+LossEvent = events.SyncSeen | events.HeartbeatSeen | events.TargetSeen | events.ControlSeen | events.StatusSeen
 _SOON_NS = 100_000_000
 """Time after EMCY 0000h within which a stop is an answer to it."""
 _PATIENCE_NS = 2_000_000_000
@@ -36,17 +29,17 @@ _PATIENCE_NS = 2_000_000_000
 
 
 @rule(15, answers=True)
-def targets_after_fault(case: Case, node: SeenNode) -> Watch[EmcySeen | StatusSeen | TargetSeen]:
+def targets_after_fault(case: Case, node: SeenNode) -> Watch[events.EmcySeen | events.StatusSeen | events.TargetSeen]:
     """The targets of a faulty axis go on."""
     onward: Onward | None = None
     while event := (yield):
-        if isinstance(event, TargetSeen):
+        if isinstance(event, events.TargetSeen):
             if onward is not None and onward.goes_on(event):
                 late_ms = (event.frame.t_ns - onward.cause.t_ns) * 1e-6
                 case.blame(node, f"{late_ms:.0f} ms after the fault the targets go on", onward.cause, event)
                 onward = None
             continue
-        if isinstance(event, EmcySeen):
+        if isinstance(event, events.EmcySeen):
             begins = event.code and event.code >> 8 not in _COMMUNICATION and node.is_drive
             ends = not event.code and node.state not in _FAULTY
         else:
@@ -61,13 +54,13 @@ def targets_after_fault(case: Case, node: SeenNode) -> Watch[EmcySeen | StatusSe
 
 
 @rule(16, answers=True)
-def reset_taken_for_error(case: Case) -> Watch[EmcySeen | StatusSeen | ControlSeen | NmtSeen]:
+def reset_taken_for_error(case: Case) -> Watch[StopEvent]:
     """The end of an error is taken for an error."""
     resets: dict[SeenNode, BusFrame] = {}  # messages that healthy, enabled drives sent
     errors_ns: dict[SeenNode, int] = {}
     while event := (yield):
         stopped: tuple[SeenNode, ...] = ()
-        if isinstance(event, EmcySeen):
+        if isinstance(event, events.EmcySeen):
             recent = event.frame.t_ns - errors_ns.get(event.node, -_SECOND_NS) < _SECOND_NS
             if event.code:
                 errors_ns[event.node] = event.frame.t_ns
@@ -75,10 +68,10 @@ def reset_taken_for_error(case: Case) -> Watch[EmcySeen | StatusSeen | ControlSe
             elif event.node.enabled and not recent:
                 case.looked += 1
                 resets[event.node] = event.frame
-        elif isinstance(event, StatusSeen):
+        elif isinstance(event, events.StatusSeen):
             if not event.node.enabled:
                 resets.pop(event.node, None)
-        elif isinstance(event, ControlSeen):
+        elif isinstance(event, events.ControlSeen):
             stopped = (event.node,) if command_of(event.word) in _DOWN and event.node.enabled else ()
         elif event.command is not NmtCommand.START:
             stopped = event.nodes
@@ -88,20 +81,20 @@ def reset_taken_for_error(case: Case) -> Watch[EmcySeen | StatusSeen | ControlSe
 
 
 @rule(21, answers=True)
-def boot_up_ignored(case: Case, node: SeenNode) -> Watch[HeartbeatSeen | TargetSeen | ControlSeen | AnswerSeen]:
+def boot_up_ignored(case: Case, node: SeenNode) -> Watch[BootEvent]:
     """A node boots by itself, and the master goes on as before."""
     onward: Onward | None = None  # targets after a boot-up that nobody asked for
     stale: BusFrame | None = None  # that boot-up, until the node is configured
     while event := (yield):
-        if isinstance(event, HeartbeatSeen):
+        if isinstance(event, events.HeartbeatSeen):
             if event.state is NmtState.INITIALISING and event.before is NmtState.OPERATIONAL:
                 case.looked += 1
                 onward = Onward(node, event.frame.t_ns + QUEUED_NS, case.bus.period_ns, event.frame)
                 stale = event.frame if node.configured else stale
-        elif isinstance(event, AnswerSeen):
+        elif isinstance(event, events.AnswerSeen):
             if event.writes:
                 onward = stale = None
-        elif isinstance(event, TargetSeen):
+        elif isinstance(event, events.TargetSeen):
             if onward is not None and onward.goes_on(event):
                 late_ms = (event.frame.t_ns - onward.cause.t_ns) * 1e-6
                 case.blame(node, f"targets go on {late_ms:.0f} ms after a boot-up", onward.cause, event)
@@ -125,18 +118,18 @@ class _Losses:
 
     def hear(self, event: LossEvent) -> None:
         """Take an event."""
-        if isinstance(event, HeartbeatSeen):
+        if isinstance(event, events.HeartbeatSeen):
             self._beat[event.node] = event.frame
             self._find(event.node)
-        elif isinstance(event, StatusSeen):
+        elif isinstance(event, events.StatusSeen):
             if event.frame.can_id in event.node.tpdos:
                 self._report[event.node] = event.frame
                 if not self._beats(event.node):
                     self._find(event.node)
-        elif isinstance(event, SyncSeen) or (isinstance(event, TargetSeen) and not self._bus.syncs_ns):
+        elif isinstance(event, events.SyncSeen) or (isinstance(event, events.TargetSeen) and not self._bus.syncs_ns):
             for node in self._bus.nodes.values():
                 self._look(node)
-        if isinstance(event, TargetSeen | ControlSeen) and event.node.enabled and self._lost:
+        if isinstance(event, events.TargetSeen | events.ControlSeen) and event.node.enabled and self._lost:
             self._follow(event)
 
     def _find(self, node: SeenNode) -> None:
@@ -188,14 +181,14 @@ class _Losses:
         consumed_ms = max(word & 0xFFFF for word in consumers)
         return max(3 * usual_ns, consumed_ms * 1_000_000) + 2 * self._bus.period_ns
 
-    def _follow(self, event: TargetSeen | ControlSeen) -> None:
+    def _follow(self, event: events.TargetSeen | events.ControlSeen) -> None:
         node = event.node
         lost = next((one for one in self._lost if self._follows(node, one)), None)
         if lost is None or node in self._blamed:
             return
         last = self._lost[lost]
         since_ns = last.t_ns + self._limit_ns(lost)
-        if isinstance(event, TargetSeen):
+        if isinstance(event, events.TargetSeen):
             onward = self._onward.setdefault(node, Onward(node, since_ns, self._bus.period_ns, last))
             found = onward.goes_on(event)
             if event.value != event.before:
@@ -241,7 +234,7 @@ def mute_ignored(case: Case) -> Watch[LossEvent]:
 
 
 @rule(20, answers=True)
-def missing_from_start(case: Case) -> Watch[StatusSeen]:
+def missing_from_start(case: Case) -> Watch[events.StatusSeen]:
     """A node has never been heard, or never answered, and others are enabled."""
     first: BusFrame | None = None  # that shows an enabled axis
     blamed: set[SeenNode] = set()

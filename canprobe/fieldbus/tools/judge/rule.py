@@ -6,7 +6,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
+from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -21,7 +21,7 @@ QUEUED_NS = 5_000_000
 CHARGED_NS = 1_000_000_000
 """Time after a fault of ours for which what follows is charged to it."""
 _KEPT_FINDINGS = 5
-_FACTS = tomllib.loads(files(__package__).joinpath("rules.toml").read_text(encoding="utf-8"))
+_FACTS = tomllib.loads(Path(__file__).with_name("rules.toml").read_text(encoding="utf-8"))
 Event = TypeVar("Event", bound=BusEvent)
 Watch = Generator[None, Event | None, None]
 """Gets the events that its annotation names, one after the other, and None at the end of the bus."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.sdo import Abort, Place, place_text
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.enable import enables
-from canprobe.fieldbus.tools.judge.events import AbortSeen, AnswerSeen, ControlSeen, RequestSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
@@ -18,14 +18,14 @@ _STALE_NS = 10_000_000
 
 
 @rule(26, answers=True)
-def abort_passed_over(case: Case, node: SeenNode) -> Watch[AbortSeen | AnswerSeen | ControlSeen]:
+def abort_passed_over(case: Case, node: SeenNode) -> Watch[events.AbortSeen | events.AnswerSeen | events.ControlSeen]:
     """A write is aborted, and the drive is enabled all the same."""
-    aborts: dict[Place, AbortSeen] = {}  # of writes, until the object is written or read
+    aborts: dict[Place, events.AbortSeen] = {}  # of writes, until the object is written or read
     while event := (yield):
-        if isinstance(event, AbortSeen):
+        if isinstance(event, events.AbortSeen):
             if event.writes and event.place is not None and not event.by_client:
                 aborts[event.place] = event
-        elif isinstance(event, AnswerSeen):
+        elif isinstance(event, events.AnswerSeen):
             aborts.pop(event.place, None)
         elif enables(event):
             case.looked += 1
@@ -36,7 +36,7 @@ def abort_passed_over(case: Case, node: SeenNode) -> Watch[AbortSeen | AnswerSee
 
 
 @rule(28)
-def polls_each_cycle(case: Case, node: SeenNode) -> Watch[RequestSeen]:
+def polls_each_cycle(case: Case, node: SeenNode) -> Watch[events.RequestSeen]:
     """An object is read by SDO in each cycle."""
     last: dict[Place, int] = {}  # number of the SYNC period in which an object was read
     while event := (yield):
@@ -49,12 +49,12 @@ def polls_each_cycle(case: Case, node: SeenNode) -> Watch[RequestSeen]:
 
 
 @rule(29, answers=True)
-def timeout_too_short(case: Case, node: SeenNode) -> Watch[AbortSeen | AnswerSeen]:
+def timeout_too_short(case: Case, node: SeenNode) -> Watch[events.AbortSeen | events.AnswerSeen]:
     """The client gives up before the node answers."""
-    abort: AbortSeen | None = None
+    abort: events.AbortSeen | None = None
     late_answers = 0  # in a row; two show that the time is too short
     while event := (yield):
-        if isinstance(event, AbortSeen):
+        if isinstance(event, events.AbortSeen):
             if not event.by_client or event.code != Abort.TIMED_OUT or event.request is None:
                 continue
             abort = event
@@ -74,14 +74,14 @@ def timeout_too_short(case: Case, node: SeenNode) -> Watch[AbortSeen | AnswerSee
 
 
 @rule(30)
-def abort_without_object(case: Case, node: SeenNode) -> Watch[AbortSeen | AnswerSeen]:
+def abort_without_object(case: Case, node: SeenNode) -> Watch[events.AbortSeen | events.AnswerSeen]:
     """An abort names no object."""
     last: tuple[Place, BusFrame] | None = None  # end of a transfer, which the abort may cross
     while event := (yield):
         over = last
         if event.place is not None:
             last = event.place, event.frame
-        if isinstance(event, AnswerSeen) or not event.by_client:
+        if isinstance(event, events.AnswerSeen) or not event.by_client:
             continue
         if event.place is None and over is None and not node.booted:
             continue
@@ -96,7 +96,7 @@ def abort_without_object(case: Case, node: SeenNode) -> Watch[AbortSeen | Answer
 
 
 @rule(31)
-def two_requests(case: Case, node: SeenNode) -> Watch[RequestSeen]:
+def two_requests(case: Case, node: SeenNode) -> Watch[events.RequestSeen]:
     """A second request is sent before the first one is answered."""
     while event := (yield):
         case.looked += 1

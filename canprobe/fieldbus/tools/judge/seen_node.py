@@ -12,7 +12,7 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode, known_state
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, NmtState
-from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, RPDOS, TO_MAPPING, TPDOS, PdoEntry, PdoLayout
 from canprobe.fieldbus.protocol.sdo import Place
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 
@@ -71,11 +71,6 @@ class PdoView:
     event_timer_ms: int
     certain: bool
     used: bool
-
-    @property
-    def synchronous(self) -> bool:
-        """Whether its content acts at the next SYNC."""
-        return self.layout.transmission_type <= 240
 
     def maps(self, *indices: int) -> bool:
         """Whether it maps one of these objects."""
@@ -175,7 +170,7 @@ class SeenNode:
         """Take the value of an object, written or read. A mode that is asked for again keeps its first time."""
         if place[0] != cia402.MODE or self.number(cia402.MODE) != value:
             self._known[place] = Known(value, frame)
-        if 0x1400 <= place[0] < 0x1C00:
+        if place[0] in PDO_OBJECTS:
             self.read_pdos()
         if place[0] == cia402.POSITION:
             self.positions.append((frame.t_ns, value))
@@ -198,24 +193,24 @@ class SeenNode:
 
     def read_pdos(self) -> None:
         """Read the PDOs anew from their parameters."""
-        self.rpdos = self._valid_pdos(self._description.rpdos, 0x1400)
-        self.tpdos = self._valid_pdos(self._description.tpdos, 0x1800)
+        self.rpdos = self._valid_pdos(self._description.rpdos, RPDOS)
+        self.tpdos = self._valid_pdos(self._description.tpdos, TPDOS)
 
-    def _valid_pdos(self, numbers: Sequence[int], base: int) -> dict[int, PdoView]:
+    def _valid_pdos(self, numbers: Sequence[int], area: range) -> dict[int, PdoView]:
         found = {}
         for number in numbers:
-            index = base + number - 1
+            index = area[number - 1]
             cob_id = self.value(index, 1)
-            count = self.value(index + 0x200)
+            count = self.value(index + TO_MAPPING)
             if cob_id is None or cob_id & INVALID_FLAG or not count or count > 64:
                 continue
-            words = [self.value(index + 0x200, sub) or 0 for sub in range(1, count + 1)]
+            words = [self.value(index + TO_MAPPING, sub) or 0 for sub in range(1, count + 1)]
             entries = tuple(PdoEntry.from_word(word, self._is_signed(word)) for word in words)
             try:
                 layout = PdoLayout(cob_id & 0x7FF, entries, self.value(index, 2) or 0)
             except ProtocolError:
                 continue
-            touched = {index, index + 0x200} & self._touched
+            touched = {index, index + TO_MAPPING} & self._touched
             certain = self._served or len(touched) == 2
             found[layout.cob_id] = PdoView(number, layout, self.value(index, 5) or 0, certain, bool(touched))
         return found

@@ -5,8 +5,8 @@ from __future__ import annotations
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, OperationMode, command_of
 from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.events import ControlSeen, ModeSeen, NmtSeen, RpdoSeen, StatusSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import TARGET_OF_MODE, TARGETS, Known, SeenNode
 
@@ -42,7 +42,7 @@ class Onward:
         self._before: float | None = None
         self._way = 0.0
 
-    def goes_on(self, event: TargetSeen) -> bool:
+    def goes_on(self, event: events.TargetSeen) -> bool:
         """Take a target; whether a window that is over has at least 90 % of the way of the one before."""
         found, cyclic = False, event.index in _PLACES
         while event.frame.t_ns >= self._begin_ns + self._window_ns:
@@ -57,7 +57,7 @@ class Onward:
 
 
 @rule(5)
-def mode_while_moving(case: Case, node: SeenNode) -> Watch[ModeSeen]:
+def mode_while_moving(case: Case, node: SeenNode) -> Watch[events.ModeSeen]:
     """The mode is changed while the axis moves."""
     while event := (yield):
         if not node.enabled or event.mode in (event.before, 0):
@@ -67,7 +67,7 @@ def mode_while_moving(case: Case, node: SeenNode) -> Watch[ModeSeen]:
 
 
 @rule(38)
-def step_too_large(case: Case, node: SeenNode) -> Watch[TargetSeen]:
+def step_too_large(case: Case, node: SeenNode) -> Watch[events.TargetSeen]:
     """Targets step or accelerate more than the drive may."""
     last: int | None = None
     while event := (yield):
@@ -94,7 +94,7 @@ def step_too_large(case: Case, node: SeenNode) -> Watch[TargetSeen]:
 
 
 @rule(39)
-def outside_limits(case: Case, node: SeenNode) -> Watch[TargetSeen]:
+def outside_limits(case: Case, node: SeenNode) -> Watch[events.TargetSeen]:
     """Targets lie outside the software limits."""
     while event := (yield):
         limits = node.soft_limits()
@@ -107,11 +107,11 @@ def outside_limits(case: Case, node: SeenNode) -> Watch[TargetSeen]:
 
 
 @rule(40, answers=True)
-def following_error_ignored(case: Case, node: SeenNode) -> Watch[StatusSeen | TargetSeen]:
+def following_error_ignored(case: Case, node: SeenNode) -> Watch[events.StatusSeen | events.TargetSeen]:
     """The axis does not follow, and the targets go on."""
     onward: Onward | None = None
     while event := (yield):
-        if isinstance(event, StatusSeen):
+        if isinstance(event, events.StatusSeen):
             late = bool(event.word >> cia402.FOLLOWING_ERROR_BIT & 1)
             lags = late and node.enabled and node.mode in _POSITION_MODES
             if case.in_a_row(node, lags, 4):
@@ -125,18 +125,18 @@ def following_error_ignored(case: Case, node: SeenNode) -> Watch[StatusSeen | Ta
 
 
 @rule(17)
-def ends_moving(case: Case, node: SeenNode) -> Watch[NmtSeen | RpdoSeen | StatusSeen]:
+def ends_moving(case: Case, node: SeenNode) -> Watch[events.NmtSeen | events.RpdoSeen | events.StatusSeen]:
     """The master goes while an axis moves."""
     last: BusFrame | None = None  # RPDO with a target
     while event := (yield):
-        if isinstance(event, NmtSeen):
+        if isinstance(event, events.NmtSeen):
             if event.command is NmtCommand.START:
                 continue
             last = None
             if node.enabled:
                 what = f"NMT {event.command.name.lower().replace('_', ' ')} while the axis moves"
                 case.expect(node, not _unstopped(case, node), what, *motion_of(node), event)
-        elif isinstance(event, RpdoSeen):
+        elif isinstance(event, events.RpdoSeen):
             last = event.frame if event.pdo.maps(*TARGETS) else last
         elif last is not None:
             silent_ns = event.frame.t_ns - last.t_ns
@@ -154,7 +154,7 @@ def _unstopped(case: Case, node: SeenNode) -> bool:
 
 
 @rule(47)
-def power_off_moving(case: Case, node: SeenNode) -> Watch[ControlSeen]:
+def power_off_moving(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
     """The voltage is taken away while the axis moves."""
     while event := (yield):
         command = command_of(event.word, event.before or 0)

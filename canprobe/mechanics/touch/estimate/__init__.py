@@ -32,8 +32,7 @@ Estimators, one sample after another:
 
 Answers:
 
-    observed            the rank decision: which combinations of curvature the data observed
-    known_curvature     what one source says about curvature, before that decision
+    observed            what one source says about curvature, and which combinations of it count as observed
     answer              a solution carried to the contact frame: the estimate
     fit                 the entry: `fit_surface` for recorded points, `make_estimator` by name
 

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
-from canprobe.mechanics.touch.estimate.observed import Decision, outside, tensor
+from canprobe.mechanics.touch.estimate.observed import CurvatureInformation, Decision, outside, tensor
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import transport
 from canprobe.mechanics.touch.linear_algebra import checked, principal, read_only

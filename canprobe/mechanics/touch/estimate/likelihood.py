@@ -18,11 +18,16 @@ from canprobe.mechanics.touch.estimate.answer import (
     partial_covariance,
 )
 from canprobe.mechanics.touch.estimate.gate import MeasuredContact, noise_of, slow_errors
-from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import MENTIONED_PROBABILITY, correct, misfit_notes
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors, make_noise, mixed
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION, fit
-from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of
+from canprobe.mechanics.touch.estimate.observed import (
+    curvature_covariance,
+    decide,
+    evidence_of,
+    nothing_observed,
+    spread_of,
+)
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise

@@ -21,11 +21,10 @@ from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEs
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength, slow_errors
 from canprobe.mechanics.touch.estimate.information import InformationFilter
-from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
-from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
+from canprobe.mechanics.touch.estimate.observed import curvature_covariance, decide, evidence_of, nothing_observed
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit
 from canprobe.mechanics.touch.estimate.path_length import PathLength, Spread
 from canprobe.mechanics.touch.estimate.prior import Prior

@@ -14,8 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from canprobe.mechanics.touch.explore.ground import NEAR_FLOOR, GroundCells
-from canprobe.mechanics.touch.explore.lanes import InwardLanes
-from canprobe.mechanics.touch.explore.spacing import LaneForecast, Spacing
+from canprobe.mechanics.touch.explore.lanes import InwardLanes, LaneForecast, Spacing
 from canprobe.mechanics.touch.explore.stretches import (
     STEP_M,
     Heading,

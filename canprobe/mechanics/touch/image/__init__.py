@@ -5,8 +5,7 @@ the pad, doubts) and second moments go out, for the servo and the estimators.
 
 From an image:
 
-    patch               sums and centres the pressure
-    beyond_window       extrapolates a patch that the window cuts
+    patch               sums and centres the pressure, also of a patch that the window cuts
     silent_taxels       finds taxels that do not measure, in one image or by several, and bridges them
     pad_lag             corrects the lag of the centroid behind the contact
     moments             second moments of an image, and the traces that creep leaves in them

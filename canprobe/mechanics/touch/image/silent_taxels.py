@@ -53,7 +53,7 @@ def mended(taxels: Image) -> tuple[Image, int]:
     The same array (rows, columns) is returned where none is dead; else a copy in which each dead taxel has the mean of
     its four neighbours.
     """
-    if not may_be_dead(taxels.tobytes()):
+    if _GAP not in taxels.tobytes().translate(_LEVELS):  # a quick test before the whole search, mostly true
         return taxels, 0
     inner = taxels[1:-1, 1:-1]
     sides = (taxels[:-2, 1:-1], taxels[2:, 1:-1], taxels[1:-1, :-2], taxels[1:-1, 2:])
@@ -66,11 +66,6 @@ def mended(taxels: Image) -> tuple[Image, int]:
     whole = taxels.copy()
     whole[1:-1, 1:-1][dead] = np.rint(mean[dead]).astype(np.uint8)
     return whole, n
-
-
-def may_be_dead(counts: bytes) -> bool:
-    """Whether a taxel reads nothing between two pressed ones; a quick test before the whole search, mostly False."""
-    return _GAP in counts.translate(_LEVELS)
 
 
 class SilentTaxels:

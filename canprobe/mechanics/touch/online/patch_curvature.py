@@ -24,9 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad
-from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
 from canprobe.mechanics.touch.estimate.noise import CHI2_999
-from canprobe.mechanics.touch.estimate.observed import turned
+from canprobe.mechanics.touch.estimate.observed import CurvatureInformation, turned
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.touch.image.image_model import ImageModel
 from canprobe.mechanics.touch.image.moments import Moments, PadMemory, overlapping

@@ -9,7 +9,7 @@ region of curvature holds, in the order in which it comes in:
    conditions", 1967.
 2. The terms that a quadric leaves out: `estimate.misfit`, `estimate.omitted_terms`. Source: Hoeting, Madigan, Raftery
    and Volinsky, "Bayesian model averaging: a tutorial", 1999.
-3. Errors of c13, c23, c33, as far as a plane is refuted: `estimate.known_curvature.curvature_covariance`. Source: Judge
+3. Errors of c13, c23, c33, as far as a plane is refuted: `estimate.observed.curvature_covariance`. Source: Judge
    and Bock, 1978.
 4. The patch narrows it by its own information, which knows the errors of the calibration, of a mean that belongs to an
    earlier place, and of traces of creep (`patch_curvature`); χ² of both, where motion and patch disagree, widens it:
@@ -28,7 +28,7 @@ from dataclasses import replace
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate, is_umbilic
-from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.estimate.observed import CurvatureInformation
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q
 from canprobe.mechanics.types import Floats
 

@@ -7,9 +7,9 @@ import pytest
 
 from canprobe.mechanics.touch import Correlation, Prior
 from canprobe.mechanics.touch.estimate.information import InformationFilter
-from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
 from canprobe.mechanics.touch.estimate.noise import Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
+from canprobe.mechanics.touch.estimate.observed import curvature_covariance
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, OmittedTerms
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
 from canprobe.mechanics.touch.estimate.sandwich import Score
@@ -154,25 +154,31 @@ def test_sums_are_carried_along_as_if_they_were_taken_in_the_last_frame():
     assert np.abs((score - wanted[9:, 9:]) / np.outer(size[9:], size[9:])).max() < 0.09
 
 
-def test_without_forgetting_an_answer_is_that_of_a_batch():
-    """All rows at once: the terms' score has the covariance of their information, and both ways agree."""
-    rng = RNG(4)
-    J, E, e = rng.normal(size=(200, 3, 9)), rng.normal(size=(200, 3, 9)), rng.normal(size=(200, 3))
+QUADRIC = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
+
+
+def sums_of(seed, size, scale=1.0):
+    """Sums of 200 samples of a surface with terms that a quadric has not; rows, H of the quadric, and residuals."""
+    rng = RNG(seed)
+    J, E, e = rng.normal(size=(200, 3, 9)), rng.normal(size=(200, 3, 9)), rng.normal(size=600)
     rows = np.concatenate([J, E], axis=2)
     flat = rows.reshape(-1, 18)
-    prior = 1e-9 * np.eye(9)
-    sums = OmittedTerms(prior, None)
-    c = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
     H = np.linalg.inv(flat[:, :9].T @ flat[:, :9])
-    a = 0.3 * rng.normal(size=9)
-    residuals = flat[:, 9:] @ a + e.reshape(-1)
+    residuals = scale * (flat[:, 9:] @ (size * rng.normal(size=9)) + e)
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))  # at the quadric that fits best
+    sums = OmittedTerms(1e-9 * np.eye(9), None)
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    found = sums.amend(c, H, np.zeros(3), ExpectedMisfit(), np.eye(3))
+    return sums, flat, H, residuals
+
+
+def test_without_forgetting_an_answer_is_that_of_a_batch():
+    """All rows at once: the terms' score has the covariance of their information, and both ways agree."""
+    sums, flat, H, residuals = sums_of(4, 0.3)
+    found = sums.amend(QUADRIC, H, np.zeros(3), ExpectedMisfit(), np.eye(3))
     both = np.linalg.lstsq(flat, residuals, rcond=None)[0]  # terms that show: those that fit best
     assert found.misfit > 0.999
-    assert np.allclose(found.c - c, both[:9], atol=0.02)
-    assert np.allclose(sums.explanation(c, H, ExpectedMisfit()), both, atol=0.02)
+    assert np.allclose(found.c - QUADRIC, both[:9], atol=0.02)
+    assert np.allclose(sums.explanation(QUADRIC, H, ExpectedMisfit()), both, atol=0.02)
     wide = np.linalg.inv(flat.T @ flat)[:9, :9]
     spread = np.diag(H + found.covariance) / np.diag(wide)
     assert np.all(spread[:6] > 0.9)
@@ -195,18 +201,10 @@ def test_where_k_is_its_noise_the_others_hardly_count():
 
 def test_generous_noise_does_not_hide_a_misfit():
     """Deviations stated three times too large make a misfit ten times less evident; said so, it is found again."""
-    rng = RNG(11)
-    J, E = rng.normal(size=(200, 3, 9)), rng.normal(size=(200, 3, 9))
-    rows, e = np.concatenate([J, E], axis=2), rng.normal(size=600)
-    flat = rows.reshape(-1, 18)
-    H = np.linalg.inv(flat[:, :9].T @ flat[:, :9])
-    a = 0.14 * rng.normal(size=9)
-    residuals = (flat[:, 9:] @ a + e) / 3.0
-    residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))
-    sums = OmittedTerms(1e-9 * np.eye(9), None)
-    c = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
-    sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    stated, known = (sums.amend(c, H, np.zeros(3), ExpectedMisfit(noise), np.eye(3)) for noise in (1.0, 1.0 / 9.0))
+    sums, _, H, _ = sums_of(11, 0.14, 1.0 / 3.0)
+    stated, known = (
+        sums.amend(QUADRIC, H, np.zeros(3), ExpectedMisfit(noise), np.eye(3)) for noise in (1.0, 1.0 / 9.0)
+    )
     assert stated.misfit < 0.5
     assert known.misfit > 0.99
 

@@ -8,7 +8,7 @@ import pytest
 from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap
 from canprobe.mechanics.touch.explore.explorer import Explorer
 from canprobe.mechanics.touch.explore.ground import GroundCells
-from canprobe.mechanics.touch.explore.spacing import LaneForecast
+from canprobe.mechanics.touch.explore.lanes import LaneForecast
 from canprobe.mechanics.touch.map.nodes import COLUMNS
 from canprobe.mechanics.touch.map.stiffness import Stiffness
 from canprobe.mechanics.touch.strategies import Rectangle

@@ -31,7 +31,7 @@ from canprobe.mechanics.touch import (
     indentation_from_force,
     make_estimator,
 )
-from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.estimate.observed import CurvatureInformation
 from canprobe.mechanics.touch.online.patch_curvature import MIN_FRAMES
 from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
@@ -59,17 +59,7 @@ def after_path(line, *, moments=True, method="recursive", seed=4):
     one = estimator(method)
     for i, (x, y) in enumerate(line):
         touch = cylinder_touch(x, y, i * 5e-3, moments)
-        one.add(
-            ContactSample(
-                touch.t_s,
-                touch.p_base + 1e-5 * rng.standard_normal(3),
-                touch.n_base,
-                touch.T_base_probe,
-                touch.r_probe,
-                FORCE,
-                moments=touch.moments,
-            )
-        )
+        one.add(replace(touch, p_base=touch.p_base + 1e-5 * rng.standard_normal(3)))
     return one
 
 
@@ -128,10 +118,10 @@ def test_along_a_straight_path_over_a_torus_both_are_right_or_say_so(torus_line)
     assert np.mean(held) > 0.9
 
 
-def across(estimate):
-    """Standard deviation of the curvature across the axis, 1/m."""
-    y = estimate.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
-    weights = np.array([y[0] ** 2, 2 * y[0] * y[1], y[1] ** 2])
+def across(estimate, direction=(0.0, 1.0, 0.0)):
+    """Standard deviation of the curvature across the axis, or along another direction, 1/m."""
+    x, y = estimate.T_frame_contact[:3, :2].T @ direction
+    weights = np.array([x * x, 2 * x * y, y * y])
     return math.sqrt(weights @ estimate.covariance @ weights)
 
 
@@ -161,8 +151,7 @@ def test_images_that_lie_widen_what_both_know_until_nothing_is_observed():
         answer = list(lies(factor))[1]
         ex = answer.T_frame_contact[:3, :2].T @ [1.0, 0.0, 0.0]
         assert 2.0 * ex @ answer.S[:2, :2] @ ex == pytest.approx(0.0, abs=0.5)
-        weights = np.array([ex[0] ** 2, 2.0 * ex[0] * ex[1], ex[1] ** 2])
-        sigma = math.sqrt(weights @ answer.covariance @ weights)
+        sigma = across(answer, [1.0, 0.0, 0.0])
         assert sigma > before
         before = sigma
     for answer in list(lies(2.0))[1:]:

@@ -10,22 +10,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from canprobe.fieldbus.protocol import cia402
-from canprobe.fieldbus.protocol.cia402 import (
-    TRANSITIONS,
-    DriveCommand,
-    DriveState,
-    OperationMode,
-    describe_state,
-    known_state,
-)
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, OperationMode
 from canprobe.fieldbus.protocol.sdo import Abort, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
-point = PointGroup("drive402")
-AUTOMATON = "CiA 402-2, finite state automaton"
+point = PointGroup("drive402", "CiA 402-2", needs="drive")
+AUTOMATON = "finite state automaton"
 _WORDS = {command: pattern for _, pattern, command in cia402.CONTROLWORD_PATTERNS}
 _WAY_UP = (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION)
 _STATES = tuple(DriveState)[1:5]
@@ -38,8 +31,9 @@ _PRESENT_POSITION = (37, 35)
 def _reach(bench: Bench, state: DriveState, what: str) -> None:
     """Wait for a state of the drive. Raises Deviation."""
     until_ns = bench.now_ns + round(_REACH_S * 1e9)
-    while known_state(word := bench.number(cia402.STATUSWORD)) is not state:
-        bench.expect(bench.now_ns < until_ns, f"{what}: the drive is {describe_state(word)}, expected {state.name}")
+    while cia402.known_state(word := bench.number(cia402.STATUSWORD)) is not state:
+        found = cia402.describe_state(word)
+        bench.expect(bench.now_ns < until_ns, f"{what}: the drive is {found}, expected {state.name}")
         bench.pass_time(0.01)
 
 
@@ -73,7 +67,7 @@ def _supported(bench: Bench) -> int:
 def _off(bench: Bench) -> None:
     """Disable the voltage, and reset a fault that is there."""
     bench.put(cia402.CONTROLWORD, 0, 0, 2)
-    if known_state(bench.number(cia402.STATUSWORD)) is DriveState.FAULT:
+    if cia402.known_state(bench.number(cia402.STATUSWORD)) is DriveState.FAULT:
         bench.does_not_apply("the drive is in FAULT; reset it first")
     _reach(bench, DriveState.SWITCH_ON_DISABLED, "disable voltage")
 
@@ -85,20 +79,14 @@ def _go(bench: Bench, state: DriveState) -> None:
     _reach(bench, state, "on the way up")
 
 
-@point(48, "statusword", "CiA 402-2, 6041h", "the bits of a state, the power stage off", needs="drive")
+@point(48, "statusword", "6041h", "the bits of a state, the power stage off")
 def statusword(bench: Bench) -> None:
     """The bits of 6041h are those of a state."""
     word = bench.number(cia402.STATUSWORD)
-    bench.expect(known_state(word) is not None, f"6041h is {word:04X}h, which is no state")
+    bench.expect(cia402.known_state(word) is not None, f"6041h is {word:04X}h, which is no state")
 
 
-@point(
-    53,
-    "supported modes",
-    "CiA 402-2, 6502h",
-    "6061h shows one of them or 0; what differs from the EDS is noted",
-    needs="drive",
-)
+@point(53, "supported modes", "6502h", "6061h shows one of them or 0; what differs from the EDS is noted")
 def supported_modes(bench: Bench) -> None:
     """6502h beside the EDS, and the mode that 6061h shows."""
     entry = bench.device.described(cia402.SUPPORTED_MODES)
@@ -111,9 +99,7 @@ def supported_modes(bench: Bench) -> None:
         bench.deviates(f"6061h shows mode {mode}, which 6502h does not list")
 
 
-@point(
-    53, "mode display", "CiA 402-2, 6060h 6061h", "6061h follows 6060h; other modes are refused", needs="drive motion"
-)
+@point(53, "mode display", "6060h 6061h", "6061h follows 6060h; other modes are refused", needs="motion")
 def mode_display(bench: Bench) -> None:
     """Every mode from 1 to 10, with the power stage off."""
     modes = _supported(bench)
@@ -132,11 +118,11 @@ def mode_display(bench: Bench) -> None:
         bench.expect((shown := bench.number(cia402.MODE_DISPLAY)) == mode, f"6061h is {shown} after mode {mode}")
 
 
-@point(49, "transitions", AUTOMATON, "every command leads where the table says", needs="drive motion")
+@point(49, "transitions", AUTOMATON, "every command leads where the table says", needs="motion")
 def transitions(bench: Bench) -> None:
     """Every command that does something, in every state up to operation enabled; quick stop is point 51."""
     with _at_rest(bench):
-        for (source, command), goal in TRANSITIONS.items():
+        for (source, command), goal in cia402.TRANSITIONS.items():
             if source not in _STATES or command not in _WORDS or goal is DriveState.QUICK_STOP_ACTIVE:
                 continue
             _go(bench, source)
@@ -146,13 +132,13 @@ def transitions(bench: Bench) -> None:
             _reach(bench, goal, f"{command.name} in {source.name}")
 
 
-@point(50, "illegal commands", AUTOMATON, "commands without a transition change nothing", needs="drive motion")
+@point(50, "illegal commands", AUTOMATON, "commands without a transition change nothing", needs="motion")
 def illegal_commands(bench: Bench) -> None:
     """Commands that have no transition, in the states below operation enabled."""
     with _at_rest(bench):
         for source in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON):
             for command in _WORDS:
-                if (source, command) in TRANSITIONS:
+                if (source, command) in cia402.TRANSITIONS:
                     continue
                 _go(bench, source)
                 _command(bench, command)
@@ -160,9 +146,7 @@ def illegal_commands(bench: Bench) -> None:
                 _reach(bench, source, f"{command.name} in {source.name}")
 
 
-@point(
-    51, "quick stop", "CiA 402-2, 605Ah", "5 to 8 stay in quick stop active, others switch off", needs="drive motion"
-)
+@point(51, "quick stop", "605Ah", "5 to 8 stay in quick stop active, others switch off", needs="motion")
 def quick_stop(bench: Bench) -> None:
     """Quick stop at rest, with the option that the drive has."""
     option = bench.number(0x605A) if bench.device.described(0x605A) is not None else 2
@@ -174,13 +158,7 @@ def quick_stop(bench: Bench) -> None:
         _reach(bench, goal, f"quick stop with 605Ah = {option}")
 
 
-@point(
-    54,
-    "handshake of profile position",
-    "CiA 402-2, profile position",
-    "bit 12 follows bit 4 of 6040h",
-    needs="drive motion",
-)
+@point(54, "handshake of profile position", "profile position", "bit 12 follows bit 4 of 6040h", needs="motion")
 def handshake(bench: Bench) -> None:
     """A set-point where the axis is: it is acknowledged, and the acknowledgement goes with bit 4."""
     with _at_rest(bench, OperationMode.PROFILE_POSITION):
@@ -192,7 +170,7 @@ def handshake(bench: Bench) -> None:
                 bench.deviates(f"bit 12 of 6041h is {found} after controlword {word:04X}h")
 
 
-@point(55, "homing", "CiA 402-2, homing", "bit 12 comes, bit 13 does not", needs="drive motion")
+@point(55, "homing", "homing", "bit 12 comes, bit 13 does not", needs="motion")
 def homing(bench: Bench) -> None:
     """Method 37 or 35, which takes the present position as home."""
     with _at_rest(bench, OperationMode.HOMING):

@@ -14,7 +14,7 @@ from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicabl
 from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("emcy")
+point = PointGroup("emcy", "CiA 301")
 _INHIBIT_MS = 200
 _GENERIC, _COMMUNICATION = 0x01, 0x10
 
@@ -31,7 +31,7 @@ def _provoke(bench: Bench) -> tuple[Emcy, int]:
         raise PointNotApplicable("no EMCY could be provoked: a SYNC of the wrong length brings none") from error
 
 
-@point(42, "history", "CiA 301, 1003h", "the newest error first: its code in the low 16 bits", needs="nmt sync")
+@point(42, "history", "1003h", "the newest error first: its code in the low 16 bits", needs="nmt sync")
 def history(bench: Bench) -> None:
     """The count and the first entry after an error."""
     bench.need((0x1003, 0), written=False)
@@ -43,14 +43,14 @@ def history(bench: Bench) -> None:
     bench.expect(newest & 0xFFFF == SYNC_LENGTH_CODE, f"1003h:01 is {newest:08X}h after EMCY 8240h")
 
 
-@point(42, "write to the history", "CiA 301, 1003h", accepted.VALUE)
+@point(42, "write to the history", "1003h", accepted.VALUE)
 def write_to_history(bench: Bench) -> None:
     """1003h:00 takes nothing but 0."""
     bench.need((0x1003, 0))
     bench.must_refuse(pack_write(0x1003, 0, b"\1"), (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
 
 
-@point(42, "empty entry", "CiA 301, 1003h", accepted.text(accepted.NO_DATA) + ", or 06090011h")
+@point(42, "empty entry", "1003h", accepted.text(accepted.NO_DATA) + ", or 06090011h")
 def empty_entry(bench: Bench) -> None:
     """The entry behind the last error."""
     bench.need((0x1003, 0), written=False)
@@ -59,7 +59,7 @@ def empty_entry(bench: Bench) -> None:
     bench.must_refuse(pack_read(0x1003, beyond), codes, f"read of 1003h:{beyond:02X}, which is empty")
 
 
-@point(42, "clearing the history", "CiA 301, 1003h", "0 to 1003h:00 empties it")
+@point(42, "clearing the history", "1003h", "0 to 1003h:00 empties it")
 def clear_history(bench: Bench) -> None:
     """Where the user permits it."""
     bench.need((0x1003, 0))
@@ -68,7 +68,7 @@ def clear_history(bench: Bench) -> None:
         bench.deviates(f"1003h:00 is {count} after 0 was written")
 
 
-@point(43, "identifier", "CiA 301, 1014h", "080h+id by default, and the one of the messages", needs="nmt sync")
+@point(43, "identifier", "1014h", "080h+id by default, and the one of the messages", needs="nmt sync")
 def identifier(bench: Bench) -> None:
     """1014h names the identifier on which an error comes."""
     bench.need((0x1014, 0), written=False)
@@ -89,7 +89,7 @@ def identifier(bench: Bench) -> None:
     bench.sync_and_wait()
 
 
-@point(43, "inhibit time", "CiA 301, 1015h", "no two messages within the inhibit time", needs="nmt sync")
+@point(43, "inhibit time", "1015h", "no two messages within the inhibit time", needs="nmt sync")
 def inhibit_time(bench: Bench) -> None:
     """An error and its end within 200 ms."""
     bench.need((0x1015, 0))
@@ -106,7 +106,7 @@ def inhibit_time(bench: Bench) -> None:
 @point(
     47,
     "error register",
-    "CiA 301, 1001h",
+    "1001h",
     "bits 0 and 4 with 8240h, at least one of them; as the EMCY says; as before after its end",
     needs="nmt sync",
 )

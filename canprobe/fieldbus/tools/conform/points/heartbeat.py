@@ -10,7 +10,7 @@ from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("heartbeat")
+point = PointGroup("heartbeat", "CiA 301")
 _PERIOD_MS, _CONSUMED_MS, _GUARD_MS, _LIFE_FACTOR = 50, 200, 100, 2
 _SHARE = 0.1
 """Share by which a period of the device may be off."""
@@ -33,7 +33,7 @@ def _beat(bench: Bench, producer: int) -> int:
     return bench.send(HEARTBEAT_BASE + producer, bytes((NmtState.OPERATIONAL,)))
 
 
-@point(8, "producer", "CiA 301, 1017h", "a write acts at once: the period is kept within 10 %, 0 is silence")
+@point(8, "producer", "1017h", "a write acts at once: the period is kept within 10 %, 0 is silence")
 def producer(bench: Bench) -> None:
     """Heartbeats every 50 ms for a second, then none."""
     bench.need((0x1017, 0))
@@ -59,7 +59,7 @@ def _need_guarding(bench: Bench) -> None:
         bench.does_not_apply("the heartbeat cannot be switched off, and excludes guarding")
 
 
-@point(9, "guarding", "CiA 301, node guarding", "the state, with a bit that toggles, from 0 on", needs="nmt")
+@point(9, "guarding", "node guarding", "the state, with a bit that toggles, from 0 on", needs="nmt")
 def guarding(bench: Bench) -> None:
     """Remote requests: the state of each answer, and its toggle bit."""
     try:
@@ -76,7 +76,7 @@ def guarding(bench: Bench) -> None:
         bench.deviates(f"guarding answers {got}; expected {', '.join(f'{one:02X}h' for one in wanted)}")
 
 
-@point(9, "life guarding", "CiA 301, life guarding, 100Ch 100Dh", "EMCY 8130h when requests stop", needs="nmt")
+@point(9, "life guarding", "life guarding, 100Ch 100Dh", "EMCY 8130h when requests stop", needs="nmt")
 def life_guarding(bench: Bench) -> None:
     """Two requests, then none for the life time."""
     _need_guarding(bench)
@@ -90,7 +90,7 @@ def life_guarding(bench: Bench) -> None:
     bench.put(0x100D, 0, 0)
 
 
-@point(89, "before guarding", "CiA 301, error control", "with 1017h set the heartbeat comes, not guarding")
+@point(89, "before guarding", "error control", "with 1017h set the heartbeat comes, not guarding")
 def heartbeat_wins(bench: Bench) -> None:
     """Guard and life time are set beside the heartbeat: heartbeats come, and no request starts life guarding."""
     bench.need((0x100C, 0), (0x100D, 0), (0x1017, 0))
@@ -109,7 +109,7 @@ def heartbeat_wins(bench: Bench) -> None:
 @point(
     44,
     "consumer",
-    "CiA 301, 1016h",
+    "1016h",
     "watched from the first heartbeat on: silence in time, EMCY 8130h when it is late",
     needs="nmt",
 )
@@ -132,7 +132,7 @@ def consumer(bench: Bench) -> None:
     bench.put(0x1016, 1, 0)
 
 
-@point(44, "duplicate consumer", "CiA 301, 1016h", accepted.DUPLICATE)
+@point(44, "duplicate consumer", "1016h", accepted.DUPLICATE)
 def duplicate_consumer(bench: Bench) -> None:
     """Two entries for one producer."""
     bench.need((0x1016, 2))
@@ -141,13 +141,7 @@ def duplicate_consumer(bench: Bench) -> None:
     bench.must_refuse(request, accepted.DUPLICATE, "a second entry for one producer")
 
 
-@point(
-    45,
-    "error behaviour",
-    "CiA 301, 1029h:01",
-    "after the loss 0: pre-operational, 1: no change, 2: stopped",
-    needs="nmt",
-)
+@point(45, "error behaviour", "1029h:01", "after the loss 0: pre-operational, 1: no change, 2: stopped", needs="nmt")
 def error_behaviour(bench: Bench) -> None:
     """The loss of a producer in operational, with each behaviour that the device takes."""
     bench.need((0x1029, 1), (0x1016, 1))

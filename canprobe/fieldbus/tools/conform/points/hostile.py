@@ -5,61 +5,53 @@ Source: CiA 301, "Service data object" (eight bytes), "Restricted CAN-IDs"; ISO 
 
 from __future__ import annotations
 
-from canprobe.fieldbus.protocol.frames import (
-    EFF_FLAG,
-    EMCY_BASE,
-    HEARTBEAT_BASE,
-    NMT_ID,
-    RTR_FLAG,
-    SDO_RX_BASE,
-    NmtCommand,
-    NmtState,
-)
+from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.lss import LSS_REQUEST_ID
-from canprobe.fieldbus.protocol.sdo import pack_read, pack_request
+from canprobe.fieldbus.protocol.pdo import RPDOS, TPDOS
+from canprobe.fieldbus.protocol.sdo import pack_request
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
-point = PointGroup("hostile")
-_READ_TYPE = pack_read(0x1000)
+point = PointGroup("hostile", "CiA 301")
+format_point = PointGroup("hostile", "ISO 11898-1")
 _FD_BYTES = 12
 _PACE_S = 0.02
 
 
-@point(93, "SDO of every length", "CiA 301, SDO: eight bytes", "0 to 7 bytes are not answered")
+@point(93, "SDO of every length", "SDO: eight bytes", "0 to 7 bytes are not answered")
 def sdo_lengths(bench: Bench) -> None:
     """A request cut to 0 to 7 bytes. Some devices answer shorter requests on purpose, which is noted."""
-    answered = [length for length in range(8) if not bench.ignores(bench.request_id, _READ_TYPE[:length])]
+    answered = [length for length in range(8) if not bench.ignores(bench.request_id, READ_TYPE[:length])]
     bench.expect(not any(length < 4 for length in answered), f"requests of {answered} bytes are answered")
     if answered:
         bench.notes.append(f"requests of {answered} bytes are answered, as for old PLCs")
     bench.serves("short requests")
 
 
-@point(94, "remote requests", "CiA 301, CAN data frames", "remote requests for SDO and EMCY are ignored")
+@point(94, "remote requests", "CAN data frames", "remote requests for SDO and EMCY are ignored")
 def remote_requests(bench: Bench) -> None:
     """Remote requests under every identifier of the device but guarding and TPDOs."""
-    for can_id in (bench.request_id, bench.answer_id, EMCY_BASE + bench.node_id):
-        bench.expect(bench.ignores(can_id | RTR_FLAG), f"a remote request for {can_id:03X}h is answered")
+    for can_id in (bench.request_id, bench.answer_id, frames.EMCY_BASE + bench.node_id):
+        bench.expect(bench.ignores(can_id | frames.RTR_FLAG), f"a remote request for {can_id:03X}h is answered")
     bench.serves("remote requests")
 
 
-@point(95, "29-bit frames", "CiA 301, CAN base frames", "frames with 29 bits are another device's", needs="alone nmt")
+@point(95, "29-bit frames", "CAN base frames", "frames with 29 bits are another device's", needs="alone nmt")
 def extended_frames(bench: Bench) -> None:
     """The identifiers of SDO and NMT in 29 bits, as they are and above the 11 bits."""
     bench.watch_state()
     for shift in (0, 18):
-        can_id = bench.request_id << shift | EFF_FLAG
-        if not bench.ignores(can_id, _READ_TYPE):
-            bench.deviates(f"an SDO request with identifier {can_id & ~EFF_FLAG:08X}h is answered")
-        bench.send(NMT_ID << shift | EFF_FLAG, bytes((NmtCommand.STOP, bench.node_id)))
-        if (state := bench.state()) != NmtState.PRE_OPERATIONAL:
+        can_id = bench.request_id << shift | frames.EFF_FLAG
+        if not bench.ignores(can_id, READ_TYPE):
+            bench.deviates(f"an SDO request with identifier {can_id & ~frames.EFF_FLAG:08X}h is answered")
+        bench.send(frames.NMT_ID << shift | frames.EFF_FLAG, bytes((frames.NmtCommand.STOP, bench.node_id)))
+        if (state := bench.state()) != frames.NmtState.PRE_OPERATIONAL:
             bench.deviates(f"an NMT command in 29 bits leads to state {state:02X}h")
     bench.serves("29-bit frames")
 
 
-@point(96, "every SDO command", "CiA 301, SDO command specifiers", "an answer of eight bytes or none; then it serves")
+@point(96, "every SDO command", "SDO command specifiers", "an answer of eight bytes or none; then it serves")
 def every_command(bench: Bench) -> None:
     """All 256 command bytes with 1000h, which cannot be written; what may begin a transfer is aborted."""
     value = bench.device.values.get((0x1000, 0), bytes(4))
@@ -77,16 +69,16 @@ def every_command(bench: Bench) -> None:
     bench.serves("all command bytes")
 
 
-@point(97, "CAN FD frames", "ISO 11898-1, FD format", "an FD frame is no SDO request", needs="alone")
+@format_point(97, "CAN FD frames", "FD format", "an FD frame is no SDO request", needs="alone")
 def fd_frames(bench: Bench) -> None:
     """A request in a frame of twelve bytes, where the bus carries such frames."""
     bench.require(bench.fd, "the bus carries no CAN FD frames")
-    if not bench.ignores(bench.request_id, _READ_TYPE.ljust(_FD_BYTES, b"\0")):
+    if not bench.ignores(bench.request_id, READ_TYPE.ljust(_FD_BYTES, b"\0")):
         bench.deviates("an SDO request of twelve bytes is answered")
     bench.serves("CAN FD frames")
 
 
-@point(99, "own frames", "CiA 301, CAN base frames", "data frames with 11 bits only", needs="alone")
+@point(99, "own frames", "CAN base frames", "data frames with 11 bits only", needs="alone")
 def own_frames(bench: Bench) -> None:
     """What came so far, where nobody else is on the bus."""
     if bench.odd_ids:
@@ -97,7 +89,7 @@ def own_frames(bench: Bench) -> None:
 @point(
     98,
     "identifiers of nobody",
-    "CiA 301, CAN identifiers",
+    "CAN identifiers",
     "frames of every length under other identifiers are ignored",
     needs="alone nmt",
 )
@@ -107,14 +99,14 @@ def other_identifiers(bench: Bench) -> None:
     own = {*bench.device.valid_pdos(RPDOS), *bench.device.valid_pdos(TPDOS)}
     lengths = 0
     for can_id in range(0x103, 0x7E0, 16):
-        services = can_id & 0x7F == bench.node_id or HEARTBEAT_BASE <= can_id < HEARTBEAT_BASE + 128 or can_id in own
-        if services or SDO_RX_BASE < can_id < SDO_RX_BASE + 128:
+        is_service = can_id & ~0x7F in (frames.HEARTBEAT_BASE, frames.SDO_RX_BASE)
+        if is_service or can_id & 0x7F == bench.node_id or can_id in own:
             continue
         bench.send(can_id, bytes(range(lengths % 9)))
         lengths += 1
     for length in range(8):
         bench.send(LSS_REQUEST_ID, bytes(length))
     bench.pass_time(0.01)
-    if (state := bench.state()) != NmtState.PRE_OPERATIONAL:
+    if (state := bench.state()) != frames.NmtState.PRE_OPERATIONAL:
         bench.deviates(f"state {state:02X}h after frames under identifiers of nobody")
     bench.serves("frames under identifiers of nobody")

@@ -22,7 +22,7 @@ from canprobe.fieldbus.protocol.lss import (
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("lss")
+point = PointGroup("lss", "CiA 305", needs="alone")
 _NO_BIT_RATE = 5
 """Index of table 0 that is reserved."""
 _ANSWER_S = 0.2
@@ -71,7 +71,7 @@ def _configuration(bench: Bench) -> Iterator[None]:
         _release(bench)
 
 
-@point(66, "switch state selective", "CiA 305, switch state selective", "44h from the one address alone", needs="alone")
+@point(66, "switch state selective", "switch state selective", "44h from the one address alone")
 def switch_selective(bench: Bench) -> None:
     """The address of the device, and one with another serial number."""
     numbers = _address(bench)
@@ -90,7 +90,7 @@ def switch_selective(bench: Bench) -> None:
         bench.deviates("an inquiry is answered in waiting state")
 
 
-@point(67, "identify remote slave", "CiA 305, identify remote slave", "4Fh inside the ranges only", needs="alone")
+@point(67, "identify remote slave", "identify remote slave", "4Fh inside the ranges only")
 def identify(bench: Bench) -> None:
     """Ranges round the address, and a range of serial numbers beside it."""
     vendor, product, revision, serial = _address(bench)
@@ -107,13 +107,7 @@ def identify(bench: Bench) -> None:
             bench.deviates("the device answers identify remote slave outside the range")
 
 
-@point(
-    68,
-    "only without an id",
-    "CiA 305, identify non-configured, fastscan",
-    "a device with an id is silent",
-    needs="alone",
-)
+@point(68, "only without an id", "identify non-configured, fastscan", "a device with an id is silent")
 def only_without_id(bench: Bench) -> None:
     """Questions to devices without an id."""
     with _configuration(bench):
@@ -123,7 +117,7 @@ def only_without_id(bench: Bench) -> None:
             bench.deviates(f"command {message[0]:02X}h is answered although the device has an id")
 
 
-@point(69, "configure node-ID", "CiA 305, configure node-ID", "0 and 128: error 1; the own id: no error", needs="alone")
+@point(69, "configure node-ID", "configure node-ID", "0 and 128: error 1; the own id: no error")
 def configure_node_id(bench: Bench) -> None:
     """Ids that are none, then its own, which changes nothing."""
     with _configuration(bench):
@@ -134,7 +128,7 @@ def configure_node_id(bench: Bench) -> None:
                 bench.deviates(f"configure node-ID {node_id}: {got}, expected {'an' if refused else 'no'} error")
 
 
-@point(70, "configure bit timing", "CiA 305, configure bit timing", "a reserved rate: error 1", needs="alone")
+@point(70, "configure bit timing", "configure bit timing", "a reserved rate: error 1")
 def configure_bit_timing(bench: Bench) -> None:
     """A reserved index; nothing is activated."""
     with _configuration(bench):
@@ -144,7 +138,7 @@ def configure_bit_timing(bench: Bench) -> None:
         bench.expect(answer is not None, "no answer to configure bit timing")
 
 
-@point(73, "inquire", "CiA 305, inquire services", "the four numbers of 1018h and the node-ID", needs="alone")
+@point(73, "inquire", "inquire services", "the four numbers of 1018h and the node-ID")
 def inquire(bench: Bench) -> None:
     """All five inquiries."""
     numbers = _address(bench)

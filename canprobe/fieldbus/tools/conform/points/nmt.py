@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from canprobe.fieldbus.node.core import NO_RTR_FLAG
+from collections.abc import Mapping
+
 from canprobe.fieldbus.protocol.frames import NMT_ID, RTR_FLAG, NmtCommand, NmtState
-from canprobe.fieldbus.protocol.sdo import pack_read
+from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, TPDOS
 from canprobe.fieldbus.tools.conform.bench import QUEUED_NS, Bench
-from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
 from canprobe.fieldbus.tools.conform.outcome import NotPermitted
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
-point = PointGroup("nmt")
+point = PointGroup("nmt", "CiA 301", needs="nmt")
 _STATES = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
-_READ_TYPE = pack_read(0x1000)
 _PACE_S = 0.02
 
 
-@point(1, "boot-up", "CiA 301, NMT boot-up", "700h+id with 00h, then pre-operational", needs="nmt")
+@point(1, "boot-up", "NMT boot-up", "700h+id with 00h, then pre-operational")
 def boot_up(bench: Bench) -> None:
     """After a reset the device announces itself once, and is pre-operational."""
     before = bench.boots
@@ -31,7 +31,7 @@ def boot_up(bench: Bench) -> None:
     bench.expect(bench.boots == before + 1, f"{bench.boots - before} boot-up messages after one reset")
 
 
-@point(1, "power on", "CiA 301, NMT boot-up", "700h+id with 00h after the power came back", needs="nmt")
+@point(1, "power on", "NMT boot-up", "700h+id with 00h after the power came back")
 def power_on(bench: Bench) -> None:
     """The device announces itself when it gets its power, which a person switches."""
     before = bench.boots
@@ -41,13 +41,7 @@ def power_on(bench: Bench) -> None:
     bench.expect(bench.boots != before, "no boot-up message after the power came back")
 
 
-@point(
-    2,
-    "reset communication",
-    "CiA 301, NMT node control",
-    "82h boots again from every state, and 1017h has its power-on value",
-    needs="nmt",
-)
+@point(2, "reset communication", "NMT node control", "82h boots again from every state; 1017h has its power-on value")
 def reset_communication(bench: Bench) -> None:
     """82h from pre-operational, operational and stopped."""
     bench.reset()
@@ -60,7 +54,7 @@ def reset_communication(bench: Bench) -> None:
             bench.deviates(f"1017h is {found} after the reset, {default} after the one before")
 
 
-@point(2, "reset node", "CiA 301, NMT node control", "81h boots again from every state", needs="nmt")
+@point(2, "reset node", "NMT node control", "81h boots again from every state")
 def reset_node(bench: Bench) -> None:
     """81h, where the user permits that application objects are reset."""
     for state in _STATES:
@@ -70,13 +64,7 @@ def reset_node(bench: Bench) -> None:
         bench.reset(NmtCommand.RESET_NODE)
 
 
-@point(
-    3,
-    "wrong commands",
-    "CiA 301, NMT node control",
-    "commands that do not exist, or of another length, change nothing",
-    needs="nmt",
-)
+@point(3, "wrong commands", "NMT node control", "commands that do not exist, or of another length, change nothing")
 def wrong_commands(bench: Bench) -> None:
     """In each state: unknown specifiers, and valid ones with a byte too many or too few."""
     wrong = [bytes((specifier, bench.node_id)) for specifier in (0x00, 0x03, 0x7F, 0x83, 0xFF)]
@@ -92,7 +80,7 @@ def wrong_commands(bench: Bench) -> None:
             bench.deviates(f"state {found:02X}h after wrong commands in state {state:02X}h")
 
 
-@point(4, "initialisation", "CiA 301, NMT initialisation", "nothing is served before the boot-up", needs="nmt")
+@point(4, "initialisation", "NMT initialisation", "nothing is served before the boot-up")
 def initialisation(bench: Bench) -> None:
     """SDO requests from the reset on: none is answered before the boot-up message."""
     beat_id, answer_id = bench.beat_id, bench.answer_id
@@ -102,7 +90,7 @@ def initialisation(bench: Bench) -> None:
     frames: list[CameFrame] = []
     until_ns = started_ns + round(bench.times.boot_s * 1e9)
     while not any(frame.can_id == beat_id for frame in frames) and bench.now_ns < until_ns:
-        bench.send(bench.request_id, _READ_TYPE)
+        bench.send(bench.request_id, READ_TYPE)
         bench.pass_time(_PACE_S)
         frames += [*bench.taken(answer_id), *(frame for frame in bench.taken(beat_id) if frame.data == b"\0")]
     booted_ns = next((frame.t_ns for frame in frames if frame.can_id == beat_id), None)
@@ -118,23 +106,17 @@ def initialisation(bench: Bench) -> None:
         )
 
 
-@point(5, "stopped", "CiA 301, NMT stopped", "SDO requests are not answered in stopped", needs="nmt")
+@point(5, "stopped", "NMT stopped", "SDO requests are not answered in stopped")
 def stopped(bench: Bench) -> None:
     """SDO is silent in stopped, and served again in pre-operational."""
     bench.watch_state()
     bench.go(NmtState.STOPPED)
-    bench.expect(bench.ignores(bench.request_id, _READ_TYPE), "an SDO request is answered in stopped")
+    bench.expect(bench.ignores(bench.request_id, READ_TYPE), "an SDO request is answered in stopped")
     bench.go(NmtState.PRE_OPERATIONAL)
     bench.serves("the return to pre-operational")
 
 
-@point(
-    6,
-    "PDOs",
-    "CiA 301, NMT states",
-    "TPDOs come in operational only: neither SYNC nor a remote request brings one elsewhere",
-    needs="nmt",
-)
+@point(6, "PDOs", "NMT states", "TPDOs come in operational only: neither SYNC nor remote request brings one elsewhere")
 def pdos_in_operational(bench: Bench) -> None:
     """SYNC and remote requests in pre-operational and stopped; frames that were queued before may still come."""
     tpdos = bench.device.valid_pdos(TPDOS)
@@ -146,9 +128,7 @@ def pdos_in_operational(bench: Bench) -> None:
         for _ in range(2):
             if with_sync:
                 bench.sync()
-            for cob_id, pdo in tpdos.items():
-                if not bench.device.number(pdo, 1) & NO_RTR_FLAG:
-                    request_pdo(bench, cob_id)
+            request_pdos(bench, tpdos)
         bench.pass_time(bench.times.silence_s)
         frames = [frame for can_id in tpdos for frame in bench.taken(can_id) if frame.t_ns > changed_ns + QUEUED_NS]
         if frames:
@@ -156,17 +136,18 @@ def pdos_in_operational(bench: Bench) -> None:
     bench.nmt(NmtCommand.PRE_OPERATIONAL)
 
 
-def request_pdo(bench: Bench, cob_id: int) -> None:
-    """Send a remote request for a TPDO, where it may be sent."""
-    try:
-        bench.send(cob_id | RTR_FLAG)
-    except NotPermitted:
-        bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
+def request_pdos(bench: Bench, pdos: Mapping[int, int]) -> None:
+    """Send a remote request for each TPDO whose bit 30 allows it, where it may be sent."""
+    for cob_id, pdo in pdos.items():
+        if bench.device.number(pdo, 1) & NO_RTR_FLAG:
+            continue
+        try:
+            bench.send(cob_id | RTR_FLAG)
+        except NotPermitted:
+            bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
 
 
-@point(
-    7, "operational", "CiA 301, NMT state machine", "01h leads to operational, and the device stays there", needs="nmt"
-)
+@point(7, "operational", "NMT state machine", "01h leads to operational, and the device stays there")
 def reaches_operational(bench: Bench) -> None:
     """What was seen before the first point; points that need operational do not apply where it is not reached."""
     bench.expect(not bench.kept_out, f"{bench.kept_out}; end this error, and examine the device again")
@@ -175,9 +156,8 @@ def reaches_operational(bench: Bench) -> None:
 @point(
     7,
     "transitions",
-    "CiA 301, NMT state machine",
+    "NMT state machine",
     "01h, 02h and 80h lead to their states from every state, and error control reports them",
-    needs="nmt",
 )
 def transitions(bench: Bench) -> None:
     """Every transition between the three states."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
+from canprobe.fieldbus.protocol.frames import RESTRICTED_IDS, is_restricted
+from canprobe.fieldbus.protocol.pdo import RPDOS, TO_MAPPING, TPDOS
 from canprobe.fieldbus.protocol.sdo import ABORT, Abort, pack_read, pack_write, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
@@ -19,7 +20,6 @@ _SHOWN = 5
 """Entries that a verdict names."""
 _MAY_HAVE_NOTHING = (Abort.NO_DATA, Abort.DEVICE_STATE, Abort.LOCAL_CONTROL_PREVENTS_IT)
 """Codes of an entry that is there and has no value now."""
-_RESTRICTED = (0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x780, 0x7FF)
 
 
 def _named(entries: list[str]) -> str:
@@ -103,7 +103,7 @@ def pdos_of_the_eds(bench: Bench) -> None:
     for area, numbers in ((RPDOS, description.rpdos), (TPDOS, description.tpdos)):
         for number in numbers:
             index = area[number - 1]
-            for place in ((index, 1), (index, 2), (index + 0x200, 0)):
+            for place in ((index, 1), (index, 2), (index + TO_MAPPING, 0)):
                 if bench.device.described(*place) is not None and not bench.device.has(*place):
                     bench.deviates(f"the device has no {place_text(*place)}, which the EDS describes")
         beyond = area[max(numbers, default=0)]
@@ -115,7 +115,7 @@ def sync_identifier(bench: Bench) -> None:
     """1005h names the identifier of SYNC."""
     bench.need((0x1005, 0), written=False)
     if (value := bench.number(0x1005)) & 0x7FF != 0x80:
-        if bench.device.described(0x1005) is None or value & 0x7FF in _RESTRICTED:
+        if bench.device.described(0x1005) is None or is_restricted(value & 0x7FF):
             bench.deviates(f"1005h is {value:08X}h")
         bench.notes.append(f"SYNC has identifier {value & 0x7FF:03X}h")
 
@@ -128,7 +128,7 @@ def restricted_identifiers(bench: Bench) -> None:
         if not bench.device.writable(index):
             continue
         found = True
-        for cob_id in _RESTRICTED:
+        for cob_id in RESTRICTED_IDS:
             request = pack_write(index, 0, cob_id.to_bytes(4, "little"))
             bench.must_refuse(request, accepted.VALUE, f"{cob_id:03X}h for {index:04X}h")
     bench.require(found, "none of 1005h, 1012h and 1014h can be written")

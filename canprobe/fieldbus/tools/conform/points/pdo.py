@@ -5,10 +5,9 @@ from __future__ import annotations
 from itertools import pairwise
 
 from canprobe.fieldbus.eds.description import DescribedEntry
-from canprobe.fieldbus.node.core import NO_RTR_FLAG
 from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
+from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, TPDOS
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import TPDOS
 from canprobe.fieldbus.tools.conform.pdo_setup import (
     EVENT_TYPE,
     changeable_pdo,
@@ -24,10 +23,10 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
     word_of,
 )
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
+from canprobe.fieldbus.tools.conform.points.nmt import request_pdos
 
-point = PointGroup("pdo")
-TRANSMISSION = "CiA 301, PDO transmission types"
+point = PointGroup("pdo", "CiA 301")
+TRANSMISSION = "PDO transmission types"
 _EVENT_MS, _INHIBIT_MS, _WATCHED_MS = 50, 100, 200
 _WINDOW_US = 100_000
 _SHARE = 0.1
@@ -110,7 +109,7 @@ def remote_request(bench: Bench) -> None:
     cob_id = put_to_work(bench, pdo, 253)
     bench.start()
     bench.taken(cob_id)
-    request_pdo(bench, cob_id)
+    request_pdos(bench, {cob_id: pdo})
     if bench.next(cob_id, bench.times.slack_s) is None:
         bench.deviates("a remote request for a TPDO of type 253 is not answered")
 
@@ -122,7 +121,7 @@ def _event_driven(bench: Bench, event_ms: int, inhibit: int = 0) -> list[int]:
     return [frame.t_ns for frame in bench.during(0.5, cob_id)]
 
 
-@point(31, "event timer", "CiA 301, 18xxh:05", "the TPDO repeats within 10 % of its event time", needs="nmt")
+@point(31, "event timer", "18xxh:05", "the TPDO repeats within 10 % of its event time", needs="nmt")
 def event_timer(bench: Bench) -> None:
     """50 ms, for half a second: an event may bring more frames, none less."""
     times = _event_driven(bench, _EVENT_MS)
@@ -132,7 +131,7 @@ def event_timer(bench: Bench) -> None:
         bench.deviates(f"{len(times)} TPDOs in 0.5 s with an event time of {_EVENT_MS} ms{longest}")
 
 
-@point(31, "inhibit time", "CiA 301, 18xxh:03", "no two TPDOs within the inhibit time", needs="nmt")
+@point(31, "inhibit time", "18xxh:03", "no two TPDOs within the inhibit time", needs="nmt")
 def inhibit_time(bench: Bench) -> None:
     """An event time of 20 ms within an inhibit time of 100 ms."""
     times = _event_driven(bench, 20, inhibit=_INHIBIT_MS * 10)
@@ -142,9 +141,7 @@ def inhibit_time(bench: Bench) -> None:
     bench.expect(gaps, "no TPDOs come with an event time of 20 ms")
 
 
-@point(
-    32, "synchronous RPDO", "CiA 301, synchronous RPDO", "applied at the next SYNC, not before", needs="nmt sync eds"
-)
+@point(32, "synchronous RPDO", "synchronous RPDO", "applied at the next SYNC, not before", needs="nmt sync eds")
 def synchronous_rpdo(bench: Bench) -> None:
     """An entry that the user lets be written, by an RPDO of type 1."""
     entry = permitted_entry(bench, transmits=False)
@@ -164,7 +161,7 @@ def _send_value(bench: Bench, cob_id: int, value: int, bits: int) -> None:
     bench.pass_time(0.005)
 
 
-@point(33, "short RPDO", "CiA 301, RPDO length", "EMCY 8210h", needs="nmt")
+@point(33, "short RPDO", "RPDO length", "EMCY 8210h", needs="nmt")
 def short_rpdo(bench: Bench) -> None:
     """A dummy RPDO without a byte; a whole one ends the error."""
     _, cob_id, length = rpdo_of_dummies(bench)
@@ -178,7 +175,7 @@ def short_rpdo(bench: Bench) -> None:
     bench.pass_time(bench.times.slack_s)
 
 
-@point(33, "short RPDO applied", "CiA 301, RPDO length", "a short RPDO is not applied", needs="nmt eds")
+@point(33, "short RPDO applied", "RPDO length", "a short RPDO is not applied", needs="nmt eds")
 def short_rpdo_applied(bench: Bench) -> None:
     """An entry that the user lets be written keeps its value."""
     entry = permitted_entry(bench, transmits=False)
@@ -193,7 +190,7 @@ def short_rpdo_applied(bench: Bench) -> None:
     _send_value(bench, cob_id, before, entry.bits)
 
 
-@point(34, "long RPDO", "CiA 301, RPDO length", "its first bytes are used; EMCY 8220h is optional", needs="nmt eds")
+@point(34, "long RPDO", "RPDO length", "its first bytes are used; EMCY 8220h is optional", needs="nmt eds")
 def long_rpdo(bench: Bench) -> None:
     """An entry that the user lets be written, by an RPDO with a byte too many."""
     entry = permitted_entry(bench, transmits=False)
@@ -207,7 +204,7 @@ def long_rpdo(bench: Bench) -> None:
     _send_value(bench, cob_id, before, entry.bits)
 
 
-@point(35, "RPDO event timer", "CiA 301, 14xxh:05", "EMCY 8250h after the time, not before the first RPDO", needs="nmt")
+@point(35, "RPDO event timer", "14xxh:05", "EMCY 8250h after the time, not before the first RPDO", needs="nmt")
 def rpdo_event_timer(bench: Bench) -> None:
     """A dummy RPDO with 200 ms, sent twice and then no more."""
     pdo, cob_id, length = rpdo_of_dummies(bench)
@@ -230,7 +227,7 @@ def rpdo_event_timer(bench: Bench) -> None:
 @point(
     36,
     "synchronous window",
-    "CiA 301, 1007h",
+    "1007h",
     "an RPDO within the window is applied; one behind may be dropped",
     needs="nmt sync eds",
 )
@@ -254,7 +251,7 @@ def synchronous_window(bench: Bench) -> None:
         bench.notes.append("an RPDO behind the window is applied; it may be dropped")
 
 
-@point(37, "SYNC start value", "CiA 301, 18xxh:06", "the first TPDO at the SYNC with this counter", needs="nmt sync")
+@point(37, "SYNC start value", "18xxh:06", "the first TPDO at the SYNC with this counter", needs="nmt sync")
 def sync_start_value(bench: Bench) -> None:
     """Type 2 with start value 3, SYNC counters 1 to 8 with overflow 10."""
     pdo = changeable_pdo(bench, TPDOS)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from canprobe.fieldbus.node.core import NO_RTR_FLAG
+from canprobe.fieldbus.protocol.frames import RESTRICTED_IDS
+from canprobe.fieldbus.protocol.pdo import MAX_SYNC_TYPE, RPDOS, TO_MAPPING, TPDOS, PdoSub
 from canprobe.fieldbus.protocol.sdo import ABORT, pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.device import RPDOS, TPDOS
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_setup import (
     changeable_pdo,
@@ -20,19 +20,15 @@ from canprobe.fieldbus.tools.conform.pdo_setup import (
     word_of,
 )
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.points.nmt import request_pdo
+from canprobe.fieldbus.tools.conform.points.nmt import request_pdos
 from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 
-point = PointGroup("pdo")
-MAPPING = "CiA 301, PDO mapping"
+point = PointGroup("pdo", "CiA 301")
+MAPPING = "PDO mapping"
 _ABSENT_WORD, _IDENTITY_WORD, _DUMMY_WORD = 0x1FF00020, 0x10180120, 0x00070020
-_INHIBIT, _START = 3, 6
-_RESERVED_TYPES = {"RPDO": (0xF1, 0xF8, 0xFD), "TPDO": (0xF1, 0xF6, 0xFB)}
-_RESTRICTED = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x601, 0x6E0, 0x701, 0x77F, 0x7FF)
+_RESERVED_TYPES = {RPDOS: (0xF1, 0xF8, 0xFD), TPDOS: (0xF1, 0xF6, 0xFB)}
 _LONG_ENTRIES = 9
 _CHANGED_BIT = 0x08
-_CYCLIC = 240
-"""Highest transmission type that goes by SYNC."""
 _SYNC_PACE_S = 0.005
 _LONGEST_EVENT_MS = 2000
 """Longest event time (18xxh:05) that is waited for."""
@@ -49,9 +45,9 @@ def _valid(bench: Bench, area: range, *, mapping: bool = False) -> int:
 
 def _refused_entry(bench: Bench, pdo: int, what: str) -> int:
     """Write another word to the first mapped entry, which must be refused; the word that is there."""
-    first = bench.number(pdo + 0x200, 1)
+    first = bench.number(pdo + TO_MAPPING, 1)
     other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
-    request = pack_write(pdo + 0x200, 1, other.to_bytes(4, "little"))
+    request = pack_write(pdo + TO_MAPPING, 1, other.to_bytes(4, "little"))
     bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), what)
     return first
 
@@ -61,7 +57,7 @@ def mapping_while_valid(bench: Bench) -> None:
     """An entry of a PDO in use gets another value, and its count 0."""
     pdo = _valid(bench, TPDOS, mapping=True)
     first = _refused_entry(bench, pdo, "an entry of a PDO in use")
-    bench.expect(bench.number(pdo + 0x200, 1) == first, "a mapping entry has changed although the write was refused")
+    bench.expect(bench.number(pdo + TO_MAPPING, 1) == first, "a mapping entry changes although the write is refused")
 
 
 @point(
@@ -74,7 +70,7 @@ def mapping_while_valid(bench: Bench) -> None:
 def count_while_valid(bench: Bench) -> None:
     """The count of a PDO in use gets 0."""
     pdo = _valid(bench, TPDOS, mapping=True)
-    bench.must_refuse(pack_write(pdo + 0x200, 0, b"\0"), accepted.MAPPING_LOCKED, "the count of a PDO in use")
+    bench.must_refuse(pack_write(pdo + TO_MAPPING, 0, b"\0"), accepted.MAPPING_LOCKED, "the count of a PDO in use")
 
 
 @point(25, "mapping while counted", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
@@ -85,9 +81,9 @@ def mapping_while_counted(bench: Bench) -> None:
 
 def _refused_at_last(bench: Bench, pdo: int, words: list[int], codes: accepted.AbortSet, what: str) -> None:
     """Map entries to a PDO out of use: one of the writes must be refused."""
-    bench.put(pdo + 0x200, 0, 0)
-    requests = [pack_write(pdo + 0x200, n, word.to_bytes(4, "little")) for n, word in enumerate(words, start=1)]
-    for request in (*requests, pack_write(pdo + 0x200, 0, bytes((len(words),)))):
+    bench.put(pdo + TO_MAPPING, 0, 0)
+    requests = [pack_write(pdo + TO_MAPPING, n, word.to_bytes(4, "little")) for n, word in enumerate(words, start=1)]
+    for request in (*requests, pack_write(pdo + TO_MAPPING, 0, bytes((len(words),)))):
         answer = bench.ask(request)
         if answer[0] == ABORT:
             bench.check_abort(answer, codes, what)
@@ -100,9 +96,9 @@ def mapping_too_long(bench: Bench) -> None:
     """More than eight bytes: the first entry of a TPDO again and again."""
     pdo = idle_pdo(bench, TPDOS, mapping=True)
     word = bench.device.mapping(pdo)[0]
-    places = sum(bench.device.has(pdo + 0x200, n) for n in range(1, 65))
+    places = sum(bench.device.has(pdo + TO_MAPPING, n) for n in range(1, 65))
     count = min(64 // max(word & 0xFF, 1) + 1, _LONG_ENTRIES)
-    if count > max(places, bench.device.number(pdo + 0x200)):
+    if count > max(places, bench.device.number(pdo + TO_MAPPING)):
         _refused_at_last(
             bench, pdo, [word] * count, (*accepted.MAPPING_LENGTH, *accepted.NO_ENTRY), "more than the places"
         )
@@ -135,22 +131,20 @@ def map_unmappable(bench: Bench) -> None:
     bench.require(tried, "no mapping can be changed, or the EDS lets everything be mapped")
 
 
-@point(28, "identifier while valid", "CiA 301, 14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
+@point(28, "identifier while valid", "14xxh 18xxh", accepted.PDO_LOCKED, needs="nmt")
 def identifier_while_valid(bench: Bench) -> None:
     """Another identifier for a PDO in use."""
-    for area in (RPDOS, TPDOS):
-        if not bench.device.pdos(area):
-            continue
+    for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = _valid(bench, area)
         word = bench.number(pdo, 1) ^ _CHANGED_BIT
         bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
 
 
-@point(28, "times while valid", "CiA 301, 18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
+@point(28, "times while valid", "18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
 def times_while_valid(bench: Bench) -> None:
     """Inhibit time and SYNC start value of a TPDO in use."""
     pdo, tried = _valid(bench, TPDOS), 0
-    for subindex in (_INHIBIT, _START):
+    for subindex in (PdoSub.INHIBIT_TIME, PdoSub.SYNC_START):
         if bench.device.writable(pdo, subindex):
             tried += 1
             value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
@@ -158,27 +152,23 @@ def times_while_valid(bench: Bench) -> None:
     bench.require(tried, "the TPDOs have neither inhibit time nor start value")
 
 
-@point(28, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE, needs="nmt")
+@point(28, "restricted identifiers", "restricted CAN-IDs", accepted.VALUE, needs="nmt")
 def restricted_identifiers_of_pdos(bench: Bench) -> None:
     """Restricted identifiers for a PDO out of use."""
-    for area in (RPDOS, TPDOS):
-        if not bench.device.pdos(area):
-            continue
+    for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = idle_pdo(bench, area)
-        for cob_id in _RESTRICTED:
+        for cob_id in RESTRICTED_IDS:
             request = pack_write(pdo, 1, cob_id.to_bytes(4, "little"))
             bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
 
 
-@point(29, "reserved types", "CiA 301, transmission type", accepted.VALUE, needs="nmt")
+@point(29, "reserved types", "transmission type", accepted.VALUE, needs="nmt")
 def reserved_types(bench: Bench) -> None:
     """Reserved transmission types for a PDO out of use."""
-    for what, area in (("RPDO", RPDOS), ("TPDO", TPDOS)):
-        if not bench.device.pdos(area):
-            continue
+    for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = idle_pdo(bench, area)
         bench.need((pdo, 2))
-        for kind in _RESERVED_TYPES[what]:
+        for kind in _RESERVED_TYPES[area]:
             bench.must_refuse(pack_write(pdo, 2, bytes((kind,))), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
 
 
@@ -249,15 +239,13 @@ def heard_lengths(bench: Bench) -> None:
 def _ask_for_tpdos(bench: Bench, pdos: Mapping[int, int]) -> None:
     """Send as many SYNCs as the slowest cyclic type of the device needs, and remote requests where they are allowed."""
     overflow = bench.device.number(0x1019)
-    kinds = [kind for pdo in pdos.values() if (kind := bench.device.number(pdo, 2)) <= _CYCLIC]
+    kinds = [kind for pdo in pdos.values() if (kind := bench.device.number(pdo, 2)) <= MAX_SYNC_TYPE]
     starts = [bench.device.number(pdo, 6) for pdo in pdos.values()]
     if kinds and not bench.permits.surroundings.lacks("sync"):
         for number in range(max(kinds) + max(starts) + 1):
             bench.sync(number % overflow + 1 if overflow else None)
             bench.pass_time(_SYNC_PACE_S)
-    for cob_id, pdo in pdos.items():
-        if not bench.device.number(pdo, 1) & NO_RTR_FLAG:
-            request_pdo(bench, cob_id)
+    request_pdos(bench, pdos)
 
 
 @point(84, "mapped anew", MAPPING, "out of use, 0, entries, count, in use: all writes are accepted", needs="nmt")
@@ -267,7 +255,7 @@ def mapped_anew(bench: Bench) -> None:
     words = bench.device.mapping(pdo)
     map_entries(bench, pdo, words)
     switch_on(bench, pdo)
-    if (found := [bench.number(pdo + 0x200, n) for n in range(1, len(words) + 1)]) != words:
+    if (found := [bench.number(pdo + TO_MAPPING, n) for n in range(1, len(words) + 1)]) != words:
         bench.deviates(f"the mapping is {found}, written was {words}")
 
 

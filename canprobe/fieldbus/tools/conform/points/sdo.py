@@ -10,9 +10,10 @@ from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
-point = PointGroup("sdo")
-CODES = "CiA 301, SDO abort codes"
+point = PointGroup("sdo", "CiA 301")
+CODES = "SDO abort codes"
 _ABSENT = (0x1FF0, 0x5FFE, 0x9FFE)
 """Indices that hardly any device has, in three areas; they are read only."""
 
@@ -98,7 +99,7 @@ def limits(bench: Bench) -> None:
     bench.require(found, "no entry that may be written has a limit; --write names more")
 
 
-@point(75, "default channel", "CiA 301, 1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
+@point(75, "default channel", "1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")
 def default_channel(bench: Bench) -> None:
     """The identifiers of the default SDO server."""
     bench.need((0x1200, 1), (0x1200, 2), written=False)
@@ -107,7 +108,7 @@ def default_channel(bench: Bench) -> None:
             bench.deviates(f"1200h:{subindex:02X} is {found:08X}h, expected {base + bench.node_id:08X}h")
 
 
-@point(76, "further channels", "CiA 301, 1201h to 127Fh", accepted.NO_OBJECT, needs="eds")
+@point(76, "further channels", "1201h to 127Fh", accepted.NO_OBJECT, needs="eds")
 def further_channels(bench: Bench) -> None:
     """Channels that the EDS does not describe are not there."""
     for index in (0x1201, 0x1202, 0x1240, 0x127F):
@@ -115,7 +116,7 @@ def further_channels(bench: Bench) -> None:
             bench.must_refuse(pack_read(index), accepted.NO_OBJECT, f"read of {index:04X}h")
 
 
-@point(24, "two channels", "CiA 301, 1200h to 127Fh", "transfers on two channels do not disturb each other")
+@point(24, "two channels", "1200h to 127Fh", "transfers on two channels do not disturb each other")
 def two_channels(bench: Bench) -> None:
     """A segmented upload on the default channel, and an expedited one on 1201h within it."""
     bench.need((0x1201, 1), (0x1201, 2), written=False)
@@ -123,7 +124,7 @@ def two_channels(bench: Bench) -> None:
     bench.require(not (request_id | answer_id) >> 11, "channel 1201h is not in use")
     name = bench.device.values.get((0x1008, 0), b"")
     answer = bench.request(0x40, 0x1008)
-    bench.send(request_id, pack_read(0x1000))
+    bench.send(request_id, READ_TYPE)
     frame = bench.next(answer_id, bench.times.sdo_s)
     bench.expect(frame and frame.data == bench.first_answer, "no answer with 1000h on the channel of 1201h")
     segment = b"" if answer[0] & 2 else bench.ask(bytes((0x60,)) + bytes(7))[1:8]

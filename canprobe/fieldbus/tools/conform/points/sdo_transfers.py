@@ -11,11 +11,12 @@ from canprobe.fieldbus.protocol.sdo import ABORT, Abort, abort_code, pack_reques
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import AbortSet
 from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.device import TEXTS
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
-point = PointGroup("sdo")
-SEGMENTS = "CiA 301, SDO segmented transfer"
-BLOCKS = "CiA 301, SDO block transfer"
+point = PointGroup("sdo", "CiA 301")
+SEGMENTS = "SDO segmented transfer"
+BLOCKS = "SDO block transfer"
 _SERVER_TIMEOUT_S = 5.0
 _HEARTBEAT = 0x1017
 
@@ -30,7 +31,7 @@ def _segmented_download(bench: Bench, announced: int = 2) -> None:
 
 def _segmented_upload(bench: Bench) -> None:
     """Begin a segmented upload of a text."""
-    for index in (0x1008, 0x1009, 0x100A):
+    for index in TEXTS:
         if len(bench.device.values.get((index, 0), b"")) > 4:
             if bench.request(0x40, index)[0] & 0xE2 != 0x40:
                 bench.deviates(f"{index:04X}h is longer than four bytes, and comes expedited")
@@ -42,6 +43,12 @@ def _segment(value: bytes, toggle: int = 0, *, last: bool = True) -> bytes:
     return bytes((toggle | (7 - len(value)) << 1 | last,)) + value.ljust(7, b"\0")
 
 
+def _must_end_transfer(bench: Bench, segment: bytes, codes: AbortSet, what: str) -> None:
+    """Send a frame that must end the transfer with an abort; the server is free afterwards."""
+    bench.must_refuse(segment, codes, what)
+    bench.serves("the transfer")
+
+
 def _own_value(bench: Bench) -> bytes:
     return bench.device.values[_HEARTBEAT, 0]
 
@@ -50,19 +57,17 @@ def _own_value(bench: Bench) -> bytes:
 def toggle_down(bench: Bench) -> None:
     """The first segment has toggle bit 1."""
     _segmented_download(bench)
-    bench.must_refuse(_segment(_own_value(bench), 0x10), accepted.TOGGLE, "a segment that is not toggled")
-    bench.serves("the transfer")
+    _must_end_transfer(bench, _segment(_own_value(bench), 0x10), accepted.TOGGLE, "a segment that is not toggled")
 
 
 @point(18, "toggle of an upload", SEGMENTS, accepted.TOGGLE)
 def toggle_up(bench: Bench) -> None:
     """The first request for a segment has toggle bit 1."""
     _segmented_upload(bench)
-    bench.must_refuse(b"\x70" + bytes(7), accepted.TOGGLE, "a request for a segment that is not toggled")
-    bench.serves("the transfer")
+    _must_end_transfer(bench, b"\x70" + bytes(7), accepted.TOGGLE, "a request for a segment that is not toggled")
 
 
-@point(19, "time-out", "CiA 301, SDO abort codes", "05040000h, or no time-out at all; then it serves again")
+@point(19, "time-out", "SDO abort codes", "05040000h, or no time-out at all; then it serves again")
 def server_timeout(bench: Bench) -> None:
     """A download that is not continued: an abort, if one comes, is the time-out, and the server is free afterwards."""
     _segmented_download(bench)
@@ -81,34 +86,31 @@ def no_transfer(bench: Bench) -> None:
         bench.must_refuse(bytes((command,)) + bytes(7), accepted.UNKNOWN_COMMAND, f"{what} without a transfer")
 
 
-@point(21, "client's abort", "CiA 301, SDO abort", "no answer; the transfer is over")
+@point(21, "client's abort", "SDO abort", "no answer; the transfer is over")
 def client_abort(bench: Bench) -> None:
     """The client aborts a download."""
     _segmented_download(bench)
     bench.taken(bench.answer_id)
     bench.abort(_HEARTBEAT)
     bench.expect(bench.is_silent(), "the abort of the client is answered")
-    bench.must_refuse(_segment(_own_value(bench)), accepted.UNKNOWN_COMMAND, "a segment after the abort")
-    bench.serves("the transfer")
+    _must_end_transfer(bench, _segment(_own_value(bench)), accepted.UNKNOWN_COMMAND, "a segment after the abort")
 
 
 @point(22, "fewer than announced", SEGMENTS, accepted.TOO_SHORT)
 def fewer_than_announced(bench: Bench) -> None:
     """Two bytes are announced, one is sent."""
     _segmented_download(bench)
-    bench.must_refuse(_segment(_own_value(bench)[:1]), accepted.TOO_SHORT, "1 byte where 2 were announced")
-    bench.serves("the transfer")
+    _must_end_transfer(bench, _segment(_own_value(bench)[:1]), accepted.TOO_SHORT, "1 byte where 2 were announced")
 
 
 @point(22, "more than announced", SEGMENTS, accepted.TOO_LONG)
 def more_than_announced(bench: Bench) -> None:
     """Two bytes are announced, three are sent."""
     _segmented_download(bench)
-    bench.must_refuse(_segment(_own_value(bench) + b"\0"), accepted.TOO_LONG, "3 bytes where 2 were announced")
-    bench.serves("the transfer")
+    _must_end_transfer(bench, _segment(_own_value(bench) + b"\0"), accepted.TOO_LONG, "3 bytes where 2 were announced")
 
 
-@point(23, "expedited", "CiA 301, SDO expedited transfer", "1000h in four bytes; 1017h takes its own value")
+@point(23, "expedited", "SDO expedited transfer", "1000h in four bytes; 1017h takes its own value")
 def expedited(bench: Bench) -> None:
     """An upload, and a download that is read back."""
     bench.need((0x1000, 0), written=False)
@@ -125,7 +127,7 @@ def segmented_upload(bench: Bench) -> None:
     """A text in segments, twice the same."""
     _segmented_upload(bench)
     bench.abort(_HEARTBEAT)
-    for index in (0x1008, 0x1009, 0x100A):
+    for index in TEXTS:
         value = bench.device.values.get((index, 0), b"")
         if len(value) > 4 and bench.upload(index) != value:
             bench.deviates(f"{index:04X}h differs from one upload to the next")
@@ -151,7 +153,7 @@ def _block_answer(bench: Bench, request: bytes) -> bytes:
 
 def _text_index(bench: Bench) -> int:
     """A text of the device. Raises PointNotApplicable."""
-    index = next((i for i in (0x1008, 0x1009, 0x100A) if bench.device.has(i)), 0x1008)
+    index = next((i for i in TEXTS if bench.device.has(i)), 0x1008)
     bench.need((index, 0), written=False)
     return index
 
@@ -193,8 +195,9 @@ def acknowledgement_of_128(bench: Bench) -> None:
     """A block upload, of which more segments are acknowledged than a block can have."""
     index = _text_index(bench)
     _block_segments(bench, index)
-    bench.must_refuse(bytes((0xA2, 128, 127)) + bytes(5), accepted.SEQUENCE, "an acknowledgement of 128 segments")
-    bench.serves("the transfer")
+    _must_end_transfer(
+        bench, bytes((0xA2, 128, 127)) + bytes(5), accepted.SEQUENCE, "an acknowledgement of 128 segments"
+    )
 
 
 def _block_download(bench: Bench, value: bytes, *, number: int = 1, crc: int | None = None) -> bytes:

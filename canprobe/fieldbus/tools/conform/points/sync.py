@@ -10,12 +10,12 @@ from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync, synchronous_tp
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.points.pdo import syncs
 
-point = PointGroup("sync")
+point = PointGroup("sync", "CiA 301")
 _PERIOD_US = 100_000
 _RESERVED = (1, 241, 248, 255)
 
 
-@point(39, "reserved overflow", "CiA 301, 1019h", accepted.VALUE)
+@point(39, "reserved overflow", "1019h", accepted.VALUE)
 def reserved_overflow(bench: Bench) -> None:
     """1019h with 1 and with 241 to 255."""
     bench.need((0x1019, 0))
@@ -25,7 +25,7 @@ def reserved_overflow(bench: Bench) -> None:
         bench.must_refuse(pack_write(0x1019, 0, bytes((value,))), accepted.VALUE, f"{value} for 1019h")
 
 
-@point(39, "overflow while a period is set", "CiA 301, 1019h", accepted.SYNC_LOCKED, needs="sync")
+@point(39, "overflow while a period is set", "1019h", accepted.SYNC_LOCKED, needs="sync")
 def overflow_while_period(bench: Bench) -> None:
     """1019h while 1006h is not 0, and again while it is."""
     bench.need((0x1019, 0), (0x1006, 0))
@@ -36,7 +36,7 @@ def overflow_while_period(bench: Bench) -> None:
     bench.put(0x1019, 0, value[0])
 
 
-@point(40, "wrong length", "CiA 301, SYNC; 8240h", "EMCY 8240h, and no TPDO", needs="nmt sync")
+@point(40, "wrong length", "SYNC; 8240h", "EMCY 8240h, and no TPDO", needs="nmt sync")
 def wrong_length(bench: Bench) -> None:
     """A SYNC with a byte while 1019h is 0; a right one ends the error."""
     cob_id = synchronous_tpdo(bench)
@@ -47,7 +47,7 @@ def wrong_length(bench: Bench) -> None:
     syncs(bench, cob_id, [None])
 
 
-@point(41, "lost SYNC", "CiA 301, 1006h", "in time no EMCY; 8100h after the period, if at all", needs="nmt sync")
+@point(41, "lost SYNC", "1006h", "in time no EMCY; 8100h after the period, if at all", needs="nmt sync")
 def lost_sync(bench: Bench) -> None:
     """1006h is 100 ms: SYNCs in time, then none. A device may watch from a SYNC on that came long before."""
     bench.need((0x1006, 0))

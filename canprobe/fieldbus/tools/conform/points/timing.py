@@ -5,12 +5,12 @@ from __future__ import annotations
 from itertools import pairwise
 
 from canprobe.fieldbus.protocol.frame_bits import NS_PER_S
-from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS, Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import PointGroup
+from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
-point = PointGroup("timing")
+point = PointGroup("timing", "CiA 301")
 SDO_TIME, SYNC_TIME, HEARTBEAT_TIME = "SDO answer", "SYNC to TPDO", "heartbeat period"
 """Names of the distributions."""
 _SDO_COUNT, _SYNC_COUNT, _BEAT_COUNT = 100, 50, 20
@@ -28,7 +28,7 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     times: list[float] = []
     for _ in range(count):
         bench.taken(bench.answer_id)
-        t_ns = bench.send(bench.request_id, pack_read(0x1000))
+        t_ns = bench.send(bench.request_id, READ_TYPE)
         frame = bench.next(bench.answer_id, bench.times.sdo_s)
         if frame is None or frame.data != bench.first_answer:
             bench.deviates(f"read {len(times) + 1} of {count} of 1000h is not answered within {bench.times.sdo_s:g} s")
@@ -36,19 +36,13 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
     return tuple(times)
 
 
-@point(100, "SDO", "CiA 301, SDO time-out of the client", "each of 100 reads of 1000h is answered in time")
+@point(100, "SDO", "SDO time-out of the client", "each of 100 reads of 1000h is answered in time")
 def sdo_time(bench: Bench) -> None:
     """Times of 100 reads, one after another."""
     bench.distributions[SDO_TIME] = _sdo_times(bench, _SDO_COUNT)
 
 
-@point(
-    101,
-    "SYNC to TPDO",
-    "CiA 301, synchronous TPDO",
-    "one TPDO for each of 50 SYNCs, within 10 ms",
-    needs="nmt sync stamps",
-)
+@point(101, "SYNC to TPDO", "synchronous TPDO", "one TPDO for each of 50 SYNCs, within 10 ms", needs="nmt sync stamps")
 def sync_time(bench: Bench) -> None:
     """Times from SYNC to a TPDO of type 1, at 100 Hz."""
     cob_id = synchronous_tpdo(bench)
@@ -64,7 +58,7 @@ def sync_time(bench: Bench) -> None:
     bench.distributions[SYNC_TIME] = tuple(times)
 
 
-@point(102, "heartbeat", "CiA 301, 1017h", "no period differs by more than 20 % from 1017h", needs="stamps")
+@point(102, "heartbeat", "1017h", "no period differs by more than 20 % from 1017h", needs="stamps")
 def heartbeat_time(bench: Bench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
@@ -79,13 +73,7 @@ def heartbeat_time(bench: Bench) -> None:
         )
 
 
-@point(
-    103,
-    "under load",
-    "CiA 301, SDO, heartbeat",
-    "reads are answered and heartbeats come under half load",
-    needs="alone",
-)
+@point(103, "under load", "SDO, heartbeat", "reads are answered and heartbeats come under half load", needs="alone")
 def under_load(bench: Bench) -> None:
     """Frames of higher priority take half the bus, while 1000h is read and the heartbeat runs."""
     bench.need((0x1017, 0))
