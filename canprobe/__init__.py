@@ -17,9 +17,9 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.cell.master.controller import Measurement as Measurement
     from canprobe.cell.recorded.reestimate import ReplayResult as ReplayResult
     from canprobe.cell.recorded.reestimate import replay as replay
-    from canprobe.cell.results.contacts import Contacts as Contacts
-    from canprobe.cell.results.files import load_table as load_table
     from canprobe.cell.results.result import RunResult as RunResult
+    from canprobe.cell.results.run_files import load_table as load_table
+    from canprobe.cell.results.scores import Contacts as Contacts
     from canprobe.cell.results.surface_file import load_surface_map as load_surface_map
     from canprobe.cell.results.traffic import measure_traffic as measure_traffic
     from canprobe.cell.scene.load import load_scene as load_scene
@@ -56,8 +56,8 @@ _MODULES = {
     "canprobe.cell.recorded.reestimate": ("ReplayResult", "replay"),
     "canprobe.cell.scene.load": ("load_scene",),
     "canprobe.lab.studies.many": ("Runs", "run_many"),
-    "canprobe.cell.results.contacts": ("Contacts",),
-    "canprobe.cell.results.files": ("load_table",),
+    "canprobe.cell.results.scores": ("Contacts",),
+    "canprobe.cell.results.run_files": ("load_table",),
     "canprobe.cell.results.surface_file": ("load_surface_map",),
     "canprobe.mechanics.touch.contact": ("ContactSample",),
     "canprobe.mechanics.touch.estimate.likelihood": ("cramer_rao",),

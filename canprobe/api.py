@@ -19,9 +19,8 @@ from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.bus_tools import commission, monitor, scan
+from canprobe.cell.session.bus_tools import commission, emulate, monitor, scan
 from canprobe.cell.session.check import check
-from canprobe.cell.session.emulation import emulate
 from canprobe.cell.session.served import emulate_eds
 from canprobe.cell.session.session import with_bridges
 from canprobe.cell.session.target import Target

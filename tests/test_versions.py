@@ -10,7 +10,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.master import node_record
-from canprobe.cell.planning import report_json
+from canprobe.cell.planning import report
 from canprobe.cell.recorded import reestimate
 from canprobe.cell.results import run_files, surface_file
 from canprobe.cell.scene import calibrations
@@ -41,7 +41,7 @@ def test_the_page_has_the_schemas_of_the_code():
         "calibration of an array (`*.toml`)": str(calibrations.SCHEMA),
         "`summary.json`": f"{run_files.SCHEMA}; of `replay` {reestimate.SCHEMA}",
         "`surface.npz`": str(surface_file.FORMAT_VERSION),
-        "plan (`plan --json`)": str(report_json.SCHEMA),
+        "plan (`plan --json`)": str(report.SCHEMA),
         "report of an examination (`*.json`)": str(json_file.SCHEMA),
         "snapshot of a device (`*.snapshot.json`)": str(journal.SCHEMA),
         "zeros of a cell (`zeros-CELL.json`)": str(node_record.SCHEMA),

@@ -49,7 +49,7 @@ def agreed(args: argparse.Namespace, cell: OpenCell, question: str) -> bool:
     """Whether the person says yes; the nodes are kept awake meanwhile."""
     if args.yes:
         return True
-    from canprobe.cell.tasks.joint_finding import Answer
+    from canprobe.cell.tasks.joint_check import Answer
     from canprobe.cli.operator import TerminalOperator
 
     operator, clock = TerminalOperator(), MonotonicClock()

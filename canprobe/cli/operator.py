@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 
-from canprobe.cell.tasks.joint_finding import Answer, SeenWay
+from canprobe.cell.tasks.joint_check import Answer, SeenWay
 from canprobe.cli.output import say
 from canprobe.fieldbus.bus.system import system
 

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_into(args: argparse.Namespace) -> int:
     """Feed the log to bridges; print the estimates and the state of the bridges."""
-    from canprobe.cell.recorded.into_bridges import replay_into
+    from canprobe.cell.recorded.reestimate import replay_into
     from canprobe.cell.results.text import bridge_lines
 
     replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=args.report.say)

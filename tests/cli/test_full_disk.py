@@ -69,7 +69,7 @@ def test_a_run_whose_frames_cannot_be_written_lets_go_and_ends_with_the_same_sta
 
 
 def test_a_table_leaves_no_part_of_a_file(scan, tmp_path):
-    table = pytest.importorskip("canprobe.cell.results.files")
+    table = pytest.importorskip("canprobe.cell.results.run_files")
     pytest.importorskip("pyarrow")
     with room_for(ROOM), pytest.raises(ResultsError, match=r"log\.parquet: cannot be written"):
         table.write_parquet(read_npz(scan / "log.npz"), tmp_path / "log.parquet")

@@ -8,8 +8,8 @@ import re
 import pytest
 
 import canprobe
+from canprobe.cell.planning.contact import witness_rows
 from canprobe.cell.planning.report import plan_text, verdict_text
-from canprobe.cell.planning.witnesses import witness_rows
 from canprobe.cell.scene.load import packaged
 from canprobe.cli import main
 

@@ -28,7 +28,7 @@ def bus(monkeypatch):
 @pytest.fixture
 def serve(bus, monkeypatch):
     """Runs `canprobe emulate`; its nodes live on the bus afterwards."""
-    monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
+    monkeypatch.setattr("canprobe.cell.session.bus_tools.rehearse", lambda plan: None)
     monkeypatch.setattr("canprobe.cell.session.served.ask_for_processor", lambda: False)
     nodes = []
 

@@ -40,11 +40,11 @@ from reach import Reach
 
 ROOT = Path(__file__).resolve().parents[2]
 MASTER_MODULES = (
-    *("lift_off", "supervisor", "supervision", "conditions", "drives", "bringup", "node_bringup", "entries", "homing"),
+    *("lift_off", "supervisor", "supervision", "conditions", "drives", "bringup", "node_bringup", "homing"),
     *("watch", "cycle", "supervised_cycle", "arm_power", "cell"),
     *("following", "position_track", "trail", "image_witness", "push_witness"),
 )
-PLANNING_MODULES = ("contact", "witnesses")
+PLANNING_MODULES = ("contact",)
 MODULES = {
     **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
     **{name: f"canprobe/cell/planning/{name}.py" for name in PLANNING_MODULES},

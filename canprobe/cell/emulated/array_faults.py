@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from canprobe.cell.emulated.array import TactileApplication
-from canprobe.cell.emulated.image_processing import Raw
+from canprobe.cell.emulated.array import Raw, TactileApplication
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter, numbers

@@ -16,7 +16,7 @@ A `cell.Cell` is made of a plan and a port; nothing is sent before it is entered
 
 `position_track` is the position of a motor as its TPDOs report it, `tactile_frame` the frame that controllers see;
 `observers` see every cycle after its work. `log` keeps rows. `homing` finds the zeros of drives without an absolute
-encoder, each led by SDO (`entries`), and `node_record` keeps them. `monitor` reads a bus without sending.
+encoder, each led by SDO, and `node_record` keeps them. `monitor` reads a bus without sending.
 `commission` lists nodes, and gives node ids by LSS; `options` is what the caller of a run sets.
 The room knows `Setup`, `Plan`, `Clock` and `Port`; it never sees the emulator.
 Start reading at `cell`, then `conditions`.

@@ -23,8 +23,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.master.entries import read_entry, write_entry
-from canprobe.cell.master.node_bringup import IDENTITY, NodeBringUp
+from canprobe.cell.master.node_bringup import IDENTITY, NodeBringUp, read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import TARE, TARE_COMMAND
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write

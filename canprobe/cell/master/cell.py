@@ -175,14 +175,14 @@ class Cell:
             self.stop()
             if not self._options.recover:
                 self.close()
-            self.watch.name_another_master(error, self.notes)
+            self.cycles.name_another_master(error)
             raise
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self.close()
         if error is not None:
-            self.watch.name_another_master(error, self.notes)
+            self.cycles.name_another_master(error)
 
     def run(
         self,
@@ -242,7 +242,11 @@ class Cell:
         measurement = cycles.begin()  # SYNC, collect
         held = self._supervise(measurement)
         with self._lifting_off_on_error():
-            self._take(interrupts)
+            try:
+                interrupts.take()
+            except KeyboardInterrupt as interrupt:  # a controller that brakes by itself raises it when it has
+                if not controller.brake(interrupt):
+                    raise
             command = self._held.freeze(measurement) if held else controller.step(measurement)
             check_command(command, arm=self.drives is not None)
         command, finding = self.supervisor.guard_target(command if held else self._held.thaw(command, measurement))
@@ -258,14 +262,6 @@ class Cell:
             found = self._retreats_for
             raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
         return bool(command.done)
-
-    def _take(self, interrupts: Interrupts) -> None:
-        """Raise an interrupt that came; a controller that brakes by itself raises it when it has."""
-        try:
-            interrupts.take()
-        except KeyboardInterrupt as interrupt:
-            if not self.cycles.controller.brake(interrupt):
-                raise
 
     def tare(self) -> None:
         """Take what the array shows for zero.
@@ -313,7 +309,7 @@ class Cell:
         try:
             yield
         except BaseException as error:
-            self.watch.name_another_master(error, self.notes)
+            self.cycles.name_another_master(error)
             raise
         finally:
             self._running = False
@@ -324,7 +320,7 @@ class Cell:
         try:
             yield
         except BaseException as error:
-            lift_off(self._plan, self.drives, self.watch, self.cycles, error)
+            lift_off(self._plan, self.cycles, error)
             raise
 
     # supervision
@@ -366,7 +362,7 @@ class Cell:
             controller.retreat(str(finding.error))
             return
         if reaction in (Reaction.RETREAT, Reaction.LIFT):
-            lift_off(self._plan, self.drives, self.watch, self.cycles, finding.error)
+            lift_off(self._plan, self.cycles, finding.error)
         raise finding.error
 
     # the way out

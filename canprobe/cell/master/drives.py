@@ -15,7 +15,7 @@ import numpy as np
 from canprobe.cell.master.following import Following
 from canprobe.cell.master.position_track import PERIOD_NS, REST_NS, PositionTrack, rest_counts
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.planning.operation import TARGETS, Place
+from canprobe.cell.planning.sync import TARGETS, Place
 from canprobe.cell.planning.units import lag_s
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.cia402 import (

@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.master.bringup import MODE_DISPLAY
-from canprobe.cell.master.entries import read_entry, write_entry
-from canprobe.cell.master.node_bringup import IDENTITY
+from canprobe.cell.master.node_bringup import IDENTITY, read_entry, write_entry
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.master.watch import NodeWatch
@@ -316,9 +315,13 @@ class Homing:
         """
         for axis in self.order:
             if self._drives[axis].setup.node_id in node_ids:
-                self.known.discard(axis)
-                if axis in self._recorded:
-                    self._record.put(self._drives[axis].setup.node_id, None)
+                self._set_known(axis, False)
+
+    def _set_known(self, axis: int, known: bool) -> None:
+        """Note whether a zero is known, in the record as well."""
+        (self.known.add if known else self.known.discard)(axis)
+        if axis in self._recorded:
+            self._record.put(self._drives[axis].setup.node_id, self._evidence(axis) if known else None)
 
     def refuse_unhomed(self) -> None:
         """Refuse to go on where a zero is not known.
@@ -396,9 +399,7 @@ class Homing:
         self.link.beats = True
         units = self._positions(axis)
         home = round(drive_position_at(self._model, axis, zero.home, units))
-        self.known.discard(axis)
-        if axis in self._recorded:
-            self._record.put(setup.node_id, None)
+        self._set_known(axis, False)
         with drive.left_disabled():
             for write in setup.homing:
                 drive.write(replace(write, value=-home) if write.index == HOME_OFFSET else write)
@@ -424,9 +425,7 @@ class Homing:
             stands = f"it stands at {joint.text(inside, '.2f')}, inside its range"
         elif inside != zero.home:
             stands = "it stands there, outside its range: move it inside by hand before a run"
-        self.known.add(axis)
-        if axis in self._recorded:
-            self._record.put(setup.node_id, self._evidence(axis))
+        self._set_known(axis, True)
         return f"{setup.name} ({joint.name}) is homed: home is at {joint.text(zero.home, '.2f')}; {stands}"
 
     def _positions(self, axis: int) -> Floats:

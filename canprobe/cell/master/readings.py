@@ -11,7 +11,7 @@ from collections import deque
 from canopen.objectdictionary import ODVariable
 from canopen.objectdictionary.datatypes import UNSIGNED32
 
-from canprobe.cell.master.entries import read_entry
+from canprobe.cell.master.node_bringup import read_entry
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.errors import NodeError

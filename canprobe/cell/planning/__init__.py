@@ -4,9 +4,9 @@ What comes in is a `Setup`; what goes out is a frozen `Plan`, or a `PlanError` w
 changes that would fit. Nothing is opened or sent here.
 
 1. `device_capabilities` reads what each device can from its EDS file (objects, PDOs, mappings, bit rates), and names
-   what a device cannot take its part without. `operation` finds the mode of each drive, `sync` the SYNC period, the
-   period as each drive takes it and the trigger of the array. `units` compares counts, `pdos` and `raw_frames` find the
-   messages that carry what is needed, `identifiers` gives them their order, and `configuration` has what is written.
+   what a device cannot take its part without. `sync` finds the mode of each drive, the SYNC period, the period as each
+   drive takes it and the trigger of the array. `units` compares counts, `pdos` finds the messages that carry what is
+   needed, `identifiers` gives them their order, and `configuration` has what is written.
    What a device lacks and what cannot be done without is a reason; what can be done without is listed as not
    available, with what that means.
 2. `free_parameters` closes what the setup leaves open ("auto"). What costs least is tried first: other mappings and

@@ -15,8 +15,8 @@ from canprobe.cell.planning.array import (
 from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
+from canprobe.cell.scene.geometry import mesh_warnings
 from canprobe.cell.scene.setup import Arm, Array, Setup, Touch, Touching
-from canprobe.cell.scene.surface_files import mesh_warnings
 from canprobe.errors import install_line
 from canprobe.fieldbus.bus.real.adapters import bus_open_to_others
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS

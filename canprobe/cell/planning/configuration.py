@@ -26,7 +26,7 @@ from canprobe.cell.planning.model import (
     PlannedPdo,
 )
 from canprobe.cell.planning.node_configuration import FixedEntry, LeftOut, NodeConfiguration, Write
-from canprobe.cell.planning.operation import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
+from canprobe.cell.planning.sync import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
 from canprobe.cell.planning.units import (
     FOLLOWING_WINDOW,
     POLARITY,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,6 +138,8 @@ _EVERY_NODE: Mapping[int, str] = {
     0x1017: "producer heartbeat",
     0x1018: "identity",
 }
+SECTIONS: Mapping[NodeKind, str] = {"drive": "arm", "tactile": "sensor"}
+"""Sections of a scene that name the EDS files."""
 _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
     "drive": {
         0x6040: "controlword",
@@ -150,22 +152,15 @@ _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
 }
 
 
-def missing_objects(device: DeviceCapabilities, kind: NodeKind, setup: Setup) -> list[str]:
-    """One line for every object that the EDS lacks."""
-    needed = {**_EVERY_NODE, **_OF_KIND[kind]}
-    section = "arm" if kind == "drive" else "sensor"
-    return [
-        f"{section}.eds = {device.eds}: object {index:04X}h ({what}) is missing; scene {setup.name} needs it"
-        for index, what in needed.items()
-        if index not in device.od.indices
-    ]
-
-
-def missing_bitrate(device: DeviceCapabilities, kind: NodeKind, setup: Setup) -> list[str]:
-    """One line where the EDS lists bit rates and that of the bus is not among them."""
+def lacks(device: DeviceCapabilities, kind: NodeKind, setup: Setup) -> Iterator[str]:
+    """One line for every object that the EDS lacks, and for a bit rate that is not among those which it lists."""
+    for index, what in {**_EVERY_NODE, **_OF_KIND[kind]}.items():
+        if index not in device.od.indices:
+            yield (
+                f"{SECTIONS[kind]}.eds = {device.eds}: object {index:04X}h ({what}) is missing; scene {setup.name}"
+                " needs it"
+            )
     bitrates = device.description.bitrates
-    if not bitrates or setup.bus.bitrate in bitrates:
-        return []
-    section = "arm" if kind == "drive" else "sensor"
-    has = ", ".join(map(str, bitrates))
-    return [f"bus.bitrate = {setup.bus.bitrate}: {section}.eds = {device.eds} has {has} bit/s"]
+    if bitrates and setup.bus.bitrate not in bitrates:
+        has = ", ".join(map(str, bitrates))
+        yield f"bus.bitrate = {setup.bus.bitrate}: {SECTIONS[kind]}.eds = {device.eds} has {has} bit/s"

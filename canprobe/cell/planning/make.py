@@ -10,9 +10,14 @@ from canprobe.cell.planning.advice import omitted_features, outputs, warnings
 from canprobe.cell.planning.array import array_problems, as_supported, cut_patch, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_configurations
-from canprobe.cell.planning.device_capabilities import DeviceCapabilities, missing_bitrate, missing_objects
+from canprobe.cell.planning.device_capabilities import SECTIONS, DeviceCapabilities, lacks
 from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes
-from canprobe.cell.planning.identifiers import identifier_problems, order_by_deadline
+from canprobe.cell.planning.identifiers import (
+    identifier_problems,
+    order_by_deadline,
+    plan_raw_frames,
+    raw_frame_problems,
+)
 from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
     Choice,
@@ -24,10 +29,16 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.motion import check_motion
-from canprobe.cell.planning.operation import choose_mode, early_stops, operation_problems
 from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
-from canprobe.cell.planning.raw_frames import plan_raw_frames, raw_frame_problems
-from canprobe.cell.planning.sync import interpolations, period_problem, plan_ratio, plan_sync
+from canprobe.cell.planning.sync import (
+    choose_mode,
+    early_stops,
+    interpolations,
+    operation_problems,
+    period_problem,
+    plan_ratio,
+    plan_sync,
+)
 from canprobe.cell.planning.traffic import PlannedTraffic, plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.scene.setup import Node, Setup
@@ -335,10 +346,10 @@ def _devices(setup: Setup) -> tuple[dict[int, DeviceCapabilities], list[str]]:
         try:
             device = devices[node.node_id] = DeviceCapabilities.of(node.eds, node.node_id)
         except EdsError as error:
-            problems += [f"{'arm' if kind == 'drive' else 'sensor'}.eds: {error}"] if first else []
+            problems += [f"{SECTIONS[kind]}.eds: {error}"] if first else []
             continue
         if first:
-            problems += missing_objects(device, kind, setup) + missing_bitrate(device, kind, setup)
+            problems += lacks(device, kind, setup)
             problems += operation_problems(device) if kind == "drive" else []
     return devices, problems
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
-from canprobe.cell.planning.operation import TARGETS, Place, choose_mode
+from canprobe.cell.planning.sync import TARGETS, Place, choose_mode
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, WINDOW_SIZE, has_known

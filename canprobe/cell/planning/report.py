@@ -11,6 +11,7 @@ from typing import Any
 
 from canprobe.cell.planning.array import array_text, support_of
 from canprobe.cell.planning.bridges import BRIDGES
+from canprobe.cell.planning.contact import witness_rows
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -23,9 +24,8 @@ from canprobe.cell.planning.model import (
     Traffic,
 )
 from canprobe.cell.planning.timeline import timeline, timeline_rows
-from canprobe.cell.planning.witnesses import witness_rows
+from canprobe.cell.scene.geometry import mesh_text
 from canprobe.cell.scene.setup import Setup
-from canprobe.cell.scene.surface_files import mesh_text
 from canprobe.fieldbus.protocol.pdo import PdoEntry
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
 

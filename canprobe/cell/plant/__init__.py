@@ -3,7 +3,7 @@
 `plant.Plant` is asked for motor positions, torques and images at an instant, and moves itself there.
 
 - Both arms have 1 to 8 joints that turn or slide. `ideal_arm`: each drive is a second-order system, solved exactly.
-  `dynamic_arm`: rigid links, friction, the drive `cascade` and the object's push, by `equations` and one of the
+  `dynamic_arm`: rigid links, friction, drive cascade and the object's push, by `equations` and one of the
   `integrators` on dynamics held over a cycle; `pushing` is the contact forces near one posture. `make_arm`
   makes the arm that a configuration asks for.
 - `contact` finds the contact of a state: where the probe's ball is, what it touches and what presses. `elastic_contact`

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.cell.plant.cascade import DriveLoops
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.equations import ArmEquations, Effects
+from canprobe.cell.plant.equations import ArmEquations, DriveLoops, Effects
 from canprobe.cell.plant.ideal_arm import NEVER, PEAK_PERMILLE, IdealArm, Ramp
 from canprobe.cell.plant.integrators import STEPS
 from canprobe.cell.plant.pushing import Neighbourhood, Rubbing

@@ -8,13 +8,12 @@ refuses to be read before. All files of a run count time from the 0 of its `bus.
     run_data       all data of a finished run
     result         the data for Python users: tables, figures, scores and the page that replays a run, on request
     summary        the document of `summary.json` (versioned by `schema`; what does not apply is null), and the files
-    scores         comparison with the plant's truth, where there is one; a map and estimates as columns
-    contacts       the contacts of a scan, and the errors of estimators on them
+    scores         comparison with the plant's truth, where there is one; a map and estimates as columns; the contacts
+                   of a scan, and the errors of estimators on them
     text           a summary as text
     expected       the figures to expect of a packaged scene
     traffic        a recorded bus beside the plan
-    run_files      the files of a run's folder, checked when they are read
-    files          tables with their units
+    run_files      the files of a run's folder, checked when they are read; tables of them with their units
     surface_file   a surface map as a file
     tool_file      a calibrated tool centre as a file
     array_report   text and picture of an array's calibration

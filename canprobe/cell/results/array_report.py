@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from canprobe.cell.results.summary import without_nan
 from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
 
 
@@ -52,11 +53,7 @@ def _percent(value: float, before: str = "") -> str:
 def as_document(fit: ArrayFit) -> dict[str, Any]:
     """The calibration in JSON types; None where a value is not known."""
     c = fit.calibration
-
-    def known(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
-    return {
+    document = {
         "array": c.array,
         "made_on": c.made_on,
         "newtons": c.newtons,
@@ -65,20 +62,20 @@ def as_document(fit: ArrayFit) -> dict[str, Any]:
         "left_out": fit.left_out,
         "stiffness_n_m3": c.stiffness.moments,
         "stiffness_sigma_n_m3": c.stiffness.moments_sigma,
-        "stiffness_by_depth_n_m3": known(c.stiffness.depth),
-        "arm_compliance_um_n": known(1e6 * c.stiffness.arm_compliance),
-        "arm_compliance_sigma_um_n": known(1e6 * c.stiffness.arm_compliance_sigma),
+        "stiffness_by_depth_n_m3": c.stiffness.depth,
+        "arm_compliance_um_n": 1e6 * c.stiffness.arm_compliance,
+        "arm_compliance_sigma_um_n": 1e6 * c.stiffness.arm_compliance_sigma,
         "scale": c.image.scale,
         "blur_mm": 1e3 * c.image.blur,
         "crosstalk": c.image.crosstalk,
         "memory": c.image.memory,
-        "force_error_percent": known(100 * c.residuals.force),
+        "force_error_percent": 100 * c.residuals.force,
         "force_array_percent": 100 * c.force.array,
         "creep_percent_decade": 100 * c.force.creep,
         "creep_sigma_percent_decade": 100 * c.force.creep_sigma,
         "moments_error_percent": 100 * c.residuals.moments,
         "curvature_error_percent": 100 * c.residuals.curvature,
-        "rod_curvature_error_percent": known(100 * c.residuals.rod_curvature),
+        "rod_curvature_error_percent": 100 * c.residuals.rod_curvature,
         "image_noise_um": 1e6 * c.noise.scale,
         "image_noise_power": c.noise.power,
         "slow_noise_um": 1e6 * c.noise.slow,
@@ -88,6 +85,7 @@ def as_document(fit: ArrayFit) -> dict[str, Any]:
         "uses_gains": bool(c.gains),
         "dead": [list(place) for place in c.dead],
     }
+    return {name: without_nan(value) for name, value in document.items()}
 
 
 def draw_calibration(fit: ArrayFit, path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,7 +14,7 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.master.observers import Observers
-from canprobe.cell.master.options import RunOptions
+from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
@@ -76,6 +75,7 @@ class OpenCell:
         self._out, self._say, self._early_summary = options.out, options.say, options.early_summary
         self._bridges = Bridges(plan, options.out, virtual=self.session.virtual, say=options.say)
         self._task = task
+        self._patch_reader: PatchReader | None = make_patch_reader(plan.setup)
         self._last: Controller | None = task
         self._result = RunResult()
 
@@ -118,10 +118,6 @@ class OpenCell:
         if self._patch_reader is None:
             raise UsageError(f"{self.plan.setup.name}: expected a scene with an array; got one without")
         return self._patch_reader.read(sample)
-
-    @cached_property
-    def _patch_reader(self) -> PatchReader | None:
-        return make_patch_reader(self.plan.setup)
 
     def probe(self, q: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Pose of the probe at joint positions, and its Jacobian there.
@@ -334,7 +330,7 @@ class OpenCell:
             self._write(lambda out: write_files(data, out))
         if failure is None:
             self._early_summary(summary)
-        self._estimate_again(data)
+        _estimate_again(self.session, data, self._say)
         summary["bridges"] = self._bridges.end(summary)
         self._write(lambda out: write_summary(summary, out))
         for name in PICTURES if len(data.log["t_s"]) else ():
@@ -386,20 +382,6 @@ class OpenCell:
             start_s=start_s,
         )
 
-    def _estimate_again(self, data: RunData) -> None:
-        """Add the answers of the scene's other estimators on the same contacts, and their scores."""
-        setup = self.plan.setup
-        if setup.shape is None or data.tracker is None:
-            return
-        for method in setup.shape.also:
-            self._say(f"estimate again with {method}")
-            found = estimates_of(setup, data.tracker.records, data.settled, [method], MOST_REPLAYED)
-            if truth := truth_of(self.session):
-                times = since_first_sync(data.log["t_s"], self.cell.log.start_s)
-                scores = {name: score_shape(records, truth, times) for name, records in found.items()}
-                data.summary["shape"]["methods"] |= without_nan(methods_table(scores))
-            data.estimates.update({name: on_run_clock(records, data.start_s) for name, records in found.items()})
-
     def _write(self, write: Callable[[Path], None]) -> None:
         """Write files into the run's folder; a failure is noted, and raised at the end."""
         if self._out is None:
@@ -411,6 +393,21 @@ class OpenCell:
             for line in str(error).splitlines():
                 if line not in self.session.files.unwritten:  # the summary is written twice
                     self.session.files.note_unwritten(line)
+
+
+def _estimate_again(session: Session, data: RunData, say: Say) -> None:
+    """Add the answers of the scene's other estimators on the same contacts, and their scores."""
+    setup = session.plan.setup
+    if setup.shape is None or data.tracker is None:
+        return
+    for method in setup.shape.also:
+        say(f"estimate again with {method}")
+        found = estimates_of(setup, data.tracker.records, data.settled, [method], MOST_REPLAYED)
+        if truth := truth_of(session):
+            times = since_first_sync(data.log["t_s"], session.cell.log.start_s)
+            scores = {name: score_shape(records, truth, times) for name, records in found.items()}
+            data.summary["shape"]["methods"] |= without_nan(methods_table(scores))
+        data.estimates.update({name: on_run_clock(records, data.start_s) for name, records in found.items()})
 
 
 def _draw(data: RunData, path: Path) -> str | None:

@@ -21,9 +21,8 @@ from canprobe.cell.master.options import quiet
 from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.results.files import to_frame, write_parquet
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.results.run_files import LOG, TACTILE
+from canprobe.cell.results.run_files import LOG, TACTILE, to_frame, write_parquet
 from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Setup, Touch
@@ -36,8 +35,8 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-    from canprobe.cell.results.contacts import Contacts, Scores
-    from canprobe.cell.tasks.own_estimators import OwnEstimator
+    from canprobe.cell.results.scores import Contacts, Scores
+    from canprobe.cell.tasks.shape import OwnEstimator
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 
@@ -202,7 +201,7 @@ class RunResult:
         Raises:
             UsageError: when nothing was scanned, no truth is known, or a method is unknown.
         """
-        from canprobe.cell.results.contacts import score_estimators
+        from canprobe.cell.results.scores import score_estimators
 
         task, scene = self.plan.setup.task, self.plan.scene
         if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.scores import Contacts, contacts_of
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.cell.results.contacts import Contacts
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 
@@ -54,6 +54,4 @@ class RunData:
         task = self.plan.setup.task
         if self.tracker is None or not isinstance(task, Touch):
             return None
-        from canprobe.cell.results.contacts import contacts_of
-
         return contacts_of(self.settled, task, self.start_s)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.log import since_first_sync
-from canprobe.cell.planning.witnesses import reports_torque
+from canprobe.cell.planning.contact import reports_torque
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import (

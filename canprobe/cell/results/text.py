@@ -55,7 +55,7 @@ def summary_text(summary: dict[str, Any], out: Path | None, *, full: bool = True
     if summary.get("listen") is not None:
         lines.append(f"  images     {listened_text(summary['listen'])}")
     if shape["method"] is not None:
-        lines += shape_lines(shape) if full else [_curvature_line(shape)]
+        lines += shape_lines(shape, full=full)
     if summary.get("explore") is not None:
         lines.append(f"  explored   {explored_text(summary['explore'])}")
     if summary.get("calibration") is not None:
@@ -143,21 +143,16 @@ def listened_text(listened: Mapping[str, Any]) -> str:
     return f"{listened['images']}{rate}, {shown}"
 
 
-def _curvature_line(shape: Mapping[str, Any]) -> str:
-    """The curvature at the end with its error over the scan, in one line."""
+def shape_lines(shape: dict[str, Any], *, full: bool = True) -> list[str]:
+    """The section ``shape`` of a summary as text; or one line, the curvature with its error over the scan."""
     estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
+    curvature = f"  curvature  {estimated}; true {true}"
     error, percent = shape.get("kappa_rms_error_per_m"), shape.get("kappa_rms_error_percent")
-    off = (
-        "" if error is None else f"; RMS error {error:.2f} 1/m" + (f" ({percent:.1f} %)" if percent is not None else "")
-    )
-    return f"  curvature  {estimated}; true {true}{off}"
-
-
-def shape_lines(shape: dict[str, Any]) -> list[str]:
-    """The section ``shape`` of a summary as text."""
-    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
-    lines = [f"  curvature  {estimated}; true {true}"]
-    lines += method_lines(shape.get("methods", {}))
+    if not full and error is not None:
+        curvature += f"; RMS error {error:.2f} 1/m" + (f" ({percent:.1f} %)" if percent is not None else "")
+    if not full:
+        return [curvature]
+    lines = [curvature, *method_lines(shape.get("methods", {}))]
     if (surface := shape.get("map")) is not None:
         lines.append(f"  map        {_map_text(surface)}")
     return lines

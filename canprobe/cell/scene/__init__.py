@@ -17,10 +17,9 @@ whole for its task).
   is its result; `arms` makes chain, joints and drive units. Planning, cell, tasks and emulator read a `Setup` and
   never a `Scene`.
 - `plugins` finds cells, scenes, arrays and estimators of other packages by their entry points.
-- `calibrations` reads and writes calibration files of arrays, which `sensor.calibration` names; `surface_files` and
-  `stl_files` read the surface of an object from a file.
-- `geometry` turns the object, the probe and the path of a scene into frames and surfaces; it is used by `resolve` and
-  by those who show a scene.
+- `calibrations` reads and writes calibration files of arrays, which `sensor.calibration` names.
+- `geometry` turns the object, whose surface may be in a file, the probe and the path of a scene into frames and
+  surfaces; it is used by `resolve` and by those who show a scene.
 
 Invariant: behind `resolve` there is no optional part that "must be there"; a task's setup holds exactly what that
 task needs. To add a key: a field in `model`, a line in `resolve`, and its user. Start reading at `model`, then

@@ -102,9 +102,6 @@ def find_plugin(kind: str, name: str) -> Plugin | None:
     found = [plugin for plugin in plugins(kind) if name in (plugin.name, plugin.whole_name)]
     if len(found) > 1:
         names, packages = " or ".join(one.whole_name for one in found), " and ".join(one.package for one in found)
-        raise SceneError([f"{name}: the packages {packages} each offer {_a(kind)} of this name; type {names}"])
+        article = "an" if kind[0] in "ae" else "a"
+        raise SceneError([f"{name}: the packages {packages} each offer {article} {kind} of this name; type {names}"])
     return found[0] if found else None
-
-
-def _a(kind: str) -> str:
-    return f"an {kind}" if kind[0] in "ae" else f"a {kind}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint, posture_in_si
 from canprobe.cell.scene.calibrations import load_calibration
-from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
+from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, refuse_narrow, scan_axes, true_object
 from canprobe.cell.scene.hardware import MM, EmulateSettings, KeepOutSettings
 from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
@@ -44,7 +44,6 @@ from canprobe.cell.scene.setup import (
     Touch,
     Truth,
 )
-from canprobe.cell.scene.surface_files import refuse_narrow
 from canprobe.errors import PlanError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame

@@ -26,7 +26,7 @@ from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
-from canprobe.cell.planning.operation import INTERPOLATION_TIME
+from canprobe.cell.planning.sync import INTERPOLATION_TIME
 from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
 from canprobe.fieldbus.drive.drive import DriveApplication

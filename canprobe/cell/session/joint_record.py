@@ -16,7 +16,7 @@ from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.folder import record_file
-from canprobe.cell.tasks.joint_finding import JointFinding
+from canprobe.cell.tasks.joint_check import JointFinding
 from canprobe.errors import UsageError
 
 WHAT_CHANGED = {

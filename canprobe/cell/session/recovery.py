@@ -19,8 +19,8 @@ from collections.abc import Callable
 from canprobe.cell.master.bringup import HEARTBEAT_CONSUMER
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller
-from canprobe.cell.master.entries import read_entry
 from canprobe.cell.master.homing import TOLERANCE_RAD, UnhomedError
+from canprobe.cell.master.node_bringup import read_entry
 from canprobe.cell.master.notes import nodes_text
 from canprobe.cell.master.options import Say
 from canprobe.cell.master.watch import NodeWatch

@@ -64,11 +64,11 @@ def emulate_eds(
     Args:
         files: (name or path of an EDS, DCF, XDD or XDC file, node id) of each node; 255: it waits for LSS.
         target: the bus.
-        store_folder: as for :func:`canprobe.cell.session.emulation.emulate`.
+        store_folder: as for :func:`canprobe.cell.session.bus_tools.emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         positions: place of the motor of each drive at first, counts; left out: 0.
         in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
-        faults, observer: as for :func:`canprobe.cell.session.emulation.emulate`.
+        faults, observer: as for :func:`canprobe.cell.session.bus_tools.emulate`.
         say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:

@@ -22,8 +22,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.model import BridgeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.bus_record import BusRecord
-from canprobe.cell.session.buses import RealBuses, make_buses
+from canprobe.cell.session.buses import BusRecord, RealBuses, make_buses
 from canprobe.cell.session.folder import STEPS, KeptFiles, StepLog, zeros_file
 from canprobe.cell.session.joint_record import exchanged
 from canprobe.cell.session.links import need_controllers

@@ -17,8 +17,7 @@ from canprobe.cell.session.joint_record import JointRecord, warned
 from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.session.target import refuse_virtual
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.joint_check import JointCheck
-from canprobe.cell.tasks.joint_finding import Answer, JointFinding, Operator, SeenWay
+from canprobe.cell.tasks.joint_check import Answer, JointCheck, JointFinding, Operator, SeenWay
 from canprobe.errors import NodeError, ResultsError, UsageError
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.model import ArmModel

@@ -4,13 +4,13 @@
 
 - `touch` approaches, settles, scans or holds, and retreats; `regain` searches for a lost contact, `requested` lets a
   bridge start, stop and set the task. `calibrate` touches a known object again and again: a ball from several sides,
-  or it presses and rolls there. All derive from `probing.ProbingTask`, which has the order of a cycle and its phases;
-  `probe_motion` turns the probe's pose into joint targets.
+  or it presses and rolls there. All derive from `probing.ProbingTask`, which has the order of a cycle and its phases,
+  and turns the probe's pose into joint targets.
 - `sensing` makes a contact of a measurement: joints at the instant of the image, the patch, the squeezed layer.
 - `shape` is the estimator in the loop: contacts go in when they are measured, answers are computed in `update` when the
   commands are out, and are used from the next cycle on.
 - `free_and_listen` has the tasks without touch: hold, swing, listen. `joint_check` moves each joint alone for the first
-  time, by a small and a larger way, and `joint_finding` has the results.
+  time, by a small and a larger way, which an operator watches.
 - `hand_way` is a way that a person asks for, `hand_motion` goes it, and `guided_arm` lets one after the other go, each
   as long as it is renewed.
 - `paused` holds the arm of a cell that has come back from a loss, until motion is asked for.

@@ -87,7 +87,7 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         "coupling": centroid_coupling(task.probe),
     }
     if method not in METHODS and (plugin := find_plugin("estimator", method)) is not None:
-        from canprobe.cell.tasks.own_estimators import OfferedEstimator, RenewedEstimator
+        from canprobe.cell.tasks.shape import OfferedEstimator, RenewedEstimator
 
         return RenewedEstimator(lambda: OfferedEstimator(plugin, settings))
     motion = make_estimator(method, **settings)

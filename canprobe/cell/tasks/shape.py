@@ -1,20 +1,26 @@
-"""The estimator in the loop: it takes the contacts of a scan, and its answers go to the servo and the log."""
+"""The estimator in the loop: it takes the contacts of a scan, and its answers go to the servo and the log.
+
+It may be a user's: one that is given, or that another package offers.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from canprobe.mechanics.touch import indentation_from_force
+from canprobe.cell.scene.plugins import Plugin
+from canprobe.errors import CanprobeError, UsageError
+from canprobe.mechanics.touch import ContactSample, SurfaceEstimate, indentation_from_force
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth
+from canprobe.mechanics.touch.estimate.gate import Dropped
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import ContactSample, Estimator, SurfaceEstimate, SurfaceMap
+    from canprobe.mechanics.touch import Estimator, SurfaceMap
 
 
 GAP_S = 0.1
@@ -213,3 +219,73 @@ def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every
         tracker.add(sample)
         tracker.answer_at_once(sample.t_s)
     return tracker.records
+
+
+class OwnEstimator(Protocol):
+    """Methods that an estimator of your own needs."""
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The shape at the last contact; None before there is an answer."""
+
+
+class RenewedEstimator:
+    """A user's estimator in the loop: a new one is made after each loss of contact; dropped samples are not counted.
+
+    Args:
+        make: function that makes the estimator.
+    """
+
+    def __init__(self, make: Callable[[], OwnEstimator]) -> None:
+        self._make = make
+        self.dropped = Dropped()
+        self.reset()
+
+    def reset(self) -> None:
+        """Make a new one."""
+        inner = self._make()
+        self.add, self.estimate = inner.add, inner.estimate
+
+
+class OfferedEstimator:
+    """An estimator of another package, whose errors name it.
+
+    Args:
+        plugin: the entry point of a function that takes the settings by name and returns the estimator.
+        settings: keyword arguments of that function, those of `make_estimator`.
+
+    Raises:
+        SceneError: the package cannot be imported.
+        UsageError: the estimator cannot be made.
+    """
+
+    def __init__(self, plugin: Plugin, settings: dict[str, Any]) -> None:
+        make = plugin.load()
+        self._plugin = plugin
+
+        def methods() -> tuple[Callable[[ContactSample], None], Callable[[], SurfaceEstimate | None]]:
+            inner = make(**settings)
+            return inner.add, inner.estimate
+
+        self._add, self._estimate = self._guarded(methods)
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+        self._guarded(lambda: self._add(sample))
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The shape at the last contact; None before there is an answer."""
+        answer = self._guarded(self._estimate)
+        if answer is not None and not isinstance(answer, SurfaceEstimate):
+            raise UsageError(f"{self._plugin}: expected a SurfaceEstimate or None from estimate(), got {answer!r:.60}")
+        return answer
+
+    def _guarded(self, act: Callable[[], Any]) -> Any:
+        try:
+            return act()
+        except CanprobeError:
+            raise
+        except Exception as error:  # whatever a foreign package raises; the cell stops for it
+            raise UsageError(f"{self._plugin}: {type(error).__name__}: {error}") from error

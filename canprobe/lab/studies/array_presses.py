@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.cell.emulated.image_processing import follow
+from canprobe.cell.emulated.array import follow
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit, calibrate_array

@@ -21,8 +21,8 @@ from canprobe.api import run_plan
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.results.files import unit_of
 from canprobe.cell.results.result import RunResult
+from canprobe.cell.results.run_files import unit_of
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene, with_files
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve

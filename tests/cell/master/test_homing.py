@@ -20,7 +20,7 @@ from canprobe.cell.master.controller import Command
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.joint_finding import Answer
+from canprobe.cell.tasks.joint_check import Answer
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant

@@ -1,8 +1,8 @@
 """What the plan says of the witnesses of the force, by what the cell has."""
 
 import canprobe
+from canprobe.cell.planning.contact import reports_torque, witness_rows
 from canprobe.cell.planning.report import plan_dict, plan_text
-from canprobe.cell.planning.witnesses import reports_torque, witness_rows
 
 
 def test_the_margin_and_the_error_of_the_depth_are_stated():

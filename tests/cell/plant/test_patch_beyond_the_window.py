@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from canprobe.cell.emulated.image_processing import follow, middle
+from canprobe.cell.emulated.array import follow, middle
 from canprobe.cell.planning.array import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig

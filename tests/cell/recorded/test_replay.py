@@ -14,7 +14,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.npz import read_npz
-from canprobe.cell.recorded.run_folder import RunFolder
+from canprobe.cell.recorded.recording import RunFolder
 from canprobe.cli import main
 from canprobe.fieldbus.bus.candump import read_candump
 

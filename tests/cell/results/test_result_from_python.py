@@ -8,7 +8,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.results import result as page
-from canprobe.cell.results.contacts import contacts_of
+from canprobe.cell.results.scores import contacts_of
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
 

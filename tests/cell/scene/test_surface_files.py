@@ -13,11 +13,10 @@ import pytest
 
 import canprobe
 from canprobe.cell.npz import read_npz
-from canprobe.cell.scene.geometry import true_object
+from canprobe.cell.scene.geometry import stl_damage, true_object
 from canprobe.cell.scene.load import load_scene, packaged_files, scenes_folder
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.scene.stl_files import stl_damage
 from canprobe.cell.session.folder import write_scene
 from canprobe.cli import main
 from canprobe.errors import PlanError, UsageError

@@ -23,7 +23,7 @@ def served(monkeypatch):
     def emulate(act, *options, what=("free", "--channel", "vcan0", "--nodes", "1,2")):
         bus = LockstepBus(VirtualClock())
         monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
-        monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
+        monkeypatch.setattr("canprobe.cell.session.bus_tools.rehearse", lambda plan: None)
         for name, stand_in in (("ask_for_processor", lambda: False), ("garbage_collection_paused", nullcontext)):
             monkeypatch.setattr(f"canprobe.cell.session.served.{name}", stand_in)  # not for the tests' own process
 

@@ -20,7 +20,7 @@ from canprobe.cell.session.buses import SessionBuses
 from canprobe.cell.session.joint_record import JointRecord, warned
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import reporting_notes
-from canprobe.cell.tasks.joint_finding import Answer, JointFinding, SeenWay
+from canprobe.cell.tasks.joint_check import Answer, JointFinding, SeenWay
 from canprobe.cli import main
 from canprobe.errors import NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.node.dictionary import key_of

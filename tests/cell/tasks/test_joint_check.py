@@ -13,8 +13,7 @@ from puma_arm import UPENN
 import canprobe
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.supervisor import JointGuard
-from canprobe.cell.tasks.joint_check import JointCheck
-from canprobe.cell.tasks.joint_finding import Answer, SeenWay, find_seen_fault
+from canprobe.cell.tasks.joint_check import Answer, JointCheck, SeenWay, find_seen_fault
 from canprobe.cli.operator import TerminalOperator
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints

@@ -5,7 +5,7 @@ import pytest
 from serial_arms import five, gantry, scara, seven
 
 from canprobe.cell.scene.setup import Arm, Probe, SafetyLimits
-from canprobe.cell.tasks.probe_motion import ProbeMotion
+from canprobe.cell.tasks.probing import ProbeMotion
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.inverse import task_rows

@@ -16,7 +16,7 @@ from undrawn import undrawn_run
 
 import canprobe
 import canprobe.errors
-from canprobe.cell.recorded.into_bridges import replay_into
+from canprobe.cell.recorded.reestimate import replay_into
 from canprobe.cli import main
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.eds.packaged import eds_path

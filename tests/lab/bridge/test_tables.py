@@ -10,7 +10,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from canprobe.cell.results.files import load_table, to_frame, unit_of
+from canprobe.cell.results.run_files import load_table, to_frame, unit_of
 from canprobe.errors import UsageError
 
 

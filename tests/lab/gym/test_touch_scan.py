@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from patience import patience_s
 
 import canprobe.lab.gym
-from canprobe.cell.results.files import load_table
+from canprobe.cell.results.run_files import load_table
 from canprobe.errors import SceneError, UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.lab.examples import learn_touch_scan

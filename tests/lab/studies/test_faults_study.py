@@ -145,7 +145,7 @@ def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch, tm
         raise ZeroDivisionError("nobody thought of it")
 
     monkeypatch.setattr(touch.TouchTask, "step", crash)
-    monkeypatch.setattr("canprobe.cell.session.bus_record.TrafficMeter.frames", property(lambda self: 1))
+    monkeypatch.setattr("canprobe.cell.session.buses.TrafficMeter.frames", property(lambda self: 1))
     monkeypatch.setattr("canprobe.lab.studies.fault_runs.summarise", lambda *_: {"force": float("nan")})
     failures = FaultRun(plan, folder=tmp_path).result()["failures"]
     assert any("ZeroDivisionError" in failure for failure in failures)
