@@ -28,7 +28,7 @@ from typing import Any
 
 from canprobe.errors import UsageError, did_you_mean, package_line
 from canprobe.fieldbus.bus.real.link import missing_ip, read_link, setting_line, sudo
-from canprobe.fieldbus.bus.real.socketcan import has_socketcan, how_to_make
+from canprobe.fieldbus.bus.real.socketcan import NO_SOCKETCAN, has_socketcan, how_to_make
 
 LOCAL_GROUP = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
@@ -410,7 +410,7 @@ def missing_here(interface: str) -> tuple[str, ...]:
     if interface != SOCKETCAN:
         return BACKENDS[interface].missing
     if not has_socketcan():
-        return ("this kernel has no SocketCAN; a vcan0 in a virtual machine: canprobe vcan -- COMMAND",)
+        return (NO_SOCKETCAN,)
     if not _kernel_interfaces():
         return (f"no interface; a virtual one: {how_to_make('vcan0').removeprefix('type: ')}",)
     return ()
