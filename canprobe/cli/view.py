@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import sys
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -136,7 +137,8 @@ class _Browser:
     def __init__(self, port: int, say: Callable[[str], None], *, quiet: bool) -> None:
         self.port = port
         self._say = say
-        self._quiet = quiet or not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        has_display = sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        self._quiet = quiet or not has_display
 
     def show(self, address: str) -> None:
         """Print the address of the page, and open the browser."""

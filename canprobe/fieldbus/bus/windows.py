@@ -22,6 +22,7 @@ KILL = signal.SIGTERM
 NON_BLOCKING_PIPES = False
 OWN_SESSION: dict[str, Any] = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}  # type: ignore[attr-defined]
 monotonic_ns = time.perf_counter_ns  # before Python 3.13 the other one has steps of 15.6 ms; time.sleep has none
+_LOCKED_BYTE = 0x7FFFFFFE  # nobody else can read a byte that is locked: one behind the end of the file
 _FIRST_LOOK_S = 0.05
 """Longest time of the first look at a stream: what was typed before it counts as typed, a closed stream as closed."""
 _READ: dict[int, _Reading] = {}
@@ -30,11 +31,14 @@ _WRITTEN: dict[int, _Writing] = {}
 
 
 def lock(file: IO[Any]) -> None:
-    file.seek(0)
+    place = file.tell()
+    file.seek(_LOCKED_BYTE)
     try:
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
     except PermissionError as error:
         raise BlockingIOError(*error.args) from error
+    finally:
+        file.seek(place)
 
 
 class _Reading(threading.Thread):
