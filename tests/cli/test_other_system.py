@@ -146,6 +146,13 @@ def test_a_console_needs_no_posix(ends, status):
     assert json.loads(out.splitlines()[-1]) == {"says": "stop and disable the drives"}
 
 
+def test_a_console_writes_in_the_encoding_of_its_terminal():
+    console = Beside("console", "puma260", "--plain")
+    console.type("where")
+    out, errors = console.process.communicate(timeout=60)
+    assert console.process.returncode == 0 and " ± " in out.decode("cp1252"), errors
+
+
 def test_a_console_that_nobody_reads_does_what_is_typed_and_ends():
     """Its answers are more than a pipe holds."""
     console = Beside("console", "puma260", "--json")
