@@ -53,6 +53,7 @@ COMMANDS = (
     ("replay", "first"),
     ("judge", "--record", "first/bus.log", "cylinder"),
     ("adapters",),
+    ("view", "first", "--html", "page.html"),
     ("move", "puma260", "--joint", "1", "--by", "1deg", "--yes"),
     ("check", "free"),
     ("tare", "puma260", "--yes"),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.options import quiet
 from canprobe.cell.npz import write_npz
-from canprobe.cell.planning.bridges import check_bridges
+from canprobe.cell.planning.bridges import check_view
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.files import to_frame, write_parquet
 from canprobe.cell.results.run_data import RunData
@@ -79,7 +79,7 @@ def page_of(folder: Path, setup: Setup) -> Page:
     """
     page = Page(folder / "report.html")
     if not page.path.is_file():
-        check_bridges(["view"], "")
+        check_view()
         write_page_of(folder, setup)
     if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.path.resolve().as_uri())
