@@ -55,9 +55,7 @@ def _list(args: argparse.Namespace) -> int:
         {
             "name": kind.name,
             "parameters": {name: asdict(one) for name, one in kind.parameters.items()},
-            "what": kind.what,
-            "clause": kind.clause,
-            "reaction": kind.reaction,
+            **{key: getattr(kind, key) for key in ("what", "clause", "reaction")},
             "conditions": sorted(kind.conditions),
             "points": sorted(kind.points),
             "needs": kind.needs,

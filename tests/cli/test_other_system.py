@@ -147,6 +147,15 @@ def test_a_console_needs_no_posix(ends, status):
     assert json.loads(out.splitlines()[-1]) == {"says": "stop and disable the drives"}
 
 
+def test_a_console_ends_with_whoever_reads_it():
+    console = Beside("console", "puma260", "--json")
+    console.moves()
+    console.process.stdout.close()
+    console.process.wait(timeout=60)
+    _, errors = console.process.communicate()
+    assert (console.process.returncode, errors) == (0, b"")
+
+
 def test_a_console_writes_in_the_encoding_of_its_terminal():
     console = Beside("console", "puma260", "--plain")
     console.type("where")
