@@ -12,7 +12,7 @@ import importlib.util
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from canprobe.cli.hands import ROWS
 from canprobe.cli.interrupts import left_by_ctrl_c
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cli.console_words import Words
     from canprobe.cli.hand_session import HandSession
 
-    output = WaitingOutput(sys.stdout.fileno(), as_json=args.json)
+    output = WaitingOutput(sys.stdout, as_json=args.json)
     homes = any(joint.zero == "homing" for joint in scene.joints.values())
 
     def observe(observation: Observation) -> None:
@@ -85,15 +85,16 @@ class WaitingOutput:
     """Lines for a reader that may be slow or stand still: what it does not take waits, and no cycle with it.
 
     Args:
-        descriptor: file descriptor of a terminal, file or pipe.
+        stream: a terminal, file or pipe.
         as_json: each line is a JSON document, and states are written, too.
 
     Attributes:
         gone: whether nobody reads it any more.
     """
 
-    def __init__(self, descriptor: int, *, as_json: bool) -> None:
-        self._descriptor, self._as_json, self._waiting = descriptor, as_json, b""
+    def __init__(self, stream: TextIO, *, as_json: bool) -> None:
+        self._descriptor, self._encoding = stream.fileno(), stream.encoding
+        self._as_json, self._waiting = as_json, b""
         self.gone = False
 
     def show(self, what: str | dict[str, Any]) -> None:
@@ -101,7 +102,7 @@ class WaitingOutput:
         if self._as_json and (isinstance(what, str) or not self._waiting):
             what = json.dumps({"says": what} if isinstance(what, str) else what, separators=(",", ":"))
         if isinstance(what, str) and len(self._waiting) < _MOST_WAITING:
-            self._waiting += what.encode() + b"\n"
+            self._waiting += what.encode(self._encoding, "backslashreplace") + b"\n"
         self.flush()
 
     def flush(self, patience_s: float = 0.0) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.argument_types import node_ids, number_of_32_bits, whole
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
-from canprobe.cli.target import loaded, real_target, target_of
+from canprobe.cli.target import loaded, one_channel, real_target, target_of
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -125,11 +125,11 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     for option in ("nodes", "seed", "truth", "without_id"):
         if getattr(args, option) not in (None, ()):
             raise UsageError(f"emulate: --{option.replace('_', '-')} belongs to a scene, not to {source}")
-    files = eds_files(args)
-    channels = [channel for _, channel in args.channel or [(None, None)]]
-    if len(channels) > 1 or (args.channel and args.channel[0][0] is not None):
-        raise UsageError(f"emulate: with {source} there is one channel, without a name: --channel CH")
-    target = real_target(args.bus, channels[0], args.bitrate)
+    files = eds_files("emulate", args) if args.bus_yml is None else _files_of_bus_yml(args)
+    if len(args.serial) > len(files):
+        raise UsageError(f"emulate: {len(args.serial)} --serial, but {len(files)} --eds")
+    channel = one_channel(args, f"emulate: with {source} there is one channel, without a name: --channel CH")
+    target = real_target(args.bus, channel, args.bitrate)
 
     from canprobe.cell.session.served import emulate_eds
 
@@ -144,20 +144,20 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     )
 
 
-def eds_files(args: argparse.Namespace, command: str = "emulate") -> list[tuple[str | Path, int]]:
-    """File and node id of each node without a scene."""
-    if args.bus_yml is not None:
-        from canprobe.lab.bridge.bus_yml import read_bus_yml
+def _files_of_bus_yml(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
+    from canprobe.lab.bridge.bus_yml import read_bus_yml
 
-        if args.node_id or args.serial:
-            raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
-        return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml, args.report.say)]
+    if args.node_id or args.serial:
+        raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
+    return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml, args.report.say)]
+
+
+def eds_files(command: str, args: argparse.Namespace) -> list[tuple[str | Path, int]]:
+    """File and node id of each node without a scene."""
     if len(args.eds) != len(args.node_id):
         raise UsageError(
             f"{command}: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own"
         )
-    if len(args.serial) > len(args.eds):
-        raise UsageError(f"emulate: {len(args.serial)} --serial, but {len(args.eds)} --eds")
     return list(zip(args.eds, args.node_id, strict=True))
 
 

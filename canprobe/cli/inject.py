@@ -8,6 +8,7 @@ Only the user who serves the nodes may throw faults.
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 
 from canprobe.cli.argument_types import word
 from canprobe.cli.output import print_answer, print_table
@@ -53,13 +54,8 @@ def _list(args: argparse.Namespace) -> int:
     document = [
         {
             "name": kind.name,
-            "parameters": {
-                name: {"default": one.default, "low": one.low, "high": one.high, "what": one.what}
-                for name, one in kind.parameters.items()
-            },
-            "what": kind.what,
-            "clause": kind.clause,
-            "reaction": kind.reaction,
+            "parameters": {name: asdict(one) for name, one in kind.parameters.items()},
+            **{key: getattr(kind, key) for key in ("what", "clause", "reaction")},
             "conditions": sorted(kind.conditions),
             "points": sorted(kind.points),
             "needs": kind.needs,

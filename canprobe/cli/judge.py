@@ -24,7 +24,7 @@ from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
-from canprobe.cli.target import loaded, real_target
+from canprobe.cli.target import loaded, one_channel, real_target
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -91,8 +91,6 @@ def run(args: argparse.Namespace) -> int:
     """Judge a log, or a master on served nodes."""
     if args.list:
         return _list(args)
-    args.bus_yml = None
-    args.serial = ()
     if (args.scene is None) is not bool(args.eds):
         raise UsageError("judge: name a SCENE or a cell, or else --eds FILE --node-id N")
     if args.inject and args.passive:
@@ -110,14 +108,12 @@ def _judge_record(args: argparse.Namespace) -> int:
             raise UsageError(f"judge: {name} belongs to served nodes, not to --record")
     from canprobe.fieldbus.tools.judge import Judge, nodes_of, read_record
 
-    named = [name for _, name in args.channel or ()]
-    if len(named) > 1:
-        raise UsageError("judge: a log is judged for one channel: --channel CH")
-    frames = read_record(args.record, named[0] if named else None)
-    nodes = _descriptions(args, named[0] if named else None)
-    judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without).hear(frames)
+    channel = one_channel(args, "judge: a log is judged for one channel: --channel CH")
+    nodes = _descriptions(args, channel)
+    judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without)
+    judge.hear(read_record(args.record, channel))
     if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
-        raise UsageError(_no_such_node(args, nodes, nodes_of(read_record(args.record, named[0] if named else None))))
+        raise UsageError(_no_such_node(args, nodes, nodes_of(read_record(args.record, channel))))
     if not judge.bus.now_ns:
         args.report.say(f"{args.record} has no times, so no interval or time-out is judged; record with candump -ta")
     facts = {**_facts(args), "frames": str(judge.frame_count)}
@@ -169,15 +165,13 @@ def _server(
     args: argparse.Namespace, bench: MasterBench, nodes: Mapping[int, Description]
 ) -> tuple[Target, Callable[[], None]]:
     """The bus, and the function that serves the nodes on it; drives stand away from 0, where a jump to 0 is seen."""
-    channels = args.channel or [(None, None)]
-    if len(channels) > 1 or channels[0][0] is not None:
-        raise UsageError("judge: the nodes are served on one channel, without a name: --channel CH")
+    channel = one_channel(args, "judge: the nodes are served on one channel, without a name: --channel CH")
     if args.scene is None:
         from canprobe.cell.session.served import emulate_eds
         from canprobe.fieldbus.tools.judge.bench import start_position
 
-        target = real_target(args.bus, channels[0][1], args.bitrate)
-        files = eds_files(args, "judge")
+        target = real_target(args.bus, channel, args.bitrate)
+        files = eds_files("judge", args)
         positions = [start_position(node) for node in nodes.values()]
         return target, lambda: emulate_eds(files, target, positions=positions, observer=bench, say=args.report.say)
     from canprobe import api
@@ -206,7 +200,7 @@ def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mappi
     from canprobe.fieldbus.eds.packaged import load_eds
 
     if args.scene is None:
-        files = eds_files(args, "judge")
+        files = eds_files("judge", args)
         if any(one == 255 for _, one in files):
             raise UsageError("judge: nodes without an id (255) are not judged")
     else:

@@ -144,14 +144,14 @@ def _rehearse(plan: Plan) -> str:
     """
     from canprobe.cell.session.session import run_beginning
 
-    what = f'{len(plan.nodes)} nodes brought up, then {{time:.2f}} s of task.kind = "{plan.setup.kind}"'
     try:
         session = run_beginning(plan)
     except PlanError:
         raise
     except CanprobeError as error:
         raise PlanError([f"the rehearsal failed ({type(error).__name__}): {error}"]) from error
-    return what.format(time=len(session.cell.log) / plan.sync.rate_hz) + ": done"
+    task_s = len(session.cell.log) / plan.sync.rate_hz
+    return f'{len(plan.nodes)} nodes brought up, then {task_s:.2f} s of task.kind = "{plan.setup.kind}": done'
 
 
 def _scene_beside(log: Path) -> str | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Collection, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -145,13 +146,8 @@ def _refuse_wrong(args: argparse.Namespace, typed: str, studies: Mapping[str, st
 
 def _replay(args: argparse.Namespace, typed: str) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
-    if typed == "faults":
-        from canprobe.lab.studies.faults import replay
-    elif typed == "regions":
-        from canprobe.lab.studies.regions import replay
-    else:
-        from canprobe.lab.studies.recover import replay
-    outcome = replay(args.seed, args.report.say)
+    module = {"faults --recover": "recover"}.get(typed, typed)
+    outcome = import_module(f"canprobe.lab.studies.{module}").replay(args.seed, args.report.say)
     if args.json:
         print_json(outcome)
     return 1 if outcome["failures"] else 0

@@ -94,6 +94,19 @@ def target_of(args: argparse.Namespace, scene: Scene) -> Target:
     return Target.over(scene, interface, channels | ({} if channel is None else {main: channel}), bitrate)
 
 
+def one_channel(args: argparse.Namespace, refusal: str) -> str | None:
+    """The channel of the command line where there can be one, without a name; None where none is given.
+
+    Raises:
+        UsageError: there are several, or it has a name.
+    """
+    given: Sequence[tuple[str | None, str | None]] = args.channel or [(None, None)]
+    (name, channel), *more = given
+    if more or name is not None:
+        raise UsageError(refusal)
+    return channel
+
+
 def real_target(
     bus: str | None,
     channel: str | None,

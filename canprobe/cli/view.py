@@ -1,7 +1,7 @@
 """Show a scene or a recorded run in three dimensions, in a browser (extra `view`).
 
-A scene is run and shown live, at the pace of real time, and then as a replay. The page is served until Ctrl-C. If a
-folder has the name of a packaged scene, write ./NAME for the folder.
+A scene is run and shown live, at the pace of real time, and then as a replay; on Windows only as a replay. The page is
+served until Ctrl-C. If a folder has the name of a packaged scene, write ./NAME for the folder.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import sys
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -52,9 +53,9 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show it until Ctrl-C, or write the file."""
-    from canprobe.cell.planning.bridges import check_bridges
+    from canprobe.cell.planning.bridges import check_view
 
-    check_bridges(["view"], "")
+    check_view()
     folder, browser = Path(args.what), _Browser(args.port, args.report.say, quiet=args.no_open)
     leave = left_by_ctrl_c() if args.html is None else contextlib.nullcontext()  # the normal end of a page only
     with leave:
@@ -93,6 +94,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from dataclasses import replace
 
     from canprobe import api
+    from canprobe.cell.planning.bridges import BRIDGES
     from canprobe.cell.scene.load import load_scene, packaged_files
     from canprobe.cell.scene.model import BridgeSettings
     from canprobe.cell.session.target import VIRTUAL
@@ -106,7 +108,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         raise
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
     scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
-    live = args.html is None
+    live = args.html is None and not BRIDGES["view"].lacks
     folder = api.results_folder(scene, args.out)
     api.run(
         scene,
@@ -136,7 +138,8 @@ class _Browser:
     def __init__(self, port: int, say: Callable[[str], None], *, quiet: bool) -> None:
         self.port = port
         self._say = say
-        self._quiet = quiet or not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        has_display = sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        self._quiet = quiet or not has_display
 
     def show(self, address: str) -> None:
         """Print the address of the page, and open the browser."""

@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from network_buses import group  # noqa: F401
 
 IMITATION = Path(__file__).parents[1] / "support" / "other_system"
 FAULT = "this is a fault of canprobe itself"
@@ -52,6 +53,7 @@ COMMANDS = (
     ("replay", "first"),
     ("judge", "--record", "first/bus.log", "cylinder"),
     ("adapters",),
+    ("view", "first", "--html", "page.html"),
     ("move", "puma260", "--joint", "1", "--by", "1deg", "--yes"),
     ("check", "free"),
     ("tare", "puma260", "--yes"),
@@ -99,27 +101,30 @@ def test_what_is_missing_is_named(folder):
         assert status in (2, 3) and says in said and FAULT not in said
 
 
-class Console:
-    """`canprobe console` on the imitated system, with pipes."""
+class Beside:
+    """A command on the imitated system, with pipes."""
 
     def __init__(self, *words: str) -> None:
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-        command = [sys.executable, "-m", "canprobe", "console", "puma260", *words]
-        self.process = subprocess.Popen(command, env=environment(), **pipes)
+        self.process = subprocess.Popen([sys.executable, "-m", "canprobe", *words], env=environment(), **pipes)
+
+    def send_break(self) -> None:
+        """CTRL_BREAK, which stands for SIGWINCH in the imitation."""
+        self.process.send_signal(signal.SIGWINCH)
 
     def type(self, line: str) -> None:
         self.process.stdin.write(line.encode() + b"\n")
         self.process.stdin.flush()
 
     def until(self, word: str) -> str:
-        """The line with this word, which the console prints."""
+        """The line with this word, which it prints."""
         for line in self.process.stdout:
             if word.encode() in line:
                 return line.decode()
         pytest.fail(f"no {word}: {self.process.stderr.read().decode()}")
 
     def moves(self) -> None:
-        """Let joint 1 move."""
+        """Let joint 1 of a console move."""
         self.type("enable")
         self.until("[yes, no]")
         self.type("yes")
@@ -130,26 +135,68 @@ class Console:
 
 @pytest.mark.parametrize(("ends", "status"), [("quit", 0), ("input", 0), ("break", 143)])
 def test_a_console_needs_no_posix(ends, status):
-    """It ends by a word, by the end of its input, and by CTRL_BREAK, which stands for SIGWINCH in the imitation."""
-    console = Console("--json")
+    """It ends by a word, by the end of its input, and by CTRL_BREAK."""
+    console = Beside("console", "puma260", "--json")
     console.moves()
     if ends == "quit":
         console.type("quit")
     elif ends == "break":
-        console.process.send_signal(signal.SIGWINCH)
+        console.send_break()
     out, errors = console.process.communicate(timeout=60)
     assert (console.process.returncode, errors) == (status, b"")
     assert json.loads(out.splitlines()[-1]) == {"says": "stop and disable the drives"}
 
 
+def test_a_console_ends_with_whoever_reads_it():
+    console = Beside("console", "puma260", "--json")
+    console.moves()
+    console.process.stdout.close()
+    console.process.wait(timeout=60)
+    _, errors = console.process.communicate()
+    assert (console.process.returncode, errors) == (0, b"")
+
+
+def test_a_console_writes_in_the_encoding_of_its_terminal():
+    console = Beside("console", "puma260", "--plain")
+    console.type("where")
+    out, errors = console.process.communicate(timeout=60)
+    assert console.process.returncode == 0 and " ± " in out.decode("cp1252"), errors
+
+
 def test_a_console_that_nobody_reads_does_what_is_typed_and_ends():
     """Its answers are more than a pipe holds."""
-    console = Console("--json")
+    console = Beside("console", "puma260", "--json")
     for line in (*["help"] * 100, "enable", "yes", "jog 1 +", "quit"):
         console.type(line)
     assert console.process.wait(timeout=60) == 0
     out, errors = console.process.communicate()
     assert out.count(b"print this list") < 100 and not errors
+
+
+def test_a_bus_of_python_can_is_scanned_and_a_device_on_it_examined(folder, group):
+    served = ("--bus", "udp_multicast", "--channel", group)
+    device = Beside("emulate", "--eds", "puma260_joint", "--node-id", "5", *served)
+    try:
+        while b"serving" not in device.process.stderr.readline():
+            assert device.process.poll() is None
+        status, said = typed(folder, "scan", *served)
+        assert status == 0 and "canprobe PUMA 260 joint" in said
+        status, said = typed(
+            folder, "conform", "--node", "5", "--eds", "puma260_joint", *served, "--points", "12", "--listen", "0.1"
+        )
+        assert status == 0 and "1 pass" in said
+    finally:
+        device.send_break()
+    device.process.communicate(timeout=60)
+    assert device.process.returncode == 143
+
+
+@pytest.mark.slow(reason="a master in real time")
+def test_a_master_is_judged_beside_served_nodes(folder, group):
+    master = (sys.executable, str(IMITATION.with_name("small_master.py")), "5", "udp_multicast", group)
+    served = ("--eds", "puma260_joint", "--node-id", "5", "--bus", "udp_multicast", "--channel", group)
+    status, said = typed(folder, "judge", *served, "--passive", "--without", "32,33,34", "--", *master)
+    assert status == 1 and "target at enable" in said and FAULT not in said
 
 
 def test_a_plan_says_what_its_system_cannot_do(folder):

@@ -43,6 +43,11 @@ class BridgeInfo:
         """What it lacks here, with what to do; empty where it can be used."""
         if not system.NON_BLOCKING_PIPES:
             return "its process is fed by a pipe that never waits, which this system lacks; " + _ELSEWHERE
+        return self.lacks_packages
+
+    @property
+    def lacks_packages(self) -> str:
+        """The packages that it lacks, with what to type; empty where they are installed."""
         return f"needs {', '.join(self.missing)}; type: {self.pip}" if self.missing else ""
 
     @property
@@ -73,8 +78,18 @@ BRIDGES: Mapping[str, BridgeInfo] = {
 }
 
 
-def check_bridges(names: Iterable[str], what: str = "bridge ") -> None:
-    """Check that every name is a bridge whose packages are installed; `what` precedes the name in the message.
+def check_view() -> None:
+    """Check that a recorded run can be viewed, for which no process is fed.
+
+    Raises:
+        UsageError: packages are missing; the message has the line to type.
+    """
+    if lacks := BRIDGES["view"].lacks_packages:
+        raise UsageError(f"view: {lacks}")
+
+
+def check_bridges(names: Iterable[str]) -> None:
+    """Check that every name is a bridge that can be used here.
 
     Raises:
         UsageError: when one is unknown or lacks packages; the message lists the bridges, or has the line to type.
@@ -85,7 +100,7 @@ def check_bridges(names: Iterable[str], what: str = "bridge ") -> None:
             hint = did_you_mean(name, BRIDGES)
             raise UsageError(f"bridge {name!r}: there is no such bridge{hint}; there are: {known}")
         if lacks := BRIDGES[name].lacks:
-            raise UsageError(f"{what}{name}: {lacks}")
+            raise UsageError(f"bridge {name}: {lacks}")
 
 
 def unavailable_bridges(setup: Setup) -> tuple[tuple[str, str], ...]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.options import quiet
 from canprobe.cell.npz import write_npz
-from canprobe.cell.planning.bridges import check_bridges
+from canprobe.cell.planning.bridges import check_view
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE, to_frame, write_parquet
@@ -78,7 +78,7 @@ def page_of(folder: Path, setup: Setup) -> Page:
     """
     page = Page(folder / "report.html")
     if not page.path.is_file():
-        check_bridges(["view"], "")
+        check_view()
         write_page_of(folder, setup)
     if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.path.resolve().as_uri())

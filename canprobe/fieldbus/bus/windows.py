@@ -22,79 +22,68 @@ KILL = signal.SIGTERM
 NON_BLOCKING_PIPES = False
 OWN_SESSION: dict[str, Any] = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}  # type: ignore[attr-defined]
 monotonic_ns = time.perf_counter_ns  # before Python 3.13 the other one has steps of 15.6 ms; time.sleep has none
+_LOCKED_BYTE = 0x7FFFFFFE  # nobody else can read a byte that is locked: one behind the end of the file
 _FIRST_LOOK_S = 0.05
 """Longest time of the first look at a stream: what was typed before it counts as typed, a closed stream as closed."""
-_READ: dict[int, _Reading] = {}
-_WRITTEN: dict[int, _Writing] = {}
-"""Threads of the streams, by descriptor: two readers of a terminal would take each other's lines."""
+_READ: dict[int, SimpleQueue[bytes]] = {}
+"""What a thread reads, by descriptor: only a socket says here whether it has anything, and two would share a line."""
+_WRITERS: dict[int, threading.Thread] = {}
+_BROKEN: set[int] = set()
+"""Threads that write a piece, for whose reader nobody waits; and descriptors that nobody reads any more."""
 
 
 def lock(file: IO[Any]) -> None:
-    file.seek(0)
+    place = file.tell()
+    file.seek(_LOCKED_BYTE)
     try:
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
     except PermissionError as error:
         raise BlockingIOError(*error.args) from error
+    finally:
+        file.seek(place)
 
 
-class _Reading(threading.Thread):
-    """Reads a stream as long as there is one: here only a socket says whether it has anything to read."""
-
-    def __init__(self, descriptor: int) -> None:
-        super().__init__(daemon=True)
-        self.came, self.is_open = SimpleQueue[bytes](), True
-        self._descriptor = descriptor
-        self.start()
-
-    def run(self) -> None:
-        data = b"-"
-        while data:
-            try:
-                data = os.read(self._descriptor, 4096)
-            except OSError:
-                data = b""
-            self.came.put(data)
+def _read(descriptor: int, came: SimpleQueue[bytes]) -> None:
+    data = b"-"
+    while data:
+        try:
+            data = os.read(descriptor, 4096)
+        except OSError:
+            data = b""
+        came.put(data)
 
 
 def typed(descriptor: int) -> tuple[bytes, bool]:
     found, patience_s = b"", 0.0
-    if (reading := _READ.get(descriptor)) is None:
-        reading, patience_s = _READ.setdefault(descriptor, _Reading(descriptor)), _FIRST_LOOK_S
-    while reading.is_open:
-        try:
-            data = reading.came.get(timeout=patience_s)
-        except Empty:
-            break
-        found, reading.is_open, patience_s = found + data, bool(data), 0.0
-    return found, reading.is_open
+    if (came := _READ.get(descriptor)) is None:
+        came, patience_s = _READ.setdefault(descriptor, SimpleQueue()), _FIRST_LOOK_S
+        threading.Thread(target=_read, args=(descriptor, came), daemon=True).start()
+    with contextlib.suppress(Empty):
+        while data := came.get(timeout=patience_s):
+            found, patience_s = found + data, 0.0
+        came.put(b"")  # the end is there at the next look, too
+        return found, False
+    return found, True
 
 
-class _Writing(threading.Thread):
-    """Writes a piece, for whose reader nobody waits."""
-
-    def __init__(self, descriptor: int, data: bytes) -> None:
-        super().__init__(daemon=True)
-        self.error: OSError | None = None
-        self._descriptor, self._data = descriptor, data
-        self.start()
-
-    def run(self) -> None:
-        try:
-            while self._data:
-                self._data = self._data[os.write(self._descriptor, self._data) :]
-        except OSError as error:
-            self.error = error
+def _write(descriptor: int, data: bytes) -> None:
+    try:
+        while data:
+            data = data[os.write(descriptor, data) :]
+    except OSError:
+        _BROKEN.add(descriptor)
 
 
 def write_some(descriptor: int, data: bytes, patience_s: float) -> int:
-    if (writing := _WRITTEN.get(descriptor)) is not None:
-        writing.join(patience_s)
-        if writing.is_alive():
+    if (writer := _WRITERS.get(descriptor)) is not None:
+        writer.join(patience_s)
+        if writer.is_alive():
             return 0
-        if writing.error is not None:
-            raise writing.error
+    if descriptor in _BROKEN:
+        raise BrokenPipeError("nobody reads any more")
     if data:
-        _WRITTEN[descriptor] = _Writing(descriptor, data)
+        writer = _WRITERS[descriptor] = threading.Thread(target=_write, args=(descriptor, data), daemon=True)
+        writer.start()
     return len(data)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import types
 
 import can
 import pytest
@@ -148,6 +149,18 @@ def test_serial_ports_and_a_kernel_without_can_say_what_to_install(tmp_path, mon
     assert (port.interface, port.channel, port.is_up) == ("slcan", str(tmp_path / "ttyACM0"), False)
     assert "install 'python-can[serial]'" in port.type_next
     assert "canprobe vcan -- COMMAND" in missing_here("socketcan")[0]
+
+
+def test_serial_ports_of_windows_are_those_that_pyserial_lists(monkeypatch):
+    ports = types.SimpleNamespace(comports=lambda: [types.SimpleNamespace(device="COM7")])
+    monkeypatch.setattr(adapters, "has_socketcan", lambda: False)
+    monkeypatch.setattr(adapters.importlib.util, "find_spec", lambda name: object() if name == "serial" else None)
+    monkeypatch.setitem(sys.modules, "serial.tools.list_ports", ports)
+    monkeypatch.setattr(adapters, "_detected", list)
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert [(port.channel, port.type_next) for port in find_adapters()] == [
+        ("COM7", "canprobe scan --bus slcan --channel COM7")
+    ]
 
 
 def test_a_kernel_driver_is_named_only_where_there_is_one(monkeypatch):

@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import types
+from pathlib import Path
 from typing import Any
 
 MODULES = ("fcntl", "resource", "termios", "tty", "pty", "pwd", "grp", "readline", "curses")
@@ -48,6 +49,9 @@ def hide() -> None:
         seen.__dict__.update({name: value for name, value in rest.items() if name not in names})
         sys.modules[module.__name__] = seen
     sys.modules["msvcrt"] = _locks()
+    sys.modules["platform"].system = lambda: "Windows"  # type: ignore[attr-defined]
+    is_there = Path.exists
+    Path.exists = lambda self, **more: self.parts[1:2] != ("proc",) and is_there(self, **more)  # type: ignore[assignment]
     there: Any = sys.modules["signal"]
     there.SIGBREAK = there.CTRL_BREAK_EVENT = signal.SIGWINCH
     subprocess.CREATE_NEW_PROCESS_GROUP = 0  # type: ignore[attr-defined]

@@ -28,7 +28,7 @@ from typing import Any
 
 from canprobe.errors import UsageError, did_you_mean, package_line
 from canprobe.fieldbus.bus.real.link import missing_ip, read_link, setting_line, sudo
-from canprobe.fieldbus.bus.real.socketcan import has_socketcan, how_to_make
+from canprobe.fieldbus.bus.real.socketcan import NO_SOCKETCAN, has_socketcan, how_to_make
 
 LOCAL_GROUP = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
@@ -38,7 +38,9 @@ _FD_CLOCK_HZ = 80_000_000
 _WHERE_SHOWN = "`canprobe adapters` shows what works here"
 _ARPHRD_CAN = "280"
 _NET_FOLDER, _DEVICE_FOLDER = Path("/sys/class/net"), Path("/dev")
-_USB_SERIAL = ("ttyACM*", "ttyUSB*")
+_USB_SERIAL = ("ttyACM*", "ttyUSB*", "cu.usb*")  # the last one is that of macOS
+_ON_WINDOWS = sys.platform == "win32"
+_SERIAL_PORT = "COM3" if _ON_WINDOWS else "/dev/ttyACM0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +111,7 @@ BACKENDS: Mapping[str, Backend] = {
         "name of the channel in PCAN-Basic",
         "PCAN_USBBUS1",
         driver="PCAN-Basic of peak-system.com",
-        library="PCANBasic" if sys.platform == "win32" else "pcanbasic",
+        library="PCANBasic" if _ON_WINDOWS else "pcanbasic",
         module="peak_usb",
         has="fd-timing listen-only errors stamps",
         bitrates_kbit=(1000, 800, 500, 250, 125, 100, 95, 83, 50, 47, 33, 20, 10, 5),
@@ -119,7 +121,7 @@ BACKENDS: Mapping[str, Backend] = {
         "number, from 0",
         "0",
         driver="CANlib of kvaser.com",
-        library="canlib32" if sys.platform == "win32" else "canlib",
+        library="canlib32" if _ON_WINDOWS else "canlib",
         indexed=True,
         module="kvaser_usb",
         has="fd filter listen-only errors stamps",
@@ -144,7 +146,7 @@ BACKENDS: Mapping[str, Backend] = {
     "slcan": Backend(
         "CANable (slcan firmware), USBtin, Lawicel: a serial line",
         "serial port",
-        "/dev/ttyACM0",
+        _SERIAL_PORT,
         package="serial",
         extra="serial",
         has="fd-timing listen-only",
@@ -156,7 +158,7 @@ BACKENDS: Mapping[str, Backend] = {
         "0",
         package="gs_usb",
         extra="gs-usb",
-        driver=f"libusb ({sudo()}apt-get install -y libusb-1.0-0)",
+        driver=f"libusb ({'of libusb.info' if _ON_WINDOWS else f'{sudo()}apt-get install -y libusb-1.0-0'})",
         library="usb-1.0",
         indexed=True,
         module="gs_usb",
@@ -395,6 +397,8 @@ def _serial_ports() -> list[Adapter]:
     """Serial ports by USB, each of which may be an slcan adapter."""
     ports = sorted(str(path) for pattern in _USB_SERIAL for path in _DEVICE_FOLDER.glob(pattern))
     lacks = BACKENDS["slcan"].missing
+    if sys.platform == "win32" and not lacks:
+        ports = [one.device for one in importlib.import_module("serial.tools.list_ports").comports()]
     state = "a serial port; whether an adapter is behind it only opening it shows"
     return [
         Adapter("slcan", port, state, not lacks, lacks[0] if lacks else _scan_line("slcan", port)) for port in ports
@@ -410,7 +414,7 @@ def missing_here(interface: str) -> tuple[str, ...]:
     if interface != SOCKETCAN:
         return BACKENDS[interface].missing
     if not has_socketcan():
-        return ("this kernel has no SocketCAN; a vcan0 in a virtual machine: canprobe vcan -- COMMAND",)
+        return (NO_SOCKETCAN,)
     if not _kernel_interfaces():
         return (f"no interface; a virtual one: {how_to_make('vcan0').removeprefix('type: ')}",)
     return ()

@@ -19,6 +19,7 @@ import os
 import select
 import socket
 import struct
+import sys
 import time
 from collections.abc import Callable, Collection, Sequence
 from itertools import accumulate
@@ -403,6 +404,13 @@ class SocketCanPort:
                 self._reports.error_frame(can_id, data, t_ns - offset_ns)
 
 
+NO_SOCKETCAN = "this kernel has no SocketCAN" + (
+    "; a virtual machine with a real vcan0 runs any COMMAND: canprobe vcan -- COMMAND"
+    if sys.platform == "linux"
+    else ", which is Linux's"
+)
+
+
 def has_socketcan() -> bool:
     """Return whether this kernel and this Python have SocketCAN; load the module if that is allowed."""
     try:
@@ -426,8 +434,7 @@ def check_interface(channel: str, setting: str | None = None, fd: bool = False) 
     """
     if not has_socketcan():
         raise InterfaceError(
-            f"{channel}: this kernel has no SocketCAN (AF_CAN); a virtual machine with a real vcan0 runs any COMMAND:"
-            " canprobe vcan -- COMMAND; without one `canprobe run` takes --bus lockstep (virtual time), and `canprobe"
+            f"{channel}: {NO_SOCKETCAN}; without one `canprobe run` takes --bus lockstep (virtual time), and `canprobe"
             " adapters` shows what else works here"
         )
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
