@@ -11,6 +11,7 @@ long the nodes took to be brought up.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -22,6 +23,7 @@ from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.mechanics.robot.model import units_to_joints
+from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 
 Truth = dict[str, float | bool | Floats]
@@ -94,6 +96,11 @@ class Plant:
             self._solved = None
             if self.arm is not None:
                 self.arm.advance(t_ns)
+
+    def place(self, shape: PlacedShape | None) -> None:
+        """Put another object in the place of the present one; None: nothing is there any more."""
+        self.config = replace(self.config, object=shape)
+        self._solver, self._solved = ContactSolver(self.config), None
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Set the reference of a drive, see ``IdealArm.set_ramp``.

@@ -34,7 +34,7 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
     flat = replace(scene, object=ObjectSettings("plane", scene.object.position_mm, scene.object.rotation_deg))
     with pytest.raises(SafetyStop) as stopped, Session(flat) as session:
         plant = session.buses.world.plant
-        plant.config = replace(plant.config, object=true_object(scene.object))
+        plant.place(true_object(scene.object))
         session.run(make_task(session.plan))
     assert "the contact runs off the edge of the array" in stopped.value.reason
     truth = session.buses.truth

@@ -24,7 +24,7 @@ def press_begun_pressed(**limits):
     raised = true_object(replace(scene.object, position_mm=(x, y, z + 8.3)))
 
     plant = session.buses.world.plant
-    plant.config = replace(plant.config, object=raised)
+    plant.place(raised)
     with pytest.raises(SafetyStop) as stopped, session:
         session.run(make_task(session.plan))
     return stopped.value.reason, session

@@ -50,8 +50,7 @@ class Disturbed(Wrapped):
                 there = canprobe.cell.scene.geometry.true_object(
                     replace(self.session.scene.object, position_mm=tuple(moved))
                 )
-            plant.config = replace(plant.config, object=there)
-            plant._solved = None
+            plant.place(there)
         command = self.task.step(measurement)
         self.positions.append((int(self.task.phase), *self.task._motion.pose.centre))
         return command

@@ -394,8 +394,7 @@ def test_force_above_the_limit_makes_the_probe_retreat():
 
 def vanish(run):
     plant = run.session.buses.world.plant
-    plant.config = replace(plant.config, object=None)
-    plant._solved = None
+    plant.place(None)
 
 
 def test_contact_lost_makes_the_probe_retreat():
@@ -414,8 +413,7 @@ def test_contact_lost_in_a_scan_makes_it_search_and_then_retreat():
             if self.injected_ns is not None and (sunk := (measurement.cycle - self.at) * 2.5e-3 * 12.0) < 8.0:
                 plant, given = self.session.buses.world.plant, self.session.scene.object
                 moved = tuple(np.subtract(given.position_mm, (0.0, 0.0, sunk)))
-                plant.config = replace(plant.config, object=true_object(replace(given, position_mm=moved)))
-                plant._solved = None
+                plant.place(true_object(replace(given, position_mm=moved)))
             if self.gone_ns is None and self.task.losses and self.task.losses[0].searched > self.limits.regain:
                 self.gone_ns = self.now()
             return command

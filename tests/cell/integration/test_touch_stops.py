@@ -42,8 +42,7 @@ def test_no_object_where_it_was_expected():
 
     def sink(session):
         plant = session.buses.world.plant
-        plant.config = replace(plant.config, object=None)
-        plant._solved = None
+        plant.place(None)
 
     reason, truth = run_until_stopped(session, at_cycle=60, action=sink)
     assert "no object found up to 2 mm beyond" in reason
