@@ -2,10 +2,10 @@
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `whole_cell`, `vcan0`, `pace`,
 `side_by_side`, `growth`, `held`, `gym`, `learning`, `bridges`, `local_node`, `canopen_node`, `canopen_node_vcan`,
-`hard_cases`, `test_lines`, `pictures`, `screens`, one of `FORMS`, or one of `PRINTED`, what a page shows of a command
-that the tests repeat. Without names everything is measured but what takes more than half an hour or needs clones
-(`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has its own
-command, date, commit and machine, so that one can be measured anew without the others; an entry whose study is gone
+`hard_cases`, `first_hour`, `test_lines`, `pictures`, `screens`, one of `FORMS`, or one of `PRINTED`, what a page shows
+of a command that the tests repeat. Without names everything is measured but what takes more than half an hour or needs
+clones (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has its
+own command, date, commit and machine, so that one can be measured anew without the others; an entry whose study is gone
 stays with its commit. Then `python docs/generate.py` writes the pages.
 """
 
@@ -371,6 +371,13 @@ def test_lines() -> Entry:
     return entry
 
 
+def first_hour() -> Entry:
+    """Times from a key of the console to frames and standstill, on a vcan0."""
+    command = "canprobe vcan -- python -m pytest -n0 -s tests/vcan/test_first_hour.py -m ''"
+    lines = printed(command).splitlines()
+    return {"command": command, "findings": [line for line in lines if line.startswith("key to")]}
+
+
 def hard_runs() -> Entry:
     """The runs that press hardest."""
     return {"command": "python docs/hard_cases.py", "table": hard_cases.table()}
@@ -488,6 +495,7 @@ def drawing_code(name: str) -> str:
 OTHERS: Mapping[str, Callable[[], Entry]] = {
     "local_node": local_node,
     "hard_cases": hard_runs,
+    "first_hour": first_hour,
     "test_lines": test_lines,
     "canopen_node": canopen_node,
     "canopen_node_vcan": canopen_node_vcan,

@@ -179,21 +179,17 @@ def _array_length(array: ODArray) -> int:
     return min(count, 254) if isinstance(count, int) else 0
 
 
-def _bits(variable: ODVariable, data_type: int) -> int:
-    if data_type in values.TEXT_TYPES | values.OCTET_TYPES:
-        return 0
-    return values.TIME_BITS if data_type in values.TIME_TYPES else len(variable)
-
-
 def described_entry(variable: ODVariable) -> DescribedEntry:
     """What a variable of a dictionary states."""
     data_type = variable.data_type or int(datatypes.DOMAIN)
+    unfixed = data_type in values.TEXT_TYPES | values.OCTET_TYPES
+    bits = 0 if unfixed else values.TIME_BITS if data_type in values.TIME_TYPES else len(variable)
     return DescribedEntry(
         index=variable.index,
         subindex=variable.subindex,
         name=variable.name,
         data_type=data_type,
-        bits=_bits(variable, data_type),
+        bits=bits,
         signed=data_type in values.SIGNED_BITS,
         access=variable.access_type,
         mappable=variable.pdo_mappable,

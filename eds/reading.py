@@ -26,6 +26,7 @@ from canprobe.fieldbus.eds.numbers import parse_sum
 from canprobe.fieldbus.eds.object_lists import check_lists
 from canprobe.fieldbus.eds.sections import Section, Source, decode, split_sections
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
+from canprobe.fieldbus.eds.variables import plain_variable
 from canprobe.fieldbus.protocol.frames import EFF_MASK, INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, RPDOS, TPDOS, is_mapping
 
@@ -202,16 +203,17 @@ class _Repair:
             if index not in od.indices:
                 value = _SERVO_DRIVE_TYPE if index == 0x1000 and source.drive else 0
                 source.faults.warn(0, f"{index:04X}", "", f"{name} is mandatory, but not there; served as {value:#x}")
-                od.add_object(_variable(name, index, 0, data_type, value))
+                od.add_object(plain_variable(name, (index, 0), data_type, "ro", value))
         if 0x1018 not in od.indices:
             numbers = {1: 0, **self._identity}
             text = ", ".join(f"{_IDENTITY_NAMES[subindex]} {number:#x}" for subindex, number in numbers.items())
             source.faults.warn(0, "1018", "", f"Identity object is mandatory, but not there; served with {text}")
             identity = ODRecord("Identity object", 0x1018)
-            identity.add_member(_variable("Highest sub-index supported", 0x1018, 0, datatypes.UNSIGNED8, max(numbers)))
+            highest = "Highest sub-index supported"
+            identity.add_member(plain_variable(highest, (0x1018, 0), datatypes.UNSIGNED8, "ro", max(numbers)))
             for subindex, number in numbers.items():
                 name = _IDENTITY_NAMES[subindex].capitalize()
-                identity.add_member(_variable(name, 0x1018, subindex, datatypes.UNSIGNED32, number))
+                identity.add_member(plain_variable(name, (0x1018, subindex), datatypes.UNSIGNED32, "ro", number))
             od.add_object(identity)
 
     def _fill(self, place: tuple[int, int], value: int, text: str) -> None:
@@ -304,12 +306,6 @@ class _Repair:
             self._source.faults.warn(0, f"{index:04X}sub{subindex:X}", "DefaultValue", text)
         else:
             self._source.warn(section, key, text)
-
-
-def _variable(name: str, index: int, subindex: int, data_type: int, default: int) -> ODVariable:
-    variable = ODVariable(name, index, subindex)
-    variable.data_type, variable.access_type, variable.default = data_type, "ro", default
-    return variable
 
 
 def _text(variable: ODVariable) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 from canprobe.fieldbus.eds.mandatory import COUNTING_INDICES, is_variable
 from canprobe.fieldbus.eds.numbers import parse_integer
 from canprobe.fieldbus.eds.sections import Section, Source
-from canprobe.fieldbus.eds.variables import build_variable, set_value
+from canprobe.fieldbus.eds.variables import build_variable, plain_variable, set_value
 
 _OBJECT_PATTERN = re.compile(r"(?:0x)?([0-9a-f]{4})")
 _SUB_OBJECT_PATTERN = re.compile(r"(?:0x)?([0-9a-f]{4})\s*sub\s*(?:0x)?([0-9a-f]{1,2})")
@@ -85,9 +85,7 @@ def _add_dummies(source: Source, od: ObjectDictionary) -> None:
     for data_type in range(1, 8):
         key = f"Dummy{data_type:04d}"
         if source.number(section, key) == 1:
-            dummy = ODVariable(key, data_type, 0)
-            dummy.data_type, dummy.access_type = data_type, "const"
-            od.add_object(dummy)
+            od.add_object(plain_variable(key, (data_type, 0), data_type, "const", None))
 
 
 def _build_composite(source: Source, index: int, head: Section, subs: Subs, kind: int) -> ODArray | ODRecord | None:
@@ -135,11 +133,8 @@ def _compact_members(source: Source, index: int, head: Section) -> dict[int, ODV
 
 
 def _count_of(index: int, count: int) -> ODVariable:
-    variable = ODVariable("Number of entries", index, 0)
-    variable.data_type = datatypes.UNSIGNED8
-    variable.access_type = "rw" if index in COUNTING_INDICES else "ro"
-    variable.default = count
-    return variable
+    access = "rw" if index in COUNTING_INDICES else "ro"
+    return plain_variable("Number of entries", (index, 0), datatypes.UNSIGNED8, access, count)
 
 
 def _check_count(source: Source, head: Section, subs: Subs) -> None:

@@ -14,6 +14,7 @@ from canprobe.fieldbus.eds import values
 from canprobe.fieldbus.eds.mandatory import CHOICE_INDICES, U8, USUAL_TYPES, decides, standard_access, standard_type
 from canprobe.fieldbus.eds.numbers import Remark, parse_flag, parse_integer, parse_sum
 from canprobe.fieldbus.eds.sections import Section, Source
+from canprobe.fieldbus.protocol.sdo import Place
 
 _OBJECT_DOMAIN = 2
 _OTHER_TYPES = {
@@ -24,6 +25,13 @@ _OTHER_TYPES = {
 """Data types beyond `KNOWN_TYPES`. Source: CiA 301, "Object dictionary data types"."""
 _ACCESS_TYPES = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly": "wo", "readwrite": "rw", "c": "const"}
+
+
+def plain_variable(name: str, place: Place, data_type: int, access: str, value: int | None) -> ODVariable:
+    """A variable that no section describes, with its default."""
+    variable = ODVariable(name, *place)
+    variable.data_type, variable.access_type, variable.default = data_type, access, value
+    return variable
 
 
 def build_variable(source: Source, section: Section, index: int, subindex: int, composite: bool = False) -> ODVariable:

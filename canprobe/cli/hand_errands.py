@@ -50,8 +50,7 @@ class Errands:
             packaged = f"{self._cell_file} is packaged, `canprobe init` makes a file of it"
             return self._show(f"{text}, until the end of this session: {packaged}")
         joints = self._cell.plan.setup.needed_arm().model.joints
-        posture = [round(its.shown(value), 4) for its, value in zip(joints, q, strict=True)]
-        self.writes.append(partial(save_posture, self._cell_file, name, posture))
+        self.writes.append(partial(save_posture, self._cell_file, name, joints, q))
         self._show(f"{text}; it is written into {self._cell_file} when the drives are disabled")
 
     def tare(self) -> None:
@@ -72,8 +71,8 @@ class Errands:
             self.waiting.append(errand)
             self._motions.arm.leaves = True
 
-        arm = self._cell.plan.setup.needed_arm()
-        self._questions.ask(f"{arm.left_alone}\n{question}" if self._motions.enabled else question, leave)
+        disables = f"{self._questions.left_alone}\n" if self._motions.enabled else ""
+        self._questions.ask(f"{disables}{question}", leave)
 
     def _tare(self) -> None:
         self._cell.tare()

@@ -11,7 +11,7 @@ class Questions:
     """The question that waits, and what the answers until now allow.
 
     Args:
-        left_alone: what the arm does when its drives are disabled.
+        left_alone: what the arm does when its drives are disabled, which is said before.
         show: called with each question, and with what else a person is told.
         resume: called where the arm may move again after a stop.
 
@@ -22,7 +22,7 @@ class Questions:
     """
 
     def __init__(self, left_alone: str, show: Callable[[str], None], resume: Callable[[], None]) -> None:
-        self._left_alone, self.show, self._resume = left_alone, show, resume
+        self.left_alone, self.show, self._resume = left_alone, show, resume
         self.asked: tuple[str, Callable[[], None]] | None = None
         self.stopped: str | None = None
         self.enables = self._allowed = False
@@ -40,9 +40,8 @@ class Questions:
         """
         self.refuse_stopped()
         if not self._allowed:
-            self.ask(
-                f"nothing has moved in this session yet; {self._left_alone}: is the arm free to move?", self._allow
-            )
+            question = "nothing has moved in this session yet: is the arm free to move?"
+            self.ask(f"{self.left_alone}\n{question}", self._allow)
         else:
             self.enables = True
 
@@ -60,7 +59,8 @@ class Questions:
         """Ask whether the arm may move again after a stop."""
         if self.stopped is None:
             raise UsageError("nothing was stopped")
-        self.ask(f"stopped: {self.stopped}\n{self._left_alone}; may the arm move again? faults are reset", self._go_on)
+        question = "may the arm move again? faults are reset"
+        self.ask(f"stopped: {self.stopped}\n{self.left_alone}\n{question}", self._go_on)
 
     def _allow(self) -> None:
         self._allowed = self.enables = True

@@ -18,12 +18,14 @@ from canprobe.cli.stdin import InputOpen
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy.typing as npt
 
     from canprobe.cell.master.controller import Measurement
     from canprobe.cell.planning.model import Plan
-    from canprobe.cell.results.open_cell import OpenCell
     from canprobe.cell.tasks.hand_way import HandWay
+    from canprobe.mechanics.types import Floats
 
 HELP = "move the arm to a posture, or one joint by a way"
 EXAMPLE = """\
@@ -78,8 +80,12 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("move: expected a posture, or --joint and --by; `canprobe posture list CELL` has the postures")
     args.yes = args.yes or args.dry_run
     stdin = InputOpen()
-    with opened(args) as cell:
-        found = cell.way_to(_goal(args, cell), args.speed)
+    cell = opened(args)
+    goal = _goal(args, cell.plan)  # what is wrong in it is told before anything is sent
+    with cell:
+        q = cell.read().q
+        assert q is not None
+        found = cell.way_to(goal(q), args.speed)
         print(described(cell.plan, found, args.speed))
         args.report.say(f"{cell.plan.setup.needed_arm().left_alone}; they are at the end")
         if args.dry_run or not agreed(args, cell, "move?"):
@@ -94,24 +100,21 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _goal(args: argparse.Namespace, cell: OpenCell) -> str | npt.ArrayLike:
-    """The posture of the command line: a name, or joint positions, rad or m."""
-    arm = cell.plan.setup.arm
-    if arm is None:
-        raise UsageError(f"move: {cell.plan.setup.name} has no arm")
-    joints = arm.model.joints
-    if args.joint is not None:
-        if not 1 <= args.joint <= len(joints):
-            raise UsageError(f"move: --joint {args.joint}: the arm has joints 1 to {len(joints)}")
-        its, (number, unit) = joints[args.joint - 1], args.by
-        if unit not in (None, its.unit):
-            raise UsageError(f"move: --by {number:g}{unit}: joint {args.joint} moves in {its.unit}")
-        q = cell.read().q
-        assert q is not None
-        q = q.copy()
-        q[args.joint - 1] += number / its.shown(1.0)
-        return q
-    return positions_of(cell.plan, args.to)
+def _goal(args: argparse.Namespace, plan: Plan) -> Callable[[Floats], npt.ArrayLike]:
+    """The posture of the command line: where the joints (n,), rad or m, go from where they stand."""
+    from canprobe.cell.tasks.hand_way import goal_of
+
+    joints = plan.setup.needed_arm("move").model.joints
+    if args.joint is None:
+        posture = goal_of(plan, positions_of(plan, args.to))
+        return lambda _: posture
+    if not 1 <= args.joint <= len(joints):
+        raise UsageError(f"move: --joint {args.joint}: the arm has joints 1 to {len(joints)}")
+    its, (number, unit) = joints[args.joint - 1], args.by
+    if unit not in (None, its.unit):
+        raise UsageError(f"move: --by {number:g}{unit}: joint {args.joint} moves in {its.unit}")
+    way = number / its.shown(1.0)
+    return lambda q: [value + way * (i == args.joint) for i, value in enumerate(q, start=1)]
 
 
 def positions_of(plan: Plan, text: str) -> str | list[float]:
@@ -120,9 +123,7 @@ def positions_of(plan: Plan, text: str) -> str | list[float]:
     Raises:
         UsageError: they are not as many as the joints.
     """
-    arm = plan.setup.arm
-    assert arm is not None
-    joints = arm.model.joints
+    joints = plan.setup.needed_arm().model.joints
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -134,15 +135,13 @@ def positions_of(plan: Plan, text: str) -> str | list[float]:
 
 def described(plan: Plan, found: HandWay, speed: float) -> str:
     """The way in words: what each joint does, and how long it takes."""
-    arm = plan.setup.arm
-    assert arm is not None
+    joints = plan.setup.needed_arm().model.joints
     start, end, duration_s = found.q[0], found.q[-1], found.profile().duration_s
     lines = [
         f"  joint {i + 1}: {its.shown(start[i]):.2f} to {its.text(end[i], '.2f')} ({its.shown(end[i] - start[i]):+.2f})"
-        for i, its in enumerate(arm.model.joints)
+        for i, its in enumerate(joints)
     ]
-    tip = found.tip[-1]
-    places = ", ".join(f"{1e3 * value:.0f}" for value in tip)
+    places = ", ".join(f"{1e3 * value:.0f}" for value in found.tip[-1])
     slowed = f"; {found.slowed_by}" if found.slowed_by else ""
     head = f"the way: {duration_s:.1f} s at {100 * speed:g} % of the speed limits{slowed}"
     return "\n".join([head, *lines, f"  {plan.setup.probe.tip} comes to {places} mm"])
@@ -150,6 +149,6 @@ def described(plan: Plan, found: HandWay, speed: float) -> str:
 
 def standing(plan: Plan, measurement: Measurement) -> str:
     """Where the arm stands, in deg or mm."""
-    arm, q = plan.setup.arm, measurement.q
-    assert arm is not None and q is not None
-    return ", ".join(its.text(value, ".2f") for its, value in zip(arm.model.joints, q, strict=True))
+    joints, q = plan.setup.needed_arm().model.joints, measurement.q
+    assert q is not None
+    return ", ".join(its.text(value, ".2f") for its, value in zip(joints, q, strict=True))

@@ -56,9 +56,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.scene.resolve import resolve
 
     plan = make_plan(resolve(loaded(args)))
-    arm = plan.setup.arm
-    if arm is None:
-        raise UsageError(f"posture: {plan.setup.name} has no arm")
+    arm = plan.setup.needed_arm("posture")
     shown = {
         name: [round(its.shown(value), 3) for its, value in zip(arm.model.joints, q, strict=True)]
         for name, q in arm.postures.items()
@@ -77,8 +75,7 @@ def _check(plan: Plan) -> int:
     """Print what is wrong with each posture; status 2 where something is."""
     from canprobe.cell.tasks.hand_way import joint_way
 
-    arm, wrong = plan.setup.arm, 0
-    assert arm is not None
+    arm, wrong = plan.setup.needed_arm(), 0
     for name, q in arm.postures.items():
         try:
             joint_way(plan, arm.q_start, q).whole()
@@ -91,16 +88,16 @@ def _check(plan: Plan) -> int:
 
 def _save(args: argparse.Namespace) -> int:
     """Read where the arm stands, and write it into the cell file."""
-    from canprobe.cli.posture_file import save_posture
+    from canprobe.cli.posture_file import postures_file, save_posture
 
     path = Path(args.cell or args.scene)
-    with opened(args) as cell:
-        arm, measurement = cell.plan.setup.arm, cell.read()
-        q = measurement.q
-        if arm is None or q is None:
-            raise UsageError(f"posture: {cell.plan.setup.name} has no arm")
-        text = standing(cell.plan, measurement)
-        posture = [round(its.shown(value), 4) for its, value in zip(arm.model.joints, q, strict=True)]
-    save_posture(path, args.name, posture)
+    cell = opened(args)
+    joints = cell.plan.setup.needed_arm("posture").model.joints
+    postures_file(path, args.name)  # what is wrong is told before anything is sent
+    with cell:
+        measurement = cell.read()
+        assert measurement.q is not None
+    text = standing(cell.plan, measurement)
+    save_posture(path, args.name, joints, measurement.q)
     print(f"{path}: {args.name} is {text}")
     return 0

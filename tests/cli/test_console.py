@@ -397,6 +397,8 @@ def test_what_cannot_be_is_one_clear_line():
     assert (q == q[0]).all(), "nothing has moved"
     with pytest.raises(UsageError, match="listen has no arm; `canprobe listen` shows an array"):
         Typist("listen")
+    with pytest.raises(UsageError, match=r"cycle.rate_hz = 20 .* cannot stand within 150 ms: expected a higher rate"):
+        Typist("free", **{"cycle.rate_hz": 20.0})
 
 
 def without_home_offset(folder):

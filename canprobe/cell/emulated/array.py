@@ -24,8 +24,7 @@ from canprobe.cell.scene.setup import Array
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import WINDOW_SIZE
-from canprobe.fieldbus.node.dictionary import Dictionary
-from canprobe.fieldbus.node.entry import Value, key_of
+from canprobe.fieldbus.node.dictionary import Dictionary, Value, key_of
 from canprobe.fieldbus.node.slave_node import Application, SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtState
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort

@@ -18,8 +18,7 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.period import PeriodFit
 from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
-from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
-from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
+from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileHeader, TactileMode
 from canprobe.mechanics.touch import ForceReading, Patch, PatchCalibration, compute_patch
 from canprobe.mechanics.touch.image.patch import patch_from_features
 from canprobe.mechanics.touch.image.silent_taxels import SilentTaxels

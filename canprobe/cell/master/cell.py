@@ -175,14 +175,14 @@ class Cell:
             self.stop()
             if not self._options.recover:
                 self.close()
-            self.cycles.name_another_master(error)
+            self.watch.name_another_master(error, self.notes)
             raise
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self.close()
         if error is not None:
-            self.cycles.name_another_master(error)
+            self.watch.name_another_master(error, self.notes)
 
     def run(
         self,
@@ -242,11 +242,7 @@ class Cell:
         measurement = cycles.begin()  # SYNC, collect
         held = self._supervise(measurement)
         with self._lifting_off_on_error():
-            try:
-                interrupts.take()
-            except KeyboardInterrupt as interrupt:  # a controller that brakes by itself raises it when it has
-                if not controller.brake(interrupt):
-                    raise
+            self._take(interrupts)
             command = self._held.freeze(measurement) if held else controller.step(measurement)
             check_command(command, arm=self.drives is not None)
         command, finding = self.supervisor.guard_target(command if held else self._held.thaw(command, measurement))
@@ -262,6 +258,14 @@ class Cell:
             found = self._retreats_for
             raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
         return bool(command.done)
+
+    def _take(self, interrupts: Interrupts) -> None:
+        """Raise an interrupt that came; a controller that brakes by itself raises it when it has."""
+        try:
+            interrupts.take()
+        except KeyboardInterrupt as interrupt:
+            if not self.cycles.controller.brake(interrupt):
+                raise
 
     def tare(self) -> None:
         """Take what the array shows for zero.
@@ -309,7 +313,7 @@ class Cell:
         try:
             yield
         except BaseException as error:
-            self.cycles.name_another_master(error)
+            self.watch.name_another_master(error, self.notes)
             raise
         finally:
             self._running = False
@@ -320,7 +324,7 @@ class Cell:
         try:
             yield
         except BaseException as error:
-            lift_off(self._plan, self.cycles, error)
+            lift_off(self._plan, self.drives, self.watch, self.cycles, error)
             raise
 
     # supervision
@@ -362,7 +366,7 @@ class Cell:
             controller.retreat(str(finding.error))
             return
         if reaction in (Reaction.RETREAT, Reaction.LIFT):
-            lift_off(self._plan, self.cycles, finding.error)
+            lift_off(self._plan, self.drives, self.watch, self.cycles, finding.error)
         raise finding.error
 
     # the way out
@@ -379,7 +383,7 @@ class Cell:
     def close(self) -> None:
         """Stop safely and close the bus. Never raises; failures are faults."""
         self.stop()
-        self._try(self.port.close)
+        self.notes.attempt(self.port.close)
         self.cycles.note_silent_taxels()
         for line in self.supervisor.notes():
             self.notes.add(line)
@@ -389,24 +393,13 @@ class Cell:
         if self._stopped:
             return
         self._stopped = True
-        self._try(self.cycles.record_last)
-        self._try(self.disable)
+        self.notes.attempt(self.cycles.record_last)
+        self.notes.attempt(self.disable)
         self.cycles.note_pressing()
         if isinstance(self.tactile, RawReceiver):
-            self._try(partial(self.tactile.stop, self.port))
+            self.notes.attempt(partial(self.tactile.stop, self.port))
         if self.homing is not None:
-            self._try(self.homing.keep)
-        self._try(self.bring_up.release)
+            self.notes.attempt(self.homing.keep)
+        self.notes.attempt(self.bring_up.release)
         if self.found is not None and self.bring_up.took_over:
-            self._try(self.found.restore)
-
-    def _try(self, action: Callable[[], None]) -> None:
-        """Run one step of the way out to its end: an interrupt repeats it once, a failure is noted."""
-        for _ in range(2):
-            try:
-                action()
-            except KeyboardInterrupt:
-                continue
-            except CanprobeError as error:
-                self.notes.add(f"while stopping: {error}")
-            return
+            self.notes.attempt(self.found.restore)

@@ -14,8 +14,7 @@ from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, 
 from canprobe.fieldbus.bus.clock import elapsed_ns
 from canprobe.fieldbus.bus.joined import send_on
 from canprobe.fieldbus.bus.port import Port, TimedFrame
-from canprobe.fieldbus.protocol.frames import NmtState, pack_heartbeat
-from canprobe.fieldbus.protocol.sync import SyncCounter, pack_sync
+from canprobe.fieldbus.protocol.frames import NmtState, SyncCounter, pack_heartbeat, pack_sync
 
 SYNCS_REMEMBERED = 240
 """Number of SYNCs that are remembered where SYNC has no counter."""

@@ -30,10 +30,10 @@ from canprobe.mechanics.robot.inverse import lifting_step
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
 from canprobe.mechanics.types import Floats
 
-REST_S = 0.05
-"""Time in which drives come to rest at their last targets before a quick stop, s: the longest usual lag."""
 LEAP_RAD = 10e-3
 """Distance of a joint from its target, rad, beyond which it does not lag: at 25 mm/s the joints lag by 7 mrad."""
+REST_S = 0.05
+"""Time in which drives come to rest at their last targets before a quick stop, s: the longest usual lag."""
 
 
 class WayBack:
@@ -149,22 +149,29 @@ class LiftOff:
         return not bool((self._free & (~enabled | late)).any()) and not any(self._free[i] for i in beyond)
 
 
-def lift_off(plan: Plan, cycles: SupervisedCycle, error: BaseException) -> None:
-    """Lift the probe off before the cell is stopped for an error; where that is not possible, let it rest."""
-    supervisor = cycles.supervisor
-    seen = supervisor.seen
-    if seen.drives is None or seen.tactile is None or not supervisor.pressing() or supervisor.must_stop():
+def lift_off(
+    plan: Plan, drives: DriveGroup | None, watch: NodeWatch, cycles: SupervisedCycle, error: BaseException
+) -> None:
+    """Lift the probe off what it presses before a cell is stopped; where that is not possible, let the arm rest.
+
+    Args:
+        plan, watch, error: as for `LiftOff`.
+        drives: drives of the arm; without one nothing is done.
+        cycles: the cycle of the cell, which goes on meanwhile.
+    """
+    supervisor, notes = cycles.supervisor, cycles.notes
+    if drives is None or not supervisor.pressing() or supervisor.must_stop():
         return
-    lift = LiftOff(plan, seen.drives, seen.watch, error, cycles.controller.trail)
-    t_s = cycles.run_s(seen.measurement)
+    lift = LiftOff(plan, drives, watch, error, cycles.controller.trail)
+    t_s = cycles.run_s(supervisor.seen.measurement)
     commands: Iterator[Command] = iter(())
     if lift.possible:
         cycles.say("lift off with the drives that obey")
-        cycles.notes.add("lift off", t_s=t_s)
+        notes.add("lift off", t_s=t_s)
         lift.begin()
         commands = iter(lambda: lift.command(supervisor), None)
     else:
-        cycles.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
+        notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
     # In a quick stop each drive brakes on a ramp of its own, from the speed of its targets: off the path, and after
     # a step of the target the wrong way (45 N at 25 mm/s). So all come to rest at their last targets before.
     rest = repeat(Command(), round(REST_S * 1e9 / plan.sync.period_ns))
@@ -173,12 +180,12 @@ def lift_off(plan: Plan, cycles: SupervisedCycle, error: BaseException) -> None:
             cycles.begin()
         for command in chain(commands, rest):
             cycles.cycle.end(command)
-            cycles.record(seen.measurement, command)
+            cycles.record(supervisor.seen.measurement, command)
             cycles.begin()
             if supervisor.must_stop():
                 break
     except CanprobeError as failure:
-        cycles.notes.add(f"while lifting off: {failure}")
+        notes.add(f"while lifting off: {failure}")
 
 
 def _obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:

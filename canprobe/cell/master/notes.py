@@ -43,6 +43,17 @@ class Notes:
         """Number of kinds."""
         return len(self._kinds)
 
+    def attempt(self, action: Callable[[], None]) -> None:
+        """Run one step of the way out to its end: an interrupt repeats it once, a failure is noted."""
+        for _ in range(2):
+            try:
+                action()
+            except KeyboardInterrupt:
+                continue
+            except CanprobeError as error:
+                self.add(f"while stopping: {error}")
+            return
+
     def add(self, what: str, *, node_id: int | None = None, t_s: float | None = None) -> None:
         """Count an event.
 

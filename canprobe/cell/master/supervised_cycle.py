@@ -22,7 +22,6 @@ from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.rows import joint_columns
-from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.mechanics.touch import Patch
 
@@ -165,17 +164,6 @@ class SupervisedCycle:
     def run_s(self, measurement: Measurement) -> float:
         """Time of a measurement on the run's clock, s."""
         return (self.start_ns + measurement.t_ns) * 1e-9
-
-    def name_another_master(self, error: BaseException) -> None:
-        """Add another master that was heard to an error that ends the cell: it may be the cause."""
-        watch = self.supervisor.seen.watch
-        words = watch.another_master
-        if words is None or str(watch.foreign) in str(error):
-            return
-        if isinstance(error, CanprobeError):
-            error.args = (f"{error}; {words}",)
-        elif words not in self.notes.lines():
-            self.notes.add(words)
 
     def note_alarms(self) -> None:
         """Note the alarms of the nodes since the last time."""

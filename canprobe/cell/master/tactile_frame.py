@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.fieldbus.protocol.tactile import Features, Shape, TactileHeader, TactileMode
-from canprobe.fieldbus.protocol.tactile_assembler import TactileMessage
+from canprobe.fieldbus.protocol.tactile import Features, Shape, TactileHeader, TactileMessage, TactileMode
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+from canprobe.cell.master.notes import Notes
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID
-from canprobe.errors import ProtocolError
+from canprobe.errors import CanprobeError, ProtocolError
 from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
 
@@ -122,6 +123,16 @@ class NodeWatch:
     def another_master(self) -> str | None:
         """A message that another master was heard, with its frame; None where none was heard."""
         return None if self.foreign is None else f"another master is on the bus: {self.foreign}"
+
+    def name_another_master(self, error: BaseException, notes: Notes) -> None:
+        """Add another master that was heard to an error that ends the cell: it may be the cause."""
+        words = self.another_master
+        if words is None or str(self.foreign) in str(error):
+            return
+        if isinstance(error, CanprobeError):
+            error.args = (f"{error}; {words}",)
+        elif words not in notes.lines():
+            notes.add(words)
 
     def last_words(self, node_id: int) -> str:
         """The node's last alarm, to be put behind an error; empty without one."""

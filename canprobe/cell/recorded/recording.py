@@ -33,8 +33,7 @@ from canprobe.errors import ProtocolError, UsageError
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame, is_bus_error
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
-from canprobe.fieldbus.protocol.frames import SYNC_ID
-from canprobe.fieldbus.protocol.sync import is_sync, long_syncs_text
+from canprobe.fieldbus.protocol.frames import SYNC_ID, is_sync, long_syncs_text
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 

@@ -15,8 +15,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import ERR_FLAG, is_bus_error
-from canprobe.fieldbus.protocol.frames import SYNC_ID
-from canprobe.fieldbus.protocol.sync import is_sync, long_syncs_text
+from canprobe.fieldbus.protocol.frames import SYNC_ID, is_sync, long_syncs_text
 
 LOG = "bus.log"
 

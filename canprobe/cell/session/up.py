@@ -120,6 +120,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     plan = make_plan(resolve(scene))
     arm, check, record = plan.setup.needed_arm(), JointCheck(plan, operator), JointRecord(plan)
     serials: dict[int, int] = {}
+    say(arm.left_alone)
     try:
         with Session(plan, RunOptions(say=say, rows_kept=ROWS_OF_UP)) as session:
             serials = session.cell.bring_up.serial_numbers(record.node_ids)
@@ -183,6 +184,7 @@ def home(
     """
     plan = make_plan(resolve(scene))
     homed_of(plan, joints)
+    say(plan.setup.needed_arm().left_alone)
     with Session(plan, RunOptions(say=say, rows_kept=ROWS_OF_UP, to_home=True)) as session:
         home_joints(plan, session.cell, joints, operator, say)
 

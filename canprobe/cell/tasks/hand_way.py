@@ -192,11 +192,8 @@ class HandWay:
     def _time_at(self, place: float) -> float:
         """Time from the start at which a place is reached, s."""
         profile = self.profile()
-        low, high = 0.0, profile.duration_s
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if profile.at(middle)[0] < place else (low, middle)
-        return high
+        t = np.linspace(0.0, profile.duration_s, 1001)
+        return float(np.interp(place, [profile.at(one)[0] for one in t.tolist()], t))
 
 
 def goal_of(plan: Plan, to: str | npt.ArrayLike) -> Floats:
@@ -298,8 +295,7 @@ def _probe_places(plan: Plan, start: Floats, way: Floats, turn: Floats) -> Itera
     Raises:
         UsageError: the arm cannot go there, as at the end of its reach.
     """
-    arm, guard, q = plan.setup.arm, JointGuard(plan), start
-    assert arm is not None
+    arm, guard, q = plan.setup.needed_arm(), JointGuard(plan), start
     T = guard.T_base_tip(start)
     for place in count(1):
         pose = np.eye(4)

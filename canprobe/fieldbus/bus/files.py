@@ -1,12 +1,15 @@
-"""Files that are written whole or not at all, whatever stops the writing."""
+"""Files that are written whole or not at all, whatever stops the writing, and small ones that are read whole."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
-from canprobe.errors import ResultsError
+from canprobe.errors import ResultsError, UsageError, regular_file
+
+T = TypeVar("T")
 
 
 @contextlib.contextmanager
@@ -68,3 +71,23 @@ def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str |
     """Write a text file whole, as `whole_file` does; encoding and line ends are those of `open`."""
     with whole_file(path) as part:
         part.write_text(text, encoding=encoding, newline=newline)
+
+
+def read_document(path: Path, most_bytes: int, parse: Callable[[str], T], expected: str) -> T:
+    """What a text file holds, parsed.
+
+    Args:
+        path: path of the file.
+        most_bytes: largest size that is read.
+        parse: function that reads the text; what it raises but for errors of canprobe says that the file is another.
+        expected: what the file should be, in the message.
+
+    Raises:
+        UsageError: the file cannot be read, or is another; the message says why.
+    """
+    try:
+        return parse(regular_file(path, most_bytes).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise UsageError(f"{path}: expected {expected}: {error}") from error

@@ -10,7 +10,7 @@ from canprobe.fieldbus.drive.mode import REACHED_FLAG, CyclicMode
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
 from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile import torque_run, uniform
-from canprobe.fieldbus.node.entry import Value, key_of
+from canprobe.fieldbus.node.dictionary import Value, key_of
 from canprobe.fieldbus.protocol.cia402 import ENABLE_INTERPOLATION_BIT, INTERPOLATION_ACTIVE_BIT, OperationMode
 from canprobe.fieldbus.protocol.emcy import REFERENCE_LIMIT_CODE
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort

@@ -22,7 +22,7 @@ from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
-from canprobe.fieldbus.node.entry import Value, key_of
+from canprobe.fieldbus.node.dictionary import Value, key_of
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.fieldbus.protocol import cia402

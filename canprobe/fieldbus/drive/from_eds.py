@@ -13,7 +13,7 @@ from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.fieldbus.drive.reference import AxisPlant
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.eds.reading import is_drive
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
 

@@ -27,7 +27,7 @@ from canprobe.fieldbus.drive.parameters import check_among
 from canprobe.fieldbus.drive.parts import NEGATIVE_SWITCH_FLAG, POSITIVE_SWITCH_FLAG, DriveParts
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED_BIT, HOMING_ERROR_BIT, HOMING_START_BIT, OperationMode
 
 PRESENT_POSITION_METHODS = frozenset({35, 37})

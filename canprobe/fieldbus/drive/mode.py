@@ -11,7 +11,7 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
 from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.reference import STEP_NS
-from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE

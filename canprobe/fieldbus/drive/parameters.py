@@ -11,8 +11,7 @@ from math import inf
 
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery, Units
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, SYNC_FACTOR
-from canprobe.fieldbus.node.dictionary import Dictionary
-from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.dictionary import Dictionary, Value
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 STAYING_QUICK_STOP_OPTIONS = frozenset({5, 6})  # values of 605Ah by which the drive stays in QUICK_STOP_ACTIVE

@@ -19,7 +19,7 @@ from canprobe.fieldbus.drive.mode import REACHED_FLAG, ProfiledMode
 from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.protocol import cia402
 
 _PROFILE_SPEED_KEY = key_of(0x6081)

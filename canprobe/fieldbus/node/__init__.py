@@ -6,8 +6,7 @@ Each service of the standard is one module:
 
     core                what all services share: identity, NMT state, time, timers, dictionary, frames to send
     timers              the deadlines of one node
-    entry               one entry of the dictionary: type, rights, limits, bytes
-    dictionary          all values, with the checks that an access over the bus must pass
+    dictionary          its entries: type, rights, limits, bytes; all values, with the checks of an access over the bus
     sdo_states          the state machine of an SDO server as a table
     sdo_transfers       segmented and block transfers, each an object with its state
     sdo_server          expedited transfers, and the beginning and end of the others

@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from canprobe.fieldbus.bus.port import nothing
-from canprobe.fieldbus.node.dictionary import Dictionary
-from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.dictionary import Dictionary, Value
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.timers import Holder, Timers
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, Frame, NmtState, is_restricted

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Hashable
 
 from canprobe.fieldbus.node.core import TALKING_STATES, NodeCore, Service, check_cob_id
-from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
+from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.emcy import Emergency
-from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.timers import Timer
 from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState, pack_heartbeat

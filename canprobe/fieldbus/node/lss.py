@@ -12,20 +12,8 @@ from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
 from canprobe.fieldbus.node.store import Store
-from canprobe.fieldbus.protocol.lss import (
-    BIT_RATES,
-    LSS_ANSWER_ID,
-    LSS_BYTES,
-    LSS_REQUEST_ID,
-    PRESENCE_CHECK,
-    UNCONFIGURED_ID,
-    LssAddress,
-    LssCommand,
-    LssError,
-    LssState,
-    pack_lss,
-    pack_number,
-)
+from canprobe.fieldbus.protocol import lss
+from canprobe.fieldbus.protocol.lss import LssAddress, LssCommand, LssError, LssState
 from canprobe.fieldbus.protocol.sdo import SdoAbort
 
 _SELECT_COMMANDS = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
@@ -63,7 +51,7 @@ class LssSlave(Service):
     @property
     def unconfigured(self) -> bool:
         """Whether the node has no id and waits for one."""
-        return self._core.node_id == UNCONFIGURED_ID
+        return self._core.node_id == lss.UNCONFIGURED_ID
 
     def power_on(self) -> None:
         """Take the stored id, if there is one."""
@@ -76,10 +64,10 @@ class LssSlave(Service):
 
     def routes(self) -> Mapping[int, Route]:
         """Identifier of the LSS master, in every NMT state."""
-        return {LSS_REQUEST_ID: self._receive}
+        return {lss.LSS_REQUEST_ID: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:
-        if len(data) != LSS_BYTES:
+        if len(data) != lss.LSS_BYTES:
             return
         if data[0] == LssCommand.SWITCH_GLOBAL:
             self._switch(data[1], t_ns)
@@ -88,12 +76,12 @@ class LssSlave(Service):
         if answer is None and self.state is LssState.CONFIGURATION:
             answer = self._configured(data)
         if answer is not None:
-            self._core.send(LSS_ANSWER_ID, answer)
+            self._core.send(lss.LSS_ANSWER_ID, answer)
 
     def _switch(self, mode: int, t_ns: int) -> None:
         if mode not in tuple(LssState):
             return
-        boots = self.state is LssState.CONFIGURATION and self.unconfigured and self.pending != UNCONFIGURED_ID
+        boots = self.state is LssState.CONFIGURATION and self.unconfigured and self.pending != lss.UNCONFIGURED_ID
         self._enter(LssState(mode))
         if boots and mode == LssState.WAITING:
             self._reset(t_ns)
@@ -105,35 +93,36 @@ class LssSlave(Service):
     def _searched(self, data: bytes) -> bytes | None:
         """Answer the questions by which a master finds the slave; only a slave without an id answers fastscan."""
         command, waits = data[0], self.state is LssState.WAITING
-        blank = self.unconfigured and self.pending == UNCONFIGURED_ID  # it has no id, and was given none yet
+        blank = self.unconfigured and self.pending == lss.UNCONFIGURED_ID  # it has no id, and was given none yet
         if command in _IDENTIFY_COMMANDS and self._search.identifies(data, self.address):
-            return pack_lss(LssCommand.IDENTIFIED)
+            return lss.pack_lss(LssCommand.IDENTIFIED)
         if command == LssCommand.IDENTIFY_UNCONFIGURED and blank:
-            return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED)
+            return lss.pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED)
         if waits and command in _SELECT_COMMANDS and self._search.selects(data, self.address):
             self._enter(LssState.CONFIGURATION)
-            return pack_lss(LssCommand.SELECTED)
+            return lss.pack_lss(LssCommand.SELECTED)
         if waits and command == LssCommand.FASTSCAN and blank:
             matches, found = self._search.fastscan(data, self.address)
             if found:
                 self._enter(LssState.CONFIGURATION)
-            return pack_lss(LssCommand.IDENTIFIED) if matches else None
+            return lss.pack_lss(LssCommand.IDENTIFIED) if matches else None
         return None
 
     def _configured(self, data: bytes) -> bytes | None:
         """Answer the questions and orders of a master in configuration state."""
         command, error = data[0], LssError.NONE
         if command in _INQUIRE_COMMANDS:
-            return pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE_COMMANDS[0]])
+            return lss.pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE_COMMANDS[0]])
         if command == LssCommand.INQUIRE_NODE_ID:  # in initialisation the pending one, which becomes active
-            return pack_lss(LssCommand(command), bytes((self.pending if self.unconfigured else self._core.node_id,)))
+            node_id = self.pending if self.unconfigured else self._core.node_id
+            return lss.pack_lss(LssCommand(command), bytes((node_id,)))
         if command == LssCommand.CONFIGURE_NODE_ID:
-            if 1 <= data[1] <= 127 or data[1] == UNCONFIGURED_ID:
+            if 1 <= data[1] <= 127 or data[1] == lss.UNCONFIGURED_ID:
                 self.pending = data[1]
             else:
                 error = LssError.REFUSED
         elif command == LssCommand.CONFIGURE_BIT_TIMING:
-            if data[1] != 0 or BIT_RATES.get(data[2]) != self.bitrate:
+            if data[1] != 0 or lss.BIT_RATES.get(data[2]) != self.bitrate:
                 error = LssError.REFUSED
         elif command == LssCommand.STORE:
             try:
@@ -142,7 +131,7 @@ class LssSlave(Service):
                 error = LssError.STORE_FAILED
         else:
             return None
-        return pack_lss(LssCommand(command), bytes((error,)))
+        return lss.pack_lss(LssCommand(command), bytes((error,)))
 
 
 class LssSearch:
@@ -179,9 +168,9 @@ class LssSearch:
     def fastscan(self, data: bytes, mine: LssAddress) -> tuple[bool, bool]:
         """Whether the asked bits of one number are mine, and whether the whole address is found."""
         bit, position, following = data[5:]
-        if not (bit < 32 or bit == PRESENCE_CHECK) or position > 3 or following > 3:
+        if not (bit < 32 or bit == lss.PRESENCE_CHECK) or position > 3 or following > 3:
             return False, False
-        if bit == PRESENCE_CHECK:
+        if bit == lss.PRESENCE_CHECK:
             self._position = 0
             return True, False
         asked = _NUMBER_MASK << bit & _NUMBER_MASK

@@ -11,8 +11,8 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.fieldbus.node.core import NO_ROUTES, DelayedFrames, NodeCore, Route, Service
+from canprobe.fieldbus.node.dictionary import Value, key_of
 from canprobe.fieldbus.node.emcy import Emergency
-from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.node.rpdo import Rpdo
 from canprobe.fieldbus.node.tpdo import BUFFERED_TYPE, Packing, Sampler, Tpdo

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 
 from canprobe.fieldbus.eds.packaged import LONG_PDOS
 from canprobe.fieldbus.node.core import check_cob_id
-from canprobe.fieldbus.node.dictionary import Dictionary
-from canprobe.fieldbus.node.entry import Value, key_of
-from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.node.dictionary import Dictionary, Value, key_of
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, MAX_SYNC_COUNT
 from canprobe.fieldbus.protocol.pdo import MAX_FD_PDO_BITS, MAX_PDO_BITS, TO_MAPPING, PdoEntry, PdoSub
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
-from canprobe.fieldbus.protocol.sync import MAX_SYNC_COUNT
 
 _RESERVED_RPDO_TYPES = range(0xF1, 0xFE)
 _RESERVED_TPDO_TYPES = range(0xF1, 0xFC)

@@ -6,9 +6,8 @@ Source: CiA 301, "RPDO", objects 1400h and 1600h; errors 8210h, 8220h, 8250h.
 from __future__ import annotations
 
 from canprobe.fieldbus.node.core import NodeCore
-from canprobe.fieldbus.node.dictionary import Slot
+from canprobe.fieldbus.node.dictionary import Slot, key_of
 from canprobe.fieldbus.node.emcy import Emergency
-from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
 from canprobe.fieldbus.protocol.pdo import PdoLayout, PdoSub

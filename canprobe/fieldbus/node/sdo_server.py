@@ -9,18 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from canprobe.fieldbus.node import sdo_transfers
 from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, DelayedFrames, NodeCore, Route, Service, check_cob_id
-from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
-from canprobe.fieldbus.node.sdo_transfers import (
-    MAX_BLOCK_SEGMENTS,
-    BlockDownload,
-    BlockUpload,
-    SegmentedDownload,
-    SegmentedUpload,
-    Transfer,
-    check_block_size,
-)
+from canprobe.fieldbus.node.sdo_transfers import Transfer
 from canprobe.fieldbus.protocol import sdo
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
@@ -121,14 +114,14 @@ class SdoServer(Service):
             dictionary.write_value(entry, entry.from_bytes(sdo.expedited_value(data, entry.bits // 8 or 4)))
             dictionary.configured(self._place[0])
         else:
-            self._transfer = SegmentedDownload(entry, sdo.stated_size(data), self._store)
+            self._transfer = sdo_transfers.SegmentedDownload(entry, sdo.stated_size(data), self._store)
         return sdo.pack_request(0x60, *self._place)
 
     def _block_download(self, data: bytes) -> bytes:
         entry = self._core.dictionary.find_writable(*self._place)
         announced = int.from_bytes(data[4:8], "little") if data[0] & 2 else None
-        self._transfer = BlockDownload(entry, announced, self._store, with_crc=bool(data[0] & 4))
-        return sdo.pack_request(0xA4, *self._place, bytes((MAX_BLOCK_SEGMENTS,)))
+        self._transfer = sdo_transfers.BlockDownload(entry, announced, self._store, with_crc=bool(data[0] & 4))
+        return sdo.pack_request(0xA4, *self._place, bytes((sdo_transfers.MAX_BLOCK_SEGMENTS,)))
 
     def _store(self, value: bytes) -> None:
         self._core.dictionary.write(*self._place, value)
@@ -138,15 +131,15 @@ class SdoServer(Service):
         value = self._core.dictionary.read(*self._place)
         if 1 <= len(value) <= 4:
             return sdo.pack_request(0x43 | (4 - len(value)) << 2, *self._place, value)
-        self._transfer = SegmentedUpload(value)
+        self._transfer = sdo_transfers.SegmentedUpload(value)
         return sdo.pack_request(0x41, *self._place, len(value).to_bytes(4, "little"))
 
     def _block_upload(self, data: bytes) -> bytes:
         value = self._core.dictionary.read(*self._place)
-        block_size = check_block_size(data[4])
+        block_size = sdo_transfers.check_block_size(data[4])
         if 0 < len(value) <= data[5]:  # the protocol switch threshold
             return self._upload(data)
-        self._transfer = BlockUpload(value, block_size, with_crc=bool(data[0] & 4))
+        self._transfer = sdo_transfers.BlockUpload(value, block_size, with_crc=bool(data[0] & 4))
         return sdo.pack_request(0xC6, *self._place, len(value).to_bytes(4, "little"))
 
     def _drop(self) -> None:

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from binascii import crc_hqx
 from collections.abc import Callable
 
-from canprobe.fieldbus.node.entry import Entry
+from canprobe.fieldbus.node.dictionary import Entry
 from canprobe.fieldbus.node.sdo_states import SdoState
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.node.core import NodeCore
-from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 SAVE_SIGNATURE = int.from_bytes(b"save", "little")

@@ -8,7 +8,7 @@ from typing import Any
 
 from canprobe.errors import CanprobeError, UsageError, check_schema
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort

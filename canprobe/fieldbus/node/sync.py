@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, NodeCore, Route, Service
+from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.emcy import Emergency
-from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
-from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtState, is_restricted
+from canprobe.fieldbus.protocol.frames import MAX_SYNC_COUNT, SYNC_ID, NmtState, is_restricted
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
-from canprobe.fieldbus.protocol.sync import MAX_SYNC_COUNT
 
 _PRODUCER_FLAG = 1 << 30
 

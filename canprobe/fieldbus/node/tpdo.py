@@ -10,7 +10,7 @@ from operator import itemgetter
 from typing import Any
 
 from canprobe.fieldbus.node.core import NodeCore
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.protocol.frames import RTR_FLAG
 from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, PdoLayout, PdoSub

@@ -6,7 +6,6 @@ import struct
 from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, Frame
 
 _FORM = struct.Struct("<HB5s")
 NO_ERROR_CODE = 0x0000
@@ -111,10 +110,6 @@ class Emcy:
         if len(data) != 8:
             raise ProtocolError(f"EMCY: expected 8 bytes, got {len(data)}")
         return cls(*_FORM.unpack(data))
-
-    def frame(self, node_id: int) -> Frame:
-        """The frame on the predefined identifier 080h + node id."""
-        return EMCY_BASE + node_id, self.pack()
 
 
 def is_no_error(code: int) -> bool:

@@ -81,7 +81,7 @@ class FramePattern:
 
     def unpack(self, data: bytes) -> list[int]:
         """The values in a frame that matches."""
-        number, values = self._number(data), []
+        number, values = int.from_bytes(data[: self.length], "big"), []
         for shifts in self.values:
             value = 0
             for shift in shifts:
@@ -104,9 +104,6 @@ class FramePattern:
             for place, shift in enumerate(reversed(shifts)):
                 number |= (value >> 4 * place & 0xF) << shift
         return number.to_bytes(self.length, "big")
-
-    def _number(self, data: bytes) -> int:
-        return int.from_bytes(data[: self.length], "big")
 
 
 def value_range(bits: int, *, signed: bool) -> tuple[int, int]:

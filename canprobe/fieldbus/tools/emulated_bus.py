@@ -31,7 +31,7 @@ from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.drive.from_eds import make_eds_node
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.entry import Value, key_of
+from canprobe.fieldbus.node.dictionary import Value, key_of
 from canprobe.fieldbus.node.serve import serve
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.sdo import SdoAbort

@@ -11,8 +11,7 @@ from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.node.stored_file import keep_in_file
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES, TactileMode, window_words
-from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
+from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES, FrameAssembler, TactileMode, window_words
 from canprobe.fieldbus.tools.faults import FaultyNode, parse_fault
 
 MS = 1_000_000

@@ -12,8 +12,7 @@ from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.master.tactile_frame import decode
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.tactile import TactileMode
-from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
+from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileMode
 
 OFF = 0x80000000
 SAVE, TARE = 0x65766173, 0x65726174

@@ -12,8 +12,7 @@ from canprobe.cell.master.drives import DriveAxis, DriveGroup
 from canprobe.cell.master.position_track import MIN_REST_COUNTS, REST_NS, PositionTrack, rest_counts
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode, pack_whole
-from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
+from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from canprobe.cell.master.tactile_frame import decode
-from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
-from canprobe.fieldbus.protocol.tactile_assembler import TactileMessage
+from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMessage, TactileMode
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (12, 9)])

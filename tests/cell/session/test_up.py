@@ -23,7 +23,7 @@ from canprobe.cell.session.up import reporting_notes
 from canprobe.cell.tasks.joint_check import Answer, JointFinding, SeenWay
 from canprobe.cli import main
 from canprobe.errors import NodeError, SafetyStop, UsageError
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, SYNC_ID

@@ -17,9 +17,8 @@ from canprobe.fieldbus.bus.port import Reports
 from canprobe.fieldbus.bus.real.mmsg import Row
 from canprobe.fieldbus.bus.real.python_can import PythonCanPort
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
-from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.frames import Frame, pack_sync
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageAssembler, ImageFormat
-from canprobe.fieldbus.protocol.sync import pack_sync
 
 
 def test_virtual_time_stands_still_and_jumps() -> None:

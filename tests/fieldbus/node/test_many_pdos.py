@@ -8,8 +8,7 @@ from canopen.objectdictionary.eds import import_eds
 from canprobe.fieldbus import SlaveNode
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, load_eds
 from canprobe.fieldbus.node import Abort, SdoAbort
-from canprobe.fieldbus.node.dictionary import Dictionary
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import Dictionary, key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
 
 MS = 1_000_000

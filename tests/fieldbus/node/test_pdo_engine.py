@@ -3,7 +3,7 @@
 import pytest
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import key_of
 
 MS = 1_000_000
 OFF = 0x80000000

@@ -13,12 +13,12 @@ from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.tactile import (
     WINDOW_SIZES,
     Features,
+    FrameAssembler,
     TactileHeader,
     TactileMode,
     crc16_ccitt,
     pack_whole,
 )
-from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 
 FEATURES, WINDOW, IMAGE = TactileMode
 DEADLINE = 5_000_000

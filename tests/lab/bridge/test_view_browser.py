@@ -136,7 +136,6 @@ def test_without_the_extra_there_is_the_line_that_installs_it(monkeypatch, capsy
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nothing"], "nothing: no such scene, cell or file; scenes: "),
         (["free", "--port", "70000"], "expected an integer from 0 to 65535"),
         (["{empty}"], "no scene.toml in this folder; expected one that `canprobe run --out DIR` wrote"),
     ],

@@ -332,6 +332,7 @@ def test_an_exploration_is_coloured_by_the_height_in_its_page_too(tmp_path):
 
 
 def broken(recorded, tmp_path, name, content):
+    """A folder with one file changed; tests/cell/results/test_run_files.py has all that may be wrong in one."""
     for file in ("scene.toml", "log.npz", "summary.json"):
         shutil.copy(recorded.folder / file, tmp_path / file)
     if content is None:
@@ -343,29 +344,21 @@ def broken(recorded, tmp_path, name, content):
     return tmp_path
 
 
-ROWS = {"t_s": np.arange(0.5, 3.0)}
-
-
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
         ("log.npz", None, r"no log\.npz in this folder; expected one that `canprobe run --out DIR` wrote"),
         ("scene.toml", None, r"no scene\.toml in this folder"),
-        ("log.npz", b"no zip", r"log\.npz: expected the log of a run; cannot be read"),
-        ("log.npz", {"q_rad": np.zeros((3, 6))}, r"log\.npz: expected the columns of a run, got none called t_s"),
-        ("log.npz", {**ROWS, "q_rad": np.zeros((3, 5))}, r"q_rad: expected floats of shape \(3, 6\), got .*\(3, 5\)"),
         (
             "log.npz",
             {"t_s": np.arange(3.0)},
             r"log\.npz: expected t_s on the clock of bus\.log, .* run the scene again",
         ),
-        ("log.npz", {**ROWS, "force_n": np.array(["a"] * 3)}, r"force_n: expected floats of shape \(3,\), got <U1"),
         (
             "summary.json",
             b'{"schema": 99}',
             r"json: written by an earlier canprobe, .*: .* up to schema 2, got 99; run the scene",
         ),
-        ("summary.json", b"{", r"summary\.json: expected the summary of a run; cannot be read"),
     ],
 )
 def test_a_folder_that_is_no_run_is_told_apart(recorded, tmp_path, name, content, says):

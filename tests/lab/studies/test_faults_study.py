@@ -129,7 +129,7 @@ def test_a_fault_that_mattered_is_not_reported_as_completed():
 def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
     monkeypatch.setattr("canprobe.cell.master.arm_power.ArmPower.disable", lambda self: None)
     monkeypatch.setattr("canprobe.cell.master.bringup.BringUp.release", lambda self: None)
-    monkeypatch.setattr("canprobe.fieldbus.drive.self_stop.Supervision._lose", lambda self, code, t_ns: None)
+    monkeypatch.setattr("canprobe.fieldbus.drive.parts.Supervision._lose", lambda self, code, t_ns: None)
     monkeypatch.setattr("canprobe.fieldbus.node.slave_node.SlaveNode._communication_error", lambda self, t_ns: None)
     run = FaultRun(task_plan("press", "ideal").with_seed(0)).result()
     assert any("OPERATION_ENABLED after the stop" in failure for failure in run["failures"])

@@ -24,18 +24,12 @@ from canprobe.fieldbus.protocol.cia402 import CONTROLWORD, POWERED_STATES, descr
 from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.protocol.pdo import RPDOS
+from canprobe.fieldbus.tools.conform import outcome
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
-from canprobe.fieldbus.tools.conform.outcome import (
-    BenchFailure,
-    Deviation,
-    NotPermitted,
-    PointNotApplicable,
-    PowerStageOn,
-)
 from canprobe.fieldbus.tools.conform.permits import Permits, WriteList, is_object
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
@@ -137,7 +131,7 @@ class Examination:
         with interrupts_held():
             try:
                 self._leave()
-            except BenchFailure as error:
+            except outcome.BenchFailure as error:
                 self.report.rows.append(ReportRow("bench", "put back", Verdict.ERROR, detail=str(error)))
         self.report.left_out += LEFT_OUT if set(points) >= set(POINTS) else ()
         self.report.distributions.update(self.bench.distributions)
@@ -185,7 +179,7 @@ class Examination:
         """Bring the device to pre-operational, unless its power stage is on: an axis may hang on it."""
         try:
             self._check_power()
-        except BenchFailure as error:
+        except outcome.BenchFailure as error:
             self._ended = f"not examined: {error}"
         else:
             self._put_back()
@@ -206,7 +200,7 @@ class Examination:
     def _start_once(self) -> None:
         bench = self.bench
         state: int | None = None
-        with contextlib.suppress(Deviation, PointNotApplicable):
+        with contextlib.suppress(outcome.Deviation, outcome.PointNotApplicable):
             bench.watch_state()
             bench.nmt(NmtCommand.START)
             bench.pass_time(bench.times.silence_s)
@@ -249,7 +243,7 @@ class Examination:
                 if unasked and verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE):
                     code = unasked[0].code
                     verdict, detail = Verdict.FAIL, f"EMCY {code:04X}h ({describe(code)}) that nobody asked for"
-            except PowerStageOn as error:
+            except outcome.PowerStageOn as error:
                 verdict, detail, self._ended = Verdict.ERROR, str(error), f"not examined: {error}"
             except CanprobeError as error:
                 detail = f"{detail}; then {error}" if verdict is Verdict.FAIL else str(error)
@@ -265,14 +259,14 @@ class Examination:
         try:
             self._prepare()
             point.run(self.bench)
-        except PowerStageOn as error:
+        except outcome.PowerStageOn as error:
             self._ended = f"not examined: {error}"
             return Verdict.ERROR, str(error)
-        except PointNotApplicable as error:
-            if isinstance(error, NotPermitted):
+        except outcome.PointNotApplicable as error:
+            if isinstance(error, outcome.NotPermitted):
                 self.report.left_out.append((f"{point.group} {point.title}", str(error)))
             return Verdict.NOT_APPLICABLE, str(error)
-        except (Deviation, SdoRefused) as error:
+        except (outcome.Deviation, SdoRefused) as error:
             return Verdict.FAIL, str(error)
         except CanprobeError as error:
             return Verdict.ERROR, str(error)
@@ -311,7 +305,7 @@ class Examination:
         try:
             bench.ask(READ_TYPE)
         except CanprobeError as error:
-            raise BenchFailure(f"the device does not answer before the point begins: {error}") from error
+            raise outcome.BenchFailure(f"the device does not answer before the point begins: {error}") from error
         self._check_power()
         bench.forget()
 
@@ -327,10 +321,10 @@ class Examination:
         for index in self.bench.device.statuswords:
             try:
                 word = self.bench.number(index)
-            except Deviation as error:
-                raise BenchFailure(f"{index:04X}h cannot be read: {error}") from error
+            except outcome.Deviation as error:
+                raise outcome.BenchFailure(f"{index:04X}h cannot be read: {error}") from error
             if known_state(word) in POWERED_STATES:
-                raise PowerStageOn(f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)")
+                raise outcome.PowerStageOn(f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)")
 
     def _put_back(self) -> list[str]:
         """Put back what the point wrote, and all of it where the device booted; it is pre-operational afterwards."""
@@ -343,23 +337,19 @@ class Examination:
             bench.settle(NmtState.PRE_OPERATIONAL)
         try:
             written = self.journal.restore(bench, all_of_it=bench.boots != self._boots)
-        except BenchFailure as error:
+        except outcome.BenchFailure as error:
             if not commanded:
                 raise
             try:  # a device may have values at power on that it does not take back
                 bench.reset()
-            except Deviation:
+            except outcome.Deviation:
                 raise error from None
             written = self.journal.restore(bench, all_of_it=True)
-        if commanded and bench.asked and not self._is_well():
+        if commanded and bench.asked and bench.number(0x1001) & ~bench.device.number(0x1001):
             bench.reset()  # an error that was provoked and stays would fail the points that follow
             written += self.journal.restore(bench, all_of_it=True)
         self._boots = bench.boots
         return written
-
-    def _is_well(self) -> bool:
-        """Whether 1001h shows no error that was not there before."""
-        return not self.bench.number(0x1001) & ~self.bench.device.number(0x1001)
 
     def _leave(self) -> None:
         """Put back everything, and bring the device into the state that it had; nothing is sent to an axis with power.
@@ -380,7 +370,7 @@ class Examination:
         except CanprobeError as error:
             path = self.journal.path
             way = "" if path is None else "; " + _WAY_OUT.format(path=path, node_id=self._node_id)
-            raise BenchFailure(f"node {self._node_id}: not everything was put back: {error}{way}") from error
+            raise outcome.BenchFailure(f"node {self._node_id}: not everything was put back: {error}{way}") from error
 
 
 def _row(point: Point, verdict: Verdict, detail: str, **more: Any) -> ReportRow:
@@ -406,7 +396,7 @@ def restore_snapshot(port: Port, node_id: int, path: Path, times: BenchTimes | N
         raise NodeError(node_id, f"it is {identity} (1018h), the snapshot is of {journal.identity}")
     try:
         examination._check_power()
-    except PowerStageOn as error:
+    except outcome.PowerStageOn as error:
         raise NodeError(node_id, str(error)) from error
     bench.permits.values = journal.values
     bench.permits.written = WriteList(places=frozenset(journal.values))

@@ -11,8 +11,8 @@ import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from canprobe.errors import UsageError, check_schema, regular_file
-from canprobe.fieldbus.bus.files import write_text
+from canprobe.errors import UsageError, check_schema
+from canprobe.fieldbus.bus.files import read_document, write_text
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, TO_MAPPING
 from canprobe.fieldbus.protocol.sdo import Place, place_text
@@ -74,20 +74,18 @@ class Journal:
         Raises:
             UsageError: the file cannot be read, or is no snapshot.
         """
-        try:
-            document = json.loads(regular_file(path, _MAX_BYTES).read_text(encoding="utf-8"))
+
+        def parse(text: str) -> Journal:
+            document = json.loads(text)
             if document["kind"] != _KIND:
                 raise ValueError("another kind of file")
             check_schema(path, document.get("schema", 1), SCHEMA, "put the device back with the canprobe that wrote it")
-            values = {
-                (int(name[:4], 16), int(name[6:], 16)): bytes.fromhex(text) for name, text in document["values"].items()
-            }
-            journal = cls(values, None, str(document["identity"]))
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from error
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise UsageError(f"{path}: expected a snapshot that canprobe conform wrote: {error}") from error
-        journal.touched.update(values)
+            entries = document["values"].items()
+            values = {(int(name[:4], 16), int(name[6:], 16)): bytes.fromhex(value) for name, value in entries}
+            return cls(values, None, str(document["identity"]))
+
+        journal = read_document(path, _MAX_BYTES, parse, "a snapshot that canprobe conform wrote")
+        journal.touched.update(journal.values)
         return journal
 
     def restore(self, bench: SdoClient, *, all_of_it: bool = False) -> list[str]:
@@ -104,7 +102,7 @@ class Journal:
             BenchFailure: an entry has another value than before and does not take the old one.
         """
         wanted = sorted(self.values if all_of_it else self.touched & self.values.keys())
-        differing = [place for place in wanted if _present(bench, place) != self.values[place]]
+        differing = [place for place in wanted if bench.present(place) != self.values[place]]
         for pdo in sorted({place[0] & ~TO_MAPPING for place in differing if place[0] in PDO_OBJECTS}):
             self._restore_pdo(bench, pdo)
         others = [place for place in differing if place[0] not in PDO_OBJECTS]
@@ -116,7 +114,7 @@ class Journal:
             self._write(bench, place, bytes(4))  # two entries must not name one producer on the way
         for place in others:
             self._write(bench, place, self.values[place])
-        wrong = [place for place in differing if _present(bench, place) != self.values[place]]
+        wrong = [place for place in differing if bench.present(place) != self.values[place]]
         if wrong:
             raise BenchFailure(f"not restored: {', '.join(place_text(*place) for place in wrong)}")
         written = sorted(self.touched | set(differing))
@@ -127,7 +125,7 @@ class Journal:
         cob_id = int.from_bytes(self.values.get((index, 1), b""), "little")
         self._write(bench, (index, 1), (cob_id | INVALID_FLAG).to_bytes(4, "little"))
         mapping = [self.values[place] for place in _entries(self.values, index + TO_MAPPING)]
-        if [_present(bench, place) for place in _entries(self.values, index + TO_MAPPING)] != mapping:
+        if [bench.present(place) for place in _entries(self.values, index + TO_MAPPING)] != mapping:
             self._write(bench, (index + TO_MAPPING, 0), b"\0")
             for subindex, word in enumerate(mapping[1:], start=1):
                 self._write(bench, (index + TO_MAPPING, subindex), word)
@@ -139,7 +137,7 @@ class Journal:
 
     def _write(self, bench: SdoClient, place: Place, value: bytes) -> None:
         """Write an entry; whether it took the value is found out when it is read back."""
-        if place in self.values and value and _present(bench, place) != value:
+        if place in self.values and value and bench.present(place) != value:
             with contextlib.suppress(SdoRefused, Deviation):
                 bench.download(*place, value)
 
@@ -152,13 +150,6 @@ class Journal:
 
 def _entries(values: Mapping[Place, bytes], index: int) -> list[Place]:
     return sorted(place for place in values if place[0] == index)
-
-
-def _present(bench: SdoClient, place: Place) -> bytes | None:
-    try:
-        return bench.upload(*place)
-    except (SdoRefused, Deviation):
-        return None
 
 
 def restorable(values: Mapping[Place, bytes], permitted: Iterable[Place]) -> dict[Place, bytes]:

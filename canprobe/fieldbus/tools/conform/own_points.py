@@ -28,7 +28,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from canprobe.errors import UsageError, did_you_mean, regular_file
+from canprobe.errors import UsageError, did_you_mean
+from canprobe.fieldbus.bus.files import read_document
 from canprobe.fieldbus.protocol.frames import Frame, NmtCommand
 from canprobe.fieldbus.protocol.sdo import Place, place_text
 from canprobe.fieldbus.tools.conform.accepted import abort_text
@@ -57,12 +58,7 @@ def read_points(path: Path) -> tuple[Point, ...]:
     Raises:
         UsageError: the file cannot be read, or something in it is wrong; the message says where, and what is expected.
     """
-    try:
-        document = tomllib.loads(regular_file(path, _MAX_BYTES).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: expected TOML: {error}") from error
+    document = read_document(path, _MAX_BYTES, tomllib.loads, "TOML")
     rows = document.get("point")
     if set(document) != {"point"} or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise UsageError(f"{path}: expected tables [[point]] and nothing else")

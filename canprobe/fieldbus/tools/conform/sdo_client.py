@@ -85,6 +85,13 @@ class SdoClient(FrameLink):
             raise Deviation(f"{sdo.place_text(index, subindex)} announced {announced} bytes and sent {len(value)}")
         return value
 
+    def present(self, place: sdo.Place) -> bytes | None:
+        """The value of an entry now; None where the device does not give it."""
+        try:
+            return self.upload(*place)
+        except (SdoRefused, Deviation):
+            return None
+
     def download(self, index: int, subindex: int, value: bytes) -> None:
         """Write an entry of up to four bytes.
 

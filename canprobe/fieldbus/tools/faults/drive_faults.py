@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.drive.drive import DriveApplication
-from canprobe.fieldbus.node.entry import key_of
+from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.sdo import Abort

@@ -9,16 +9,9 @@ from typing import ClassVar
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.emcy import Emcy
-from canprobe.fieldbus.protocol.frames import (
-    CLASSIC_BYTES,
-    EFF_FLAG,
-    EMCY_BASE,
-    HEARTBEAT_BASE,
-    RTR_FLAG,
-    SYNC_ID,
-    Frame,
-)
+from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.tactile import TactileHeader, crc16_ccitt
 from canprobe.fieldbus.tools.faults.fault import SHORT_NS, Effect, Parameter, in_ms, numbers
 
@@ -146,8 +139,8 @@ class Babble(Effect):
         sorts: tuple[Frame, ...] = (
             (_GARBAGE_ID, data),
             (_TPDO1 + node_id, data),
-            (HEARTBEAT_BASE + node_id, b"\x05"),
-            (EMCY_BASE + node_id, Emcy(0x8140, 0x11, data[:5]).pack()),
+            (frames.HEARTBEAT_BASE + node_id, b"\x05"),
+            (frames.EMCY_BASE + node_id, Emcy(BUS_OFF_RECOVERED_CODE, 0x11, data[:5]).pack()),
         )
         return sorts[self.fault.seed % len(sorts)]
 
@@ -157,11 +150,11 @@ class WrongData(Effect):
 
     name = "wrong-data"
 
-    def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
+    def batch(self, sent: list[Frame], t_ns: int) -> list[Frame]:
         if self.rng.random() >= self.fault.share:
-            return frames
+            return sent
         ids = tactile_ids(self.node)
-        return self._wrong_header(frames, ids) if ids else [self._wrong_position(frame) for frame in frames]
+        return self._wrong_header(sent, ids) if ids else [self._wrong_position(frame) for frame in sent]
 
     def _wrong_position(self, frame: Frame) -> Frame:
         can_id, data = frame
@@ -174,14 +167,14 @@ class WrongData(Effect):
         values[places.index(POSITION_INDEX)] += self.rng.choice((-1, 1)) * 2 ** self.rng.randrange(20)
         return can_id, layout.pack(*values)
 
-    def _wrong_header(self, frames: list[Frame], ids: tuple[int, ...]) -> list[Frame]:
-        parts = dict(frames)
+    def _wrong_header(self, sent: list[Frame], ids: tuple[int, ...]) -> list[Frame]:
+        parts = dict(sent)
         if not all(can_id in parts for can_id in ids):
-            return frames
+            return sent
         try:
             header = TactileHeader.unpack(parts[ids[0]])
         except ProtocolError:
-            return frames
+            return sent
         self.host.hits += 1
         if self.fault.seed % 2 == 0:
             header = replace(header, sync_counter=self.rng.randrange(1, 241))
@@ -190,7 +183,7 @@ class WrongData(Effect):
         body = b"".join(parts[can_id] for can_id in ids[1:])
         first = replace(header, crc=0).pack()
         packed = replace(header, crc=crc16_ccitt(body, crc16_ccitt(first[:6]))).pack()
-        return [(can_id, packed if can_id == ids[0] else data) for can_id, data in frames]
+        return [(can_id, packed if can_id == ids[0] else data) for can_id, data in sent]
 
 
 class Short(Effect):
@@ -210,7 +203,7 @@ class Long(Effect):
     incoming = None
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return ((frame[0], frame[1] + b"\0"),) if is_pdo(frame[0]) and len(frame[1]) < CLASSIC_BYTES else None
+        return ((frame[0], frame[1] + b"\0"),) if is_pdo(frame[0]) and len(frame[1]) < frames.CLASSIC_BYTES else None
 
 
 class Burst(Duplicate):
@@ -238,8 +231,8 @@ class OddFrames(Babble):
 
     def made(self) -> Frame:
         if self.rng.random() < 0.5:
-            return RTR_FLAG | _TPDO1 + 0x40 + self.node.node_id, b""
-        return EFF_FLAG | _TPDO1 + 0x80 + self.node.node_id, self.rng.randbytes(8)
+            return frames.RTR_FLAG | _TPDO1 + 0x40 + self.node.node_id, b""
+        return frames.EFF_FLAG | _TPDO1 + 0x80 + self.node.node_id, self.rng.randbytes(8)
 
 
 class SyncJitter(Effect):
@@ -249,7 +242,7 @@ class SyncJitter(Effect):
     parameters, incoming = numbers(us=Parameter(200, 1, 1e6, "longest delay, µs")), True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        if frame[0] != SYNC_ID:
+        if frame[0] != frames.SYNC_ID:
             return None
         return self.delayed(frame, t_ns, 1e-3 * self.rng.uniform(0.0, self.fault.value("us")))
 
@@ -261,7 +254,7 @@ class SyncLost(Effect):
     incoming = True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame[0] == SYNC_ID else None
+        return () if frame[0] == frames.SYNC_ID else None
 
 
 class SyncDouble(Effect):
@@ -271,7 +264,7 @@ class SyncDouble(Effect):
     incoming = True
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return (frame, frame) if frame[0] == SYNC_ID else None
+        return (frame, frame) if frame[0] == frames.SYNC_ID else None
 
 
 class BusOff(Effect):
@@ -280,8 +273,8 @@ class BusOff(Effect):
     name = "bus-off"
     incoming, lasts_ns = True, SHORT_NS
 
-    def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
-        self.host.hits += len(frames)
+    def batch(self, sent: list[Frame], t_ns: int) -> list[Frame]:
+        self.host.hits += len(sent)
         return []
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:

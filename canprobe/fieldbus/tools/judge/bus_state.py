@@ -91,7 +91,11 @@ class BusState:
         """EMCY or SDO of a node."""
         if base == frames.SDO_RX_BASE:
             node.addressed = True
-            yield from map(self._requested, self._channels[node.node_id].from_client(frame))
+            for event in self._channels[node.node_id].from_client(frame):
+                if isinstance(event, events.RequestSeen):
+                    node.asked = True
+                    node.touch(event.place[0])
+                yield event
             return
         yield from self._sent_by(node, frame)
         if base == frames.SDO_TX_BASE:
@@ -106,7 +110,9 @@ class BusState:
             if received is not None:
                 yield from self._rpdo(frame, node, received)
             if sent is not None and frame.from_node is not False:
-                yield from self._tpdo(frame, node, sent)
+                node.hear(frame.t_ns)
+                node.answers = True
+                yield from self._valued(node, _unpacked(sent, frame), frame, sent, written=False)
             elif sent is not None and sent.certain and received is None:
                 yield events.ForgedSeen(frame, node)
 
@@ -154,12 +160,6 @@ class BusState:
             if node.nmt is frames.NmtState.OPERATIONAL and node.started_ns is None:
                 node.started_ns, node.syncs = frame.t_ns, 0
 
-    def _requested(self, event: BusEvent) -> BusEvent:
-        if isinstance(event, events.RequestSeen):
-            event.node.asked = True
-            event.node.touch(event.place[0])
-        return event
-
     def _transferred(self, event: BusEvent) -> Iterator[BusEvent]:
         """The end of a transfer, and what its value means."""
         yield event
@@ -182,11 +182,6 @@ class BusState:
         before = {place: node.sure_value(*place) for place in values}
         yield events.RpdoSeen(frame, node, pdo, values, before)
         yield from self._valued(node, values, frame, pdo, written=True)
-
-    def _tpdo(self, frame: BusFrame, node: SeenNode, pdo: PdoView) -> Iterator[BusEvent]:
-        node.hear(frame.t_ns)
-        node.answers = True
-        yield from self._valued(node, _unpacked(pdo, frame), frame, pdo, written=False)
 
     def _valued(
         self, node: SeenNode, values: Mapping[Place, int], frame: BusFrame, pdo: PdoView | None, *, written: bool

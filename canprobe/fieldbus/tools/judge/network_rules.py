@@ -7,19 +7,16 @@ from canprobe.fieldbus.protocol.cia402 import DriveCommand, OperationMode, comma
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtCommand, NmtState
 from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
+from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, SECOND_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
 _PATIENCE_NS = 5_000_000_000
 _UP = (DriveCommand.SHUTDOWN, DriveCommand.SWITCH_ON, DriveCommand.ENABLE_OPERATION)
-_SECOND_NS = 1_000_000_000
 _SLACK_NS = 2_000_000
 _GONE = 20
 """A gap of so many times is a master that was ended and begins again."""
 _JITTER_SHARE, _LEAST_INTERVALS = 0.05, 200
 """Share of the period by which 99 % of the intervals of SYNC may differ, and how many there must be."""
-_NEAR_NS = 1_000_000_000
-"""Time within which two bad SYNCs are blamed."""
 _ENOUGH_SYNCS, _PERIOD_SHARE = 5, 0.05
 """SYNCs from which on the period is known, and the share by which 60C2h may differ from it."""
 
@@ -141,7 +138,7 @@ def sync_gaps(case: Case) -> Watch[events.SyncSeen]:
             if event.counter != before.counter + 1 and not begins:
                 words.append(f"counter {event.counter} after {before.counter}")
         if words:
-            if bad is not None and event.frame.t_ns - bad.t_ns < max(_NEAR_NS, 3 * period_ns):
+            if bad is not None and event.frame.t_ns - bad.t_ns < max(SECOND_NS, 3 * period_ns):
                 case.blame(None, "; ".join(words), bad, before, event)
             bad = event.frame
 
@@ -176,7 +173,7 @@ def no_watchdog(case: Case, node: SeenNode) -> Watch[events.StatusSeen]:
             first = None
             continue
         first = first or event.frame
-        if judged or event.frame.t_ns - first.t_ns < _SECOND_NS or not node.is_sure(0x1016):
+        if judged or event.frame.t_ns - first.t_ns < SECOND_NS or not node.is_sure(0x1016):
             continue
         judged = True
         what = "enabled for a second, and neither 1016h, 14xxh:05, guarding nor 1006h watches the master"

@@ -12,10 +12,9 @@ from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS, RPDOS, TO_MAPPING, is_ma
 from canprobe.fieldbus.protocol.sdo import place_text
 from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
-from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
+from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, SECOND_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import TARGETS, SeenNode
 
-_SECOND_NS = 1_000_000_000
 _HARMLESS = {cia402.CONTROLWORD, cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE, 0x60B0, 0x60B1, 0x60B2, 0x60FE}
 """Objects of which 0 is a quiet value."""
 _PROFILE = range(0x6040, 0x6100)
@@ -69,7 +68,7 @@ def never_sent(case: Case, node: SeenNode) -> Watch[events.BusEvent]:
     """An RPDO that the master prepared is never sent."""
     yield  # the end of the bus: it hears no event
     started_ns = node.started_ns
-    if not node.operational or started_ns is None or case.bus.now_ns - started_ns < _SECOND_NS:
+    if not node.operational or started_ns is None or case.bus.now_ns - started_ns < SECOND_NS:
         return
     control = node.known(cia402.CONTROLWORD)
     by_sdo = control is not None and control.t_ns > started_ns and not any(node.rpdo_counts.values())
@@ -174,7 +173,7 @@ def cyclic_without_sync(case: Case, node: SeenNode) -> Watch[events.TargetSeen]:
         if case.in_a_row((node, "type"), kind >= 254, _WANTED_TARGETS):
             what = f"RPDO {pdo.number} with 607Ah has the transmission type {kind}: the drive takes it at any time"
             case.blame(node, what, node.known(RPDOS[pdo.number - 1], 2), event)
-        if case.in_a_row((node, "sync"), pdo.layout.synchronous and since_ns > _SECOND_NS, _WANTED_TARGETS):
+        if case.in_a_row((node, "sync"), pdo.layout.synchronous and since_ns > SECOND_NS, _WANTED_TARGETS):
             what = f"RPDO {pdo.number} of type {kind} is sent without a SYNC: the drive never takes it"
             case.blame(node, what, event)
 

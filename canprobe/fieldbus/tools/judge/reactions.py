@@ -10,7 +10,7 @@ from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.enable import enables
-from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Case, Watch, rule
+from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, SECOND_NS, Case, Watch, rule
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 from canprobe.fieldbus.tools.judge.targets import Onward
 
@@ -18,7 +18,6 @@ _COMMUNICATION = (0x81, 0x82)
 """High bytes of codes on communication, after which a node may go on."""
 _FAULTY = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
 _DOWN = (DriveCommand.DISABLE_VOLTAGE, DriveCommand.QUICK_STOP, DriveCommand.SHUTDOWN, DriveCommand.DISABLE_OPERATION)
-_SECOND_NS = 1_000_000_000
 StopEvent = events.EmcySeen | events.StatusSeen | events.ControlSeen | events.NmtSeen
 BootEvent = events.HeartbeatSeen | events.TargetSeen | events.ControlSeen | events.AnswerSeen
 LossEvent = events.SyncSeen | events.HeartbeatSeen | events.TargetSeen | events.ControlSeen | events.StatusSeen
@@ -61,7 +60,7 @@ def reset_taken_for_error(case: Case) -> Watch[StopEvent]:
     while event := (yield):
         stopped: tuple[SeenNode, ...] = ()
         if isinstance(event, events.EmcySeen):
-            recent = event.frame.t_ns - errors_ns.get(event.node, -_SECOND_NS) < _SECOND_NS
+            recent = event.frame.t_ns - errors_ns.get(event.node, -SECOND_NS) < SECOND_NS
             if event.code:
                 errors_ns[event.node] = event.frame.t_ns
                 resets.clear()
@@ -197,7 +196,7 @@ class _Losses:
         else:  # an axis that nobody sees is not held by a target that stays: its power has to go
             enables_on = command_of(event.word, event.before or 0) is DriveCommand.ENABLE_OPERATION
             waited_ns = event.frame.t_ns - max(since_ns, self._still_ns.get(node, 0))
-            found = node is lost and enables_on and waited_ns > _SECOND_NS
+            found = node is lost and enables_on and waited_ns > SECOND_NS
             what = f"6040h = {event.word:04X}h still enables it"
         if found:
             sign = "sign" if self._is_silent(lost) else "heartbeat"

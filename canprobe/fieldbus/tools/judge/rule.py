@@ -18,7 +18,8 @@ from canprobe.fieldbus.tools.reports.report import Severity
 
 QUEUED_NS = 5_000_000
 """Time for which a frame may have waited in its sender's queue."""
-CHARGED_NS = 1_000_000_000
+SECOND_NS = 1_000_000_000
+CHARGED_NS = SECOND_NS
 """Time after a fault of ours for which what follows is charged to it."""
 _KEPT_FINDINGS = 5
 _FACTS = tomllib.loads(Path(__file__).with_name("rules.toml").read_text(encoding="utf-8"))

@@ -8,8 +8,8 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from canprobe.errors import UsageError, check_schema, regular_file
-from canprobe.fieldbus.bus.files import write_text
+from canprobe.errors import UsageError, check_schema
+from canprobe.fieldbus.bus.files import read_document, write_text
 from canprobe.fieldbus.tools.reports.report import Report, ReportRow, Severity, Verdict
 
 SCHEMA = 1
@@ -40,14 +40,10 @@ def read_json(path: Path) -> Report:
     Raises:
         UsageError: the file cannot be read, is no report, or is of a newer version; the message says where and why.
     """
-    try:
-        document = json.loads(regular_file(path, _MAX_BYTES).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: expected the JSON report of canprobe conform or judge: {error}") from error
+    expected = "the JSON report of canprobe conform or judge"
+    document = read_document(path, _MAX_BYTES, json.loads, expected)
     if not isinstance(document, dict) or "tool" not in document:
-        raise UsageError(f"{path}: expected the JSON report of canprobe conform or judge, got other JSON")
+        raise UsageError(f"{path}: expected {expected}, got other JSON")
     check_schema(path, document.get("schema"), SCHEMA, "make the report anew with --json")
     try:
         return _parse_report(document)

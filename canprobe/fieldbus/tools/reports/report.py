@@ -106,6 +106,11 @@ class Report:
         return groups
 
     @property
+    def bad(self) -> list[ReportRow]:
+        """Rows that failed or were not examined."""
+        return [row for row in self.rows if row.verdict in (Verdict.FAIL, Verdict.ERROR)]
+
+    @property
     def exit_status(self) -> int:
         """Exit status of the tool: 1 where a row failed that may not, else 3 where one was not examined, else 0."""
         failed = any(row.verdict is Verdict.FAIL and row.key not in self.known for row in self.rows)
@@ -117,8 +122,5 @@ def printable(text: str) -> str:
 
     A device may report any byte as its name: XML refuses most control characters, and a terminal obeys them.
     """
-    return "".join(char if char in "\n\t" or char.isprintable() else _escaped(char) for char in text)
-
-
-def _escaped(char: str) -> str:
-    return char.encode("unicode_escape").decode("ascii")
+    plain = (char if char in "\n\t" or char.isprintable() else char.encode("unicode_escape").decode() for char in text)
+    return "".join(plain)

@@ -30,7 +30,7 @@ def row_text(row: ReportRow) -> str:
 
 def verdict_text(report: Report, change: ReportChange | None = None) -> str:
     """The verdict in some lines: whether it passes, the counts, the worst rows, and which options examine more."""
-    counts, bad = report.counts(), [row for row in report.rows if row.verdict in (Verdict.FAIL, Verdict.ERROR)]
+    counts = report.counts()
     examined = counts[Verdict.PASS] + counts[Verdict.FAIL]
     points = f"{examined} point{'s' if examined != 1 else ''}"
     if counts[Verdict.FAIL]:
@@ -41,7 +41,7 @@ def verdict_text(report: Report, change: ReportChange | None = None) -> str:
         head = f"{report.title}: passes, {points}"
     lines = [head, ", ".join(f"{number} {MARKS[verdict]}" for verdict, number in counts.items() if number)]
     causes: dict[str, list[ReportRow]] = {}
-    for row in sorted(bad, key=lambda row: row.verdict is not Verdict.FAIL):
+    for row in sorted(report.bad, key=lambda row: row.verdict is not Verdict.FAIL):
         causes.setdefault(row.detail if row.verdict is Verdict.ERROR else f"{row.group} {row.name}", []).append(row)
     for rows in [*causes.values()][:_WORST_ROWS]:
         more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
@@ -56,9 +56,7 @@ def verdict_text(report: Report, change: ReportChange | None = None) -> str:
     )
     if options:
         lines.append(f"more points with: {', '.join(f'{option} ({number})' for option, number in options.items())}")
-    lines += [f"baseline: {line}" for line in change.lines()] if change is not None else []
-    lines += [f"log: {report.log}"] if report.log is not None else []
-    return printable("\n".join(lines))
+    return printable("\n".join([*lines, *_last_lines(report, change)]))
 
 
 def closing_text(report: Report, change: ReportChange | None = None) -> str:
@@ -75,9 +73,7 @@ def closing_text(report: Report, change: ReportChange | None = None) -> str:
     ]
     lines += [f"left out: {what}: {why}" for what, why in report.left_out]
     lines += [f"by hand: {step}" for step in report.manual]
-    lines += [f"baseline: {line}" for line in change.lines()] if change is not None else []
-    lines += [f"log: {report.log}"] if report.log is not None else []
-    return printable("\n".join(line.rstrip() for line in lines))
+    return printable("\n".join(line.rstrip() for line in [*lines, *_last_lines(report, change)]))
 
 
 def append_step_summary(report: Report, environ: Mapping[str, str], change: ReportChange | None = None) -> None:
@@ -97,7 +93,7 @@ def append_step_summary(report: Report, environ: Mapping[str, str], change: Repo
     counts = ", ".join(f"{number} {MARKS[verdict]}" for verdict, number in report.counts().items() if number)
     lines = [f"### canprobe {report.tool}: {_cell(report.title)}", "", counts or "nothing was examined", ""]
     lines += [f"- baseline: {_cell(line)}" for line in change.lines()] if change is not None else []
-    bad = [row for row in report.rows if row.verdict in (Verdict.FAIL, Verdict.ERROR)]
+    bad = report.bad
     if bad:
         lines += ["", "| | point | what was wrong | clause |", "| --- | --- | --- | --- |"]
     for row in bad[:_MAX_SUMMARY_ROWS]:
@@ -107,6 +103,11 @@ def append_step_summary(report: Report, environ: Mapping[str, str], change: Repo
         lines += ["", f"{len(bad) - _MAX_SUMMARY_ROWS} more, which the files of the report have"]
     with writing(Path(path)), open(path, "a", encoding="utf-8") as file:
         file.write("\n".join(lines) + "\n\n")
+
+
+def _last_lines(report: Report, change: ReportChange | None) -> list[str]:
+    baseline = [f"baseline: {line}" for line in change.lines()] if change is not None else []
+    return baseline if report.log is None else [*baseline, f"log: {report.log}"]
 
 
 def _line(text: str) -> str:

@@ -6,8 +6,8 @@ with a flag, never a number.
 
 Model and assumptions:
 
-    quadric             the nine parameters near the origin of a working frame
-    terms               the cubic and quartic terms beside them, their gradients, and changes of the origin
+    quadric             the nine parameters near the origin of a working frame, the cubic and quartic terms beside them,
+                        their gradients, and changes of the origin
     residuals           residuals of samples and their Jacobian, from which every fit starts
     noise, prior        errors of points and normals, correlated along the path; the surface before it is touched
     path_length         how far a contact has moved beyond its noise, and how its places spread

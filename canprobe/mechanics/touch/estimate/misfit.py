@@ -30,9 +30,8 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import mixed
 from canprobe.mechanics.touch.estimate.nonlinear import robust
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, sharpest
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, DEGREE, sharpest
 from canprobe.mechanics.touch.estimate.residuals import Design, linearise
-from canprobe.mechanics.touch.estimate.terms import DEGREE
 from canprobe.mechanics.touch.linear_algebra import inverted, upper_root
 from canprobe.mechanics.types import Floats
 

@@ -15,9 +15,8 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.misfit import Averaged, averaged, scales
 from canprobe.mechanics.touch.estimate.noise import Correlation, SlowErrors
-from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, sharpest, size_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, sharpest, shifted, size_of
 from canprobe.mechanics.touch.estimate.sandwich import Score
-from canprobe.mechanics.touch.estimate.terms import shifted
 from canprobe.mechanics.touch.linear_algebra import eigen, solved
 from canprobe.mechanics.types import Floats, Vec
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import Noise
-from canprobe.mechanics.touch.estimate.quadric import STACKED_BASIS, STACKED_ENTRIES, matrix_of
-from canprobe.mechanics.touch.estimate.terms import terms
+from canprobe.mechanics.touch.estimate.quadric import STACKED_BASIS, STACKED_ENTRIES, matrix_of, terms
 from canprobe.mechanics.types import Floats
 
 

@@ -11,10 +11,10 @@ from canprobe.mechanics.touch.estimate.noise import Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.observed import curvature_covariance
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, OmittedTerms
+from canprobe.mechanics.touch.estimate.quadric import shifted, terms
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
 from canprobe.mechanics.touch.estimate.sandwich import Score
 from canprobe.mechanics.touch.estimate.start import solved_once
-from canprobe.mechanics.touch.estimate.terms import shifted, terms
 
 MEMORY = 0.02
 STEP = 0.5e-3

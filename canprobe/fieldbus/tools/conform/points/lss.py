@@ -8,17 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from canprobe.fieldbus.protocol.lss import (
-    LSS_ANSWER_ID,
-    LSS_BYTES,
-    LSS_REQUEST_ID,
-    PRESENCE_CHECK,
-    LssCommand,
-    LssState,
-    pack_fastscan,
-    pack_lss,
-    pack_number,
-)
+from canprobe.fieldbus.protocol import lss
+from canprobe.fieldbus.protocol.lss import LssCommand, LssState
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
@@ -30,11 +21,11 @@ _ANSWER_S = 0.2
 
 def _ask(bench: Bench, message: bytes, *, silent: bool = False) -> bytes | None:
     """Send a message; return the answer, None where none comes."""
-    bench.taken(LSS_ANSWER_ID)
-    bench.send(LSS_REQUEST_ID, message)
-    frame = bench.next(LSS_ANSWER_ID, bench.times.silence_s if silent else _ANSWER_S)
-    if frame is not None and len(frame.data) != LSS_BYTES:
-        bench.deviates(f"an LSS answer has {len(frame.data)} bytes, expected {LSS_BYTES}")
+    bench.taken(lss.LSS_ANSWER_ID)
+    bench.send(lss.LSS_REQUEST_ID, message)
+    frame = bench.next(lss.LSS_ANSWER_ID, bench.times.silence_s if silent else _ANSWER_S)
+    if frame is not None and len(frame.data) != lss.LSS_BYTES:
+        bench.deviates(f"an LSS answer has {len(frame.data)} bytes, expected {lss.LSS_BYTES}")
     return None if frame is None else frame.data
 
 
@@ -46,13 +37,13 @@ def _address(bench: Bench) -> tuple[int, ...]:
 def _select(bench: Bench, numbers: tuple[int, ...]) -> bytes | None:
     """Ask for the slave with these numbers; the answer to the last."""
     for n, number in enumerate(numbers[:3]):
-        if _ask(bench, pack_number(LssCommand(LssCommand.SELECT_VENDOR + n), number), silent=True) is not None:
+        if _ask(bench, lss.pack_number(LssCommand(LssCommand.SELECT_VENDOR + n), number), silent=True) is not None:
             bench.deviates(f"number {n + 1} of switch state selective is answered, expected after number 4")
-    return _ask(bench, pack_number(LssCommand.SELECT_SERIAL, numbers[3]))
+    return _ask(bench, lss.pack_number(LssCommand.SELECT_SERIAL, numbers[3]))
 
 
 def _release(bench: Bench) -> None:
-    bench.send(LSS_REQUEST_ID, pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
+    bench.send(lss.LSS_REQUEST_ID, lss.pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
     bench.pass_time(0.01)
 
 
@@ -83,10 +74,10 @@ def switch_selective(bench: Bench) -> None:
         if description is not None and description.od.device_information.LSS_supported:
             bench.deviates("no answer to its own numbers; the EDS says LSS_Supported=1")
         bench.does_not_apply("the device does not speak LSS")
-    answer = _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID))
+    answer = _ask(bench, lss.pack_lss(LssCommand.INQUIRE_NODE_ID))
     _release(bench)
     bench.expect(answer is not None, "the device answers no inquiry after it was selected")
-    if _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID), silent=True) is not None:
+    if _ask(bench, lss.pack_lss(LssCommand.INQUIRE_NODE_ID), silent=True) is not None:
         bench.deviates("an inquiry is answered in waiting state")
 
 
@@ -99,8 +90,8 @@ def identify(bench: Bench) -> None:
     for low, high, inside in ((serial, serial, True), ((serial ^ 1) & ~2, (serial ^ 1) & ~2, False)):
         numbers = (vendor, product, revision, revision, low, high)
         for n, number in enumerate(numbers[:5]):
-            bench.send(LSS_REQUEST_ID, pack_number(LssCommand(LssCommand.IDENTIFY_VENDOR + n), number))
-        answer = _ask(bench, pack_number(LssCommand.IDENTIFY_SERIAL_HIGH, numbers[5]), silent=not inside)
+            bench.send(lss.LSS_REQUEST_ID, lss.pack_number(LssCommand(LssCommand.IDENTIFY_VENDOR + n), number))
+        answer = _ask(bench, lss.pack_number(LssCommand.IDENTIFY_SERIAL_HIGH, numbers[5]), silent=not inside)
         if inside and (answer is None or answer[0] != LssCommand.IDENTIFIED):
             bench.deviates("the device does not answer identify remote slave with its own numbers")
         if not inside and answer is not None:
@@ -112,7 +103,7 @@ def only_without_id(bench: Bench) -> None:
     """Questions to devices without an id."""
     with _configuration(bench):
         pass
-    for message in (pack_lss(LssCommand.IDENTIFY_UNCONFIGURED), pack_fastscan(0, PRESENCE_CHECK, 0, 0)):
+    for message in (lss.pack_lss(LssCommand.IDENTIFY_UNCONFIGURED), lss.pack_fastscan(0, lss.PRESENCE_CHECK, 0, 0)):
         if _ask(bench, message, silent=True) is not None:
             bench.deviates(f"command {message[0]:02X}h is answered although the device has an id")
 
@@ -122,7 +113,7 @@ def configure_node_id(bench: Bench) -> None:
     """Ids that are none, then its own, which changes nothing."""
     with _configuration(bench):
         for node_id, refused in ((0, True), (128, True), (bench.node_id, False)):
-            answer = _ask(bench, pack_lss(LssCommand.CONFIGURE_NODE_ID, bytes((node_id,))))
+            answer = _ask(bench, lss.pack_lss(LssCommand.CONFIGURE_NODE_ID, bytes((node_id,))))
             if answer is None or answer[0] != LssCommand.CONFIGURE_NODE_ID or bool(answer[1]) != refused:
                 got = "no answer" if answer is None else answer.hex(" ")
                 bench.deviates(f"configure node-ID {node_id}: {got}, expected {'an' if refused else 'no'} error")
@@ -132,7 +123,7 @@ def configure_node_id(bench: Bench) -> None:
 def configure_bit_timing(bench: Bench) -> None:
     """A reserved index; nothing is activated."""
     with _configuration(bench):
-        answer = _ask(bench, pack_lss(LssCommand.CONFIGURE_BIT_TIMING, bytes((0, _NO_BIT_RATE))))
+        answer = _ask(bench, lss.pack_lss(LssCommand.CONFIGURE_BIT_TIMING, bytes((0, _NO_BIT_RATE))))
         if answer is not None and (answer[0] != LssCommand.CONFIGURE_BIT_TIMING or not answer[1]):
             bench.deviates(f"a reserved bit rate is answered with {answer.hex(' ')}, expected an error")
         bench.expect(answer is not None, "no answer to configure bit timing")
@@ -145,8 +136,8 @@ def inquire(bench: Bench) -> None:
     with _configuration(bench):
         for n, number in enumerate(numbers):
             command = LssCommand(LssCommand.INQUIRE_VENDOR + n)
-            answer = _ask(bench, pack_lss(command))
-            if answer is None or answer[:5] != pack_number(command, number)[:5]:
+            answer = _ask(bench, lss.pack_lss(command))
+            if answer is None or answer[:5] != lss.pack_number(command, number)[:5]:
                 bench.deviates(f"inquiry {command:02X}h does not give {number:#x} of 1018h:{n + 1:02X}")
-        answer = _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID))
+        answer = _ask(bench, lss.pack_lss(LssCommand.INQUIRE_NODE_ID))
         bench.expect(answer and answer[1] == bench.node_id, "the inquiry of the node-ID does not give the id")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.protocol.frames import RESTRICTED_IDS, is_restricted
 from canprobe.fieldbus.protocol.pdo import RPDOS, TO_MAPPING, TPDOS
 from canprobe.fieldbus.protocol.sdo import ABORT, Abort, pack_read, pack_write, place_text
@@ -73,24 +70,17 @@ def structure(bench: Bench) -> None:
         bench.deviates(f"1018h:FF is answered with {answer.hex(' ')}")
 
 
-def _compared(bench: Bench) -> Iterator[tuple[DescribedEntry, int]]:
-    """Entries of the communication area with a default of the EDS, and the value that the device has."""
-    for entry in bench.device.entries():
-        if isinstance(entry.default, int) and bench.device.has(*entry.place) and entry.bits:
-            yield entry, bench.device.number(*entry.place)
-
-
 @point(81, "defaults", "CiA 306-1, DefaultValue", "for information: what differs is noted", needs="eds")
 def defaults(bench: Bench) -> None:
     """Values that differ from the EDS: a device that was configured has others."""
-    differing = [
-        f"{place_text(*entry.place)} is {value:#x}, EDS {entry.default:#x}"
-        for entry, value in _compared(bench)
-        if isinstance(entry.default, int)
-        and value != entry.default & (1 << entry.bits) - 1
-        and rule_of(entry.index) is not WriteRule.NEVER
-        and entry.index not in (0x1001, 0x1003)
-    ]
+    differing = []
+    for entry in bench.device.entries():
+        stated, value = entry.default, bench.device.number(*entry.place)
+        if not (isinstance(stated, int) and entry.bits and bench.device.has(*entry.place)):
+            continue
+        varies = rule_of(entry.index) is WriteRule.NEVER or entry.index in (0x1001, 0x1003)
+        if not varies and value != stated & (1 << entry.bits) - 1:
+            differing.append(f"{place_text(*entry.place)} is {value:#x}, EDS {stated:#x}")
     if differing:
         bench.notes.append(_named(differing))
 
