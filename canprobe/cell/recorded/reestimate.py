@@ -41,7 +41,7 @@ from canprobe.errors import ProtocolError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame
-from canprobe.fieldbus.protocol.sync import is_sync
+from canprobe.fieldbus.protocol.frames import is_sync
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.fit import METHODS, unknown_method
 from canprobe.mechanics.touch.map.surface_map import SurfaceMap
