@@ -106,7 +106,7 @@ class LiftOff:
         self._retrace: Retrace | None = None
         self._begun = False
         booted = any(watch.states.get(axis.node_id) is NmtState.INITIALISING for axis in drives.axes)
-        self._all_there = not booted and not any(ages) and not drives.targets.beyond_lag()
+        self._all_there = not booted and not any(ages)
 
     @property
     def possible(self) -> bool:
@@ -132,7 +132,7 @@ class LiftOff:
             supervisor.begin_way_back()
             self._retrace = self._trail.back(measurement.q, self._step_max) if self._trail is not None else None
         retrace = self._retrace
-        # a drive that is silent, has booted or does not follow stands: the others do not go on without it
+        # a drive that is silent or has booted stands where it lost its power: the others do not go on without it
         targets = self._drives.targets.aimed if self._all_there else joints_to_units(self._model, measurement.q)
         q = self._way.step(measurement.q, targets) if retrace is None else retrace.step(self._period_s)
         if q is None:
