@@ -38,6 +38,7 @@ from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import decode, split_sections
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS
 
 _NEED = "a bus.yml needs yaml; type:"
 _DRIVERS = {
@@ -62,7 +63,6 @@ _EDS_KEYS = ("dcf", "eds")
 _SLAVE_KEYS = _DCFGEN_KEYS | _DRIVER_KEYS | frozenset(_EDS_KEYS)
 _OPTION_KEYS = frozenset(("dcf_path", "heartbeat_multiplier"))
 _FOLDER_VARIABLE = "@BUS_CONFIG_PATH@"
-_PDO_OBJECTS = range(0x1400, 0x1C00)
 _OWN_KEYS = (0x1016, 0x1017)  # dcfgen writes them from heartbeat_producer and heartbeat_consumer
 
 
@@ -165,7 +165,7 @@ def _slave(plan: Plan, node: PlannedNode, setup: NodeConfiguration, eds: str) ->
 
 def _by_sdo(plan: Plan, node: PlannedNode, write: Write) -> bool:
     """Whether dcfgen has no key that makes this write."""
-    if write.index not in _PDO_OBJECTS:
+    if write.index not in PDO_OBJECTS:
         return write.index not in _OWN_KEYS
     direction: Direction = "rpdo" if write.index < 0x1800 else "tpdo"
     pdos = {pdo.number: pdo for pdo in plan.pdos_of(node.node_id, direction)}

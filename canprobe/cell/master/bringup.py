@@ -32,10 +32,10 @@ from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import DEVICE_TYPE_REQUEST, SECOND_ANSWER_S
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues, SdoTimeoutError, hold_dialogues
-from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, STATUSWORD, state_of
+from canprobe.fieldbus.protocol.cia402 import MODE_DISPLAY, POWERED_STATES, STATUSWORD, state_of
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, pack_nmt
 
-HEARTBEAT_CONSUMER, MODE_DISPLAY = 0x1016, 0x6061
+HEARTBEAT_CONSUMER = 0x1016
 SERIAL_SUBINDEX = 4
 RELEASE_S = 0.1
 """Longest time to an answer of a node that is released."""

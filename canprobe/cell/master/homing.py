@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.master.bringup import MODE_DISPLAY
 from canprobe.cell.master.node_bringup import IDENTITY, read_entry, write_entry
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
@@ -44,6 +43,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     HOMING_ATTAINED_BIT,
     HOMING_ERROR_BIT,
     HOMING_START_BIT,
+    MODE_DISPLAY,
     NEW_SETPOINT_BIT,
     POSITION,
     SETPOINT_ACKNOWLEDGE_BIT,

@@ -19,8 +19,7 @@ from canprobe.cell.planning.sync import INTERPOLATION_TIME
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.sdo import Dialogue, SdoTimeoutError, decode_text, download, read_value, upload
 from canprobe.fieldbus.protocol.emcy import describe, is_no_error
-
-PDO_PARAMETERS = range(0x1400, 0x1C00)
+from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS
 
 
 class RefusedError(NodeError):
@@ -80,7 +79,7 @@ def _refused(setup: NodeConfiguration, write: Write, error: Exception, held: int
     text = _failed(setup, write, error)
     if held is not None:
         text += f"; it holds {held:#x}"
-        if write.index in PDO_PARAMETERS:
+        if write.index in PDO_OBJECTS:
             text += ": if it is fixed, say so in the EDS (AccessType=const), and the plan takes it as it is"
     return RefusedError(setup.node_id, text)
 
