@@ -32,7 +32,11 @@ class Foreign:
         nodes = [f"{node_id}={position}" for node_id, position in positions.items()]
         words = [sys.executable, PROGRAM, "vcan0", eds, mode, *nodes]
         self._process = subprocess.Popen([str(word) for word in words], stdout=subprocess.PIPE, text=True)
+
+    def wait(self) -> Foreign:
+        """Until it serves."""
         assert self._process.stdout is not None and self._process.stdout.readline() == "serving\n"
+        return self
 
     def end(self) -> dict[int, dict[str, Any]]:
         """End it; what each drive saw, by node id."""
@@ -42,8 +46,8 @@ class Foreign:
         return {seen["node_id"]: seen for seen in map(json.loads, out.splitlines())}
 
     def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
+        with self._process:  # at its end the pipe is closed, too
+            self._process.kill()
 
 
 @pytest.fixture
@@ -53,7 +57,7 @@ def foreign(vcan0: str) -> Iterator[Any]:
 
     def start(*arguments: Any) -> Foreign:
         started.append(Foreign(*arguments))
-        return started[-1]
+        return started[-1].wait()
 
     yield start
     for one in started:
