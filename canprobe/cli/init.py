@@ -54,6 +54,9 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
     folder: Path = args.folder
+    option = {".urdf": "--urdf", ".eds": "--eds", ".dcf": "--eds", ".xdd": "--eds", ".xdc": "--eds"}.get(folder.suffix)
+    if option is not None:
+        raise UsageError(f"{folder}: DIR is the folder to write into; type: canprobe init my-cell {option} {folder}")
     for name in ("cell.toml", "first.toml", schema_name("cell"), schema_name("scene")):
         if (folder / name).exists():
             raise UsageError(f"{folder / name} exists already: choose another folder, or remove it")

@@ -79,6 +79,13 @@ _KEYS = {
     "--duration": "task.duration_s",
 }
 """Options of some commands that set a key of the scene."""
+_FORMS = {
+    "--node": r"\d+",
+    "--eds": r".+\.(eds|dcf|xdd|xdc)",
+    "--urdf": r".+\.urdf",
+    "--record": r".+\.(log|asc|blf|trc)",
+}
+"""What arguments without their option look like."""
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
@@ -181,6 +188,9 @@ class Parser(argparse.ArgumentParser):
         """Report unknown arguments and exit; where the command takes --set, the key of an option of other commands."""
         key = _KEYS.get(words[0].partition("=")[0]) if "--set" in self._option_string_actions else None
         hint = did_you_mean(words[0], self._option_string_actions, 0.7) if words[0].startswith("-") else ""
+        for option, form in _FORMS.items():
+            if option in self._option_string_actions and re.fullmatch(form, words[0], re.IGNORECASE):
+                hint = f"; did you mean {option} {words[0]}?"
         if key is not None:
             given = words[0].partition("=")[2] or next(
                 (word for word in words[1:2] if not word.startswith("-")), "true"

@@ -196,6 +196,15 @@ def test_emulated_nodes_cannot_be_reached_over_a_virtual_bus_of_one_process(tmp_
         (("run", "press", "--bus", ""), "argument --bus: expected a name"),
         (("run", "press", "--out", ""), "argument --out: expected a name"),
         (("scan", "--bus", "lockstep"), "lives inside one run"),
+        (
+            ("plan", "my arm.urdf"),
+            "describes an arm, and no scene or cell file; type: canprobe init my-cell --urdf 'my",
+        ),
+        (("judge", "x.LOG"), "is a log of a bus, and no scene or cell file; type: canprobe replay x.LOG, or canprobe"),
+        (("run", "drive.eds"), "describes a device, and no scene or cell file; type: canprobe conform --eds drive.eds"),
+        (("conform", "drive.xdd"), "did you mean --eds drive.xdd?"),
+        (("conform", "5"), "did you mean --node 5?"),
+        (("init", "arm.urdf"), "DIR is the folder to write into; type: canprobe init my-cell --urdf arm.urdf"),
     ],
 )
 def test_wrong_use(words, text, tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
+import shlex
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -269,6 +270,16 @@ def load_array(name_or_path: str | Path) -> dict[str, Any]:
     return document
 
 
+_DEVICE = ("describes a device", "canprobe conform --eds {} --node N")
+_LOG = ("is a log of a bus", "canprobe replay {}, or canprobe judge SCENE --record {}")
+_OTHER_FILES: Mapping[str, tuple[str, str]] = {
+    ".urdf": ("describes an arm", "canprobe init my-cell --urdf {}"),
+    **dict.fromkeys((".eds", ".dcf", ".xdd", ".xdc"), _DEVICE),
+    **dict.fromkeys((".log", ".asc", ".blf", ".trc"), _LOG),
+}
+"""What a file is by its suffix that is given for a scene, and what to type with it."""
+
+
 def find_file(name: str, *kinds: str) -> tuple[Path, str]:
     """The packaged file of a name, the path that the name is, or the file that another package offers.
 
@@ -287,6 +298,11 @@ def find_file(name: str, *kinds: str) -> tuple[Path, str]:
             return own, own.name
     if inside := sorted(Path(name).glob("*.toml")) if isdir(name) else []:
         raise SceneError([f"{name}: is a folder; type the {kinds[0]} file in it: {', '.join(map(str, inside))}"])
+    if (other := _OTHER_FILES.get(Path(name).suffix.lower())) is not None:
+        what, way = other
+        raise SceneError(
+            [f"{name}: {what}, and no {' or '.join(kinds)} file; type: {way.replace('{}', shlex.quote(name))}"]
+        )
     if isfile(name) or name.endswith(".toml") or "/" in name:
         return Path(name), name
     for kind in kinds:
