@@ -16,6 +16,7 @@ from canprobe.cli.target import scene_of
 HELP = "home the joints whose drives have no absolute encoder"
 EXAMPLE = """\
 examples:
+  canprobe home cell.toml --dry-run
   canprobe home cell.toml --bus socketcan --channel can0
   canprobe home cell.toml 3 4 --bus socketcan --channel can0 --yes
 """
@@ -26,17 +27,18 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "joints", metavar="JOINT", nargs="*", type=whole(1, 99), help="numbers of joints, from 1 [all that are homed]"
     )
+    parser.add_argument("--dry-run", action="store_true", help="show how each joint would be homed, and move nothing")
     add_arguments_of_hands(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Home joint by joint."""
-    need_terminal(args.yes, "home asks before each joint")
+    need_terminal(args.yes or args.dry_run, "home asks before each joint")
     scene = scene_of(args)
 
     from canprobe import api
-    from canprobe.cli.operator import TerminalOperator
+    from canprobe.cli.operator import NobodyMoves, TerminalOperator
 
-    operator = None if args.yes else TerminalOperator()
+    operator = NobodyMoves() if args.dry_run else None if args.yes else TerminalOperator()
     api.home(scene, args.joints or None, operator=operator, say=args.report.say)
     return 0

@@ -42,6 +42,18 @@ class LetterKey:
         return self._letter in (line.strip().lower() for line in lines.decode(errors="replace").splitlines())
 
 
+class NobodyMoves:
+    """An operator who reads each question, and says no."""
+
+    def ask(self, question: str, *, for_way: bool = False) -> None:
+        """Print what would be done."""
+        print(question.removesuffix("?"))
+
+    def answer(self) -> Answer:
+        """No."""
+        return Answer.NO
+
+
 class TerminalOperator:
     """Reads whole lines from a file descriptor.
 

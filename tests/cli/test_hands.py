@@ -39,6 +39,16 @@ def test_a_dry_run_shows_the_way_and_moves_nothing(capsys):
     assert "joint 2: 65.00 to 60.00 deg (-5.00)" in told(capsys, *words).out
 
 
+def test_a_dry_run_of_homing_tells_how_and_homes_nothing(mine, capsys):
+    zero = [f"--set=joints.joint_3.{key}" for key in ("zero=homing", "homing_method=33", "home_deg=15")]
+    found = told(capsys, "home", mine, "--dry-run", *zero)
+    assert found.out == (
+        "joint 3 (joint_3, node 3): home it by method 33: move in negative direction to the next index pulse, at 5 and"
+        " 1 deg/s\n"
+    )
+    assert "joint 3 is left as it is" in found.err and "is homed" not in found.err
+
+
 def test_an_arm_without_a_probe_ends_in_its_flange(mine, capsys):
     carries = told(capsys, "move", "free", "90,65,16,0,100,0", "--dry-run").out
     mine.write_text(re.sub(r"\[sensor\]\n.*\n\n\[probe\]\n", "", mine.read_text()))
