@@ -177,7 +177,10 @@ class NodeBringUp:
                 )
             elif got != expected:
                 place = f"1018h:{subindex:02X} {IDENTITY_NAMES[subindex]}"
-                raise setup.error(f"is not the device of {setup.eds}: {place} expected {expected:#x}, got {got:#x}")
+                meant = f"; if it is meant, its serial_number is {got:#x} in the cell file" if subindex == 4 else ""
+                raise setup.error(
+                    f"is not the device of {setup.eds}: {place} expected {expected:#x}, got {got:#x}{meant}"
+                )
         if SOFTWARE_VERSION in setup.dictionary:
             try:
                 version = yield from upload(SOFTWARE_VERSION, 0)

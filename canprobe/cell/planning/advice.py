@@ -22,7 +22,7 @@ from canprobe.fieldbus.bus.real.adapters import bus_open_to_others
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FIXED_POLE, FULL_POSE, rolls_last, task_rows
 from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
-from canprobe.mechanics.touch.image.force_errors import UNSTATED
+from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
 
 _NO_SHAPE = {
@@ -200,6 +200,12 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
         yield (
             f"sensor.calibration: a file of an earlier form: {'; '.join(lacking)};"
             " `canprobe calibrate array CELL` measures what is missing"
+        )
+    if setup.array is not None and setup.array.calibration.serial_number not in (None, setup.array.serial):
+        yield (
+            f"sensor.calibration: of the array {setup.array.calibration.serial_number:#x} (1018h:04), and this one is"
+            f" {setup.array.serial:#x}: its forces are known to {100 * MAKE_SPREAD:g} % (1σ), as of any array of the"
+            " make; type: canprobe calibrate array CELL"
         )
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"

@@ -144,7 +144,7 @@ class SensorSettings:
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
     """Pressure at the largest count of a taxel."""
     serial_number: SerialNumber | None = None
-    """Serial number (1018h:04) that the array must have. Left out: any."""
+    """Serial number (1018h:04) that the array must have. Left out: that of its calibration file, or any."""
     calibration: Annotated[str | None, ScenePath()] = None
     """Calibration file of the array, by `canprobe calibrate array`: a packaged name, or a path relative to the file.
     Left out: that of the emulated array; a real array then measures in nominal newtons."""

@@ -179,6 +179,9 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
         return None
     calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
     calibrated = settings.calibration is not None or settings.emulated
+    serial = settings.serial_number if settings.serial_number is not None else calibration.serial_number
+    if calibration.serial_number not in (None, serial):
+        calibration = calibration.of_another()
     if not calibrated:  # creep of the emulated array says nothing about a real one
         calibration = replace(calibration, force=UNSTATED)
     positions, normals = (
@@ -212,7 +215,7 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
         channel=settings.channel or scene.bus.channel,
         eds=settings.eds,
         emulated=settings.emulated,
-        serial=settings.serial_number,
+        serial=serial if scene.array_is_node else None,
         name=settings.array,
         mode=settings.mode,
         window=settings.window,

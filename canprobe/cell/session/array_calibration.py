@@ -228,6 +228,7 @@ def calibrate(
     dwells: list[Dwell] = []
     unloaded: list[NDArray[np.uint8]] = []
     placed: KnownObject | None = None
+    serial: int | None = None
     for number, visit, plan in planned:
         if ask is not None and not emulated and visit.known != placed:
             ask(f"{visit.known.asked_for(at)} Then press Enter: ")
@@ -235,23 +236,24 @@ def calibrate(
         touches = f"{len(visit.presses)} touch{'es' * (len(visit.presses) != 1)}"
         say(f"visit {number} of {len(every)}: {touches} of the {visit.known.name}")
         folder = None if out is None else out / f"visit-{number:02d}"
-        found, rest = touch_object(plan, visit, folder, say, ask if not emulated else None)
+        found, rest, serial = touch_object(plan, visit, folder, say, ask if not emulated else None)
         dwells += found
         unloaded += rest
     who = f"{scene.sensor.eds.rsplit('/', 1)[-1]}, node {array.node_id}"
-    serial = f", serial number {scene.sensor.serial_number}" if scene.sensor.serial_number is not None else ""
     moved = f"{'emulated ' if scene.arm.emulated else ''}cell {Path(request.cell).stem}"
     fit = calibrate_array(
         dwells,
         pad=array.pad,
         reference=request.reference,
         reference_sigma=request.sigma,
-        array=f"{'emulated ' if emulated else ''}{who}{serial}" + (f", seed {request.seed}" if emulated else ""),
+        array=f"{'emulated ' if emulated else ''}{who}" + (f", seed {request.seed}" if emulated else ""),
         date=date,
         made_on=f"{moved}; plane, ball of {1e3 * request.ball_radius:g} mm, rod of {1e3 * request.rod_radius:g} mm",
         own_gains=request.own_gains,
         spread=request.spread,
     )
+    if request.own_gains:
+        fit = replace(fit, calibration=replace(fit.calibration, serial_number=serial))
     return Calibrated(fit, *_without_load(unloaded, array.rate_hz), tuple(notes))
 
 
@@ -317,11 +319,20 @@ def _turned(scene: Scene) -> Scene | None:
 
 def touch_object(
     plan: Plan, visit: Visit, out: Path | None, say: Say, ask: Ask | None
-) -> tuple[list[Dwell], list[NDArray[np.uint8]]]:
-    """Bring the cell up, touch, stop; the touches, and the images before them. `ask` asks for reference loads."""
+) -> tuple[list[Dwell], list[NDArray[np.uint8]], int | None]:
+    """Bring the cell up, touch, stop; the touches, the images before them, and the array's serial number (1018h:04).
+
+    Args:
+        plan, visit: the touches.
+        out: folder of the files; None: there are none.
+        say: called with each step.
+        ask: asks for reference loads.
+    """
     task, roll = plan.setup.task, _roll_task(plan, visit)
     assert isinstance(task, Touch)
     with Session(plan, RunOptions(out, say)) as session:
+        ids = [task.array.node_id] if task.array.raw is None else []
+        serials = session.cell.bring_up.serial_numbers(ids)
         session.run(roll)
     log, truth = session.cell.log.arrays(), session.buses.truth
     presses = roll.presses
@@ -339,7 +350,7 @@ def touch_object(
         place = visit.first + places.index(press.at if not press.hz[1:] else (press.at, press.heading))
         place += 50 * bool(press.hz[1:])
         dwells.append(as_dwell(pressed, visit, task.approach.start, task.probe.radius, place, force))
-    return dwells, roll.unloaded
+    return dwells, roll.unloaded, next(iter(serials.values()), 0) or None
 
 
 def _roll_task(plan: Plan, visit: Visit) -> RollTask:

@@ -11,18 +11,21 @@ import numpy as np
 import pytest
 
 from canprobe.cell.planning.make import make_plan
+from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
 from canprobe.cell.scene.load import load_scene, packaged_files
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session import array_calibration
 from canprobe.cell.session.array_calibration import KnownObject, Visit, touch_object, visits
+from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.calibrate import Press
 from canprobe.cli import main
+from canprobe.errors import NodeError
 
 AT = (-120.0, -122.5, 374.0)
 
 
 def plan_of(known):
-    scene = load_scene("press", {"cycle.rate_hz": 200.0})
+    scene = load_scene("press", {"cycle.rate_hz": 200.0, "sensor.serial_number": 0x11})
     return make_plan(
         resolve(
             replace(
@@ -44,10 +47,10 @@ def plan_of(known):
 )
 def test_a_touch_rolls_over_the_pad_and_is_recorded_with_its_reference_force(known):
     presses = (Press(1.0, (1.5e-3, -1e-3), seconds=1.5, hz=(1.0,)), Press(2.0, seconds=1.0, hz=(1.0,)))
-    dwells, unloaded = touch_object(
+    dwells, unloaded, serial = touch_object(
         plan_of(known), Visit(known, presses, rest_s=0.5, load=True), None, lambda _: None, None
     )
-    assert len(unloaded) > 80 and not np.any(unloaded)
+    assert len(unloaded) > 80 and not np.any(unloaded) and serial == 0x11
     assert [d.place for d in dwells] == [0, 1]
     for dwell, press in zip(dwells, presses, strict=True):
         assert dwell.force == pytest.approx(press.force, rel=0.08)  # just pressed, it reads 5 % low
@@ -60,6 +63,32 @@ def test_a_touch_rolls_over_the_pad_and_is_recorded_with_its_reference_force(kno
         A = 0.5 * (25.0 + dwell.kappa[0])
         depth = math.sqrt(2.0 * dwell.force * A / (math.pi * 1.27e8))
         assert dwell.push.mean() == pytest.approx(depth, rel=0.05)
+
+
+def test_a_calibration_is_of_one_array(tmp_path):
+    """Its serial number is asked for at bring-up; of another array, named in the cell, it is one of the make."""
+    file = tmp_path / "mine.toml"
+    text = packaged_files("calibrations")["inch16"].read_text()
+    gains = f"\n[taxels]\ngains = [{', '.join(['[' + '1.1, ' * 16 + ']'] * 16)}]\n"
+    file.write_text(text.replace("\n[image]", "serial_number = 0x11\n\n[image]") + gains)
+    its, another, others = (
+        make_plan(resolve(load_scene("press", {"sensor.calibration": str(file), **changes})))
+        for changes in ({}, {"sensor.serial_number": 0x22}, {"sensor.calibration": "inch16"})
+    )
+    assert its.warnings == others.warnings == ()
+    assert [[node.identity.serial_number for node in plan.nodes][-1] for plan in (its, others)] == [0x11, None]
+    (warning,) = another.warnings
+    assert "of the array 0x11 (1018h:04), and this one is 0x22: its forces are known to 5 %" in warning
+    force, its_force = (plan.setup.array.calibration.force for plan in (another, its))
+    assert (force.spread, its_force.spread) == (0.05, 0.01)
+    assert its.setup.array.calibration.gains and not another.setup.array.calibration.gains
+    assert load_calibration(file).serial_number == 0x11
+    (tmp_path / "again.toml").write_text(dump_calibration(load_calibration(file)))
+    assert load_calibration(tmp_path / "again.toml") == load_calibration(file)
+    exchanged = Session(its)
+    exchanged.buses.world.participants[:] = Session(another).buses.world.participants
+    with pytest.raises(NodeError, match=r"expected 0x11, got 0x22; if it is meant, its serial_number is 0x22 in"):
+        exchanged.__enter__()
 
 
 def test_there_are_at_most_forty_touches_and_forces_only_grow_on_an_object():

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors
+from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED, ForceErrors
 
 ForceReference = Literal["scale", "weights", "unit", "none"]
 NO_FORCE_REFERENCE = "nominal newtons: no force reference"
@@ -185,6 +185,7 @@ class ArrayCalibration:
         force: errors of the force.
         gains: (rows, columns) gains of the taxels over their mean; empty where they were not found or are not used.
         dead: (row, column) of each taxel that reads nothing under a patch.
+        serial_number: serial number of the array (1018h:04); None of a make, and where the array states none.
     """
 
     array: str
@@ -202,6 +203,7 @@ class ArrayCalibration:
     force: ForceErrors = UNSTATED
     gains: tuple[tuple[float, ...], ...] = ()
     dead: tuple[tuple[int, int], ...] = ()
+    serial_number: int | None = None
 
     @property
     def nominal(self) -> bool:
@@ -214,6 +216,11 @@ class ArrayCalibration:
         if self.nominal:
             return NO_FORCE_REFERENCE
         return f"newtons by {self.force_reference} (1σ {100.0 * self.force_sigma:.1f} %)"
+
+    def of_another(self) -> ArrayCalibration:
+        """What it says about another array of its make: without gains of single taxels, and with the spread of a make."""
+        force = replace(self.force, spread=max(self.force.spread, MAKE_SPREAD))
+        return replace(self, gains=(), dead=(), force=force)
 
     def with_stiffness(self, stiffness: float) -> ArrayCalibration:
         """The same calibration with another stiffness K/h of the layer, N/m³."""
