@@ -218,7 +218,7 @@ class ArrayCalibration:
         return f"newtons by {self.force_reference} (1σ {100.0 * self.force_sigma:.1f} %)"
 
     def of_another(self) -> ArrayCalibration:
-        """What it says about another array of its make: without gains of single taxels, and with the spread of a make."""
+        """What it says about another array of its make: no gains of single taxels, and the spread of a make."""
         force = replace(self.force, spread=max(self.force.spread, MAKE_SPREAD))
         return replace(self, gains=(), dead=(), force=force)
 
