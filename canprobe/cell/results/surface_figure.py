@@ -55,13 +55,11 @@ class MapPlane(NamedTuple):
 
     def mm(self, points: Floats) -> Floats:
         """Points (..., 3) of base, m, as mm along, across, outward."""
-        result: Floats = (points - self.origin) @ self.axes.T * 1e3
-        return result
+        return (points - self.origin) @ self.axes.T * 1e3
 
     def base(self, mm: Floats) -> Floats:
         """Points (..., 3) in mm along, across, outward, as points of base, m."""
-        result: Floats = 1e-3 * mm @ self.axes + self.origin
-        return result
+        return 1e-3 * mm @ self.axes + self.origin
 
 
 def true_surface(shape: PlacedShape, path: Floats, plane: MapPlane) -> Floats:
