@@ -639,6 +639,7 @@ def test_every_row_is_tested_here():
         source += Path(__file__).with_name(name).read_text(encoding="utf-8")
     special = {
         "error_passive": "error-passive: hold",
+        "force": 'BY_KEY["force"]',
         "image_dead": "node 16: stuck-image",
         "depth": "node 16: replayed-image",
         "push_unfelt": "torques of the drives show a push of",
