@@ -136,22 +136,6 @@ def test_cia402_607f_bounds_the_way_from_target_to_target_however_the_syncs_jitt
     assert (drive.node.application.state is S.OPERATION_ENABLED) == goes_on
 
 
-@pytest.mark.parametrize(
-    ("target", "reached", "limited"), [(900, 900, 0), (1100, 1000, 1), (-1100, -500, 1), (1000, 1000, 0)]
-)
-def test_cia402_57_software_limits_clamp_and_say_so(drive, target, reached, limited):
-    assert drive.write(0x607D, 1, -500, 4) == 0
-    assert drive.write(0x607D, 2, 1000, 4) == 0
-    master = Master(drive).enable()
-    for _ in range(4):
-        frames = master.cycle(target)
-    assert position(frames) == reached
-    assert statusword(frames) >> 11 & 1 == limited
-    for _ in range(3):
-        frames = master.cycle(0)
-    assert statusword(frames) >> 11 & 1 == 0
-
-
 def test_cia402_56_following_error_after_its_time(drive, plant):
     drive.write(0x6065, 0, 100, 4)
     drive.write(0x6066, 0, 10, 2)  # 10 ms: four cycles
