@@ -103,6 +103,7 @@ def test_version(capsys):
         (["run", "cylinder", "--channel", "vcan0", "--channel", "vcan1"], ("given 2 times",)),
         (["run", "cilinder"], ("no such scene", "did you mean cylinder?")),
         (["up", "gantri"], ("no such scene, cell or file; did you mean gantry?",)),
+        (["emulate", "cylindre"], ("cylindre: no such scene, cell or file; did you mean cylinder?",)),
         *((["jog", "puma260"], ("type canprobe console",)), (["zero"], ("type canprobe tare", "canprobe home"))),
         (["plan", "none.toml"], ("none.toml", "cannot be read", "`canprobe scenes` lists the packaged ones")),
         (["plan", "free", "--measured", "run", "--export", "dcf"], ("--measured", "no --export or --figure")),
