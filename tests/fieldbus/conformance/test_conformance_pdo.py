@@ -48,25 +48,16 @@ def test_cia301_pdo_30_event_driven(tiny, kind):
     tiny.expect((0x185, "aabbccdd0500"), (0x585, "6001200000000000"))
 
 
-def test_cia301_pdo_30_type_252_is_sampled_by_sync_and_sent_on_request(tiny):
-    tiny.set((0x1800, 2, 252, 1))
+@pytest.mark.parametrize(("kind", "first"), [(252, INITIAL), (253, "aa000000feff")])
+def test_cia301_pdo_30_types_252_and_253_are_sent_on_request_252_as_sampled_by_sync(tiny, kind, first):
+    tiny.set((0x1800, 2, kind, 1))
     tiny.nmt(0x01)
     assert syncs(tiny, None) == [[]]
     tiny.set((0x2001, 0, 0xAA, 4))
-    tiny.send(0x40000185)
-    tiny.expect((0x185, INITIAL))
-    assert syncs(tiny, None) == [[]]
-    tiny.send(0x40000185)
-    tiny.expect((0x185, "aa000000feff"))
-
-
-def test_cia301_pdo_30_type_253_is_sampled_and_sent_on_request(tiny):
-    tiny.set((0x1800, 2, 253, 1))
-    tiny.nmt(0x01)
-    assert syncs(tiny, None) == [[]]
-    tiny.set((0x2001, 0, 0xAA, 4))
-    tiny.send(0x40000185)
-    tiny.expect((0x185, "aa000000feff"))
+    for told in (first, "aa000000feff"):
+        tiny.send(0x40000185)
+        tiny.expect((0x185, told))
+        assert syncs(tiny, None) == [[]]
 
 
 @pytest.mark.parametrize("kind", [1, 255])
