@@ -676,56 +676,35 @@ def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
     assert failed.value.node_id == 3
 
 
-@pytest.mark.parametrize(("rate_hz", "taken"), [(400.0, True), (200.0, False)])
-def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_path, rate_hz, taken):
-    """25·10⁻⁴ s as delivered."""
-
-    def refuse(subindex, value):
-        raise SdoAbort(Abort.READ_ONLY)
+@pytest.mark.parametrize(
+    ("kept", "takes", "rate_hz", "told"),
+    [
+        ((1, 25), (), 400.0, None),
+        ((1, 25), (), 200.0, r"write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 "),
+        ((1, 0), (), 400.0, r"; it holds 0x0$"),
+        # 2.5 ms lie between 3 ms and 2 ms
+        ((2, -3), (1,), 400.0, r"counts in 10\^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits"),
+    ],
+)
+def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_path, kept, takes, rate_hz, told):
+    """25·10⁻⁴ s as delivered; the sub-indices of 60C2h that it takes, besides the value that it has."""
 
     def fix(node):
+        def refuse(subindex, value):
+            if subindex not in takes and (not takes or value != kept[1]):
+                raise SdoAbort(Abort.READ_ONLY)
+
         if node.node_id == 5:
+            node.dictionary.set_default(0x60C2, *kept)
             node.dictionary.on_check(0x60C2, refuse)
 
     session = open_session(tmp_path, change=fix, rate_hz=rate_hz)
-    if taken:
+    if told is None:
         with session:
             assert done_to(session) == ["configured, software 1.0"] * 6
     else:
-        with pytest.raises(
-            NodeError,
-            match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
-        ):
+        with pytest.raises(NodeError, match=rf"^node 5: \(joint 5\).*{told}"):
             session.__enter__()
-
-
-def test_a_drive_that_keeps_no_interpolation_time_at_all_has_no_rate_that_fits(tmp_path):
-    def fix(node):
-        if node.node_id == 5:
-            node.dictionary.set_default(0x60C2, 1, 0)
-            node.dictionary.on_check(0x60C2, refuse)
-
-    def refuse(subindex, value):
-        raise SdoAbort(Abort.READ_ONLY)
-
-    with pytest.raises(NodeError, match=r"; it holds 0x0$"):
-        open_session(tmp_path, change=fix).__enter__()
-
-
-def test_a_drive_whose_unit_is_fixed_is_given_the_rates_that_fit(tmp_path):
-    """60C2h:01 is taken and :02 stays at milliseconds: 2.5 ms lie between 3 ms and 2 ms."""
-
-    def fix(node):
-        if node.node_id == 5:
-            node.dictionary.set_default(0x60C2, 2, -3)
-            node.dictionary.on_check(0x60C2, refuse_units)
-
-    def refuse_units(subindex, value):
-        if subindex == 2 and value != -3:
-            raise SdoAbort(Abort.VALUE)
-
-    with pytest.raises(NodeError, match=r"counts in 10\^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits"):
-        open_session(tmp_path, change=fix).__enter__()
 
 
 def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):

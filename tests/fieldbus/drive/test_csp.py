@@ -188,34 +188,6 @@ def test_the_encoder_tells_the_nearest_whole_count_of_a_motor_that_is_between_th
     assert plant.motor_counts(0) == at
 
 
-@pytest.mark.parametrize(
-    "quick_stop",
-    [(6, 0x6085, S.QUICK_STOP_ACTIVE), (2, 0x6085, S.SWITCH_ON_DISABLED), (1, 0x6084, S.SWITCH_ON_DISABLED)],
-)
-@pytest.mark.parametrize("direction", [1, -1])
-def test_cia402_51_quick_stop_in_motion_travels_v2_over_2a(drive, plant, quick_stop, direction):
-    option, index, end = quick_stop
-    rate = 400_000
-    drive.write(0x605A, 0, option, 2)
-    drive.write(index, 0, rate, 4)
-    master = Master(drive).enable()
-    speed = 10_000 * direction  # counts/s: 25 a cycle, and 25 ms = ten steps to stop
-    for k in range(8):
-        master.cycle(25 * k * direction)
-    master.rpdo(25 * 8 * direction, 0x02)
-    master.sync()
-    assert drive.node.application.state is S.QUICK_STOP_ACTIVE
-    t_ns = master.k * CYCLE
-    plant.advance(t_ns)
-    start = plant.counts[0]
-    assert start == 25 * 6 * direction  # latched at the SYNC before, reached now
-    for step in range(1, 15):
-        drive.advance(t_ns + step * CYCLE)
-        plant.advance(t_ns + step * CYCLE)
-    assert drive.node.application.state is end
-    assert plant.counts[0] - start == pytest.approx(speed * abs(speed) / (2 * rate))
-
-
 def test_cia402_51_quick_stop_between_syncs_decelerates_from_the_running_ramp(drive, plant):
     rate = 400_000
     drive.write(0x605A, 0, 6, 2)

@@ -106,14 +106,3 @@ def test_cia402_60_halt_in_csv_is_released_into_the_present_target(csv):
     csv.cycles(4, rpdo=order(10_000))
     assert csv.bits(10, 12) == (0, 1)
     assert csv.signed(0x606C) == 10_000
-
-
-def test_cia402_58_bit_11_when_the_motion_takes_more_than_6072h(csv, plant):
-    plant.torque = -301
-    csv.cycles(3, rpdo=order(100))
-    assert csv.bits(11) == (0,)
-    csv.put(_6072=300).cycles(1, rpdo=order(100))
-    assert csv.bits(11) == (1,)
-    plant.torque = 299
-    csv.cycles(1, rpdo=order(100))
-    assert csv.bits(11) == (0,)
