@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from makes import write_eds
 from scenes import with_joints, without_torque
 from undrawn import undrawn_run
 
@@ -585,47 +586,9 @@ def test_a_node_that_boots_again_ends_bring_up(tmp_path):
     assert_left_pre_operational(tmp_path, before=(0x81, 0x01))
 
 
-def other_make(tmp_path):
-    """The EDS of a drive of another make: other names and numbers, one RPDO and TPDO with mappings that are fixed, and
-    nothing that only our drive has."""
-    text = eds_path("puma260_joint").read_text(encoding="ascii")
-    text = text.replace("0x0000CA5E", "0x000000AB").replace("0x00000260", "0x00001234")
-    sections = re.split(r"(?m)^(?=\[)", text)
-    optional = "1015|1019|1016|6007|605A|6065|6066|607D|1020|1010|1011|100A|(14|16|18|1A)0[123]|2[0-9A-F]{3}"
-    gone = re.compile(rf"\[({optional})(sub\w+)?\]", re.IGNORECASE)
-    kept = [section for section in sections if not gone.match(section)]
-    objects = {m[1].upper() for s in sections if (m := re.match(r"\[([0-9A-F]{4})\]", s)) and gone.match(s)}
-    lists = "".join(kept)
-    for index in objects:
-        lists = re.sub(rf"(?mi)^\d+=0x{index}\n", "", lists)
-    path = tmp_path / "other_make.eds"
-    path.write_text(renumbered(lists), encoding="ascii")
-    return path
-
-
-def renumbered(text):
-    """The lists of objects counted from 1 again."""
-
-    def again(match):
-        indices = re.findall(r"(?m)^\d+=(0x[0-9A-Fa-f]{4})$", match[2])
-        rows = "".join(f"{n}={index}\n" for n, index in enumerate(indices, start=1))
-        return f"[{match[1]}]\nSupportedObjects={len(indices)}\n{rows}\n"
-
-    return re.sub(r"\[(\w+Objects)\]\nSupportedObjects=\d+\n((?:\d+=0x[0-9A-Fa-f]{4}\n)+)\n?", again, text)
-
-
-def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
-    scene = canprobe.load_scene("free")
-    scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
-    result = undrawn_run(scene, out=tmp_path / "out", duration_s=1.0)
-    assert result.summary["completed"] and result.summary["faults"] == []
-    assert np.ptp(result.truth["q_rad"][:, 5]) > 0.01
-    assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
-
-
 def test_drives_that_cannot_say_what_they_have_stored_are_configured_each_time(tmp_path):
     scene = canprobe.load_scene("free")
-    scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
+    scene = replace(scene, arm=replace(scene.arm, eds=str(write_eds("bare", tmp_path))))
     session = Session(
         replace(scene, bring_up=replace(scene.bring_up, store=True)), RunOptions(tmp_path, (tell := []).append)
     )
