@@ -47,16 +47,7 @@ class Sensor:
         for number in range(33):
             assert self.bench.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
         for number, word in enumerate(words):
-            index = 0x1800 + number
-            for order in [
-                (index + 0x200, 0, 0, 1),
-                (index + 0x200, 1, word, 4),
-                (index + 0x200, 0, 1, 1),
-                (index, 2, 2, 1),
-                (index, 6, start, 1),
-                (index, 1, 0x511 + number, 4),
-            ]:
-                assert self.bench.write(*order) == 0, order
+            self.bench.configure(0x1800 + number, cob_id=0x511 + number, words=[word], type=2, start=start)
 
     def go(self, t_ns=0):
         self.bench.nmt(0x01, t_ns)
@@ -290,10 +281,7 @@ def map_window(sensor, words):
     for number in range(33):
         assert sensor.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
     for number, word in enumerate([0x21200040, *(0x21100040 | sub << 8 for sub in range(1, words + 1))]):
-        index = 0x1800 + number
-        orders = [(index + 0x200, 0, 0, 1), (index + 0x200, 1, word, 4), (index + 0x200, 0, 1, 1), (index, 2, 1, 1)]
-        for order in (*orders, (index, 1, 0x511 + number, 4)):
-            assert sensor.write(*order) == 0, order
+        sensor.configure(0x1800 + number, cob_id=0x511 + number, words=[word], type=1)
 
 
 @pytest.mark.parametrize("value, abort", [(3, 0x06090032), (13, 0x06090031), (5, 0x06090030), (11, 0x06090030)])

@@ -8,18 +8,7 @@ from __future__ import annotations
 import pytest
 from conformance_bench import ON_BOTH_BUSES
 
-OFF = 0x80000000
 INITIAL, WRITTEN = "04030201feff", "112233440500"
-
-
-def configure(bench, index, *, cob_id, words, **parameters):
-    """The standard's sequence: off, mapping, parameters, on."""
-    sizes = {"type": (2, 1), "inhibit": (3, 2), "event": (5, 2), "start": (6, 1)}
-    bench.set((index, 1, OFF | cob_id, 4), (index + 0x200, 0, 0, 1))
-    bench.set(*((index + 0x200, sub, word, 4) for sub, word in enumerate(words, start=1)))
-    bench.set((index + 0x200, 0, len(words), 1))
-    bench.set(*((index, sizes[name][0], value, sizes[name][1]) for name, value in parameters.items()))
-    bench.set((index, 1, cob_id, 4))
 
 
 def syncs(bench, *counters):
@@ -83,7 +72,7 @@ def test_cia301_pdo_30_no_request_where_bit_30_forbids_it(tiny):
 )
 @ON_BOTH_BUSES
 def test_cia301_pdo_37_sync_start_value(tiny, start, every, counters, expected):
-    configure(tiny, 0x1800, cob_id=0x185, words=[0x20010020], type=every, start=start)
+    tiny.configure(0x1800, cob_id=0x185, words=[0x20010020], type=every, start=start)
     tiny.set((0x1019, 0, 10, 1))
     tiny.nmt(0x01)
     heard = [counter for counter, ids in zip(counters, syncs(tiny, *counters), strict=True) if ids]

@@ -9,17 +9,6 @@ MS = 1_000_000
 OFF = 0x80000000
 
 
-def configure(bench, index: int, *, cob_id: int, words: list[int], **parameters: int) -> None:
-    """The standard's sequence: off, mapping, parameters, on."""
-    sizes = {"type": (2, 1), "inhibit": (3, 2), "event": (5, 2), "start": (6, 1)}
-    orders = [(index, 1, OFF | cob_id, 4), (index + 0x200, 0, 0, 1)]
-    orders += [(index + 0x200, sub, word, 4) for sub, word in enumerate(words, start=1)]
-    orders += [(index + 0x200, 0, len(words), 1)]
-    orders += [(index, sizes[name][0], value, sizes[name][1]) for name, value in parameters.items()]
-    for order in [*orders, (index, 1, cob_id, 4)]:
-        assert bench.write(*order) == 0, order
-
-
 def sync(bench, *counters: int | None) -> list[str]:
     """SYNCs, one a millisecond; what each caused."""
     results = []
@@ -45,7 +34,7 @@ def test_cia301_pdo_30_type_0_follows_an_event_at_the_next_sync(bench):
 
 
 def test_cia301_pdo_31_inhibit_time_holds_back_and_sends_the_latest(bench):
-    configure(bench, 0x1800, cob_id=0x185, words=[0x20010020], type=255, inhibit=50)  # 5 ms
+    bench.configure(0x1800, cob_id=0x185, words=[0x20010020], type=255, inhibit=50)  # 5 ms
     assert bench.nmt(0x01, 0) == [(0x185, "04030201")]
     for value in (1, 2):
         bench.t_ns = 1 * MS
@@ -56,7 +45,7 @@ def test_cia301_pdo_31_inhibit_time_holds_back_and_sends_the_latest(bench):
 
 
 def test_cia301_pdo_31_event_timer_repeats_and_skips_what_was_missed(bench):
-    configure(bench, 0x1800, cob_id=0x185, words=[0x20010020], type=254, event=10)
+    bench.configure(0x1800, cob_id=0x185, words=[0x20010020], type=254, event=10)
     assert len(bench.nmt(0x01, 0)) == 1
     assert bench.node.next_deadline_ns == 10 * MS
     assert bench.advance(10 * MS) == [(0x185, "04030201")]
@@ -120,15 +109,15 @@ def test_cia301_pdo_36_synchronous_rpdo_after_the_window_is_dropped(bench):
 
 
 def test_cia301_pdo_37_all_pdos_of_one_group_go_at_the_same_sync(bench):
-    configure(bench, 0x1800, cob_id=0x511, words=[0x20010020], type=2, start=4)
-    configure(bench, 0x1801, cob_id=0x512, words=[0x20050040], type=2, start=4)
+    bench.configure(0x1800, cob_id=0x511, words=[0x20010020], type=2, start=4)
+    bench.configure(0x1801, cob_id=0x512, words=[0x20050040], type=2, start=4)
     bench.write(0x1019, 0, 240, 1)
     bench.nmt(0x01)
     assert sync(bench, 2, 3, 4, 5, 6) == ["", "", "511 512", "", "511 512"]
 
 
 def test_cia301_pdo_38_dummies_fill_room(bench):
-    configure(bench, 0x1401, cob_id=0x301, words=[0x00040020, 0x20090020], type=1)
+    bench.configure(0x1401, cob_id=0x301, words=[0x00040020, 0x20090020], type=1)
     bench.nmt(0x01)
     bench.send(0x301, "ffffffff78563412")
     bench.send(0x80, "")
@@ -136,14 +125,14 @@ def test_cia301_pdo_38_dummies_fill_room(bench):
 
 
 def test_cia301_pdo_unsigned64_entry(bench):
-    configure(bench, 0x1801, cob_id=0x512, words=[0x20050040], type=1)
+    bench.configure(0x1801, cob_id=0x512, words=[0x20050040], type=1)
     bench.nmt(0x01)
     assert bench.send(0x80, "")[1] == (0x512, "8877665544332211")
 
 
 def test_cia301_pdo_remapped_in_operational(bench):
     bench.nmt(0x01)
-    configure(bench, 0x1800, cob_id=0x444, words=[0x20020010, 0x20010020])
+    bench.configure(0x1800, cob_id=0x444, words=[0x20020010, 0x20010020])
     assert bench.send(0x80, "") == [(0x444, "feff04030201")]
     bench.write(0x1800, 1, OFF | 0x444, 4)
     assert bench.send(0x80, "") == []
@@ -161,8 +150,8 @@ def test_cia301_pdo_rpdo_identifier_changes_are_heard(bench):
 
 
 def test_cia301_pdo_35_one_pdo_that_is_back_does_not_hide_another_that_is_lost(bench):
-    configure(bench, 0x1400, cob_id=0x205, words=[0x20010020], type=255, event=20)
-    configure(bench, 0x1401, cob_id=0x305, words=[0x20070008], type=255, event=30)
+    bench.configure(0x1400, cob_id=0x205, words=[0x20010020], type=255, event=20)
+    bench.configure(0x1401, cob_id=0x305, words=[0x20070008], type=255, event=30)
     bench.nmt(0x01, 0)
     bench.send(0x205, "11223344", 0)
     bench.send(0x305, "55", 0)
@@ -186,8 +175,8 @@ def test_cia301_pdo_33_the_error_of_a_pdo_ends_when_it_is_switched_off(bench):
 @pytest.mark.parametrize("words", [[0x20010020], [0x20010020, 0x20020010], [0x20020010, 0x20010020]])
 def test_cia301_pdo_30_values_of_an_rpdo_are_one_event(bench, type_, at_once, at_sync, words):
     bench.write(0x2002, 0, 5, 2)
-    configure(bench, 0x1800, cob_id=0x185, words=[0x20010020, 0x20020010], type=type_)
-    configure(bench, 0x1400, cob_id=0x205, words=words, type=255)
+    bench.configure(0x1800, cob_id=0x185, words=[0x20010020, 0x20020010], type=type_)
+    bench.configure(0x1400, cob_id=0x205, words=words, type=255)
     bench.nmt(0x01, 0)
     bench.send(0x80, "")
     parts = {0x20010020: "aabbccdd", 0x20020010: "0500"}
@@ -203,11 +192,11 @@ def test_a_value_that_does_not_fit_its_pdo_is_named(bench):
 
 
 def test_pdos_before_one_that_cannot_be_packed_are_sent_once(bench):
-    configure(bench, 0x1801, cob_id=0x285, words=[0x20020010], type=1)
+    bench.configure(0x1801, cob_id=0x285, words=[0x20020010], type=1)
     bench.nmt(0x01)
     bench.node.dictionary.values[key_of(0x2002)] = 1 << 16
     bench.write(0x1800, 1, OFF | 0x185, 4)
-    configure(bench, 0x1800, cob_id=0x185, words=[0x20010020], type=1)
+    bench.configure(0x1800, cob_id=0x185, words=[0x20010020], type=1)
     with pytest.raises(ProtocolError, match="PDO 0x285: cannot pack"):
         bench.send(0x80, "")
     assert [can_id for can_id, _ in bench.node.core.out] == [0x185]
