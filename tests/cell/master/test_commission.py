@@ -197,6 +197,13 @@ def test_nothing_is_changed_where_one_wish_cannot_be_met(bus):
     assert [node.node_id for node in nodes] == [255, 255]
 
 
+def test_commissioning_looks_gives_and_looks_again(bus):
+    put(bus, make_node(1), make_node(2), make_node(6, node_id=6))
+    done = commission(bus.port(), [Wanted(3, "--assign", (*ANY, 2))], must=True)
+    assert [(node["node_id"], node["serial_number"]) for node in done.nodes] == [(3, 2), (6, 6)]
+    assert done.unconfigured == [address(1)]
+
+
 def test_a_scene_whose_blank_devices_are_strangers_is_refused(bus):
     put(bus, make_node(1, eds="tactile_array"))
     with pytest.raises(BusError, match="has no id, and is not one of the scene's missing nodes"):
