@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import signal
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import chain, count, repeat
 from pathlib import Path
@@ -13,6 +14,7 @@ from struct import pack, unpack
 import numpy as np
 import pytest
 from cut_port import CutPort
+from full_disk import room_for
 from injected import FREE_CYCLE, HOLD_CYCLE, SCAN_CYCLE, Injected, altered, send
 
 import canprobe
@@ -25,6 +27,7 @@ from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
+from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
@@ -550,55 +553,14 @@ def test_a_full_disk(tmp_path):
             self.session.options = replace(self.session.options, out=tmp_path)
             super()._run()
 
-    def fill(run):
-        log = run.session.record._candump
-
-        class Full:
-            closed = False
-
-            def __init__(self, file):
-                self.file, self.room = file, 3000
-
-            def write(self, data):
-                import errno
-
-                if self.room <= 0:
-                    raise OSError(errno.ENOSPC, "No space left on device")
-                part = data[: self.room]
-                self.room -= len(part)
-                return self.file.write(part)
-
-            def truncate(self, size):
-                return self.file.truncate(size)
-
-            def close(self):
-                self.file.close()
-
-        log.flush()
-        log._file = Full(log._file)
-
-        def flushed_each_time(write=log.write):
-            def written(can_id, data, t_ns):
-                write(can_id, data, t_ns)
-                log.flush()
-
-            return written
-
-        run.session.buses.lockstep.recorder = flushed_each_time()
-
-    run = OnDisk("press", HOLD_CYCLE, fill)
-    assert str(run.error) == f"{tmp_path}/bus.log: cannot be written: No space left on device"
+    log = tmp_path / "bus.log"
+    with ExitStack() as stack:
+        run = OnDisk("press", HOLD_CYCLE, lambda _: stack.enter_context(room_for(log.stat().st_size + 3000)))
+    assert str(run.error) == f"{log}: cannot be written: File too large"
     assert isinstance(run.error, ResultsError)  # after the task has let go
     run.assert_drives_off()
-    assert run.session.buses.truth["force_n"][-1] == 0.0
-    text = (tmp_path / "bus.log").read_text()
-    assert text.endswith("\n") and len(list(canprobe_lines(tmp_path / "bus.log"))) > 1000
-
-
-def canprobe_lines(path):
-    from canprobe.fieldbus.bus.candump import read_candump
-
-    return read_candump(path)
+    assert run.session.buses.truth["force_n"][run.at] > 1.8 and run.session.buses.truth["force_n"][-1] == 0.0
+    assert log.read_text().endswith("\n") and len(list(read_candump(log))) > 1000
 
 
 def test_every_row_is_tested_here():
