@@ -104,21 +104,6 @@ def test_wrong_keys_are_all_told_with_file_path_and_suggestion(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [scene]
 
 
-def test_wrong_value_and_wrong_type(tmp_path):
-    scene = edited(tmp_path, "press", ("force_n = 2", 'force_n = "two"'), ("radius_mm = 36", "radius_mm = -36"))
-    lines = lines_of(tmp_path, 2, "run", scene)
-    assert len(lines) == 2
-    for key, line in zip(("object.radius_mm", "task.force_n"), sorted(lines), strict=True):
-        assert line.startswith(f"canprobe: {scene}: {key}: ")
-
-
-def test_not_toml(tmp_path):
-    (tmp_path / "broken.toml").write_text("[scene\nname = 3")
-    (line,) = lines_of(tmp_path, 2, "run", "broken.toml")
-    assert line.startswith("canprobe: broken.toml: ")
-    assert "line 1" in line
-
-
 @pytest.mark.parametrize("command", ["run", "plan"])
 @pytest.mark.parametrize(
     ("place", "contact"),

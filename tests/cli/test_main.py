@@ -125,15 +125,6 @@ def test_wrong_usage_is_one_clear_line_and_status_2(argv, words, capsys, calls):
     assert not calls
 
 
-def test_every_problem_of_a_scene_has_its_line(tmp_path, capsys):
-    path = tmp_path / "bad.toml"
-    path.write_text("[scene]\nname = 'bad'\n[arm]\nmodle = 3\n[task]\nkind = 'free'\nduration_s = -1\n")
-    assert main(["plan", str(path)]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert all(line.startswith(f"canprobe: {path}: ") for line in lines)
-
-
 @pytest.mark.parametrize(
     ("error", "status"),
     [

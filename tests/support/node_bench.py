@@ -199,6 +199,14 @@ class Rig:
         assert self.drive.read(0x6041) & 0x6F == 0x27
         return self
 
+    def at_work(self, mode: int, *words: int) -> Rig:
+        """Operational, RPDO1 = controlword, the mode's target and what else is mapped."""
+        mapped = [(f"_1600_{sub}", mapping) for sub, mapping in enumerate(words, start=2)]
+        for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), *mapped, ("_1600_0", 1 + len(words))):
+            self.put(**{name: value})
+        self.put(_1400_1=0x201).enable(mode).drive.nmt(0x01)
+        return self
+
     def run(self, ms: float, step_us: int = 500) -> Rig:
         """Let time pass; `trace` gets (t_ns, counts)."""
         end_ns, self.trace = self.drive.t_ns + round(ms * 1e6), [(self.drive.t_ns, self.plant.counts[0])]

@@ -152,48 +152,42 @@ def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_e
         assert DriveState.OPERATION_ENABLED not in map(state_of, map(int, row))
 
 
-@pytest.mark.parametrize("what", ["bus-off", "EMCY 4210h"])
-def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
-    def say(text):
-        if text != "enable the drives":
-            return
-        if what == "bus-off":
-            session.cell.port.state = ControllerState.BUS_OFF
-        else:
-            session.buses.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
-
-    session = Session(canprobe.load_scene("free"), RunOptions(say=say))
-    with pytest.raises(CanprobeError, match=what), session:
-        session.run(lambda _: Command(done=True))
-    words = session.cell.log.arrays()["statusword"]
-    assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
-
-
 def not_enabled(told, *changes):
-    """Ends so where nodes send other data from `enable the drives` on, by (node id, COB-ID, change)."""
+    """Ends so where something is done to the session from `enable the drives` on."""
 
     def say(text):
         if text == "enable the drives":
-            for node_id, cob_id, change in changes:
-                altered(participants[node_id - 1], cob_id, change)
+            for change in changes:
+                change(session)
 
     session = Session(canprobe.load_scene("free"), RunOptions(say=say))
-    participants = session.buses.world.make_faulty().nodes
+    session.buses.world.make_faulty()
     with pytest.raises(CanprobeError, match=told), session:
         session.run(lambda _: Command(done=True))
     words = session.cell.log.arrays()["statusword"]
     assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
 
 
+def from_node(node_id, cob_id, change):
+    """A node sends other data."""
+    return lambda session: altered(session.buses.world.participants[node_id - 1], cob_id, change)
+
+
+def test_bus_off_and_an_emergency_while_the_drives_are_being_enabled_end_that():
+    not_enabled("bus-off", lambda session: setattr(session.cell.port, "state", ControllerState.BUS_OFF))
+    alarm = EMCY_BASE + 4, Emcy(0x4210, 1).pack()
+    not_enabled("EMCY 4210h", lambda session: session.buses.lockstep.port().send_batch([alarm]))
+
+
 def test_an_arm_that_does_not_stand_still_is_not_enabled():
     way = count(0, 20)
-    not_enabled("node 2: reports no position that stays for 2 s", (2, 0x182, lambda d: moved(d, next(way))))
+    not_enabled("node 2: reports no position that stays for 2 s", from_node(2, 0x182, lambda d: moved(d, next(way))))
 
 
 def test_a_jump_while_the_drives_are_being_enabled_ends_that():
     ready = DriveState.READY_TO_SWITCH_ON
     change = lambda d: moved(d, 20_000) if state_of(unpack("<H", d[:2])[0]) is ready else d  # noqa: E731
-    not_enabled("joint 2 reports a motion of", (2, 0x182, change))
+    not_enabled("joint 2 reports a motion of", from_node(2, 0x182, change))
 
 
 def test_a_heartbeat_that_is_lost_before_the_drives_are_enabled_ends_that():
@@ -201,8 +195,8 @@ def test_a_heartbeat_that_is_lost_before_the_drives_are_enabled_ends_that():
     way = chain(range(0, 3000, 20), repeat(3000))
     not_enabled(
         "node 3: lost: no heartbeat",
-        (2, 0x182, lambda d: moved(d, next(way))),
-        (3, HEARTBEAT_BASE + 3, lambda _: None),
+        from_node(2, 0x182, lambda d: moved(d, next(way))),
+        from_node(3, HEARTBEAT_BASE + 3, lambda _: None),
     )
 
 

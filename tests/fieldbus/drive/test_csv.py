@@ -10,11 +10,7 @@ from canprobe.fieldbus.protocol.cia402 import DriveState as S
 @pytest.fixture
 def csv(rig):
     """Operational, RPDO1 = controlword + target velocity."""
-    for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), ("_1600_2", 0x60FF0020), ("_1600_0", 2)):
-        rig.put(**{name: value})
-    rig.put(_1400_1=0x201).enable(9)
-    rig.drive.nmt(0x01)
-    return rig
+    return rig.at_work(9, 0x60FF0020)
 
 
 def order(velocity, word=0x0F):
