@@ -35,8 +35,7 @@ def _serialize(self: Any, buffer: Any = None, endianness: Any = None, use_versio
     carried = self.__dict__.get("carried")
     if carried is not None:
         return bytes(carried)
-    data: bytes = IdlStruct.serialize(self, buffer, endianness, use_version_2)
-    return data
+    return IdlStruct.serialize(self, buffer, endianness, use_version_2)
 
 
 class DdsTypes:

@@ -165,8 +165,7 @@ def variable_at(od: ObjectDictionary, index: int, subindex: int) -> ODVariable |
     found = od.indices.get(index)
     if isinstance(found, ODVariable):
         return found if subindex == 0 else None
-    variable: ODVariable | None = found.subindices.get(subindex) if found is not None else None
-    return variable
+    return found.subindices.get(subindex) if found is not None else None
 
 
 def _numbers(od: ObjectDictionary, area: range) -> tuple[int, ...]:

@@ -32,35 +32,11 @@ from canprobe.fieldbus.bus.real.interrupts import Terminated
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 
 COMMANDS = (
-    "scenes",
-    "cells",
-    "schema",
-    "init",
-    "plan",
-    "check",
-    "run",
-    "up",
-    "console",
-    "move",
-    "home",
-    "tare",
-    "listen",
-    "posture",
-    "emulate",
-    "inject",
-    "conform",
-    "judge",
-    "adapters",
-    "scan",
-    "monitor",
-    "replay",
-    "view",
-    "export",
-    "calibrate",
-    "study",
-    "vcan",
-    "eds",
-)
+    "scenes", "cells", "schema", "init", "plan", "check", "run", "up",
+    "console", "move", "home", "tare", "listen", "posture",
+    "emulate", "inject", "conform", "judge", "adapters", "scan", "monitor",
+    "replay", "view", "export", "calibrate", "study", "vcan", "eds",
+)  # fmt: skip
 
 ELSEWHERE = {
     "jog": "canprobe console CELL, and jog there",

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import sys
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -136,10 +135,10 @@ class _Browser:
     """
 
     def __init__(self, port: int, say: Callable[[str], None], *, quiet: bool) -> None:
-        self.port = port
-        self._say = say
-        has_display = sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        self._quiet = quiet or not has_display
+        from canprobe.cell.results.result import has_display
+
+        self.port, self._say = port, say
+        self._quiet = quiet or not has_display()
 
     def show(self, address: str) -> None:
         """Print the address of the page, and open the browser."""

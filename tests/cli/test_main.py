@@ -103,6 +103,7 @@ def test_version(capsys):
         (["run", "cylinder", "--channel", "vcan0", "--channel", "vcan1"], ("given 2 times",)),
         (["run", "cilinder"], ("no such scene", "did you mean cylinder?")),
         (["up", "gantri"], ("no such scene, cell or file; did you mean gantry?",)),
+        (["emulate", "cylindre"], ("cylindre: no such scene, cell or file; did you mean cylinder?",)),
         *((["jog", "puma260"], ("type canprobe console",)), (["zero"], ("type canprobe tare", "canprobe home"))),
         (["plan", "none.toml"], ("none.toml", "cannot be read", "`canprobe scenes` lists the packaged ones")),
         (["plan", "free", "--measured", "run", "--export", "dcf"], ("--measured", "no --export or --figure")),
@@ -122,15 +123,6 @@ def test_wrong_usage_is_one_clear_line_and_status_2(argv, words, capsys, calls):
     assert captured.err.startswith("canprobe")
     assert all(word in captured.err for word in words), captured.err
     assert not calls
-
-
-def test_every_problem_of_a_scene_has_its_line(tmp_path, capsys):
-    path = tmp_path / "bad.toml"
-    path.write_text("[scene]\nname = 'bad'\n[arm]\nmodle = 3\n[task]\nkind = 'free'\nduration_s = -1\n")
-    assert main(["plan", str(path)]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert all(line.startswith(f"canprobe: {path}: ") for line in lines)
 
 
 @pytest.mark.parametrize(

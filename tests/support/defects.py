@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from makes import Entry, Make, eds_text, pdo, word
+from makes import Entry, Make, communication, eds_text, pdo, word
 
 from canprobe.fieldbus.bus.virtual.lockstep import ALL_IDS
 from canprobe.fieldbus.node.slave_node import SlaveNode
@@ -150,25 +150,10 @@ def drops(hit: Callable[[DefectiveNode, int, str], bool]) -> Defect:
 
 def whole_device() -> Make:
     """A device with every service of CiA 301 that the points examine."""
-    objects: dict[tuple[int, int], Entry] = {
-        (0x1000, 0): Entry("Device type", "U32", "ro", "0x12"),
-        (0x1001, 0): Entry("Error register", "U8", "ro", 0, mappable=True),
-        (0x1003, 0): Entry("Number of errors", "U8", "rw", 0),
-        **{(0x1003, n): Entry(f"Error {n}", "U32", "ro", 0) for n in range(1, 9)},
-        (0x1005, 0): Entry("COB-ID SYNC", "U32", "rw", "0x80"),
-        (0x1006, 0): Entry("Communication cycle period", "U32", "rw", 0),
+    objects = communication("0x12", "a name longer than seven", errors=8, consumers=2) | {
         (0x1007, 0): Entry("Synchronous window", "U32", "rw", 0),
-        (0x1008, 0): Entry("Name", "STR", "const", "a name longer than seven"),
         (0x100C, 0): Entry("Guard time", "U16", "rw", 0),
         (0x100D, 0): Entry("Life time factor", "U8", "rw", 0),
-        (0x1014, 0): Entry("COB-ID EMCY", "U32", "rw", "$NODEID+0x80"),
-        (0x1015, 0): Entry("Inhibit time EMCY", "U16", "rw", 0),
-        (0x1016, 0): Entry("Number of consumers", "U8", "ro", 2),
-        **{(0x1016, n): Entry(f"Consumer {n}", "U32", "rw", 0) for n in (1, 2)},
-        (0x1017, 0): Entry("Producer heartbeat time", "U16", "rw", 0),
-        (0x1018, 0): Entry("Highest sub-index", "U8", "ro", 4),
-        **{(0x1018, n): Entry(f"Number {n}", "U32", "ro", 0) for n in (1, 2, 3, 4)},
-        (0x1019, 0): Entry("Synchronous counter overflow value", "U8", "rw", 0),
         (0x1029, 0): Entry("Highest sub-index", "U8", "ro", 1),
         (0x1029, 1): Entry("Communication error", "U8", "rw", 0),
         (0x1200, 0): Entry("Highest sub-index", "U8", "ro", 2),

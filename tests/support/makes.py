@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-TYPES = {"BOOL": 1, "I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7, "STR": 9}
+TYPES = {
+    "BOOL": 1, "I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7, "R32": 8, "STR": 9, "DOMAIN": 15, "U64": 27,
+}  # fmt: skip
 SIZES = {"BOOL": 8, "I8": 8, "I16": 16, "I32": 32, "U8": 8, "U16": 16, "U32": 32}
 Place = tuple[int, int]
 
@@ -86,27 +88,31 @@ def pdo(
     return found
 
 
-def standard_drive(modes: int = 0x81) -> dict[Place, Entry]:
-    """The objects that nearly every servo drive has, with four PDOs each way; `modes` is 6502h."""
-    objects = {
-        (0x1000, 0): Entry("Device type", "U32", "ro", "0x00020192"),
+def communication(device_type: str, name: str, *, errors: int, consumers: int) -> dict[Place, Entry]:
+    """The objects of CiA 301 that nearly every device has; `errors` and `consumers` are entries of 1003h and 1016h."""
+    numbers = ("Vendor-ID", "Product code", "Revision number", "Serial number")
+    return {
+        (0x1000, 0): Entry("Device type", "U32", "ro", device_type),
         (0x1001, 0): Entry("Error register", "U8", "ro", 0, mappable=True),
         (0x1003, 0): Entry("Number of errors", "U8", "rw", 0),
-        **{(0x1003, n): Entry(f"Error {n}", "U32", "ro", 0) for n in (1, 2, 3, 4)},
+        **{(0x1003, n): Entry(f"Error {n}", "U32", "ro", 0) for n in range(1, errors + 1)},
         (0x1005, 0): Entry("COB-ID SYNC", "U32", "rw", "0x80"),
         (0x1006, 0): Entry("Communication cycle period", "U32", "rw", 0),
-        (0x1008, 0): Entry("Manufacturer device name", "STR", "const", "drive"),
+        (0x1008, 0): Entry("Manufacturer device name", "STR", "const", name),
         (0x1014, 0): Entry("COB-ID EMCY", "U32", "rw", "$NODEID+0x80"),
         (0x1015, 0): Entry("Inhibit time EMCY", "U16", "rw", 0),
-        (0x1016, 0): Entry("Number of consumers", "U8", "ro", 1),
-        (0x1016, 1): Entry("Consumer heartbeat time", "U32", "rw", 0),
+        (0x1016, 0): Entry("Number of consumers", "U8", "ro", consumers),
+        **{(0x1016, n): Entry("Consumer heartbeat time", "U32", "rw", 0) for n in range(1, consumers + 1)},
         (0x1017, 0): Entry("Producer heartbeat time", "U16", "rw", 0),
         (0x1018, 0): Entry("Highest sub-index supported", "U8", "ro", 4),
-        **{
-            (0x1018, n): Entry(name, "U32", "ro", 0)
-            for n, name in enumerate(("Vendor-ID", "Product code", "Revision number", "Serial number"), start=1)
-        },
+        **{(0x1018, n): Entry(number, "U32", "ro", 0) for n, number in enumerate(numbers, start=1)},
         (0x1019, 0): Entry("Synchronous counter overflow value", "U8", "rw", 0),
+    }
+
+
+def standard_drive(modes: int = 0x81) -> dict[Place, Entry]:
+    """The objects that nearly every servo drive has, with four PDOs each way; `modes` is 6502h."""
+    objects = communication("0x00020192", "drive", errors=4, consumers=1) | {
         (0x6007, 0): Entry("Abort connection option code", "I16", "rw", 3),
         (0x603F, 0): Entry("Error code", "U16", "ro", 0, mappable=True),
         (0x6040, 0): Entry("Controlword", "U16", "rww", 0, mappable=True),
@@ -342,4 +348,6 @@ def _variable(section: str, entry: Entry) -> Iterator[str]:
         yield f"LowLimit={entry.low}"
     if entry.high is not None:
         yield f"HighLimit={entry.high}"
-    yield from (f"DefaultValue={entry.default}", f"PDOMapping={int(entry.mappable)}", "")
+    if entry.default != "":
+        yield f"DefaultValue={entry.default}"
+    yield from (f"PDOMapping={int(entry.mappable)}", "")

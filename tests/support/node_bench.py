@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import pytest
 from canopen.objectdictionary import ObjectDictionary
 from canopen.objectdictionary.eds import import_eds
+from makes import Entry, Make, Place, communication, eds_text, pdo, word
 from sdo_words import SdoWords
 
 from canprobe.fieldbus.drive.drive import make_drive_node
@@ -17,90 +18,44 @@ from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
-U8, U16, U32, U64, I16, I32, STRING, DOMAIN, REAL32 = 0x5, 0x6, 0x7, 0x1B, 0x3, 0x4, 0x9, 0xF, 0x8
 NODE_ID = 5
 OFF = 0x80000000
 
-Row = tuple[int, int | None, int, str, str, int, str, str]
-# index, sub (None: plain variable), data type, access, default, mappable, low, high
-_ROWS: list[Row] = [
-    (0x1000, None, U32, "ro", "0x12345678", 0, "", ""),
-    (0x1001, None, U8, "ro", "0", 1, "", ""),
-    *[(0x1003, sub, U32 if sub else U8, "ro" if sub else "rw", "0", 0, "", "") for sub in range(4)],
-    (0x1005, None, U32, "rw", "0x80", 0, "", ""),
-    (0x1006, None, U32, "rw", "0", 0, "", ""),
-    (0x1007, None, U32, "rw", "0", 0, "", ""),
-    (0x100C, None, U16, "rw", "0", 0, "", ""),
-    (0x100D, None, U8, "rw", "0", 0, "", ""),
-    (0x1008, None, STRING, "const", "a name longer than seven", 0, "", ""),
-    *[(0x1010, sub, U32 if sub else U8, "rw" if sub else "ro", "1" if sub else "3", 0, "", "") for sub in range(4)],
-    *[(0x1011, sub, U32 if sub else U8, "rw" if sub else "ro", "1" if sub else "3", 0, "", "") for sub in range(4)],
-    (0x1014, None, U32, "rw", "$NODEID+0x80", 0, "", ""),
-    (0x1015, None, U16, "rw", "0", 0, "", ""),
-    *[(0x1016, sub, U32 if sub else U8, "rw" if sub else "ro", "0" if sub else "2", 0, "", "") for sub in range(3)],
-    (0x1017, None, U16, "rw", "0", 0, "", ""),
-    (0x1019, None, U8, "rw", "0", 0, "", ""),
-    *[(0x1029, sub, U8, "rw" if sub else "ro", "0" if sub else "1", 0, "", "") for sub in range(2)],
-    *[(0x1201, sub, U32 if sub else U8, "rw" if sub else "ro", f"{OFF if sub else 2}", 0, "", "") for sub in range(3)],
-    (0x2000, None, U8, "rw", "50", 0, "10", "100"),
-    (0x2001, None, U32, "rw", "0x01020304", 1, "", ""),
-    (0x2002, None, I16, "rw", "-2", 1, "-100", "100"),
-    (0x2003, None, U8, "wo", "0", 0, "", ""),
-    (0x2004, None, DOMAIN, "rw", "", 0, "", ""),
-    (0x2005, None, U64, "ro", "0x1122334455667788", 1, "", ""),
-    (0x2006, None, REAL32, "rw", "1.5", 0, "", ""),
-    (0x2007, None, U8, "rw", "7", 1, "", ""),
-    (0x2008, None, U32, "rwr", "8", 1, "", ""),
-    (0x2009, None, I32, "rww", "9", 1, "", ""),
-    (0x2010, 0, U8, "ro", "2", 0, "", ""),
-    (0x2010, 1, U32, "rw", "1", 1, "", ""),
-    (0x2010, 2, U32, "rw", "2", 1, "", ""),
-]
 
-
-def _pdo_rows() -> list[Row]:
-    rows: list[Row] = []
-    cob_ids = {0x1400: "$NODEID+0x200", 0x1401: "$NODEID+0x80000300", 0x1800: "$NODEID+0x180", 0x1801: "0x80000285"}
-    mapped = {0x1600: ["0x20010020", "0x20020010"], 0x1A00: ["0x20010020", "0x20020010"], 0x1A01: ["0x20050040"]}
-    for index, cob_id in cob_ids.items():
-        subs = {0: "6", 1: cob_id, 2: "1", 3: "0", 5: "0", 6: "0"}
-        types = {0: U8, 1: U32, 2: U8, 3: U16, 5: U16, 6: U8}
-        if index < 0x1800:
-            del subs[6]
-        rows += [(index, sub, types[sub], "rw" if sub else "ro", text, 0, "", "") for sub, text in subs.items()]
-        words = mapped.get(index + 0x200, [])
-        rows.append((index + 0x200, 0, U8, "rw", str(len(words)), 0, "", ""))
-        for sub in range(1, 5):
-            word = words[sub - 1] if sub <= len(words) else "0"
-            rows.append((index + 0x200, sub, U32, "rw", word, 0, "", ""))
-    return rows
-
-
-def _section(row: Row) -> str:
-    index, sub, data_type, access, default, pdo, low, high = row
-    name = f"{index:04X}" if sub is None else f"{index:04X}sub{sub:X}"
-    lines = [f"[{name}]", f"ParameterName=object {name}", "ObjectType=0x7", f"DataType=0x{data_type:04X}"]
-    lines += [f"AccessType={access}", f"PDOMapping={pdo}"]
-    lines += [
-        f"{key}={text}" for key, text in (("DefaultValue", default), ("LowLimit", low), ("HighLimit", high)) if text
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _eds_text() -> str:
-    parts = ["[DeviceInfo]\nVendorName=test\n", "[DummyUsage]\nDummy0004=1\nDummy0005=1\n"]
-    parts[1] += "".join(f"Dummy000{i}=0\n" for i in (1, 2, 3, 6, 7))
-    seen: set[int] = set()
-    for row in sorted(_ROWS + _pdo_rows(), key=lambda row: (row[0], row[1] or 0)):
-        if row[1] is not None and row[0] not in seen:
-            parts.append(f"[{row[0]:04X}]\nParameterName=record {row[0]:04X}\nObjectType=0x9\nSubNumber=2\n")
-        seen.add(row[0])
-        parts.append(_section(row))
-    return "\n".join(parts)
+def tiny() -> dict[Place, Entry]:
+    """Objects of the tiny node: one of each data type, access and limit, and two PDOs each way, the second ones off."""
+    objects = communication("0x12345678", "a name longer than seven", errors=3, consumers=2) | {
+        (0x1007, 0): Entry("Synchronous window", "U32", "rw"),
+        (0x100C, 0): Entry("Guard time", "U16", "rw"),
+        (0x100D, 0): Entry("Life time factor", "U8", "rw"),
+        **{(index, sub): Entry("Group", "U32", "rw", 1) for index in (0x1010, 0x1011) for sub in (1, 2, 3)},
+        **{(index, 0): Entry("Highest sub-index", "U8", "ro", 3) for index in (0x1010, 0x1011)},
+        (0x1029, 0): Entry("Highest sub-index", "U8", "ro", 1),
+        (0x1029, 1): Entry("Communication error", "U8", "rw"),
+        (0x1201, 0): Entry("Highest sub-index", "U8", "ro", 2),
+        **{(0x1201, sub): Entry("COB-ID", "U32", "rw", OFF) for sub in (1, 2)},
+        (0x2000, 0): Entry("Limited", "U8", "rw", 50, low=10, high=100),
+        (0x2001, 0): Entry("Number", "U32", "rw", "0x01020304", mappable=True),
+        (0x2002, 0): Entry("Signed and limited", "I16", "rw", -2, low=-100, high=100, mappable=True),
+        (0x2003, 0): Entry("Command", "U8", "wo"),
+        (0x2004, 0): Entry("Domain", "DOMAIN", "rw", ""),
+        (0x2005, 0): Entry("Long", "U64", "ro", "0x1122334455667788", mappable=True),
+        (0x2006, 0): Entry("Real", "R32", "rw", "1.5"),
+        (0x2007, 0): Entry("Byte", "U8", "rw", 7, mappable=True),
+        (0x2008, 0): Entry("Sent", "U32", "rwr", 8, mappable=True),
+        (0x2009, 0): Entry("Received", "I32", "rww", 9, mappable=True),
+        (0x2010, 0): Entry("Highest sub-index", "U8", "ro", 2),
+        **{(0x2010, sub): Entry("Part", "U32", "rw", sub, mappable=True) for sub in (1, 2)},
+    }
+    mapped = (word(0x2001, 0, 32), word(0x2002, 0, 16))
+    objects |= pdo("rpdo", 1, mapped, places=4) | pdo("rpdo", 2, places=4, cob_id="$NODEID+0x80000300")
+    objects |= pdo("tpdo", 1, mapped, places=4)
+    objects |= pdo("tpdo", 2, (word(0x2005, 0, 64),), places=4, cob_id="0x80000285")
+    return objects | {(index, 6): Entry("SYNC start value", "U8", "rw") for index in (0x1800, 0x1801)}
 
 
 def make_tiny_od() -> ObjectDictionary:
-    return import_eds(io.StringIO(_eds_text()), NODE_ID)
+    return import_eds(io.StringIO(eds_text(Make("tiny", 0, objects=tiny(), dummies=(4, 5)))), NODE_ID)
 
 
 @dataclass
@@ -239,9 +194,17 @@ class Rig:
 
     def enable(self, mode: int) -> Rig:
         self.put(_6060=mode)
-        for word in (0x06, 0x07, 0x0F):
-            self.word(word)
+        for controlword in (0x06, 0x07, 0x0F):
+            self.word(controlword)
         assert self.drive.read(0x6041) & 0x6F == 0x27
+        return self
+
+    def at_work(self, mode: int, *words: int) -> Rig:
+        """Operational, RPDO1 = controlword, the mode's target and what else is mapped."""
+        mapped = [(f"_1600_{sub}", mapping) for sub, mapping in enumerate(words, start=2)]
+        for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), *mapped, ("_1600_0", 1 + len(words))):
+            self.put(**{name: value})
+        self.put(_1400_1=0x201).enable(mode).drive.nmt(0x01)
         return self
 
     def run(self, ms: float, step_us: int = 500) -> Rig:

@@ -1,7 +1,7 @@
 """Masters written by hand as frames, and a drive as simple as it can be: nothing of canprobe's.
 
-`Master` does everything right, and so does each subclass of `Careful` in another way. Every other class does one thing
-wrong, that of the rule whose number it has.
+`Master` does everything right, and so does each one without a number in another way. Every other one does one thing
+wrong, that of the rule whose number it has. What each does otherwise is a row of steps, `do.METHOD(…)` of `Master`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Drive:
         self.node_id, self.position, self.target = node_id, position, position
         self.state, self.word, self.bits = OFF, 0, 0
         self.values = {(0x6041, 0): OFF, (0x6064, 0): position, (0x6061, 0): 0}
-        self.nmt, self.beats, self.reports, self.stuck, self.swapped = 0, True, True, False, False
+        self.nmt, self.beats, self.reports, self.stuck = 0, True, True, False
 
     def obey(self, word):
         rises, self.word = word & ~self.word, word
@@ -49,33 +49,54 @@ class Drive:
         self.values[0x6064, 0], self.values[0x6041, 0] = self.position, self.state | self.bits
 
 
+class Steps:
+    """`do.go(20)` is the step that calls `go(20)` of a master."""
+
+    def __getattr__(self, name):
+        return lambda *args, **options: lambda master: getattr(master, name)(*args, **options)
+
+
+do = Steps()
+ENABLE = (do.hold(5, 6), do.hold(5, 7), do.hold(5, 15))
+MASTERS = []
+
+
 class Master:
     """Does everything right: configures, starts, enables, moves, stops. Subclasses do one thing otherwise."""
 
+    number = None
     nodes = (1,)
     absent = ()
     mode, steps, way = 8, 150, 100
-    watch = cycle_time = True
-    numbers = ()
+    watch = cycle_time = heard = True
+    send_delay = 0
+    running = (do.boot_all(), do.configure_all(), do.start(), do.enable(), do.move(), do.stop())
+    configuring = ()
+    starting, enabling, moving = (do.hold(5, 0),), ENABLE, (do.go(),)
+    stopping = (do.hold(20), do.hold(5, 2), do.hold(5, 0), do.leave())
+
+    def __init_subclass__(cls):
+        MASTERS.append(cls)
 
     def __init__(self):
         self.t, self.frames, self.beat_t, self.count = 0, [], 0, 0
         self.drives = {node_id: Drive(node_id) for node_id in self.nodes}
 
+    def act(self, steps):
+        for step in steps:
+            step(self)
+
     def run(self):
-        for drive in self.drives.values():
-            self.boot(drive)
-        for drive in self.drives.values():
-            self.configure(drive)
-        self.start()
-        self.enable()
-        self.move()
-        self.stop()
+        self.act(self.running)
         return self.frames
 
     def put(self, can_id, data, by_node=None):
         self.frames.append((self.t, can_id, bytes(data), by_node))
         self.t += MS // 8
+
+    def unseen(self, count):
+        """The last frames were not recorded."""
+        del self.frames[-count:]
 
     def wait(self, ms):
         until = self.t + round(ms * MS)
@@ -94,10 +115,6 @@ class Master:
 
     def master_beat(self):
         self.put(0x700 + MASTER, [5])
-
-    def boot(self, drive):
-        drive.nmt = 0x7F
-        self.put(0x700 + drive.node_id, [0], True)
 
     def nmt(self, command, node_id):
         self.put(0, [command, node_id])
@@ -135,6 +152,27 @@ class Master:
     def emcy(self, node_id, code):
         self.put(0x80 + node_id, struct.pack("<HB5x", code, 1 if code else 0), True)
 
+    # what happens to a drive
+
+    def drive(self, node_id, **values):
+        for name, value in values.items():
+            setattr(self.drives[node_id], name, value)
+
+    def know(self, values):
+        self.drives[1].values |= values
+
+    def stay(self, node_id):
+        self.drives[node_id].target = self.drives[node_id].position
+
+    def boot(self, node_id):
+        self.drives[node_id].nmt = 0x7F
+        self.put(0x700 + node_id, [0], True)
+
+    def reboot(self, node_id):
+        self.drive(node_id, state=OFF, word=0)
+        self.drives[node_id].values[0x6061, 0] = 0
+        self.boot(node_id)
+
     # a cycle
 
     def sync(self):
@@ -153,7 +191,8 @@ class Master:
         for drive in self.drives.values():
             if drive.node_id not in self.absent:
                 word = (words or {}).get(drive.node_id, drive.word)
-                self.send(drive, word, (targets or {}).get(drive.node_id, drive.target))
+                for _ in range(self.copies(drive)):
+                    self.send(drive, word, (targets or {}).get(drive.node_id, drive.target))
         self.beat()
         self.t = max(begin + self.period(), self.t)
         self.count += 1
@@ -161,9 +200,16 @@ class Master:
     def period(self):
         return PERIOD
 
+    def copies(self, drive):
+        return 1
+
+    def pack(self, word, target):
+        return struct.pack("<Hi", word, target)
+
     def send(self, drive, word, target):
-        self.put(0x200 + drive.node_id, struct.pack("<Hi", word, target))
-        if drive.nmt == 5:
+        self.t += self.send_delay
+        self.put(0x200 + drive.node_id, self.pack(word, target))
+        if drive.nmt == 5 and self.heard:
             drive.obey(word)
             drive.target = target
 
@@ -171,12 +217,22 @@ class Master:
         for _ in range(cycles):
             self.cycle({} if word is None else dict.fromkeys(self.nodes, word))
 
-    def go(self, cycles, way=None):
-        for _ in range(cycles):
-            self.cycle(targets={n: d.target + (way or self.way) for n, d in self.drives.items()})
+    def go(self, cycles=None, way=None, *, words=None, nodes=None):
+        way = self.way if way is None else way
+        for _ in range(cycles or self.steps):
+            self.cycle(words, {n: self.drives[n].target + way for n in nodes or self.nodes})
 
-    def configure(self, drive):
-        node_id = drive.node_id
+    # the parts of its work
+
+    def boot_all(self):
+        for node_id in self.nodes:
+            self.boot(node_id)
+
+    def configure_all(self):
+        for node_id in self.nodes:
+            self.configure(node_id)
+
+    def configure(self, node_id):
         self.write(node_id, 0x1017, 0, 100, 2)
         if self.watch:
             self.write(node_id, 0x1016, 1, MASTER << 16 | 250, 4)
@@ -185,6 +241,7 @@ class Master:
         self.write(node_id, 0x60C2, 2, -3, 1)
         self.set_mode(node_id, self.mode)
         self.read(node_id, 0x6064, 0, 4)
+        self.act(self.configuring)
 
     def set_mode(self, node_id, mode):
         self.write(node_id, 0x6060, 0, mode, 1)
@@ -195,68 +252,73 @@ class Master:
             if node_id not in self.absent:
                 self.nmt(1, node_id)
         self.wait(220)
-        self.hold(5, 0)
+        self.act(self.starting)
 
     def enable(self):
-        for word in (6, 7, 15):
-            self.hold(5, word)
+        self.act(self.enabling)
 
     def move(self):
-        self.go(self.steps)
+        self.act(self.moving)
 
     def stop(self):
-        self.hold(20)
-        self.hold(5, 2)
-        self.hold(5, 0)
+        self.act(self.stopping)
+
+    def leave(self):
         for node_id in self.nodes:
             self.nmt(0x80, node_id)
         self.wait(300)
 
-
-class TargetElsewhere(Master):
-    numbers = (1,)
-
-    def enable(self):
-        self.hold(5, 6)
-        self.hold(5, 7)
-        self.cycle({1: 15}, {1: 15_000})
+    def command(self, word):
+        """A controlword by SDO."""
+        self.write(1, 0x6040, 0, word, 2)
+        self.wait(20)
+        self.read(1, 0x6041, 0, 2)
 
 
-class SpeedSet(Master):
-    numbers, mode, way = (2,), 9, 0
-
-    def enable(self):
-        self.write(1, 0x60FF, 0, 500, 4)
-        super().enable()
-
-
-class TorqueSet(SpeedSet):
-    mode = 10
-
-    def enable(self):
-        self.write(1, 0x6071, 0, -20, 2)
-        Master.enable(self)
+UNANSWERED = do.read(1, 0x1018, 1, 4, answered=False)
+ANSWERED = do.read(1, 0x1018, 1, 4)
+TIMED_OUT = struct.pack("<I", 0x05040000)
+ABORT, NAMELESS_ABORT = (do.put(0x601, head + TIMED_OUT) for head in (b"\x80\x18\x10\x01", b"\x80\0\0\0"))
+STUCK_FAULT, MUTE = do.drive(1, state=FAULT, stuck=True), do.drive(1, beats=False, reports=False)
+TARGET_FIRST = (0x607A0020, 0x60400010)
 
 
-class SetpointFirst(Master):
-    numbers, mode = (3,), 1
+def remap(number, words, kind=None):
+    """Steps that map an RPDO of node 1 as one should: off, empty, its entries, their number, on."""
+    parameters, mapping, cob_id = 0x1400 + number, 0x1600 + number, 0x201 + 0x100 * number
+    return (
+        do.write(1, parameters, 1, 0x80000000 | cob_id, 4),
+        *([] if kind is None else [do.write(1, parameters, 2, kind, 1)]),
+        do.write(1, mapping, 0, 0, 1),
+        *(do.write(1, mapping, subindex, word, 4) for subindex, word in enumerate(words, 1)),
+        do.write(1, mapping, 0, len(words), 1),
+        do.write(1, parameters, 1, cob_id, 4),
+    )
 
-    def move(self):
-        for target in (5000, 5500, 6000):
-            self.cycle({1: 0x1F})
-            self.cycle({1: 0x1F}, {1: target})
-            self.hold(3, 15)
+
+def pack_target_first(master, word, target):
+    return struct.pack("<iH", target, word)
 
 
-class ModeUnread(Master):
-    numbers = (4,)
+def scripted(name, number=None, base=Master, **own):
+    """A master with other attributes and methods; one without a number is good."""
+    return type(name, (base,), own if number is None else {"number": number, **own})
 
-    def set_mode(self, node_id, mode):
-        self.write(node_id, 0x6060, 0, mode, 1)
+
+# masters with one fault
+
+TargetElsewhere = scripted(
+    "TargetElsewhere", 1, enabling=(do.hold(5, 6), do.hold(5, 7), do.cycle({1: 15}, {1: 15_000}))
+)
+scripted("SpeedSet", 2, mode=9, way=0, enabling=(do.write(1, 0x60FF, 0, 500, 4), *ENABLE))
+scripted("TorqueSet", 2, mode=10, way=0, enabling=(do.write(1, 0x6071, 0, -20, 2), *ENABLE))
+SETPOINTS = [(do.cycle({1: 0x1F}), do.cycle({1: 0x1F}, {1: n}), do.hold(3, 15)) for n in (5000, 5500, 6000)]
+scripted("SetpointFirst", 3, mode=1, moving=sum(SETPOINTS, ()))
+scripted("ModeUnread", 4, set_mode=lambda master, node_id, mode: master.write(node_id, 0x6060, 0, mode, 1))
 
 
 class ModeRefused(Master):
-    numbers = (4,)
+    number = 4
 
     def set_mode(self, node_id, mode):
         self.write(node_id, 0x6060, 0, mode, 1)
@@ -264,175 +326,39 @@ class ModeRefused(Master):
         self.read(node_id, 0x6061, 0, 1)
 
 
-class ModeInMotion(Master):
-    numbers = (5,)
-
-    def move(self):
-        self.go(30)
-        self.set_mode(1, 1)
-
-
-class ZerosFirst(Master):
-    numbers = (6,)
-
-    def start(self):
-        self.nmt(1, 1)
-        self.wait(220)
-        self.cycle({1: 0}, {1: 0})
-        self.cycle({1: 0}, {1: 5000})
-
-
-class ZerosUnseen(ZerosFirst):
-    def configure(self, drive):
-        super().configure(drive)
-        del self.frames[-2:]  # the read of 6064h
+ZEROS = (do.cycle({1: 0}, {1: 0}), do.cycle({1: 0}, {1: 5000}))
+scripted("ModeInMotion", 5, moving=(do.go(30), do.set_mode(1, 1)))
+scripted("ZerosFirst", 6, starting=ZEROS)
+scripted("ZerosUnseen", 6, starting=ZEROS, configuring=(do.unseen(2),))  # the read of 6064h
 
 
 class ZeroMode(Master):
-    numbers = (6,)
+    number = 6
+    configuring = remap(0, (0x60400010, 0x60600008, 0x607A0020))
+    starting = (do.hold(5, 0), do.read(1, 0x6061, 0, 1))
 
-    def configure(self, drive):
-        super().configure(drive)
-        self.write(1, 0x1400, 1, 0x80000201, 4)
-        self.write(1, 0x1600, 0, 0, 1)
-        for subindex, word in enumerate((0x60400010, 0x60600008, 0x607A0020), 1):
-            self.write(1, 0x1600, subindex, word, 4)
-        self.write(1, 0x1600, 0, 3, 1)
-        self.write(1, 0x1400, 1, 0x201, 4)
-
-    def send(self, drive, word, target):
-        mode = 8 if self.count else 0
-        self.put(0x201, struct.pack("<Hbi", word, mode, target))
-        drive.obey(word)
-        drive.target = target
-
-    def start(self):
-        super().start()
-        self.read(1, 0x6061, 0, 1)
+    def pack(self, word, target):
+        return struct.pack("<Hbi", word, 8 if self.count else 0, target)
 
 
-class SaysNothing(Master):
-    numbers = (7,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.read(1, 0x1400, 1, 4)
-        self.drives[1].values[0x1400, 1] = 0x201
-
-    def read(self, node_id, index, subindex, size, *, answered=True):
-        self.drives[node_id].values.setdefault((0x1400, 1), 0x201)
-        super().read(node_id, index, subindex, size, answered=answered)
-
-    def send(self, drive, word, target):
-        pass
-
-    def stop(self):
-        self.hold(100)
-
-
-class Blind(Master):
-    numbers = (8,)
-
-    def enable(self):
-        for word in (6, 7, 15):
-            self.write(1, 0x6040, 0, word, 2)
-        self.hold(5, 15)
-
-
-class HoldsReset(Master):
-    numbers = (9,)
-
-    def move(self):
-        self.drives[1].state, self.drives[1].stuck = FAULT, True
-        self.hold(3, 0)
-        self.hold(80, 0x80)
-
-
-class ResetsForEver(Master):
-    numbers = (10,)
-
-    def move(self):
-        self.drives[1].state, self.drives[1].stuck = FAULT, True
-        for _ in range(6):
-            self.hold(5, 0)
-            self.hold(5, 0x80)
-
-
-class LeavesStop(Master):
-    numbers = (11,)
-
-    def move(self):
-        self.go(20)
-        self.hold(5)
-        self.drives[1].state = QUICK
-        self.hold(20, 15)
-
-
-class HomesTwice(Master):
-    numbers, mode = (13,), 6
-
-    def move(self):
-        for _ in range(2):
-            self.hold(10, 0x1F)
-            self.hold(3, 15)
-
-
-class HomesBlind(Master):
-    numbers = (14,)
-
-    def move(self):
-        self.write(1, 0x6060, 0, 6, 1)
-        self.hold(5, 0x1F)
-        self.hold(3, 15)
-
-
-class HomesWithoutEdge(Master):
-    numbers = (14,)
-
-    def move(self):
-        self.hold(5, 0x1F)
-        self.set_mode(1, 6)
-        self.hold(80, 0x1F)
-        self.hold(3, 15)
-
-
-class FaultPassedOver(Master):
-    numbers = (15,)
-
-    def move(self):
-        self.go(20)
-        self.drives[1].state, self.drives[1].stuck = FAULT, True
-        self.emcy(1, 0x2310)
-        self.go(70)
-
-
-class EmcyPassedOver(FaultPassedOver):
-    def move(self):
-        self.go(20)
-        self.emcy(1, 0x4310)
-        self.go(70)
-
-
-class FearsNoError(Master):
-    numbers = (16,)
-
-    def move(self):
-        self.hold(10)
-        self.emcy(1, 0)
-        self.hold(5, 0)
-
-
-class StopsMoving(Master):
-    numbers = (17,)
-
-    def stop(self):
-        self.nmt(0x80, 1)
-        self.drives[1].state = OFF
-        self.wait(300)
+KNOWN_RPDO = (do.know({(0x1400, 1): 0x201}), do.read(1, 0x1400, 1, 4))
+HOMES = (do.hold(10, 0x1F), do.hold(3, 15))
+scripted("SaysNothing", 7, copies=lambda *_: 0, configuring=KNOWN_RPDO, stopping=(do.hold(100),))
+scripted("Blind", 8, enabling=(*(do.write(1, 0x6040, 0, word, 2) for word in (6, 7, 15)), do.hold(5, 15)))
+scripted("HoldsReset", 9, moving=(STUCK_FAULT, do.hold(3, 0), do.hold(80, 0x80)))
+scripted("ResetsForEver", 10, moving=(STUCK_FAULT, *6 * (do.hold(5, 0), do.hold(5, 0x80))))
+scripted("LeavesStop", 11, moving=(do.go(20), do.hold(5), do.drive(1, state=QUICK), do.hold(20, 15)))
+scripted("HomesTwice", 13, mode=6, moving=2 * HOMES)
+scripted("HomesBlind", 14, moving=(do.write(1, 0x6060, 0, 6, 1), do.hold(5, 0x1F), do.hold(3, 15)))
+scripted("HomesWithoutEdge", 14, moving=(do.hold(5, 0x1F), do.set_mode(1, 6), do.hold(80, 0x1F), do.hold(3, 15)))
+scripted("FaultPassedOver", 15, moving=(do.go(20), STUCK_FAULT, do.emcy(1, 0x2310), do.go(70)))
+scripted("EmcyPassedOver", 15, moving=(do.go(20), do.emcy(1, 0x4310), do.go(70)))
+scripted("FearsNoError", 16, moving=(do.hold(10), do.emcy(1, 0), do.hold(5, 0)))
+scripted("StopsMoving", 17, stopping=(do.nmt(0x80, 1), do.drive(1, state=OFF), do.wait(300)))
 
 
 class FallsSilentMoving(Master):
-    numbers = (17,)
+    number = 17
 
     def stop(self):
         for _ in range(50):
@@ -444,124 +370,47 @@ class FallsSilentMoving(Master):
             self.beat()
 
 
-class Unwatched(Master):
-    numbers, watch = (18,), False
-
-
-class HeartbeatPassedOver(Master):
-    numbers = (19,)
-
-    def move(self):
-        self.go(20)
-        self.drives[1].beats = False
-        self.go(150)
+scripted("Unwatched", 18, watch=False)
+scripted("HeartbeatPassedOver", 19, moving=(do.go(20), do.drive(1, beats=False), do.go(150)))
 
 
 class GoesWithout(Master):
-    numbers, nodes, absent, steps = (20,), (1, 2), (2,), 250
+    number, nodes, absent, steps = 20, (1, 2), (2,), 250
 
-    def boot(self, drive):
-        if drive.node_id == 1:
-            super().boot(drive)
+    def boot(self, node_id):
+        if node_id == 1:
+            super().boot(node_id)
 
-    def configure(self, drive):
-        if drive.node_id == 1:
-            super().configure(drive)
+    def configure(self, node_id):
+        if node_id == 1:
+            super().configure(node_id)
 
 
 class GoesWithoutAnswer(GoesWithout):
-    def boot(self, drive):
-        Master.boot(self, drive)
-        drive.beats = False
+    def boot(self, node_id):
+        Master.boot(self, node_id)
+        self.drive(node_id, beats=False)
 
-    def configure(self, drive):
-        if drive.node_id == 1:
-            super().configure(drive)
-        else:
+    def configure(self, node_id):
+        super().configure(node_id)
+        if node_id == 2:
             self.read(2, 0x1018, 1, 4, answered=False)
 
 
-class BootPassedOver(Master):
-    numbers = (21,)
-
-    def move(self):
-        self.hold(5)
-        drive = self.drives[1]
-        drive.state, drive.word, drive.values[0x6061, 0] = OFF, 0, 0
-        self.boot(drive)
-        self.start()
-        self.enable()
-
-
-class WaitsForEver(Master):
-    numbers = (22,)
-
-    def run(self):
-        self.boot(self.drives[1])
-        self.wait(6000)
-        return self.frames
-
-
-class ConfiguresLate(Master):
-    numbers = (23,)
-
-    def start(self):
-        super().start()
-        self.write(1, 0x1800, 5, 100, 2)
-
-
-class ResetsAll(Master):
-    numbers = (24,)
-
-    def stop(self):
-        self.hold(20)
-        self.nmt(0x81, 0)
-
-
-class RemapsValid(Master):
-    numbers = (25,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        for subindex, word in enumerate((0x607A0020, 0x60400010), 1):
-            self.write(1, 0x1600, subindex, word, 4)
-
-    def send(self, drive, word, target):
-        self.put(0x201, struct.pack("<iH", target, word))
-        drive.obey(word)
-        drive.target = target
-
-
-class PassesAbortOver(Master):
-    numbers = (26,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.write(1, 0x6085, 0, 5, 4, abort=0x06090030)
-
-
-class WrongLength(Master):
-    numbers = (27,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        drive.values |= {(0x1400, 1): 0x201, (0x1600, 0): 2}
-        self.read(1, 0x1400, 1, 4)
-        self.read(1, 0x1600, 0, 1)
-
-    def send(self, drive, word, target):
-        self.put(0x201, struct.pack("<Hi", word, target) + b"\0")
-        drive.obey(word)
-        drive.target = target
-
-
-class TooShort(WrongLength):
-    def send(self, drive, word, target):
-        self.put(0x201, struct.pack("<Hi", word, target)[:5])
+SWAPPED = tuple(do.write(1, 0x1600, subindex, word, 4) for subindex, word in enumerate(TARGET_FIRST, 1))
+KNOWN_MAPPING = (do.know({(0x1600, 0): 2}), *KNOWN_RPDO, do.read(1, 0x1600, 0, 1))
+scripted("BootPassedOver", 21, moving=(do.hold(5), do.reboot(1), do.start(), do.enable()))
+scripted("WaitsForEver", 22, running=(do.boot(1), do.wait(6000)))
+scripted("ConfiguresLate", 23, starting=(do.hold(5, 0), do.write(1, 0x1800, 5, 100, 2)))
+scripted("ResetsAll", 24, stopping=(do.hold(20), do.nmt(0x81, 0)))
+scripted("RemapsValid", 25, configuring=SWAPPED, pack=pack_target_first)
+scripted("PassesAbortOver", 26, configuring=(do.write(1, 0x6085, 0, 5, 4, abort=0x06090030),))
+scripted("WrongLength", 27, configuring=KNOWN_MAPPING, pack=lambda *row: Master.pack(*row) + b"\0")
+scripted("TooShort", 27, configuring=KNOWN_MAPPING, pack=lambda *row: Master.pack(*row)[:5], heard=False)
 
 
 class Polls(Master):
-    numbers = (28,)
+    number = 28
 
     def move(self):
         for _ in range(60):
@@ -571,93 +420,25 @@ class Polls(Master):
             self.t = (self.t // PERIOD + 1) * PERIOD
 
 
-class GivesUpAtOnce(Master):
-    numbers = (29,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.read(1, 0x1018, 1, 4, answered=False)
-        self.wait(3)
-        self.put(0x601, b"\x80\x18\x10\x01" + struct.pack("<I", 0x05040000))
-        self.wait(50)
-
-
-class GivesUpTooSoon(Master):
-    numbers = (29,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        for _ in range(2):
-            self.read(1, 0x1018, 1, 4, answered=False)
-            self.wait(60)
-            self.put(0x601, b"\x80\x18\x10\x01" + struct.pack("<I", 0x05040000))
-            self.wait(20)
-            self.answer(1, 0x1018, 1, 4)
-
-
-class NamelessAbort(Master):
-    numbers = (30,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.read(1, 0x1018, 1, 4, answered=False)
-        self.wait(600)
-        self.put(0x601, b"\x80\0\0\0" + struct.pack("<I", 0x05040000))
-
-
-class AbortsNothing(Master):
-    """An abort long after the transfer is over."""
-
-    numbers, named = (30,), b"\x18\x10\x01"
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.read(1, 0x1018, 1, 4)
-        self.wait(300)
-        self.put(0x601, b"\x80" + self.named + struct.pack("<I", 0x05040000))
-
-
-class AbortsNamelessAtOnce(AbortsNothing):
-    def wait(self, ms):
-        if ms != 300:
-            super().wait(ms)
-
-    named = b"\0\0\0"
-
-
-class AsksTwice(Master):
-    numbers = (31,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.read(1, 0x1018, 1, 4, answered=False)
-        self.read(1, 0x1018, 2, 4)
-
-
-class Jitters(Master):
-    numbers, steps = (32,), 300
-
-    def period(self):
-        return PERIOD + (8 if self.count % 2 else -8) * MS // 10
+LATE_ANSWER = (UNANSWERED, do.wait(60), ABORT, do.wait(20), do.answer(1, 0x1018, 1, 4))
+scripted("GivesUpAtOnce", 29, configuring=(UNANSWERED, do.wait(3), ABORT, do.wait(50)))
+scripted("GivesUpTooSoon", 29, configuring=2 * LATE_ANSWER)
+scripted("NamelessAbort", 30, configuring=(UNANSWERED, do.wait(600), NAMELESS_ABORT))
+scripted("AbortsNothing", 30, configuring=(ANSWERED, do.wait(300), ABORT))  # long after the transfer is over
+scripted("AbortsNamelessAtOnce", 30, configuring=(ANSWERED, NAMELESS_ABORT))
+scripted("AsksTwice", 31, configuring=(UNANSWERED, do.read(1, 0x1018, 2, 4)))
+scripted("Jitters", 32, steps=300, period=lambda master: PERIOD + (8 if master.count % 2 else -8) * MS // 10)
 
 
 class SkipsSyncs(Master):
-    numbers = (33,)
+    number = 33
 
     def period(self):
         return 2 * PERIOD if self.count % 10 == 0 and self.drives[1].state == ENABLED else PERIOD
 
 
-class CountsWrong(Master):
-    numbers = (33,)
-
-    def sync(self):
-        counted = self.count + self.count // 20
-        self.put(0x80, [counted % 240 + 1])
-
-
 class SendsTwice(Master):
-    numbers = (34,)
+    number = 34
 
     def send(self, drive, word, target):
         super().send(drive, word, target)
@@ -665,133 +446,35 @@ class SendsTwice(Master):
             super().send(drive, word, target)
 
 
-class SkipsRpdos(Master):
-    numbers = (34,)
-
-    def send(self, drive, word, target):
-        if not 60 < self.count < 64:
-            super().send(drive, word, target)
-
-
-class SendsLate(Master):
-    numbers = (35,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.write(1, 0x1007, 0, 2000, 4)
-
-    def send(self, drive, word, target):
-        self.t += 4 * MS
-        super().send(drive, word, target)
-
-
-class WrongTime(Master):
-    numbers, cycle_time = (36,), False
-
-
-class ByEvent(Master):
-    numbers = (37,)
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.write(1, 0x1400, 1, 0x80000201, 4)
-        self.write(1, 0x1400, 2, 255, 1)
-        self.write(1, 0x1400, 1, 0x201, 4)
-        drive.values[0x1600, 0] = 2
-        self.read(1, 0x1600, 0, 1)
-
-
-class Jumps(Master):
-    numbers = (38,)
-
-    def move(self):
-        self.go(10)
-        self.go(10, 3000)
-
-
-class JumpsOnce(Master):
-    numbers = (38,)
-
-    def move(self):
-        self.go(10)
-        self.go(1, 20_000)
-
-
-class LeavesRange(Master):
-    numbers = (39,)
-
-    def configure(self, drive):
-        drive.values |= {(0x607D, 1): 0, (0x607D, 2): 10_000}
-        super().configure(drive)
-        self.read(1, 0x607D, 1, 4)
-        self.read(1, 0x607D, 2, 4)
-
-
-class LeavesAxisBehind(Master):
-    numbers = (40,)
-
-    def move(self):
-        self.go(10)
-        self.drives[1].bits |= 0x2000
-        self.go(70)
-
-
-class Halted(Master):
-    numbers = (41,)
-
-    def move(self):
-        for _ in range(130):
-            self.cycle({1: 0x10F}, {1: self.drives[1].target + 10})
-        self.cycle({1: 0x10F}, {1: self.drives[1].position})
-
-
-class ModeUnderHalt(Master):
-    numbers = (41,)
-
-    def move(self):
-        self.hold(10, 0x10F)
-        self.set_mode(1, 1)
-
-
-class NeverStarts(Master):
-    numbers = (42,)
-
-    def run(self):
-        self.boot(self.drives[1])
-        self.configure(self.drives[1])
-        self.wait(300)
-        self.hold(50, 6)
-        return self.frames
-
-
-class Guards(Master):
-    numbers = (43,)
-
-    def move(self):
-        for _ in range(4):
-            self.hold(25)
-            self.put(0x701 | 0x40000000, b"")
-            self.put(0x701, [5 | 0x80], True)
-
-
-class SpeaksAsNode(Master):
-    numbers = (44,)
-
-    def move(self):
-        for _ in range(3):
-            self.hold(10)
-            self.put(0x701, [5], False)
+BY_EVENT = (do.write(1, 0x1400, 1, 0x80000201, 4), do.write(1, 0x1400, 2, 255, 1), do.write(1, 0x1400, 1, 0x201, 4))
+RANGE = (do.know({(0x607D, 1): 0, (0x607D, 2): 10_000}), do.read(1, 0x607D, 1, 4), do.read(1, 0x607D, 2, 4))
+HALTED = (do.go(130, 10, words={1: 0x10F}), do.stay(1), do.hold(1, 0x10F))
+GUARDS = (do.hold(25), do.put(0x701 | 0x40000000, b""), do.put(0x701, [5 | 0x80], True))
+scripted("CountsWrong", 33, sync=lambda master: master.put(0x80, [(master.count + master.count // 20) % 240 + 1]))
+scripted("SkipsRpdos", 34, copies=lambda master, _: 0 if 60 < master.count < 64 else 1)
+scripted("SendsLate", 35, configuring=(do.write(1, 0x1007, 0, 2000, 4),), send_delay=4 * MS)
+scripted("WrongTime", 36, cycle_time=False)
+scripted("ByEvent", 37, configuring=(*BY_EVENT, do.know({(0x1600, 0): 2}), do.read(1, 0x1600, 0, 1)))
+scripted("Jumps", 38, moving=(do.go(10), do.go(10, 3000)))
+scripted("JumpsOnce", 38, moving=(do.go(10), do.go(1, 20_000)))
+scripted("LeavesRange", 39, configuring=RANGE)
+scripted("LeavesAxisBehind", 40, moving=(do.go(10), do.drive(1, bits=0x2000), do.go(70)))
+scripted("Halted", 41, moving=HALTED)
+scripted("ModeUnderHalt", 41, moving=(do.hold(10, 0x10F), do.set_mode(1, 1)))
+scripted("NeverStarts", 42, running=(do.boot(1), do.configure(1), do.wait(300), do.hold(50, 6)))
+scripted("Guards", 43, moving=4 * GUARDS)
+scripted("SpeaksAsNode", 44, moving=3 * (do.hold(10), do.put(0x701, [5], False)))
 
 
 class TwoSyncs(Master):
-    numbers = (44,)
+    number = 44
 
     def sync(self):
         self.put(0x80, [self.count // 2 % 240 + 1] if self.count % 2 else b"")
 
 
 class SendsBacklog(Master):
-    numbers = (45,)
+    number = 45
 
     def move(self):
         self.go(20)
@@ -802,283 +485,101 @@ class SendsBacklog(Master):
         self.t = (self.t // PERIOD + 1) * PERIOD
 
 
-class MutePassedOver(Master):
-    numbers, nodes = (46,), (1, 2)
-
-    def move(self):
-        self.go(20)
-        drive = self.drives[2]
-        drive.beats = drive.reports = False
-        for _ in range(150):
-            self.cycle({2: 2}, {1: self.drives[1].target + 100})
-
-
-class DrivesMuteAxis(Master):
-    """The only axis says nothing any more, and its target goes on."""
-
-    numbers = (19,)
-
-    def move(self):
-        self.go(20)
-        self.drives[1].beats = self.drives[1].reports = False
-        self.go(150)
-
-    def stop(self):
-        self.hold(20, 2)
-
-
-class DrivesMuteAxisWithoutHeartbeat(DrivesMuteAxis):
-    def configure(self, drive):
-        super().configure(drive)
-        self.write(drive.node_id, 0x1017, 0, 0, 2)
-        drive.beats = False
+MutePassedOver = scripted(
+    "MutePassedOver", 46, nodes=(1, 2),
+    moving=(do.go(20), do.drive(2, beats=False, reports=False), do.go(150, words={2: 2}, nodes=(1,))),
+)  # fmt: skip
+# the only axis says nothing any more, and its target goes on
+DrivesMuteAxis = scripted("DrivesMuteAxis", 19, moving=(do.go(20), MUTE, do.go(150)), stopping=(do.hold(20, 2),))
+BEATLESS = (do.write(1, 0x1017, 0, 0, 2), do.drive(1, beats=False))
+scripted("DrivesMuteAxisWithoutHeartbeat", base=DrivesMuteAxis, configuring=BEATLESS)
+# the target stays, and the controlword goes on to enable the axis that nobody sees
+scripted("KeepsMuteAxisEnabled", base=DrivesMuteAxis, moving=(do.go(20), MUTE, do.hold(160)))
 
 
 class DrivesMuteSpeed(DrivesMuteAxis):
     """In CSV a target that stays is a motion; it comes by an RPDO beside the controlword's."""
 
     mode, way = 9, 0
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.write(1, 0x1401, 1, 0x80000301, 4)
-        self.write(1, 0x1401, 2, 1, 1)
-        self.write(1, 0x1601, 0, 0, 1)
-        self.write(1, 0x1601, 1, 0x60FF0020, 4)
-        self.write(1, 0x1601, 0, 1, 1)
-        self.write(1, 0x1401, 1, 0x301, 4)
+    configuring = remap(1, (0x60FF0020,), 1)
 
     def send(self, drive, word, target):
         self.put(0x301, struct.pack("<i", 500 if word == 15 and drive.state == ENABLED else 0))
         super().send(drive, word, drive.position)
 
 
-class KeepsMuteAxisEnabled(DrivesMuteAxis):
-    """The target stays, and the controlword goes on to enable the axis that nobody sees."""
-
-    def move(self):
-        self.go(20)
-        self.drives[1].beats = self.drives[1].reports = False
-        self.hold(160)
-
-
-class CutsPower(Master):
-    numbers = (47,)
-
-    def stop(self):
-        self.hold(1, 0)
-        self.hold(5, 0)
-        self.nmt(0x80, 1)
+scripted("CutsPower", 47, stopping=(do.hold(1, 0), do.hold(5, 0), do.nmt(0x80, 1)))
 
 
 class Starves(Master):
-    numbers = (48,)
+    number = 48
 
     def master_beat(self):
         if not 1500 * MS < self.t < 1900 * MS:
             super().master_beat()
 
 
-class Careful(Master):
-    """Base of masters that do something else than the first one, and do it right."""
+# good ones
 
-    numbers = ()
-
-
-class SetpointsBySdo(Careful):
-    """Profile position without RPDOs, SYNC or NMT start: all by SDO."""
-
-    mode = 1
-
-    def configure(self, drive):
-        self.write(1, 0x1016, 1, MASTER << 16 | 250, 4)
-        self.set_mode(1, 1)
-
-    def start(self):
-        pass
-
-    def word(self, word):
-        self.write(1, 0x6040, 0, word, 2)
-        self.wait(20)
-        self.read(1, 0x6041, 0, 2)
-
-    def enable(self):
-        self.wait(200)
-        for word in (6, 7, 15):
-            self.word(word)
-
-    def move(self):
-        for target in (6000, 7000, 6500):
-            self.write(1, 0x607A, 0, target, 4)
-            self.drives[1].target = target
-            self.word(0x1F)
-            self.word(0x0F)
-            self.wait(500)
-
-    def stop(self):
-        self.word(2)
-        self.word(0)
-
-
-class Velocities(Careful):
-    """CSV: 0 at enable, then a velocity by SDO, then 0 again."""
-
-    mode, way = 9, 0
-
-    def enable(self):
-        self.write(1, 0x60FF, 0, 0, 4)
-        super().enable()
-
-    def move(self):
-        for speed in (1000, 2000, 0):
-            self.write(1, 0x60FF, 0, speed, 4)
-            self.hold(40)
-
-
-class HomesOnce(Careful):
-    """Homes the axis in its mode, by an edge, and goes on in CSP."""
-
-    mode = 6
-
-    def move(self):
-        self.hold(10, 0x1F)
-        self.hold(5, 15)
-        self.drives[1].bits = 0
-        self.set_mode(1, 8)
-        self.go(50)
+SETPOINT = (do.command(0x1F), do.command(0x0F), do.wait(500))
+PLACES = [(do.write(1, 0x607A, 0, n, 4), do.drive(1, target=n), *SETPOINT) for n in (6000, 7000, 6500)]
+WITHOUT_RPDOS = (do.boot(1), do.write(1, 0x1016, 1, MASTER << 16 | 250, 4), do.set_mode(1, 1), do.wait(200))
+RAMP = (do.go(25, nodes=(1,)), *(do.go(1, way, nodes=(1,)) for way in range(90, -1, -10)), do.go(25, 0, nodes=(1,)))
+RECOVERY = (do.hold(20), do.hold(5, 0), do.hold(5, 0x80), do.stay(1), do.emcy(1, 0), do.enable(), do.go(30))
+# profile position without RPDOs, SYNC or NMT start: all by SDO
+scripted("SetpointsBySdo", running=(
+    *WITHOUT_RPDOS, *(do.command(word) for word in (6, 7, 15)), *sum(PLACES, ()), do.command(2), do.command(0)
+))  # fmt: skip
+# CSV: 0 at enable, then a velocity by SDO, then 0 again
+scripted("Velocities", mode=9, way=0, enabling=(do.write(1, 0x60FF, 0, 0, 4), *ENABLE), moving=sum(
+    [(do.write(1, 0x60FF, 0, speed, 4), do.hold(40)) for speed in (1000, 2000, 0)], ()
+))  # fmt: skip
+# homes the axis in its mode, by an edge, and goes on in CSP
+scripted("HomesOnce", mode=6, moving=(
+    do.hold(10, 0x1F), do.hold(5, 15), do.drive(1, bits=0), do.set_mode(1, 8), do.go(50)
+))  # fmt: skip
+# after a fault it holds the target, resets once, and enables again at the place of the axis
+scripted("Recovers", moving=(do.go(30), do.drive(1, state=FAULT), do.emcy(1, 0x2310), *RECOVERY))
+# a node that boots by itself is configured and started from the beginning
+scripted("BringsUpAnew", moving=(
+    do.go(30), do.reboot(1), do.wait(150), do.configure(1), do.start(), do.enable(), do.go(20)
+))  # fmt: skip
+# one axis falls silent: the other ramps down and is disabled
+scripted("StopsAll", nodes=(1, 2), moving=(do.go(20), do.drive(2, beats=False, reports=False), *RAMP))
+# swaps the entries of the RPDO, disabled and emptied first; 6061h comes by TPDO 2
+scripted("RemapsRightly", configuring=remap(0, TARGET_FIRST), pack=pack_target_first)
+# an abort that crosses the answer on the bus
+scripted("AbortsAnswered", configuring=(ANSWERED, ABORT))
+# one lost RPDO, one late SYNC, one repeated request after a time-out: what happens on any bus
+scripted(
+    "SkipsNow", configuring=(UNANSWERED, do.wait(500), ABORT, ANSWERED),
+    copies=lambda master, _: 1 if master.count % 70 else 0,
+    period=lambda master: PERIOD + 6 * MS if master.count == 100 else PERIOD,
+)  # fmt: skip
+TRANSFERS = """
+601 40 081000       | 581 41 081000 09
+601 60              | 581 00 63616E70726F62
+601 70              | 581 1B 6521
+601 A4 081000 7F    | 581 C6 081000 09
+601 A3              | 581 01 40404040404040 | 581 82 4040
+601 A2 02 7F        | 581 D5
+601 A1              | 601 21 102000 09      | 581 60 102000
+601 00 40404040404040 | 581 20
+601 1B 4040         | 581 30
+"""
+"""A name that is read in segments and as a block, and a value that is written in segments."""
+FRAMES = [frame.split() for line in TRANSFERS.splitlines() for frame in line.split("|") if frame.strip()]
+scripted("LongTransfers", configuring=[
+    do.put(int(can_id, 16), bytes.fromhex("".join(data)).ljust(8, b"\0"), can_id == "581" or None)
+    for can_id, *data in FRAMES
+])  # fmt: skip
 
 
-class Recovers(Careful):
-    """After a fault it holds the target, resets once, and enables again at the place of the axis."""
-
-    def move(self):
-        self.go(30)
-        drive = self.drives[1]
-        drive.state = FAULT
-        self.emcy(1, 0x2310)
-        self.hold(20)
-        self.hold(5, 0)
-        self.hold(5, 0x80)
-        drive.target = drive.position
-        self.emcy(1, 0)
-        self.enable()
-        self.go(30)
-
-
-class BringsUpAnew(Careful):
-    """A node that boots by itself is configured and started from the beginning."""
-
-    def move(self):
-        self.go(30)
-        drive = self.drives[1]
-        drive.state, drive.word, drive.values[0x6061, 0] = OFF, 0, 0
-        self.boot(drive)
-        self.wait(150)
-        self.configure(drive)
-        self.start()
-        self.enable()
-        self.go(20)
-
-
-class StopsAll(Careful):
-    """One axis falls silent: the other ramps down and is disabled."""
-
-    nodes = (1, 2)
-
-    def move(self):
-        self.go(20)
-        self.drives[2].beats = self.drives[2].reports = False
-        way = 100
-        for cycle in range(60):
-            way = way if cycle < 25 else max(0, way - 10)
-            self.cycle(targets={1: self.drives[1].target + way})
-
-
-class RemapsRightly(Careful):
-    """Swaps the entries of the RPDO, disabled and emptied first; 6061h comes by TPDO 2."""
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.write(1, 0x1400, 1, 0x80000201, 4)
-        self.write(1, 0x1600, 0, 0, 1)
-        for subindex, word in enumerate((0x607A0020, 0x60400010), 1):
-            self.write(1, 0x1600, subindex, word, 4)
-        self.write(1, 0x1600, 0, 2, 1)
-        self.write(1, 0x1400, 1, 0x201, 4)
-
-    def send(self, drive, word, target):
-        self.put(0x201, struct.pack("<iH", target, word))
-        drive.obey(word)
-        drive.target = target
-
-
-class AbortsAnswered(Careful):
-    """An abort that crosses the answer on the bus."""
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.read(1, 0x1018, 1, 4)
-        self.put(0x601, b"\x80\x18\x10\x01" + struct.pack("<I", 0x05040000))
-
-
-class SkipsNow(Careful):
-    """One lost RPDO, one late SYNC, one repeated request after a time-out: what happens on any bus."""
-
-    def configure(self, drive):
-        super().configure(drive)
-        self.read(1, 0x1018, 1, 4, answered=False)
-        self.wait(500)
-        self.put(0x601, b"\x80\x18\x10\x01" + struct.pack("<I", 0x05040000))
-        self.read(1, 0x1018, 1, 4)
-
-    def send(self, drive, word, target):
-        if self.count % 70:
-            super().send(drive, word, target)
-
-    def period(self):
-        return PERIOD + 6 * MS if self.count == 100 else PERIOD
-
-
-class LongTransfers(Careful):
-    """Reads a name in segments and as a block, and writes in segments, before it goes to work."""
-
-    def configure(self, drive):
-        super().configure(drive)
-        place = b"\x08\x10\x00"
-        self.put(0x601, b"\x40" + place + bytes(4))
-        self.put(0x581, b"\x41" + place + b"\x09\0\0\0", True)
-        for request, answer in ((b"\x60", b"\x00canprob"), (b"\x70", b"\x1be!\0\0\0\0\0")):
-            self.put(0x601, request + bytes(7))
-            self.put(0x581, answer, True)
-        self.put(0x601, b"\xa4" + place + b"\x7f\0\0\0")
-        self.put(0x581, b"\xc6" + place + b"\x09\0\0\0", True)
-        self.put(0x601, b"\xa3" + bytes(7))
-        self.put(0x581, b"\x01\x40\x40\x40\x40\x40\x40\x40", True)
-        self.put(0x581, b"\x82\x40\x40\0\0\0\0\0", True)
-        self.put(0x601, b"\xa2\x02\x7f" + bytes(5))
-        self.put(0x581, b"\xd5" + bytes(7), True)
-        self.put(0x601, b"\xa1" + bytes(7))
-        self.put(0x601, b"\x21\x10\x20\x00\x09\0\0\0")
-        self.put(0x581, b"\x60\x10\x20\x00" + bytes(4), True)
-        for request, answer in ((b"\x00\x40\x40\x40\x40\x40\x40\x40", b"\x20"), (b"\x1b\x40\x40\0\0\0\0\0", b"\x30")):
-            self.put(0x601, request)
-            self.put(0x581, answer + bytes(7), True)
-
-
-class SplitRpdos(Careful):
+class SplitRpdos(Master):
     """The controlword by event, the target with SYNC: two RPDOs."""
 
-    def configure(self, drive):
-        super().configure(drive)
-        for number, kind, word in ((0, 255, 0x60400010), (1, 1, 0x607A0020)):
-            cob_id = 0x201 + 0x100 * number
-            self.write(1, 0x1400 + number, 1, 0x80000000 | cob_id, 4)
-            self.write(1, 0x1400 + number, 2, kind, 1)
-            self.write(1, 0x1600 + number, 0, 0, 1)
-            self.write(1, 0x1600 + number, 1, word, 4)
-            self.write(1, 0x1600 + number, 0, 1, 1)
-            self.write(1, 0x1400 + number, 1, cob_id, 4)
-        self.sent = None
+    configuring = (*remap(0, (0x60400010,), 255), *remap(1, (0x607A0020,), 1))
+    sent = None
 
     def send(self, drive, word, target):
         if word != self.sent or self.count % 10 == 0:
@@ -1087,10 +588,3 @@ class SplitRpdos(Careful):
         self.put(0x301, struct.pack("<i", target))
         drive.obey(word)
         drive.target = target
-
-
-def all_masters(master=Master):
-    """All classes but the first, good and bad."""
-    for one in master.__subclasses__():
-        yield one
-        yield from all_masters(one)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+OFF = 0x80000000
+
 
 class SdoWords:
     """Expedited transfers over a bench's own `ask`, which sends one request in hex and returns the answer in hex."""
@@ -23,6 +27,16 @@ class SdoWords:
     def refusal(self, index: int, sub: int = 0) -> int:
         """Abort code of an upload."""
         return abort_code(self._upload(index, sub))
+
+    def configure(self, index: int, *, cob_id: int, words: Sequence[int], **parameters: int) -> None:
+        """A PDO by the standard's sequence: off, mapping, parameters, on."""
+        sizes = {"type": (2, 1), "inhibit": (3, 2), "event": (5, 2), "start": (6, 1)}
+        orders = [(index, 1, OFF | cob_id, 4), (index + 0x200, 0, 0, 1)]
+        orders += [(index + 0x200, sub, word, 4) for sub, word in enumerate(words, start=1)]
+        orders += [(index + 0x200, 0, len(words), 1)]
+        orders += [(index, sizes[name][0], value, sizes[name][1]) for name, value in parameters.items()]
+        for order in [*orders, (index, 1, cob_id, 4)]:
+            assert self.write(*order) == 0, order
 
     def _upload(self, index: int, sub: int) -> str:
         return self.ask(bytes((0x40, index & 0xFF, index >> 8, sub)).hex() + "00000000")

@@ -35,8 +35,8 @@ class Scripted(Participant):
         return self.timed.pop(min(self.timed))
 
 
-def make_bus(*participants, **options):
-    bus = TimedBus(VirtualClock(), "can7", **options)
+def make_bus(*participants, kind=TimedBus, **options):
+    bus = kind(VirtualClock(), "can7", **options)
     seen = []
     bus.recorder = lambda *frame: seen.append(frame)
     for participant in participants:

@@ -44,23 +44,6 @@ def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int
             assert any(fault.startswith("lift off, at ") for fault in results.summary["faults"])
 
 
-@pytest.mark.slow(reason="two cells on a real bus; test_another_master_is_at_work is of the same rule")
-def test_a_second_cell_is_refused_and_leaves_the_first_one_up(bench: Any) -> None:
-    command = bench.start("up", bench.scene("free"), *ON_VCAN0)
-    bench.bus.until_enabled(1, by=command)
-    second = bench.start("up", bench.scene("free"), *ON_VCAN0)
-    while second.running:
-        heard = {can_id for can_id, _, _ in bench.bus.hear()}
-        assert not heard.intersection((0x000, *(base + n for base in (0x580, 0x600) for n in NODES)))
-    assert second.end(3)[-1].endswith("another master is at work here; stop it first")
-    bench.bus.until_enabled(1, by=command)
-    command.send(signal.SIGINT)
-    lines = command.end(0)
-    bench.bus.hear()
-    bench.assert_left_safe(bench.bus.last, *NODES[:6])
-    assert "the cell is up: nodes 1, 2, 3, 4, 5, 6; Ctrl-C stops it" in lines
-
-
 @pytest.mark.slow(reason="a killed process on a real bus; the default kills a node and a master")
 def test_the_emulator_is_killed_in_mid_scan(bench: Any) -> None:
     (bench.folder / "results").mkdir()

@@ -36,16 +36,6 @@ def test_the_interface_goes_down_in_mid_run(bench: Any) -> None:
     assert any("while stopping" in fault for fault in results.summary["faults"])
 
 
-@pytest.mark.slow(reason="a second run whose interface goes down")
-def test_the_interface_comes_back_while_the_cell_stops(bench: Any) -> None:
-    command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
-    bench.bus.until_enabled(6, by=command, cycles=60)
-    link("down")
-    link("up")
-    command.end(3)
-    assert bench.results("results").summary["completed"] is False
-
-
 @pytest.mark.slow(reason="a stopped process on a real bus; the default kills one")
 def test_the_emulator_stands_still_and_the_drives_are_lost(bench: Any) -> None:
     command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")

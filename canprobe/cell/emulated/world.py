@@ -286,8 +286,7 @@ def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats
     An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
     probe at one place in the first posture.
     """
-    offset: Floats = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
-    return offset
+    return ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
 
 
 def _tared_s(setup: Setup) -> float:

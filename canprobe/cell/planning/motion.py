@@ -155,8 +155,7 @@ class _Stops:
         """For each joint whether a range of positions, (n,) rad or m each, is allowed."""
         model = self.arm.model
         margin = self.limits.joint_margin
-        inside: NDArray[np.bool_] = (low >= model.q_min + margin) & (high <= model.q_max - margin)
-        return inside
+        return (low >= model.q_min + margin) & (high <= model.q_max - margin)
 
     def allowed(self, joint: int) -> str:
         """A joint's range, for people."""

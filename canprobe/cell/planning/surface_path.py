@@ -130,8 +130,7 @@ def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Flo
     if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
         return np.zeros(3)  # in a tighter hollow it touches in two places, which is refused elsewhere
     beside = shape.closest(approach.start + (height + radius) * approach.normal).point - approach.start
-    across: Floats = beside - float(beside @ approach.normal) * approach.normal
-    return across
+    return beside - float(beside @ approach.normal) * approach.normal
 
 
 def _contacts(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> SurfacePath:

@@ -258,8 +258,7 @@ class ContactSolver:
         depth = config.radius_m - foot.distance
         unit = self._elastic(1.0, foot).force  # F = unit · depth²
         left = (sqrt(1.0 + 4.0 * unit * c * depth) - 1.0) / (2.0 * unit * c) if c > 0.0 else depth
-        given: tuple[float, ...] = tuple((np.array(q) + compliance * lever * (unit * left * left)).tolist())
-        return given
+        return tuple((np.array(q) + compliance * lever * (unit * left * left)).tolist())
 
     def _elastic(self, depth: float, foot: Nearest, rate: float = 0.0, damping: float = 0.0) -> Indentation:
         """The contact in one place; a hollow tighter than the ball counts as one that leaves a little."""

@@ -154,5 +154,4 @@ def total_force(touches: TouchedPlaces, radius: float, stiffness_n_m3: float, ra
     coefficient, exponent = force_laws(touches, radius, stiffness_n_m3)
     depth = np.maximum(radius - touches.distances, 0.0)
     force = coefficient * depth**exponent * np.maximum(0.0, 1.0 + 1.5 * damping * rates)
-    total: Floats = force @ touches.normals
-    return total
+    return force @ touches.normals

@@ -79,15 +79,13 @@ def runge_kutta_4(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     k2 = problem.rate(t + 0.5 * h, y + 0.5 * h * k1)
     k3 = problem.rate(t + 0.5 * h, y + 0.5 * h * k2)
     k4 = problem.rate(t + h, y + h * k3)
-    new: Floats = y + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-    return new
+    return y + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
 
 
 def implicit_euler(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     """Backward Euler by one Newton iteration."""
     rate, drift, solve = problem.linearised(t, y, h)
-    new: Floats = y + h * solve(rate + h * drift)
-    return new
+    return y + h * solve(rate + h * drift)
 
 
 def rosenbrock2(problem: Problem, t: float, y: Floats, h: float) -> Floats:
@@ -114,8 +112,7 @@ def exponential(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     augmented[:size, size] = h * h * problem.drift(t, y)
     augmented[:size, size + 1] = h * problem.rate(t, y)
     augmented[size, size + 1] = 1.0
-    new: Floats = y + expm(augmented)[:size, size + 1]
-    return new
+    return y + expm(augmented)[:size, size + 1]
 
 
 def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1e-3, atol: float = 1e-5) -> Floats:

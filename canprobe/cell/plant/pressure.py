@@ -132,8 +132,7 @@ class PressureField:
             centre: (3,) of the probe, m.
             axes: (3, 3) rows: its x, y and z axes.
         """
-        places: Floats = centre + self.radius * self._directions.reshape(3, -1).T @ axes
-        return places
+        return centre + self.radius * self._directions.reshape(3, -1).T @ axes
 
     def mean_of(self, compression: Floats) -> Floats:
         """Taxel means of a compression given at all samples, as ``mean_pressure`` gives them.
@@ -195,8 +194,7 @@ class ListField:
 
     def points(self, centre: Floats, axes: Floats) -> Floats:
         """(n, 3) places of all samples on the undeformed probe, base frame."""
-        places: Floats = centre + self.radius * self._samples[:3].T @ axes
-        return places
+        return centre + self.radius * self._samples[:3].T @ axes
 
     def mean_of(self, compression: Floats) -> Floats:
         """Taxel means of a compression given at all samples."""

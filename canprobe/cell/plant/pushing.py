@@ -85,8 +85,7 @@ class HeldContact:
     def _pushed(self, velocity: Floats, force: Floats, drag: Floats) -> Floats:
         loads = velocity * -drag
         loads[0] = force
-        torque: Floats = loads.ravel() @ self._flat
-        return torque
+        return loads.ravel() @ self._flat
 
     def _moving(self, depth: Floats, rate: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Velocities (3, k); of each place elastic force, damped force, friction per slip, and the slip's square."""

@@ -26,7 +26,8 @@ from canprobe.cell.results.picture import (
     sheet,
 )
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.results.surface_figure import TWO_SIGMA, MapPlane, add_sheet, map_surface, true_surface
+from canprobe.cell.results.scores import TWO_SIGMA
+from canprobe.cell.results.surface_figure import MapPlane, add_sheet, map_surface, true_surface
 from canprobe.cell.rows import joint_positions
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord

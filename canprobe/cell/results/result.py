@@ -70,6 +70,11 @@ def write_page_of(folder: Path, setup: Setup) -> None:
     page.write_page(recorded.read_run(folder, setup), folder / "report.html", quiet)
 
 
+def has_display() -> bool:
+    """Whether a browser has a screen to open on."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def page_of(folder: Path, setup: Setup) -> Page:
     """The page of a run's folder, written where it is missing, and opened in a browser outside of a notebook.
 
@@ -80,7 +85,7 @@ def page_of(folder: Path, setup: Setup) -> Page:
     if not page.path.is_file():
         check_view()
         write_page_of(folder, setup)
-    if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if "ipykernel" not in sys.modules and has_display():
         webbrowser.open(page.path.resolve().as_uri())
     return page
 

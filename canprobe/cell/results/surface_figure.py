@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from canprobe.cell.results.picture import BLUE, FAINT, GREY, INK, ORANGE, Part, box, drawn_rows, legend, parts, picture
 from canprobe.cell.results.run_data import RunData
+from canprobe.cell.results.scores import TWO_SIGMA
 from canprobe.cell.tasks.probing import Phase
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.shapes import PlacedShape
@@ -55,13 +56,11 @@ class MapPlane(NamedTuple):
 
     def mm(self, points: Floats) -> Floats:
         """Points (..., 3) of base, m, as mm along, across, outward."""
-        result: Floats = (points - self.origin) @ self.axes.T * 1e3
-        return result
+        return (points - self.origin) @ self.axes.T * 1e3
 
     def base(self, mm: Floats) -> Floats:
         """Points (..., 3) in mm along, across, outward, as points of base, m."""
-        result: Floats = 1e-3 * mm @ self.axes + self.origin
-        return result
+        return 1e-3 * mm @ self.axes + self.origin
 
 
 def true_surface(shape: PlacedShape, path: Floats, plane: MapPlane) -> Floats:
@@ -137,7 +136,6 @@ def _scale(values: Floats, *, signed: bool) -> Normalize:
     return Normalize(-most if signed else 0.0, most)
 
 
-TWO_SIGMA = 1.96
 COMMON = (("lag", 1e6, "µm"), ("pad scale", 1e2, "%"), ("pad x", 1e6, "µm"), ("pad y", 1e6, "µm"))
 """Errors that a scan has in common, with their units."""
 

@@ -162,5 +162,4 @@ def behind_jump(truth: Mapping[str, Floats]) -> NDArray[np.bool_]:
     before = np.searchsorted(way, way - JUMP_WAY_M)
     jumps = np.linalg.norm(truth["kappa_per_m"] - truth["kappa_per_m"][before], axis=1) > JUMP_PER_M
     onset = jumps & ~np.concatenate(([False], jumps[:-1]))
-    behind: NDArray[np.bool_] = way - np.maximum.accumulate(np.where(onset, way, -np.inf)) < BEHIND_JUMP_M
-    return behind
+    return way - np.maximum.accumulate(np.where(onset, way, -np.inf)) < BEHIND_JUMP_M

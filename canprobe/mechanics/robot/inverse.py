@@ -328,5 +328,4 @@ def _regular_step(J: Floats, twist: Floats) -> Floats | None:
         return None
     if float(np.vdot(inverse, inverse)) * _DAMPING_THRESHOLD**2 >= 1.0:
         return None
-    step: Floats = inverse @ twist
-    return step
+    return inverse @ twist

@@ -310,5 +310,4 @@ def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, dir
 def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, direction: npt.ArrayLike) -> Floats:
     """(n,) motion of the tool along a direction by one unit of each drive, m; arguments as for `position_sigma`."""
     _, J = forward_jacobian(model.chain, q, T_flange_tool)
-    per_unit: Floats = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
-    return per_unit
+    return np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit

@@ -106,8 +106,7 @@ class ToolEstimate:
     @property
     def sigma(self) -> Floats:
         """Standard deviation of each coordinate (3,), m."""
-        sigma: Floats = np.sqrt(np.diag(self.covariance))
-        return sigma
+        return np.sqrt(np.diag(self.covariance))
 
 
 def calibrate_tool(touches: Sequence[BallTouch], model: BallModel) -> ToolEstimate:

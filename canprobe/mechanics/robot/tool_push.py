@@ -54,13 +54,11 @@ class PushGeometry:
     def per_newton(self, q: Floats) -> Floats:
         """Torques (n,) that a push of 1 N against the pole asks of the motors at joints (n,), rad or m."""
         T, J = forward_jacobian(self.model.chain, q, self._flange_tool)
-        asked: Floats = T[:3, 2] @ J[:3] @ self._per_motor
-        return asked
+        return T[:3, 2] @ J[:3] @ self._per_motor
 
     def motors(self, q: Floats) -> Floats:
         """Motor coordinates (n,) at joints (n,), up to their zeros."""
-        x: Floats = self.model.units_per_q @ q / units_per_motor(self.model)
-        return x
+        return self.model.units_per_q @ q / units_per_motor(self.model)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

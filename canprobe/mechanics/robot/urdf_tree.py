@@ -208,8 +208,7 @@ class UrdfTree:
         length = float(np.linalg.norm(axis))
         if length < 1e-6:
             raise self.wrong(edge.name, "an axis that is not zero", str(axis.tolist()))
-        unit: Floats = axis / length
-        return unit
+        return axis / length
 
     def body(self, edge: UrdfEdge, path: set[str], turned: Floats) -> Body | None:
         """Everything that a joint of the path carries up to the next one, branches included, in its turned frame."""
@@ -293,8 +292,7 @@ def _parsed(content: bytes) -> ElementTree.Element:
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
     parser.Parse(content, True)
-    root: ElementTree.Element = builder.close()
-    return root
+    return builder.close()
 
 
 def _is_xacro(element: ElementTree.Element) -> bool:

@@ -280,8 +280,7 @@ def _curved(triangles: Floats, normals: Floats, along: int, across: int) -> Floa
             on_sides += control / 6.0
     middle = 1.5 * on_sides - 0.5 * triangles.mean(axis=1)
     points += 6.0 * (share[0] * share[1] * share[2])[None, :, None] * middle[:, None]
-    flat: Floats = points.reshape(-1, 3)
-    return flat
+    return points.reshape(-1, 3)
 
 
 def _seen(samples: Floats, spacing: float) -> npt.NDArray[np.bool_]:
@@ -291,8 +290,7 @@ def _seen(samples: Floats, spacing: float) -> npt.NDArray[np.bool_]:
     cell = cell.reshape(-1)
     top = np.full(cell.max() + 1, -np.inf)
     np.maximum.at(top, cell, samples[:, 2])
-    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - HIDDEN_DEPTH_SPACINGS * spacing
-    return seen
+    return samples[:, 2] >= top[cell] - HIDDEN_DEPTH_SPACINGS * spacing
 
 
 def _covered(triangles: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:

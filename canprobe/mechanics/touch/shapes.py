@@ -273,8 +273,7 @@ class Bowl(RoundShape):
         inside = self.radius - np.hypot(out, zc)
         lip = np.hypot(out - self.radius - LIP_M, zc) - LIP_M
         above = np.where(out >= self.radius + LIP_M, zc - LIP_M, lip)
-        gaps: Floats = np.where(zc > 0.0, above, inside)
-        return gaps
+        return np.where(zc > 0.0, above, inside)
 
     def _tightest_anywhere(self) -> float:
         return self.radius

@@ -129,8 +129,7 @@ class SurfaceMatrix:
 
     def gradient(self, points: ArrayLike) -> Floats:
         """∇f = 2 (S X)₁..₃ at points (…, 3); points outward."""
-        result: Floats = 2.0 * (_places(points) @ self.S[:3, :3] + self.S[:3, 3])
-        return result
+        return 2.0 * (_places(points) @ self.S[:3, :3] + self.S[:3, 3])
 
     def normal(self, points: ArrayLike) -> Floats:
         """Outward unit normal (…, 3) at points (…, 3), of the level set through the point (12)."""

@@ -47,16 +47,7 @@ class Sensor:
         for number in range(33):
             assert self.bench.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
         for number, word in enumerate(words):
-            index = 0x1800 + number
-            for order in [
-                (index + 0x200, 0, 0, 1),
-                (index + 0x200, 1, word, 4),
-                (index + 0x200, 0, 1, 1),
-                (index, 2, 2, 1),
-                (index, 6, start, 1),
-                (index, 1, 0x511 + number, 4),
-            ]:
-                assert self.bench.write(*order) == 0, order
+            self.bench.configure(0x1800 + number, cob_id=0x511 + number, words=[word], type=2, start=start)
 
     def go(self, t_ns=0):
         self.bench.nmt(0x01, t_ns)
@@ -229,34 +220,6 @@ def test_sensor_64_tare_takes_the_mean_of_the_next_images(make, plant):
     assert (frame.taxels[3, 3], frame.taxels[4, 4], frame.taxels.sum()) == (18, 0, 18)
 
 
-@pytest.mark.parametrize("stored", [True, False])
-def test_sensor_64_tare_and_gain_survive_a_restart_when_stored(make, plant, stored):
-    plant.image = spot(3, 3, 30)
-    sensor = make(mode=TactileMode.IMAGE, tare_images=1).go()
-    sensor.bench.write(0x2002, 0, 2000, 2)
-    sensor.bench.write(0x2003, 0, TARE, 4)
-    sensor.frames(1)
-    if stored:
-        assert sensor.bench.write(0x1010, 1, 0x65766173, 4) == 0
-    sensor.bench.nmt(0x81)
-    assert sensor.bench.read(0x2002) == (2000 if stored else 1000)
-    for order in [(0x1019, 0, 240, 1), (0x2000, 0, 2, 1), (0x2001, 0, 0, 1)]:
-        sensor.bench.write(*order)
-    sensor.configure(TactileMode.IMAGE, 0)
-    plant.image = spot(3, 3, 50)
-    sensor.assembler.reset()
-    frame = sensor.go(t_ns=sensor.k * CYCLE).frames(1)[0]
-    assert frame.taxels[3, 3] == (40 if stored else 50)
-
-
-@pytest.mark.parametrize(("value", "flag"), [(254, 0), (255, 1)])
-def test_sensor_65_overload_is_flagged(make, plant, value, flag):
-    plant.image = spot(8, 8, value)
-    sensor = make().go()
-    assert sensor.frames(1)[0].header.overload == bool(flag)
-    assert sensor.bench.read(0x2005) == flag
-
-
 def test_sensor_features_by_hand(make, plant):
     plant.image = spot(4, 6, 100) + spot(6, 10, 100)
     features = make(mode=TactileMode.FEATURES).go().frames(1)[0].features
@@ -318,10 +281,7 @@ def map_window(sensor, words):
     for number in range(33):
         assert sensor.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
     for number, word in enumerate([0x21200040, *(0x21100040 | sub << 8 for sub in range(1, words + 1))]):
-        index = 0x1800 + number
-        orders = [(index + 0x200, 0, 0, 1), (index + 0x200, 1, word, 4), (index + 0x200, 0, 1, 1), (index, 2, 1, 1)]
-        for order in (*orders, (index, 1, 0x511 + number, 4)):
-            assert sensor.write(*order) == 0, order
+        sensor.configure(0x1800 + number, cob_id=0x511 + number, words=[word], type=1)
 
 
 @pytest.mark.parametrize("value, abort", [(3, 0x06090032), (13, 0x06090031), (5, 0x06090030), (11, 0x06090030)])

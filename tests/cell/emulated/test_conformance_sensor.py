@@ -38,9 +38,7 @@ class Reader:
         for number in range(33):
             sensor.set((0x1800 + number, 1, OFF | 0x511 + number, 4))
         for number, word in enumerate(words):
-            index = 0x1800 + number
-            sensor.set((index + 0x200, 0, 0, 1), (index + 0x200, 1, word, 4), (index + 0x200, 0, 1, 1))
-            sensor.set((index, 2, 2, 1), (index, 1, 0x511 + number, 4))
+            sensor.configure(0x1800 + number, cob_id=0x511 + number, words=[word], type=2)
         self.count = len(words)
         self.assembler = FrameAssembler(list(range(0x511, 0x511 + self.count)), mode, 10**12)
         sensor.nmt(0x01)

@@ -199,21 +199,6 @@ def test_a_joint_target_needs_an_arm():
         cell.run(lambda _: Command(q_target=np.zeros(6)))
 
 
-@pytest.mark.parametrize(
-    ("q_target", "says"),
-    [
-        (np.zeros((6, 1)), r"the controller's q_target has shape \(6, 1\): expected 6 finite angles, rad"),
-        ([0.0] * 5, r"the controller's q_target has shape \(5,\): expected 6 finite angles, rad"),
-        ([1j] * 6, r"the controller's q_target is .*1j.*: expected 6 angles, rad"),
-        ("home", r"the controller's q_target is 'home': expected 6 angles, rad"),
-        ([np.inf] * 6, r"the controller's q_target is \[inf .*: expected 6 finite angles, rad"),
-    ],
-)
-def test_a_joint_target_of_another_kind_stops_the_cell_and_is_named(free, q_target, says):
-    with canprobe.open_cell(free) as cell, pytest.raises(SafetyStop, match=says):
-        cell.run(lambda _: Command(q_target=q_target))
-
-
 @pytest.mark.filterwarnings("ignore:log. 3 values of column 'odd'")
 @pytest.mark.parametrize("odd", [[1.0, [2.0, 3.0]], "text", 1j])
 def test_a_column_that_is_no_number_costs_only_itself(free, tmp_path, odd):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import signal
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import chain, count, repeat
 from pathlib import Path
@@ -11,6 +13,8 @@ from struct import pack, unpack
 
 import numpy as np
 import pytest
+from cut_port import CutPort
+from full_disk import room_for
 from injected import FREE_CYCLE, HOLD_CYCLE, SCAN_CYCLE, Injected, altered, send
 
 import canprobe
@@ -23,31 +27,93 @@ from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
+from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtCommand, NmtState, pack_nmt
 
+# what ends a run with one cause and one answer
+
+
+def thrown(text):
+    return lambda run: run.inject(text)
+
+
+def says(node_id, can_id, change=lambda _: None):
+    """A node sends an identifier with other data, or no more."""
+    return lambda run: altered(run.nodes[node_id], can_id, change)
+
+
+def sends(can_id, data):
+    return lambda run: send(run, (can_id, data))
+
+
+def in_state(state):
+    def change(run):
+        run.session.cell.port.state = state
+
+    return change
+
+
+def raising(error):
+    def raise_it(run):
+        raise error
+
+    return raise_it
+
+
+def vanish(run):
+    run.session.buses.world.plant.place(None)
+
+
+def moved(data, counts):
+    return data[:2] + pack("<i", unpack("<i", data[2:6])[0] + counts) + data[6:]
+
+
+PASSIVE = in_state(ControllerState.PASSIVE)
+FOREIGN = "another master is on the bus: an NMT command from another master"
+NO_STATE = "node 3: (joint 3) left operation enabled: in no CiA 402 state (statusword 0x0601)"
+UNHEARD = "lost: no usable TPDO for 6 cycles"
+
+
+@pytest.mark.parametrize(
+    ("key", "scene", "action", "told", "error", "more"),
+    [
+        ("heartbeat", "free", thrown("node 3: heartbeat-off"), "node 3: lost: no heartbeat", NodeError, {}),
+        ("nmt_state", "free", thrown("node 2: reboot for 1 ms"), "node 2: left operation: NMT state", NodeError, {}),
+        ("drive_fault", "free", thrown("node 2: drive-fault"), "4310h", NodeError, {}),
+        ("drive_fault", "free", says(3, 0x183, lambda d: b"\x01\x06" + d[2:]), NO_STATE, NodeError, {}),
+        ("foreign_master", "free", sends(SYNC_ID, b""), "another master is on the bus", SafetyStop, {}),
+        *(
+            ("foreign_master", "free", sends(*pack_nmt(*command)), FOREIGN, SafetyStop, {})
+            for command in ((NmtCommand.STOP, 0), (NmtCommand.PRE_OPERATIONAL, 3), (NmtCommand.RESET_NODE, 0))
+        ),
+        ("drive_silent", "free", says(5, 0x185), f"node 5: {UNHEARD}", NodeError, {}),
+        ("drive_silent", "free", says(2, 0x182, lambda d: moved(d, 2000)), f"node 2: {UNHEARD}", NodeError, {}),
+        ("sensor_stale", "press", says(16, 0x511), "no tactile frame for 7 cycles", SafetyStop, {}),
+        ("error_passive_long", "press", PASSIVE, "error-passive for 1.0 s", CanprobeError, {"until": 1500}),
+        ("bus_off", "free", in_state(ControllerState.BUS_OFF), "bus-off", InterfaceError, {}),
+        ("force_fell", "press", vanish, "the measured force fell from", SafetyStop, {}),
+        ("force_fell", "cylinder", vanish, "or the object was taken away", SafetyStop, {"task": {"regain_mm": 0.0}}),
+        ("interrupt", "free", raising(KeyboardInterrupt), "", KeyboardInterrupt, {}),
+        ("interrupt", "free", raising(ZeroDivisionError), "", ZeroDivisionError, {}),
+    ],
+)
+def test_a_cause_is_answered_within_its_time_and_told(key, scene, action, told, error, more):  # noqa: PLR0917
+    run = Injected(scene, {"free": FREE_CYCLE, "press": HOLD_CYCLE, "cylinder": SCAN_CYCLE}[scene], action, **more)
+    run.assert_within(key).assert_drives_off()
+    assert isinstance(run.error, error) and told in str(run.error)
+    assert told not in (FOREIGN, NO_STATE) or str(run.error) == told
+    if told == NO_STATE:
+        assert run.session.cell.notes.lines() == ["while stopping: node 3 did not confirm that it is disabled"]
+    if scene == "press":
+        assert run.session.buses.truth["force_n"][-1] == 0.0
+    else:
+        assert np.abs(np.diff(run.session.buses.truth["q_rad"], axis=0)).max() < 0.01, "no joint jumps"
+
+
 # nodes
-
-
-def test_heartbeat_lost():
-    run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 3: heartbeat-off"))
-    run.assert_within("heartbeat").assert_drives_off()
-    assert isinstance(run.error, NodeError) and run.error.node_id == 3 and "heartbeat" in str(run.error)
-
-
-def test_a_node_that_boots_again():
-    run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 2: reboot for 1 ms"))
-    run.assert_within("nmt_state").assert_drives_off()
-    assert isinstance(run.error, NodeError) and run.error.node_id == 2
-    assert "INITIALISING" in str(run.error) or "PRE_OPERATIONAL" in str(run.error)
-
-
-def test_a_drive_fault():
-    run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 2: drive-fault"))
-    run.assert_within("drive_fault").assert_drives_off()
-    assert run.error.node_id == 2 and "4310h" in str(run.error)
 
 
 def test_an_emcy_of_the_sensor():
@@ -69,21 +135,6 @@ def test_an_emcy_about_communication_is_noted():
     assert run.session.cell.notes.lines() == [told]
 
 
-def test_another_master():
-    run = Injected("free", FREE_CYCLE, lambda r: send(r, (SYNC_ID, b"")))
-    run.assert_within("foreign_master")
-    assert isinstance(run.error, SafetyStop) and "another master" in str(run.error)
-
-
-@pytest.mark.parametrize(
-    ("command", "node_id"), [(NmtCommand.STOP, 0), (NmtCommand.PRE_OPERATIONAL, 3), (NmtCommand.RESET_NODE, 0)]
-)
-def test_another_master_is_named_by_what_it_sent_and_not_by_what_the_nodes_made_of_it(command, node_id):
-    run = Injected("free", FREE_CYCLE, lambda r: send(r, pack_nmt(command, node_id)))
-    run.assert_within("foreign_master")
-    assert str(run.error) == "another master is on the bus: an NMT command from another master"
-
-
 @pytest.mark.parametrize("step", ["identify", "start all", "enable"])
 def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_enabled(step):
     said = []
@@ -101,52 +152,42 @@ def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_e
         assert DriveState.OPERATION_ENABLED not in map(state_of, map(int, row))
 
 
-@pytest.mark.parametrize("what", ["bus-off", "EMCY 4210h"])
-def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
-    def say(text):
-        if text != "enable the drives":
-            return
-        if what == "bus-off":
-            session.cell.port.state = ControllerState.BUS_OFF
-        else:
-            session.buses.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
-
-    session = Session(canprobe.load_scene("free"), RunOptions(say=say))
-    with pytest.raises(CanprobeError, match=what), session:
-        session.run(lambda _: Command(done=True))
-    words = session.cell.log.arrays()["statusword"]
-    assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
-
-
 def not_enabled(told, *changes):
-    """Ends so where nodes send other data from `enable the drives` on, by (node id, COB-ID, change)."""
+    """Ends so where something is done to the session from `enable the drives` on."""
 
     def say(text):
         if text == "enable the drives":
-            for node_id, cob_id, change in changes:
-                altered(participants[node_id - 1], cob_id, change)
+            for change in changes:
+                change(session)
 
     session = Session(canprobe.load_scene("free"), RunOptions(say=say))
-    participants = session.buses.world.make_faulty().nodes
+    session.buses.world.make_faulty()
     with pytest.raises(CanprobeError, match=told), session:
         session.run(lambda _: Command(done=True))
     words = session.cell.log.arrays()["statusword"]
     assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
 
 
-def moved(data, counts):
-    return data[:2] + pack("<i", unpack("<i", data[2:6])[0] + counts) + data[6:]
+def from_node(node_id, cob_id, change):
+    """A node sends other data."""
+    return lambda session: altered(session.buses.world.participants[node_id - 1], cob_id, change)
+
+
+def test_bus_off_and_an_emergency_while_the_drives_are_being_enabled_end_that():
+    not_enabled("bus-off", lambda session: setattr(session.cell.port, "state", ControllerState.BUS_OFF))
+    alarm = EMCY_BASE + 4, Emcy(0x4210, 1).pack()
+    not_enabled("EMCY 4210h", lambda session: session.buses.lockstep.port().send_batch([alarm]))
 
 
 def test_an_arm_that_does_not_stand_still_is_not_enabled():
     way = count(0, 20)
-    not_enabled("node 2: reports no position that stays for 2 s", (2, 0x182, lambda d: moved(d, next(way))))
+    not_enabled("node 2: reports no position that stays for 2 s", from_node(2, 0x182, lambda d: moved(d, next(way))))
 
 
 def test_a_jump_while_the_drives_are_being_enabled_ends_that():
     ready = DriveState.READY_TO_SWITCH_ON
     change = lambda d: moved(d, 20_000) if state_of(unpack("<H", d[:2])[0]) is ready else d  # noqa: E731
-    not_enabled("joint 2 reports a motion of", (2, 0x182, change))
+    not_enabled("joint 2 reports a motion of", from_node(2, 0x182, change))
 
 
 def test_a_heartbeat_that_is_lost_before_the_drives_are_enabled_ends_that():
@@ -154,8 +195,8 @@ def test_a_heartbeat_that_is_lost_before_the_drives_are_enabled_ends_that():
     way = chain(range(0, 3000, 20), repeat(3000))
     not_enabled(
         "node 3: lost: no heartbeat",
-        (2, 0x182, lambda d: moved(d, next(way))),
-        (3, HEARTBEAT_BASE + 3, lambda _: None),
+        from_node(2, 0x182, lambda d: moved(d, next(way))),
+        from_node(3, HEARTBEAT_BASE + 3, lambda _: None),
     )
 
 
@@ -205,28 +246,13 @@ def test_missed_pdos_are_lived_with(fault):
         assert run.session.cell.drives.malformed > 0
 
 
-def test_a_silent_drive():
-    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[5], 0x185, lambda _: None))
-    run.assert_within("drive_silent").assert_drives_off()
-    assert "node 5: lost: no usable TPDO for 6 cycles" in str(run.error)
-
-
-def test_tactile_frames_that_are_corrupt_are_dropped():
-    run = Injected("press", HOLD_CYCLE, lambda r: r.inject("node 16: corrupt for 15 ms"), until=40)
-    run.assert_counted("torn_frame")
-
-
-def test_a_frame_that_names_another_sync():
-    run = Injected("press", HOLD_CYCLE, lambda r: r.inject("node 16: wrong-data seed=4 for 15 ms"), until=40)
-    run.assert_counted("sync_mismatch")
+@pytest.mark.parametrize(
+    ("fault", "key"), [("corrupt for 15 ms", "torn_frame"), ("wrong-data seed=4 for 15 ms", "sync_mismatch")]
+)
+def test_a_wrong_frame_of_the_array_is_not_used(fault, key):
+    run = Injected("press", HOLD_CYCLE, lambda r: r.inject(f"node 16: {fault}"), until=40)
+    run.assert_counted(key)
     assert run.session.buses.truth["force_n"].max() < 3.0
-
-
-def test_a_stale_sensor_makes_the_probe_retreat():
-    run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[16], 0x511, lambda _: None))
-    run.assert_within("sensor_stale").assert_drives_off()
-    assert "no tactile frame for 7 cycles" in str(run.error)
-    assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
 def test_a_drive_that_is_late_makes_all_of_them_hold():
@@ -244,7 +270,7 @@ def test_a_drive_that_is_late_makes_all_of_them_hold():
 
 def test_a_wrong_position_is_not_believed():
     def lie(run):
-        run.lie = altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 60) + d[6:])
+        run.lie = altered(run.nodes[2], 0x182, lambda d: moved(d, 60))
 
     class Liar(Injected):
         def after(self, measurement):
@@ -285,12 +311,8 @@ class Passive(Injected):
             self.session.cell.port.state = ControllerState.ACTIVE
 
 
-def passive(run):
-    run.session.cell.port.state = ControllerState.PASSIVE
-
-
 def test_error_passive_holds_until_it_is_over():
-    run = Passive("free", FREE_CYCLE, passive, until=100)
+    run = Passive("free", FREE_CYCLE, PASSIVE, until=100)
     assert run.error is None
     targets = run.session.cell.log.arrays()["q_target_rad"]
     stands = (np.diff(targets, axis=0) == 0.0).all(axis=1)
@@ -299,61 +321,17 @@ def test_error_passive_holds_until_it_is_over():
     assert any("error-passive: hold" in fault for fault in run.session.cell.notes.lines())
 
 
-def test_error_passive_for_long_makes_the_probe_retreat():
-    run = Injected("press", HOLD_CYCLE, passive, until=1500)
-    assert "error-passive for 1.0 s" in str(run.error)
-    run.assert_within("error_passive_long")
-    assert run.session.buses.truth["force_n"][-1] == 0.0
-
-
-def test_bus_off():
-    def off(run):
-        run.session.cell.port.state = ControllerState.BUS_OFF
-
-    run = Injected("free", FREE_CYCLE, off)
-    run.assert_within("bus_off").assert_drives_off()
-    assert isinstance(run.error, InterfaceError) and "bus-off" in str(run.error)
-
-
-@pytest.mark.parametrize("back_after_ns", [None, 100_000_000])
+@pytest.mark.parametrize("back_after_ns", [math.inf, 100_000_000])
 def test_the_interface_is_removed_and_the_drives_stop_by_themselves(back_after_ns):
     def remove(run):
-        port = run.session.cell.port
-        bus, counters = run.session.buses.lockstep, port.counters
-        gone_ns = run.now()
-
-        class Gone:
-            stamps_arrival, clock, channel, state = True, bus.clock, bus.channel, ControllerState.ACTIVE
-
-            def __init__(self):
-                self.counters = counters
-
-            def check(self):
-                if back_after_ns is None or bus.clock.now_ns() < gone_ns + back_after_ns:
-                    raise InterfaceError("can0: interface lost: Network is down")
-
-            def send_batch(self, frames, t_ns=None):
-                self.check()
-                port.send_batch(frames)
-
-            def drain(self):
-                self.check()
-                return port.drain()
-
-            def wait(self, until_ns):
-                self.check()
-                port.wait(until_ns)
-
-            def close(self):
-                port.close()
-
-        cell = run.session.cell
-        cell.port = cell.cycles.port = cell.cycle._port = cell._network.port = Gone()
+        cell, gone_ns = run.session.cell, run.now()
+        gone = CutPort(cell.port, gone_ns, gone_ns + back_after_ns)
+        cell.port = cell.cycles.port = cell.cycle._port = cell._network.port = gone
 
     run = Injected("free", FREE_CYCLE, remove)
     run.assert_within("interface").assert_drives_off()
-    assert isinstance(run.error, InterfaceError) and "interface lost" in str(run.error)
-    assert any("while stopping" in fault for fault in run.session.cell.notes.lines()) is (back_after_ns is None)
+    assert isinstance(run.error, InterfaceError) and "it is gone" in str(run.error)
+    assert any("while stopping" in fault for fault in run.session.cell.notes.lines()) is (back_after_ns == math.inf)
 
 
 # time
@@ -392,17 +370,6 @@ def test_force_above_the_limit_makes_the_probe_retreat():
     assert run.session.buses.truth["force_n"][-1] == 0.0
 
 
-def vanish(run):
-    plant = run.session.buses.world.plant
-    plant.place(None)
-
-
-def test_contact_lost_makes_the_probe_retreat():
-    run = Injected("press", HOLD_CYCLE, vanish)
-    run.assert_within("force_fell")
-    assert "the measured force fell from" in str(run.error)
-
-
 def test_contact_lost_in_a_scan_makes_it_search_and_then_retreat():
     """The object sinks faster than the probe follows; it retreats when it has searched as far as it may."""
 
@@ -423,12 +390,6 @@ def test_contact_lost_in_a_scan_makes_it_search_and_then_retreat():
     assert 0 <= run.answered_ns - run.gone_ns <= limit
     assert str(run.error) == "contact lost, and not found again within 1.0 mm"
     run.assert_drives_off()
-
-
-def test_contact_lost_in_a_scan_that_must_not_search():
-    run = Injected("cylinder", SCAN_CYCLE, vanish, task={"regain_mm": 0.0})
-    run.assert_within("force_fell")
-    assert "or the object was taken away" in str(run.error)
 
 
 def test_a_saturated_array_makes_the_probe_retreat():
@@ -501,14 +462,6 @@ def test_the_workspace_ends_an_own_controllers_motion():
     run.assert_drives_off()
 
 
-def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stopped_in_order():
-    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[3], 0x183, lambda d: b"\x01\x06" + d[2:]))
-    run.assert_within("drive_fault").assert_drives_off()
-    told = "node 3: (joint 3) left operation enabled: in no CiA 402 state (statusword 0x0601)"
-    assert str(run.error) == told
-    assert run.session.cell.notes.lines() == ["while stopping: node 3 did not confirm that it is disabled"]
-
-
 def test_a_drive_that_is_never_in_a_state_is_not_enabled():
     session = Session(canprobe.load_scene("free"))
     altered(session.buses.world.make_faulty().nodes[2], 0x183, lambda d: b"\x01\x06" + d[2:])
@@ -516,14 +469,6 @@ def test_a_drive_that_is_never_in_a_state_is_not_enabled():
     with pytest.raises(NodeError, match=told), session:
         session.run(lambda _: Command())
     assert {node.state for node in session.buses.world.nodes} == {NmtState.PRE_OPERATIONAL}
-
-
-def test_a_drive_that_keeps_telling_a_wrong_position_is_lost():
-    change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
-    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
-    run.assert_within("drive_silent").assert_drives_off()
-    assert "node 2: lost: no usable TPDO for 6 cycles" in str(run.error)
-    assert np.abs(np.diff(run.session.buses.truth["q_rad"], axis=0)).max() < 0.01
 
 
 def test_a_measured_jump_that_no_joint_can_make():
@@ -535,8 +480,7 @@ def test_a_measured_jump_that_no_joint_can_make():
             for track in self.session.cell.drives.tracks:
                 track._asked = 1e9
 
-    change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
-    run = Unguarded("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
+    run = Unguarded("free", FREE_CYCLE, says(2, 0x182, lambda d: moved(d, 2000)))
     run.assert_within("joint_speed").assert_drives_off()
     assert "joint 2 reports a motion of" in str(run.error)
 
@@ -563,16 +507,6 @@ def test_an_estimator_that_diverges_starts_afresh():
 
 
 # outside
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
-def test_an_interrupt_or_an_exception(error):
-    def raise_it(run):
-        raise error
-
-    run = Injected("free", FREE_CYCLE, raise_it)
-    run.assert_within("interrupt").assert_drives_off()
-    assert isinstance(run.error, error)
 
 
 @pytest.mark.parametrize(("hung_ns", "waits"), [(20_000_000, True), (1_100_000_000, False)])
@@ -613,55 +547,14 @@ def test_a_full_disk(tmp_path):
             self.session.options = replace(self.session.options, out=tmp_path)
             super()._run()
 
-    def fill(run):
-        log = run.session.record._candump
-
-        class Full:
-            closed = False
-
-            def __init__(self, file):
-                self.file, self.room = file, 3000
-
-            def write(self, data):
-                import errno
-
-                if self.room <= 0:
-                    raise OSError(errno.ENOSPC, "No space left on device")
-                part = data[: self.room]
-                self.room -= len(part)
-                return self.file.write(part)
-
-            def truncate(self, size):
-                return self.file.truncate(size)
-
-            def close(self):
-                self.file.close()
-
-        log.flush()
-        log._file = Full(log._file)
-
-        def flushed_each_time(write=log.write):
-            def written(can_id, data, t_ns):
-                write(can_id, data, t_ns)
-                log.flush()
-
-            return written
-
-        run.session.buses.lockstep.recorder = flushed_each_time()
-
-    run = OnDisk("press", HOLD_CYCLE, fill)
-    assert str(run.error) == f"{tmp_path}/bus.log: cannot be written: No space left on device"
+    log = tmp_path / "bus.log"
+    with ExitStack() as stack:
+        run = OnDisk("press", HOLD_CYCLE, lambda _: stack.enter_context(room_for(log.stat().st_size + 3000)))
+    assert str(run.error) == f"{log}: cannot be written: File too large"
     assert isinstance(run.error, ResultsError)  # after the task has let go
     run.assert_drives_off()
-    assert run.session.buses.truth["force_n"][-1] == 0.0
-    text = (tmp_path / "bus.log").read_text()
-    assert text.endswith("\n") and len(list(canprobe_lines(tmp_path / "bus.log"))) > 1000
-
-
-def canprobe_lines(path):
-    from canprobe.fieldbus.bus.candump import read_candump
-
-    return read_candump(path)
+    assert run.session.buses.truth["force_n"][run.at] > 1.8 and run.session.buses.truth["force_n"][-1] == 0.0
+    assert log.read_text().endswith("\n") and len(list(read_candump(log))) > 1000
 
 
 def test_every_row_is_tested_here():
@@ -674,24 +567,16 @@ def test_every_row_is_tested_here():
         "test_blind_array.py",
     ):
         source += Path(__file__).with_name(name).read_text(encoding="utf-8")
-    special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
-    special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
-    special |= {key: f'BY_KEY["{key}"]' for key in ("contact_not_regained", "force_hidden")}
-    special |= {
-        "master_dead": 'BY_KEY["master_dead"]',
-        "following": '"following"',
+    special = {
+        "error_passive": "error-passive: hold",
+        "force": 'BY_KEY["force"]',
         "image_dead": "node 16: stuck-image",
         "depth": "node 16: replayed-image",
         "push_unfelt": "torques of the drives show a push of",
         "contact_lost": "contact lost, and not found again",
         "contact_to_regain": "losses[0].searched",
         "log": "test_a_full_disk",
-        "preload": 'BY_KEY["preload"]',
-        "off_pad": 'BY_KEY["off_pad"]',
-        "silent_taxels": 'BY_KEY["silent_taxels"]',
-        "taxels_hidden": 'BY_KEY["taxels_hidden"]',
-        "drive_late": 'BY_KEY["drive_late"]',
     }
     for condition in CONDITIONS:
-        assert special.get(condition.key, f'("{condition.key}")') in source, condition.key
+        assert special.get(condition.key, f'"{condition.key}"') in source, condition.key
     assert {c.reaction for c in CONDITIONS} == set(Reaction)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cut_port import CutPort
 from undrawn import undrawn_run
 
 import canprobe
@@ -119,39 +120,13 @@ def test_each_bus_is_measured_against_its_own_part_of_the_plan(pressed):
     assert set(result.summary["traffic"]) == {"can0", "can1"}
 
 
-class Cut:
-    """A port whose interface is gone from a moment on."""
-
-    def __init__(self, port, lost_ns):
-        self._port, self._lost_ns = port, lost_ns
-
-    def __getattr__(self, name):
-        return getattr(self._port, name)
-
-    def _check(self):
-        if self._port.clock.now_ns() >= self._lost_ns:
-            raise InterfaceError(f"{self._port.channel}: it is gone")
-
-    def send_batch(self, frames, t_ns=None):
-        self._check()
-        self._port.send_batch(frames, t_ns)
-
-    def drain(self):
-        self._check()
-        return self._port.drain()
-
-    def wait(self, until_ns):
-        self._check()
-        self._port.wait(until_ns)
-
-
 def cut_session(scene, channel, lost_ns):
     """A session that loses one of its buses."""
     session = Session(scene)
     joined = session.buses._joined
 
     def cut(ports):
-        return joined({**ports, channel: Cut(ports[channel], lost_ns)})
+        return joined({**ports, channel: CutPort(ports[channel], lost_ns)})
 
     session.buses._joined = cut
     return session
@@ -196,7 +171,7 @@ def test_a_bus_that_is_lost_is_told_once_and_the_others_go_on():
     buses = {name: LockstepBus(clock, name) for name in ("a", "b")}
     for bus in buses.values():
         bus.attach(Answering(1_000_000))
-    ports = {"a": Cut(buses["a"].port(), 10_000_000), "b": buses["b"].port()}
+    ports = {"a": CutPort(buses["a"].port(), 10_000_000), "b": buses["b"].port()}
     joined = JoinedPort(ports, {})
     clock.sleep_until_ns(10_000_000)
     with pytest.raises(InterfaceError, match="a: it is gone"):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import ELBOW_FORM, UPENN
 
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement
@@ -214,11 +214,40 @@ def test_before_a_position_is_known_no_target_is_too_far(guard):
         (np.zeros((6, 1)), "has shape (6, 1): expected 6 finite"),
         (np.array([0, np.nan, 0, 0, 0, 0]), "nan"),
         ([0, 0, np.inf, 0, 0, 0], "inf"),
+        ("home", "is 'home': expected 6 angles, rad"),
+        ([1j] * 6, "expected 6 angles"),
+        *((one, "expected 6") for one in (np.ma.masked_all(6), np.zeros(6, dtype=bool), ["0"] * 6, [None] * 6, None)),
+        ([[0.0], [0.0, 0.0]], "expected 6"),
     ],
 )
-def test_a_target_of_another_shape_or_without_numbers_is_named(guard, given, told):
+def test_a_target_of_another_shape_or_without_numbers_is_named_and_never_sent(guard, given, told):
     found = guard.command(given, at(ELBOW_FORM, 0))
     assert found.q is None and told in found.limit
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_target_may_come_as_near_to_a_stop_as_the_margin(plan, guard, axis):
+    margin = np.radians(plan.scene.limits.joint_margin_deg)
+    assert margin > 0
+    for border, inward in ((UPENN.q_min, 1.0), (UPENN.q_max, -1.0)):
+        q = (UPENN.q_min + UPENN.q_max) / 2
+        q[axis] = border[axis] + inward * (margin + 1e-6)
+        assert guard.command(q, at(q, 0)).q is not None
+        q[axis] -= 2e-6 * inward
+        answer = guard.command(q, at(q, 1))
+        assert answer.q is None and answer.limit.startswith(f"joint {axis + 1} at ")
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_measured_motion_of_three_halves_of_the_speed_in_two_periods_is_the_most(plan, axis):
+    """A cycle's SYNC may come a period late, so two periods may have passed; two counts are the encoder's own."""
+    for share, believed in ((0.999, True), (-0.999, True), (1.001, False), (-1.001, False)):
+        guard = JointGuard(plan)
+        most = 1.5 * limit_of(plan)[axis] * 2 + 2 * guard.count[axis]
+        assert guard.measure(at(np.zeros(6), 0)) is None
+        told = guard.measure(at(share * most * np.eye(6)[axis], 1))
+        assert (told is None) is believed
+        assert believed or told.startswith(f"joint {axis + 1} reports a motion of {np.degrees(most):.1f} deg")
 
 
 def test_a_list_of_numbers_is_a_target_and_the_first_joint_beyond_is_named(guard):

@@ -353,22 +353,6 @@ class TestOtherDevices:
         problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
         assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
 
-    def test_fixed_mapping_is_used_where_it_is_the_right_one(self, edit):
-        assert canprobe.plan(edit((r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro")))
-
-    @pytest.mark.parametrize("fixed", [(0,), (0, 1, 2, 3)])
-    def test_fixed_mapping_that_is_another_is_refused_unless_another_pdo_does(self, edit, fixed):
-        scene = edit(
-            *((rf"(\[160{n}sub0\][^\[]*AccessType=)rw", r"\1ro") for n in fixed),
-            (r"(\[1600sub2\][^\[]*DefaultValue=)\w+", r"\g<1>0x60FF0020"),
-        )
-        if len(fixed) < 4:
-            assert canprobe.plan(scene).pdos_of(1, "rpdo")[0].number == 2
-            return
-        (problem,) = reasons(scene)
-        assert problem.startswith("nodes 1, 2, 3, 4, 5, 6: ")
-        assert "RPDO1 has the fixed mapping 60400010h, 60FF0020h" in problem
-
     def test_missing_objects_are_named(self, edit):
         no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
         problems = reasons(edit(*no_60c2, (r"\[1006\]", "[5FFE]"), (r"=0x1006", "=0x5FFE")))

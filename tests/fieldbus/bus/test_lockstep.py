@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import pytest
+import timed_buses
 from hypothesis import given
 from hypothesis import strategies as st
 from timed_buses import Scripted
@@ -16,13 +18,7 @@ from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 MS = 1_000_000
 
 
-def make_bus(*participants: Scripted, **options: int) -> tuple[LockstepBus, list[tuple[int, bytes, int]]]:
-    bus = LockstepBus(VirtualClock(), "can7", **options)
-    seen: list[tuple[int, bytes, int]] = []
-    bus.recorder = lambda *frame: seen.append(frame)
-    for participant in participants:
-        bus.attach(participant)
-    return bus, seen
+make_bus = partial(timed_buses.make_bus, kind=LockstepBus)
 
 
 def test_lowest_identifier_wins_among_the_heads_of_the_queues() -> None:

@@ -227,7 +227,9 @@ def test_cia402_56_bit_12_drive_follows(drive, plant):
     assert not drive.read(0x6041) & 1 << 12
 
 
-@pytest.mark.parametrize(("target", "reached", "limited"), [(900, 900, 0), (1100, 1000, 1), (-1100, -500, 1)])
+@pytest.mark.parametrize(
+    ("target", "reached", "limited"), [(900, 900, 0), (1100, 1000, 1), (-1100, -500, 1), (1000, 1000, 0)]
+)
 def test_cia402_57_software_limits(drive, target, reached, limited):
     drive.set((0x607D, 1, -500, 4), (0x607D, 2, 1000, 4), (0x6065, 0, 0xFFFFFFFF, 4))
     master = Master(drive).enable()

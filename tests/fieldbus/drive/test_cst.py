@@ -36,11 +36,7 @@ def integrate(torques, step_s=2.5e-3, parts=100):
 @pytest.fixture
 def cst(rig):
     """Operational, RPDO1 = controlword + target torque."""
-    for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), ("_1600_2", 0x60710010), ("_1600_0", 2)):
-        rig.put(**{name: value})
-    rig.put(_1400_1=0x201).enable(10)
-    rig.drive.nmt(0x01)
-    return rig
+    return rig.at_work(10, 0x60710010)
 
 
 def order(torque, word=0x0F):

@@ -10,11 +10,7 @@ from canprobe.fieldbus.protocol.cia402 import DriveState as S
 @pytest.fixture
 def csv(rig):
     """Operational, RPDO1 = controlword + target velocity."""
-    for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), ("_1600_2", 0x60FF0020), ("_1600_0", 2)):
-        rig.put(**{name: value})
-    rig.put(_1400_1=0x201).enable(9)
-    rig.drive.nmt(0x01)
-    return rig
+    return rig.at_work(9, 0x60FF0020)
 
 
 def order(velocity, word=0x0F):
@@ -106,14 +102,3 @@ def test_cia402_60_halt_in_csv_is_released_into_the_present_target(csv):
     csv.cycles(4, rpdo=order(10_000))
     assert csv.bits(10, 12) == (0, 1)
     assert csv.signed(0x606C) == 10_000
-
-
-def test_cia402_58_bit_11_when_the_motion_takes_more_than_6072h(csv, plant):
-    plant.torque = -301
-    csv.cycles(3, rpdo=order(100))
-    assert csv.bits(11) == (0,)
-    csv.put(_6072=300).cycles(1, rpdo=order(100))
-    assert csv.bits(11) == (1,)
-    plant.torque = 299
-    csv.cycles(1, rpdo=order(100))
-    assert csv.bits(11) == (0,)

@@ -4,17 +4,8 @@ CSP, CSV, CST = 8, 9, 10
 HOLD = "0f0000000000"
 
 
-def at_work(rig, mode, *words):
-    """Operational, RPDO1 = controlword + the mode's target + what else is mapped."""
-    mapped = [(f"_1600_{sub}", word) for sub, word in enumerate(words, start=2)]
-    for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), *mapped, ("_1600_0", 1 + len(words))):
-        rig.put(**{name: value})
-    rig.put(_1400_1=0x201).enable(mode).drive.nmt(0x01)
-    return rig
-
-
 def test_position_mode_feeds_both_forward_and_takes_them_back(rig, plant):
-    at_work(rig, CSP, 0x607A0020).put(_6072=800, _60B1=1500, _60B2=120).cycles(3, HOLD)
+    rig.at_work(CSP, 0x607A0020).put(_6072=800, _60B1=1500, _60B2=120).cycles(3, HOLD)
     assert plant.loops[-1] == (0, 800, 1500.0, 120.0)
     told = len(plant.loops)
     rig.cycles(5, HOLD)
@@ -24,7 +15,7 @@ def test_position_mode_feeds_both_forward_and_takes_them_back(rig, plant):
 
 
 def test_position_mode_feeds_what_an_rpdo_brings(rig, plant):
-    at_work(rig, CSP, 0x607A0020, 0x60B20010)
+    rig.at_work(CSP, 0x607A0020, 0x60B20010)
     for torque in (120, 120, -40):
         rig.cycles(2, HOLD + torque.to_bytes(2, "little", signed=True).hex())
     rig.cycles(1)
@@ -37,14 +28,14 @@ def test_position_mode_feeds_what_an_rpdo_brings(rig, plant):
 
 
 def test_velocity_mode_feeds_torque_only(rig, plant):
-    at_work(rig, CSV, 0x60FF0020).put(_60B1=1500, _60B2=120).cycles(3, HOLD)
+    rig.at_work(CSV, 0x60FF0020).put(_60B1=1500, _60B2=120).cycles(3, HOLD)
     assert plant.loops == [(0, 2000, 0.0, 120.0)]
     rig.word(0x07)
     assert plant.loops[-1][2:] == (0.0, 0.0)
 
 
 def test_torque_mode_feeds_nothing(rig, plant):
-    at_work(rig, CST, 0x60710010).put(_60B1=1500, _60B2=120).cycles(3, "0f000000")
+    rig.at_work(CST, 0x60710010).put(_60B1=1500, _60B2=120).cycles(3, "0f000000")
     assert plant.loops == []
 
 

@@ -81,33 +81,6 @@ def test_every_make_answers_for_all_its_objects(serve, make):
             assert served.bench.refusal(index, sub) == 0x06020000
 
 
-@pytest.mark.parametrize("make", [*sorted(set(MAKES) - {"interpolated", "no_cyclic_mode"})])
-def test_every_make_follows_targets_with_the_objects_that_it_has(serve, make):
-    served = serve(make)
-    served.cycle()
-    served.enable(8)
-    for target in (100, 200, 300, 300, 300):
-        assert served.wish(0x607A, 0, target) == 0
-        frames = served.sync()
-        assert all(can_id != EMERGENCY for can_id, _ in frames), frames
-    assert served.rig.counts == 300
-    assert served.rig.signed(0x6064) == 300
-
-
-@pytest.mark.parametrize("make", ["interpolated", "prbt_joint"])
-def test_interpolating_makes_follow_data_records(serve, make):
-    served = serve(make)
-    assert served.wish(0x60C2, 1, 10) == 0
-    assert served.wish(0x6060, 0, 8) == 0x06090030
-    served.enable(7)
-    assert served.wish(0x60C1, 1, 0) == 0
-    assert served.wish(0x6040, 0, 0x1F) == 0
-    for target in (100, 200, 300, 300, 300):
-        assert served.wish(0x60C1, 1, target) == 0
-        served.sync()
-    assert served.rig.counts == 300
-
-
 @pytest.mark.parametrize(
     ("make", "modes"),
     [("interpolated", 0x41), ("prbt_joint", 0x41), ("no_cyclic_mode", 0x21), ("tpdo_without_rtr", 0x81)],

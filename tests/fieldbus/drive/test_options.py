@@ -134,7 +134,7 @@ def test_cia402_53_a_refused_mode_leaves_the_old_one(rig):
     assert (rig.drive.read(0x6060), rig.drive.read(0x6061)) == (1, 1)
 
 
-# Every command in every state as in test_drive_states, which is in CSP.
+# Every command in every state as in test_conformance_402, which is in CSP.
 PATHS = {0x40: (), 0x21: (0x06,), 0x23: (0x06, 0x07), 0x27: (0x06, 0x07, 0x0F), 0x07: (0x06, 0x07, 0x0F, 0x02)}
 GOALS = {
     0x40: {0x06: 0x21},
@@ -201,12 +201,13 @@ def test_cia402_60b0_position_offset_is_added(rig):
     assert rig.counts == 70
 
 
-def test_cia402_58_bit_11_in_csp_and_pp_when_the_motion_takes_all_of_6072h(rig, plant):
-    rig.put(_6072=300).enable(8).drive.nmt(0x01)
+@pytest.mark.parametrize("mode", [8, 9])
+def test_cia402_58_bit_11_when_the_motion_takes_all_of_6072h(rig, plant, mode):
+    rig.put(_6072=300).enable(mode).drive.nmt(0x01)
     for torque, limited in ((0, 0), (300, 1), (-301, 1), (-299, 0)):
         plant.torque = torque
-        rig.put(_607A=0).cycles(2)
-        rig.put(_607A=0).cycles(1)
+        rig.put(_607A=0, _60FF=100).cycles(2)
+        rig.put(_607A=0, _60FF=100).cycles(1)
         assert rig.bits(11) == (limited,)
     rig.put(_6060=1)
     plant.torque = -301

@@ -1,4 +1,7 @@
-"""The drive's finite state automaton, CiA 402-2: every command in every state, statusword masks, quick stop, faults."""
+"""The drive's finite state automaton, CiA 402-2: what leads from state to state beside the commands, faults.
+
+Every command in every state: tests/fieldbus/conformance/test_conformance_402.py.
+"""
 
 from __future__ import annotations
 
@@ -16,40 +19,6 @@ PATHS = {
     S.SWITCHED_ON: [0x06, 0x07],
     S.OPERATION_ENABLED: [0x06, 0x07, 0x0F],
     S.QUICK_STOP_ACTIVE: [0x06, 0x07, 0x0F, 0x02],
-    S.FAULT: [],
-}
-# Written out from the standard, not from the package's table. "=": no change.
-SHUTDOWN, SWITCH_ON, ENABLE, VOLTAGE, QUICK, RESET = 0x06, 0x07, 0x0F, 0x00, 0x02, 0x80
-TABLE = {
-    S.SWITCH_ON_DISABLED: {SHUTDOWN: S.READY_TO_SWITCH_ON},
-    S.READY_TO_SWITCH_ON: {
-        SWITCH_ON: S.SWITCHED_ON,
-        ENABLE: S.SWITCHED_ON,
-        VOLTAGE: S.SWITCH_ON_DISABLED,
-        QUICK: S.SWITCH_ON_DISABLED,
-    },
-    S.SWITCHED_ON: {
-        SHUTDOWN: S.READY_TO_SWITCH_ON,
-        ENABLE: S.OPERATION_ENABLED,
-        VOLTAGE: S.SWITCH_ON_DISABLED,
-        QUICK: S.SWITCH_ON_DISABLED,
-    },
-    S.OPERATION_ENABLED: {
-        SHUTDOWN: S.READY_TO_SWITCH_ON,
-        SWITCH_ON: S.SWITCHED_ON,
-        VOLTAGE: S.SWITCH_ON_DISABLED,
-        QUICK: S.QUICK_STOP_ACTIVE,
-    },
-    S.QUICK_STOP_ACTIVE: {ENABLE: S.OPERATION_ENABLED, VOLTAGE: S.SWITCH_ON_DISABLED},
-    S.FAULT: {RESET: S.SWITCH_ON_DISABLED},
-}
-MASKS = {
-    S.SWITCH_ON_DISABLED: (0x4F, 0x40),
-    S.READY_TO_SWITCH_ON: (0x6F, 0x21),
-    S.SWITCHED_ON: (0x6F, 0x23),
-    S.OPERATION_ENABLED: (0x6F, 0x27),
-    S.QUICK_STOP_ACTIVE: (0x6F, 0x07),
-    S.FAULT: (0x4F, 0x08),
 }
 
 
@@ -57,8 +26,6 @@ def bring(drive, state, option=6):
     assert drive.write(0x605A, 0, option, 2) == 0
     for word in PATHS[state]:
         assert drive.write(0x6040, 0, word, 2) == 0
-    if state is S.FAULT:
-        fault(drive, 0x2310)
     assert drive.node.application.state is state
 
 
@@ -68,17 +35,6 @@ def fault(drive, code):
     frames = drive.advance(drive.t_ns)
     frames += drive.advance(drive.t_ns + CYCLE)
     return frames
-
-
-@pytest.mark.parametrize("state", TABLE)
-@pytest.mark.parametrize("word", [SHUTDOWN, SWITCH_ON, ENABLE, VOLTAGE, QUICK, RESET])
-def test_cia402_49_50_every_command_in_every_state(drive, state, word):
-    bring(drive, state)
-    drive.write(0x6040, 0, word, 2)
-    goal = TABLE[state].get(word, state)
-    assert drive.node.application.state is goal
-    mask, pattern = MASKS[goal]
-    assert drive.read(0x6041) & mask == pattern
 
 
 @pytest.mark.parametrize("word", [0x0F, 0x1F, 0x4F, 0x10F, 0xF0F])
@@ -96,7 +52,7 @@ def test_cia402_49_enabling_from_ready_passes_through_switched_on(drive):
     assert drive.node.application.state is S.OPERATION_ENABLED
 
 
-@pytest.mark.parametrize("state", [s for s in PATHS if s is not S.FAULT])
+@pytest.mark.parametrize("state", PATHS)
 def test_cia402_52_a_fault_leads_to_fault_from_every_state(drive, state):
     bring(drive, state)
     assert fault(drive, 0x2310) == [(0x81, "1023030000000000")]
@@ -130,32 +86,12 @@ def test_cia402_52_a_second_fault_is_reset_by_a_second_edge(drive):
         assert drive.node.application.state is S.SWITCH_ON_DISABLED
 
 
-@pytest.mark.parametrize("option", [1, 2, 5, 6])
-def test_cia402_51_quick_stop_options(drive, option):
-    bring(drive, S.OPERATION_ENABLED, option)
-    drive.write(0x6040, 0, 0x02, 2)
-    assert drive.node.application.state is S.QUICK_STOP_ACTIVE
-    assert drive.read(0x6041) >> 10 & 1 == 0
-    drive.advance(drive.t_ns + CYCLE)
-    if option in (1, 2):
-        assert drive.node.application.state is S.SWITCH_ON_DISABLED
-        return
-    assert drive.read(0x6041) & 0x46F == 0x407  # standstill, and stays
-    drive.write(0x6040, 0, 0x0F, 2)
-    assert drive.node.application.state is S.OPERATION_ENABLED
-
-
 @pytest.mark.parametrize("option", [1, 2])
 def test_cia402_51_transition_16_only_with_options_that_stay(drive, option):
     bring(drive, S.OPERATION_ENABLED, option)
     for word in (0x02, 0x0F):
         drive.write(0x6040, 0, word, 2)
     assert drive.node.application.state is S.QUICK_STOP_ACTIVE
-
-
-@pytest.mark.parametrize("option", [0, 3, 4, 7, 8])
-def test_cia402_51_options_that_do_not_exist_are_refused(drive, option):
-    assert drive.write(0x605A, 0, option, 2) in (0x06090030, 0x06090031, 0x06090032)
 
 
 @pytest.mark.parametrize(

@@ -59,14 +59,3 @@ def test_a_node_that_does_not_speak_lss_does_not_listen_to_it():
     node = SlaveNode(ODS[1], 1)
     node.start(0)
     assert node.lss is None and 0x7E5 not in node.listens
-
-
-def test_another_id_brings_the_defaults_of_that_id_and_keeps_the_serial_number():
-    node = SlaveNode(ODS[1], 1, od_of=OD_OF)
-    node.dictionary.set_default(0x1018, 4, 77)
-    node.start(0)
-    for text in ("0401", "1109"):
-        node.receive(0x7E5, bytes.fromhex(text.ljust(16, "0")), 1)
-    assert node.receive(0, b"\x82\x00", 2) == [(0x709, b"\0")]
-    assert node.dictionary.number(0x1800, 1) & 0x7F == 9
-    assert node.dictionary.number(0x1018, 4) == 77

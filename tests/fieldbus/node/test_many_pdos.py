@@ -12,7 +12,6 @@ from canprobe.fieldbus.node.dictionary import Dictionary, key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
 
 MS = 1_000_000
-OFF = 0x80000000
 COUNT = 512
 
 
@@ -56,36 +55,28 @@ def test_512_rpdos_and_tpdos_at_one_sync(od):
     assert got == list(range(1000, 1000 + COUNT))
 
 
-def every(bench, index, cob_id, word, **parameters):
-    """Map one object, with the parameters by sub-index, and switch the PDO on."""
-    orders = [(index, 1, OFF | cob_id, 4), (index + 0x200, 0, 0, 1), (index + 0x200, 1, word, 4)]
-    orders += [(index + 0x200, 0, 1, 1), *((index, *order) for order in parameters.values()), (index, 1, cob_id, 4)]
-    for order in orders:
-        assert bench.write(*order) == 0, order
-
-
 def sync(bench, counter):
     return [can_id for can_id, _ in bench.send(0x80, f"{counter:02x}", bench.t_ns + MS)]
 
 
 def test_a_pdo_that_is_written_to_leaves_the_phase_of_the_others(bench):
-    every(bench, 0x1800, 0x511, 0x20010020, type=(2, 4, 1), start=(6, 3, 1))
+    bench.configure(0x1800, cob_id=0x511, words=[0x20010020], type=4, start=3)
     bench.write(0x1019, 0, 240, 1)
     bench.nmt(0x01)
     assert [sync(bench, k) for k in (1, 2, 3, 4, 5, 6)] == [[], [], [0x511], [], [], []]
-    every(bench, 0x1801, 0x285, 0x20050040, type=(2, 1, 1))
+    bench.configure(0x1801, cob_id=0x285, words=[0x20050040], type=1)
     assert [sync(bench, k) for k in (7, 8, 9, 10, 11)] == [[0x511, 0x285], [0x285], [0x285], [0x285], [0x511, 0x285]]
 
 
 def test_event_timer_of_a_pdo_that_is_switched_on_in_operational(bench):
     bench.nmt(0x01)
-    every(bench, 0x1801, 0x285, 0x20050040, type=(2, 255, 1), event=(5, 10, 2))
+    bench.configure(0x1801, cob_id=0x285, words=[0x20050040], type=255, event=10)
     assert bench.advance(10 * MS) == [(0x285, "8877665544332211")]
     assert bench.advance(20 * MS) == [(0x285, "8877665544332211")]
 
 
 def test_request_is_answered_in_operational_only_and_by_all_that_share_the_identifier(bench):
-    every(bench, 0x1801, 0x185, 0x20050040, type=(2, 253, 1))
+    bench.configure(0x1801, cob_id=0x185, words=[0x20050040], type=253)
     assert bench.send(0x40000185, "") == []
     bench.nmt(0x01)
     assert bench.send(0x40000185, "") == [(0x185, "04030201feff"), (0x185, "8877665544332211")]
@@ -93,7 +84,7 @@ def test_request_is_answered_in_operational_only_and_by_all_that_share_the_ident
 
 
 def test_requests_keep_the_inhibit_time_of_event_driven_pdos(bench):
-    every(bench, 0x1800, 0x185, 0x20010020, type=(2, 255, 1), inhibit=(3, 50, 2))  # 5 ms
+    bench.configure(0x1800, cob_id=0x185, words=[0x20010020], type=255, inhibit=50)  # 5 ms
     bench.nmt(0x01, 0)
     assert bench.send(0x40000185, "", 1 * MS) == []
     assert bench.advance(5 * MS) == [(0x185, "04030201")]

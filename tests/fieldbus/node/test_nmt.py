@@ -27,22 +27,6 @@ def test_cia301_nmt_every_command_from_every_state(bench, state, command, goal, 
     assert bench.node.state is goal
 
 
-@pytest.mark.parametrize("state", [PRE, OP, STOPPED])
-@pytest.mark.parametrize("command", [0x81, 0x82])
-def test_cia301_nmt_02_resets_boot_again(bench, state, command):
-    bench.nmt(TO[state][0])
-    assert bench.nmt(command) == [(0x705, "00")]
-    assert bench.node.state is PRE
-
-
-def test_cia301_nmt_02_reset_node_restores_all_and_reset_communication_its_area(bench):
-    for command, application_value in ((0x82, 77), (0x81, 50)):
-        assert bench.write(0x2000, 0, 77, 1) == 0
-        assert bench.write(0x1017, 0, 1000, 2) == 0
-        bench.nmt(command)
-        assert (bench.read(0x1017), bench.read(0x2000)) == (0, application_value)
-
-
 @pytest.mark.parametrize("frame", ["", "01", "010500", "0106", "0305", "0005", "ff00", "8305"])
 def test_cia301_nmt_03_wrong_length_id_or_command_is_ignored(bench, frame):
     assert bench.send(0, frame) == []
@@ -60,11 +44,6 @@ def test_cia301_nmt_04_nothing_is_served_in_initialisation(make_bench):
     assert bench.send(0x605, READ_1000) == [(0x585, "4300100078563412")]
 
 
-def test_cia301_nmt_05_sdo_is_silent_when_stopped(bench):
-    bench.nmt(0x02)
-    assert bench.send(0x605, READ_1000) == []
-
-
 def test_cia301_nmt_06_pdos_only_in_operational(bench):
     assert bench.send(0x80, "") == []
     bench.send(0x205, "aabbccdd0100")
@@ -72,13 +51,6 @@ def test_cia301_nmt_06_pdos_only_in_operational(bench):
     assert bench.send(0x80, "") == [(0x185, "04030201feff")]
     bench.nmt(0x02)
     assert bench.send(0x80, "") == []
-
-
-def test_cia301_nmt_07_state_change_is_heard_at_once(bench):
-    bench.write(0x1017, 0, 100, 2)
-    assert bench.nmt(0x01) == [(0x705, "05")]
-    assert bench.nmt(0x02) == [(0x705, "04")]
-    assert bench.nmt(0x80) == [(0x705, "7f")]
 
 
 def test_foreign_frames_are_not_answered(bench):

@@ -131,13 +131,6 @@ def test_cia301_sdo_19_time_out_and_again_free(bench):
     assert bench.read(0x1000) == 0x12345678
 
 
-def test_cia301_sdo_21_client_abort_frees_the_server_without_an_answer(bench):
-    bench.ask("2104200014000000")
-    assert bench.send(0x605, "8004200000000008") == []
-    assert bench.node.next_deadline_ns is None
-    assert bench.ask("0030313233343536")[-8:] == "01000405"
-
-
 def test_cia301_sdo_24_a_new_request_takes_the_place_of_an_open_transfer(bench):
     bench.ask("2104200014000000")
     assert bench.read(0x1000) == 0x12345678

@@ -88,7 +88,7 @@ def test_a_file_that_is_none_is_refused(make_bench, tmp_path, text):
 def test_a_file_of_another_device_is_refused(stored, make_bench, path):
     content = json.loads(path.read_text())
     path.write_text(json.dumps(content | {"identity": [1, 2, 3]}))
-    with pytest.raises(UsageError, match=r"stored by the device \[1, 2, 3\], node 5 is \[0, 0, 0\]"):
+    with pytest.raises(UsageError, match=r"stored by the device \[1, 2, 3\], node 5 is \[51806, 0, 65536\]"):
         keep_in_file(make_bench().node, path)
 
 

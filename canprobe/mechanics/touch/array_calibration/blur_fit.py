@@ -81,8 +81,7 @@ def fit_blur(
         """(n, taxels) of each row of unknowns (n, 7); a taxel without a count is one below the threshold."""
         shown = gain * _images(z, counts.shape, share, max(image.shape))
         off = np.where(active, shown - counts, np.maximum(shown - THRESHOLD_COUNTS, 0.0)) / sigma
-        result: Floats = off.reshape(len(z), -1)
-        return result
+        return off.reshape(len(z), -1)
 
     z = _start(counts, blur)
     if z is None:
@@ -142,10 +141,9 @@ def _images(z: Floats, shape: tuple[int, ...], share: float, side: int) -> Float
 
 def _grid(taxels: int) -> Floats:
     """Places of the grid points along a side with a number of taxels, pitches."""
-    grid: Floats = (
+    return (
         np.arange(-MARGIN_PITCHES * STEPS_PER_PITCH, (taxels + MARGIN_PITCHES) * STEPS_PER_PITCH) + 0.5
     ) / STEPS_PER_PITCH - 0.5
-    return grid
 
 
 def _blurred(taxels: int, grid: Floats, blur: Floats, share: float, side: int) -> Floats:

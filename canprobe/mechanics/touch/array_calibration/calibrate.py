@@ -221,8 +221,7 @@ def _force(patch: PatchCalibration, s: Shown) -> float:
 def _depths(dwell: Dwell, s: Shown, patch: PatchCalibration, stiffness: float) -> Floats:
     """(n,) depth of the layer in each image of a touch, m."""
     at_1_n = indentation_from_force(1.0, stiffness, patch.pad.radius_m, dwell.kappa)
-    depths: Floats = at_1_n * np.sqrt(patch.force_gain * s.sums + patch.edge_gain * np.sqrt(s.sums))
-    return depths
+    return at_1_n * np.sqrt(patch.force_gain * s.sums + patch.edge_gain * np.sqrt(s.sums))
 
 
 def _checked(

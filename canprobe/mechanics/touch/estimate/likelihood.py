@@ -268,5 +268,4 @@ def osculating_bound(touches: ContactBatch, surface: SurfaceMatrix, prior: Prior
         hidden = 1.0 - np.einsum("ij,ij->i", V, V) > 1e-9
         return partial_covariance(V, decision.information[known], hidden) / length**2
     X = np.linalg.solve(root.T, curvature_jacobian(c).T)
-    result: Floats = X.T @ X / length**2
-    return result
+    return X.T @ X / length**2

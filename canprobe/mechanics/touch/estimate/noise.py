@@ -100,8 +100,7 @@ class SlowErrors(NamedTuple):
 
 def mixed(matrices: Floats, rows: Floats) -> Floats:
     """Rows (n, 3, k) mixed among the samples by the matrices (3, n, n) of their kinds."""
-    result: Floats = (matrices @ rows.transpose(1, 0, 2)).transpose(1, 0, 2)
-    return result
+    return (matrices @ rows.transpose(1, 0, 2)).transpose(1, 0, 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,8 +203,7 @@ def _refuse_extremes(name: str, deviations: Floats) -> None:
 
 
 def _mean_variance(sigma: Floats) -> Floats:
-    result: Floats = sigma**2 if sigma.ndim == 1 else np.trace(sigma, axis1=1, axis2=2) / 3.0
-    return result
+    return sigma**2 if sigma.ndim == 1 else np.trace(sigma, axis1=1, axis2=2) / 3.0
 
 
 def _as_covariance(sigma: Floats) -> Floats:

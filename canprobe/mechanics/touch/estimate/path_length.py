@@ -89,8 +89,7 @@ class Spread:
         """(3, 3) covariance of the points, m²."""
         M = self._moments / max(self.weight, 1e-300)
         mean = M[:3, 3]
-        result: Floats = M[:3, :3] - mean[:, None] * mean
-        return result
+        return M[:3, :3] - mean[:, None] * mean
 
     def fade(self, kept: float) -> None:
         """Weigh everything so far by a factor."""

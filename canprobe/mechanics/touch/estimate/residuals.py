@@ -102,8 +102,7 @@ class LinearisedResiduals(NamedTuple):
         G[:, 0] = F[:, 0]
         G *= self.inverse[:, None, None]
         G[:, 1:] -= self.bend[:, 0, :, None] * G[:, :1]  # the foot moves with the model
-        result: Floats = self.W @ G
-        return result
+        return self.W @ G
 
 
 def linearise(c: Floats, d: Design) -> LinearisedResiduals:

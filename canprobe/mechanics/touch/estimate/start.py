@@ -153,8 +153,7 @@ class Solved(NamedTuple):
 
     def residuals_at(self, c: Floats) -> Floats:
         """Minus the residuals (n, 3) at other parameters (9,) nearby."""
-        result: Floats = -self.r - self.rows[:, :, :9] @ (c - self.c)
-        return result
+        return -self.r - self.rows[:, :, :9] @ (c - self.c)
 
 
 def solved_once(c: Floats, d: Design, prior: tuple[Floats, Floats]) -> Solved:

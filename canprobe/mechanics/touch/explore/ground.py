@@ -88,8 +88,7 @@ class GroundCells:
 
     def in_base(self, places: Floats) -> Floats:
         """Points (n, 3) of the scan plane by their places in it (n, 2), m."""
-        result: Floats = self._origin + places @ self._axes[:2]
-        return result
+        return self._origin + places @ self._axes[:2]
 
     def walk(self, point: Floats, distance: float) -> None:
         """Take path of some length, m, that was walked at a contact (3,), m."""
@@ -169,5 +168,4 @@ class GroundCells:
     @property
     def wanting(self) -> NDArray[np.bool_]:
         """(m,) cells that are open and above their goal."""
-        result: NDArray[np.bool_] = ~self.closed & (self.sigma > self.goal)
-        return result
+        return ~self.closed & (self.sigma > self.goal)

@@ -150,8 +150,7 @@ class ImageModel:
         fall, drop = per_square * a, per_square * b
         field = (peak[:, None] - fall[:, None] * self._squares)[:, :, None] - (drop[:, None] * self._squares)[:, None]
         np.maximum(field, 0.0, out=field)
-        shown: Floats = self._blur @ field @ self._turned_blur
-        return shown
+        return self._blur @ field @ self._turned_blur
 
     def moments_of(self, shown: Floats) -> list[tuple[float, float]]:
         """Second moments above the level along both axes, m², of each of the n that `shown` gives.

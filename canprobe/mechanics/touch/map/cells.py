@@ -136,8 +136,7 @@ def solve_cells(rows: Floats, points: Floats, pad: PadLayer | None, noise: MapNo
 
 def robust(weight: Floats, chi2: Floats) -> Floats:
     """Weights (m, n) of nodes, less where their χ² is large."""
-    result: Floats = weight * np.minimum(1.0, ROBUST_CHI2 / np.maximum(chi2, 1e-300))
-    return result
+    return weight * np.minimum(1.0, ROBUST_CHI2 / np.maximum(chi2, 1e-300))
 
 
 def observed_of(fits: Quartics, V: Floats) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:

@@ -149,8 +149,7 @@ class NodeGrid:
 
     def points_of(self, row: Floats) -> Floats:
         """Contact points (…, 3) of rows (…, COLUMNS), m, with the layer unsqueezed."""
-        result: Floats = row[..., CENTRE] - self._radius * row[..., NORMAL]
-        return result
+        return row[..., CENTRE] - self._radius * row[..., NORMAL]
 
     def near(self, place: Floats) -> Floats:
         """(n, COLUMNS) the closed nodes in the blocks round a place (3,), m: all within `BLOCK_M`, and some beyond."""

@@ -242,8 +242,7 @@ class SurfaceMap:
     @property
     def normals(self) -> Floats:
         """(n, 3) outward unit normals of the nodes."""
-        result: Floats = self.nodes.rows[:, column.NORMAL]
-        return result
+        return self.nodes.rows[:, column.NORMAL]
 
     @property
     def common(self) -> CommonErrors:
