@@ -111,10 +111,7 @@ def test_another_master_is_at_work(bench: Any, frame: tuple[int, bytes], what: s
 
 @pytest.mark.parametrize(
     "words",
-    [
-        ("run", "press", "--bus", "socketcan", "--channel", "vcan7"),
-        ("emulate", "press", "--channel", "vcan7"),
-    ],
+    [("run", "press", "--bus", "socketcan", "--channel", "vcan7"), ("emulate", "press", "--channel", "vcan7")],
 )
 def test_an_interface_that_is_not_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]

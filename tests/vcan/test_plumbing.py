@@ -148,10 +148,7 @@ def test_what_the_inner_session_never_reported_is_an_error(project: Path) -> Non
 
 @pytest.mark.parametrize(
     ("required", "expected", "workers"),
-    [
-        ("", {"passed": 1, "skipped": 9}, ()),
-        pytest.param("1", {"passed": 1, "error": 9}, WORKERS, marks=TWO_WORKERS),
-    ],
+    [("", {"passed": 1, "skipped": 9}, ()), pytest.param("1", {"passed": 1, "error": 9}, WORKERS, marks=TWO_WORKERS)],
     ids=["one session", "workers"],
 )
 def test_without_a_vcan_they_are_skipped_loudly_or_fail(

@@ -82,10 +82,7 @@ def test_a_block_that_is_left_by_an_error_leaves_its_files_too(free, tmp_path, e
             raise error
         return Command(stop_reason="oh" if measurement.cycle > 100 else None)
 
-    with (
-        pytest.raises((ValueError, SafetyStop)) as raised,
-        canprobe.open_cell(undrawn(free), out=tmp_path) as cell,
-    ):
+    with pytest.raises((ValueError, SafetyStop)) as raised, canprobe.open_cell(undrawn(free), out=tmp_path) as cell:
         cell.run(fail)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["completed"], summary["stop_reason"]) == (False, reason)

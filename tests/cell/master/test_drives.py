@@ -322,11 +322,7 @@ def test_a_drive_that_was_missed_while_its_target_moved_is_believed_where_it_wen
 
 @pytest.mark.parametrize(
     ("goal", "word"),
-    [
-        (DriveState.OPERATION_ENABLED, 0x02),
-        (DriveState.QUICK_STOP_ACTIVE, 0x02),
-        (DriveState.SWITCH_ON_DISABLED, 0x00),
-    ],
+    [(DriveState.OPERATION_ENABLED, 0x02), (DriveState.QUICK_STOP_ACTIVE, 0x02), (DriveState.SWITCH_ON_DISABLED, 0x00)],
 )
 def test_a_drive_in_no_known_state_is_stopped(goal, word):
     group = make_group()

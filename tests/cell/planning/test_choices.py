@@ -9,12 +9,7 @@ import pytest
 from scenes import change, refused
 
 import canprobe
-from canprobe.cell.planning.array import (
-    cut_patch,
-    measured_share,
-    patch_radius_m,
-    true_force_n,
-)
+from canprobe.cell.planning.array import cut_patch, measured_share, patch_radius_m, true_force_n
 from canprobe.cell.planning.free_parameters import opened, second_channel
 from canprobe.cell.planning.identifiers import order_by_deadline
 from canprobe.cell.planning.make import make_plan

@@ -24,13 +24,7 @@ from canprobe.cell.scene.resolve import resolve
         ("cylinder", {"drive", "tactile"}, "recursive", "weave", {"full image (32 PDOs)"}),
         ("press", {"drive", "tactile"}, None, None, {"surface estimator", "exploration strategy"}),
         ("calibrate", {"drive", "tactile"}, None, None, {"surface estimator", "exploration strategy", "tactile servo"}),
-        (
-            "listen",
-            {"tactile"},
-            None,
-            None,
-            {"drives, their PDOs, joint limits", "surface estimator", "tactile servo"},
-        ),
+        ("listen", {"tactile"}, None, None, {"drives, their PDOs, joint limits", "surface estimator", "tactile servo"}),
         ("free", {"drive"}, None, None, {"tactile node and its PDOs", "surface estimator", "tactile servo"}),
     ],
 )

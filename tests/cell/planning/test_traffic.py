@@ -326,10 +326,7 @@ class TestOtherDevices:
 
     @pytest.mark.parametrize(
         ("fixed", "why"),
-        [
-            (False, ": 6077h is not mappable to a TPDO"),
-            (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h"),
-        ],
+        [(False, ": 6077h is not mappable to a TPDO"), (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h")],
     )
     def test_torque_that_cannot_be_mapped_is_left_away_and_it_says_so(self, tmp_path, fixed, why):
         plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))

@@ -43,11 +43,7 @@ def calibrated(touched, dwells=None, **changes):
         "date": "2026-01-01",
         "made_on": "b",
     } | changes
-    return calibrate_array(
-        touched[0] if dwells is None else dwells,
-        pad=touched_pad(touched[1]),
-        **values,
-    )
+    return calibrate_array(touched[0] if dwells is None else dwells, pad=touched_pad(touched[1]), **values)
 
 
 @pytest.fixture(scope="module")

@@ -45,14 +45,6 @@ def test_moments_of_an_elliptic_patch(u0, v0, angle):
     assert patch.good
 
 
-def test_rows_are_v_and_columns_are_u():
-    image = np.zeros((16, 16), np.uint8)
-    image[3, 9:13] = 100
-    patch = compute_patch(image, PatchCalibration())
-    assert patch.v == pytest.approx((3 - 7.5) * PITCH)
-    assert patch.u == pytest.approx((10.5 - 7.5) * PITCH, rel=1e-2)
-
-
 def test_nothing_there():
     patch = compute_patch(np.full((16, 16), 4, np.uint8), PatchCalibration())
     assert patch.force == 0.0

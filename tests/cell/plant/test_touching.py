@@ -228,10 +228,7 @@ def test_slopes_of_several_touches_are_those_of_their_push():
 
     push, (pushed, by_theta, by_rate) = e.contact.push, e.contact.linearised(theta, rate)
     assert pushed == pytest.approx(push(theta, rate))
-    for given, at in (
-        (by_theta, lambda d: push(theta + d, rate)),
-        (by_rate, lambda d: push(theta, rate + d)),
-    ):
+    for given, at in ((by_theta, lambda d: push(theta + d, rate)), (by_rate, lambda d: push(theta, rate + d))):
         slope = np.array([(at(d) - at(-d)) / 2e-6 for d in 1e-6 * np.eye(6)]).T
         assert -given == pytest.approx(slope, abs=1e-4 * np.abs(slope).max())
 

@@ -69,11 +69,7 @@ def test_minimal_scan_gets_every_default():
     ("kind", "sections", "absent"),
     [
         ("press", "[arm]\n[sensor]\n[object]\nkind = 'plane'\n", {"shape"}),
-        (
-            "calibrate",
-            "[arm]\n[sensor]\n[object]\nkind = 'sphere'\nradius_mm = 25\n",
-            {"shape", "servo"},
-        ),
+        ("calibrate", "[arm]\n[sensor]\n[object]\nkind = 'sphere'\nradius_mm = 25\n", {"shape", "servo"}),
         ("listen", "[sensor]\n", {"arm", "shape", "servo", "object"}),
         ("free", "[arm]\n", {"sensor", "wire", "object", "shape", "servo"}),
     ],

@@ -102,10 +102,7 @@ def test_sixteen_errors_make_passive_and_a_passive_sender_waits_eight_bits():
     """Meanwhile a frame of lower priority gets in, which it would not behind an active sender. (With sixteen errors the
     success of the frame makes it active again: 128 - 1.)"""
     low = (0x700, b"\5")
-    for errors, waits, order in (
-        (16, 1, [0x155, 0x156, 0x700]),
-        (17, 2, [0x155, 0x700, 0x156]),
-    ):
+    for errors, waits, order in ((16, 1, [0x155, 0x156, 0x700]), (17, 2, [0x155, 0x700, 0x156])):
         sent = errors * (4 + ERROR_BITS) + waits * 8  # waits before its second try as a passive node, too
         sender = Scripted({0: [FRAME, (0x156, b"")]})
         bus, seen = make_bus(

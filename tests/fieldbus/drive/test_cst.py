@@ -54,13 +54,7 @@ def push(cst, torques):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(
     "torques",
-    [
-        [250] * 60,
-        [49] * 10,
-        [400] * 20 + [0] * 60,
-        [400] * 20 + [-400] * 50,
-        [300, -300, 200, -60, 60, 500, 20] * 6,
-    ],
+    [[250] * 60, [49] * 10, [400] * 20 + [0] * 60, [400] * 20 + [-400] * 50, [300, -300, 200, -60, 60, 500, 20] * 6],
 )
 def test_cia402_cst_motion_under_torque(cst, torques, sign):
     torques = [sign * torque for torque in torques]

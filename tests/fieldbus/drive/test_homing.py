@@ -119,10 +119,7 @@ def switched(homing):
     return homing.put(_6099_1=8000, _6099_2=800)
 
 
-@pytest.mark.parametrize(
-    ("method", "home"),
-    [(17, -1500.5), (18, 2600.25), (1, -1000), (2, 2000)],
-)
+@pytest.mark.parametrize(("method", "home"), [(17, -1500.5), (18, 2600.25), (1, -1000), (2, 2000)])
 @pytest.mark.parametrize("start", [250.25, -1600.0, 2700.0])
 def test_cia402_55_limit_switches_and_the_pulse_behind_them(switched, method, home, start):
     switched.plant.ramps.clear()

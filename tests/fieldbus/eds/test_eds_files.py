@@ -293,16 +293,6 @@ def test_drive_limits(index, sub, low, high):
     assert (var.min, var.max) == (low, high)
 
 
-def test_drive_modes_in_6502_are_pp_homing_csp_csv_cst():
-    """CiA 402-2: 6502h bit n stands for a mode; bits 0 PP, 5 homing, 7 CSP, 8 CSV, 9 CST."""
-    assert eds.load_eds("puma260_joint", 1)[0x6502].default == 1 << 0 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9
-
-
-def test_drive_interpolates_over_2_5_ms():
-    record = eds.load_eds("puma260_joint", 1)[0x60C2]
-    assert record[1].default * 10.0 ** record[2].default == pytest.approx(2.5e-3)
-
-
 @pytest.mark.parametrize("index", [0x1003, 0x1019, 0x1600, 0x1A00, 0x1400, 0x1800])
 def test_entries_with_their_own_abort_codes_have_no_limits(index):
     """Conformance points 25, 29, 39, 42: else a generic limit check would answer 06090031h before them."""

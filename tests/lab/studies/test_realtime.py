@@ -89,12 +89,7 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
 
 # The arithmetic of `realtime --soak`; it runs on vcan0 only.
 
-ZERO = dict.fromkeys(COLUMNS, 0) | {
-    "master_mib": 90.0,
-    "nodes_mib": 80.0,
-    "monitor_mib": 85.0,
-    "latency_us": 400.0,
-}
+ZERO = dict.fromkeys(COLUMNS, 0) | {"master_mib": 90.0, "nodes_mib": 80.0, "monitor_mib": 85.0, "latency_us": 400.0}
 
 
 def hour(leak_mib_h=0.0, drift_us=0.0, lost=0):

@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch import (
-    ContactSample,
-    Doubt,
-    SurfaceMatrix,
-    cramer_rao,
-    fit_surface,
-    make_estimator,
-)
+from canprobe.mechanics.touch import ContactSample, Doubt, SurfaceMatrix, cramer_rao, fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.fit import METHODS
 
 SIGMA = (2e-5, 1e-3)
