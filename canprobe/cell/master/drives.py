@@ -44,7 +44,7 @@ DOUBTED_CYCLES = 2
 """TPDOs in a row whose statusword is not believed either, where their position cannot be: fewer than make a hold."""
 UNSTATED_LAG_S = 0.05
 """Longest usual lag of a drive without a feed-forward, s, where neither scene nor emulation states one."""
-_QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
+_QUICK_STOP, _DISABLE_VOLTAGE, _ENABLE = 0x0002, 0x0000, 0x000F
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
 """Bits of the statusword that encode the state, and their value in operation enabled; see `known_state` for others."""
 
@@ -111,7 +111,7 @@ def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
     return tuple(frames)
 
 
-class SetPoint:
+class SetPointOffer:
     """The handshake by which a drive in profile position takes targets (CiA 402-2, "Profile position mode").
 
     Bit 4 of the controlword offers a target, until bit 12 of the statusword acknowledges it; then it falls, and the
@@ -123,24 +123,23 @@ class SetPoint:
         self._target: int | None = None
         self._offered = False
 
-    def step(self, statusword: int, target: int, *, follows: bool) -> tuple[int, int]:
-        """Bits of the controlword and the target of a cycle.
+    def step(self, statusword: int, word: int, target: int) -> tuple[int, int]:
+        """Controlword and target of a cycle.
 
         Args:
             statusword: the last one of the drive.
+            word: controlword towards the goal of the drive; it gets targets where that keeps it enabled.
             target: where it is sent, counts.
-            follows: the drive is meant to follow targets; it does once it is enabled.
         """
-        if not follows or known_state(statusword) is not DriveState.OPERATION_ENABLED:
+        if word & _ENABLE != _ENABLE or known_state(statusword) is not DriveState.OPERATION_ENABLED:
             self._target, self._offered = None, False
-            return 0, target
-        if statusword >> SETPOINT_ACKNOWLEDGE_BIT & 1:
+        elif statusword >> SETPOINT_ACKNOWLEDGE_BIT & 1:
             self._offered = False
         elif target != self._target and not self._offered:
             self._target, self._offered = target, True
         if not self._offered or self._target is None:
-            return 0, target
-        return 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT, self._target
+            return word, target
+        return word | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT, self._target
 
 
 DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
@@ -363,8 +362,9 @@ class DriveTargets:
         self._words = [0] * len(axes)
         self._constants: list[int] = []
         self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
-        profiled = [i for i, axis in enumerate(axes) if axis.mode == OperationMode.PROFILE_POSITION]
-        self._set_points = {i: SetPoint() for i in profiled}
+        self._offers = {
+            i: SetPointOffer() for i, axis in enumerate(axes) if axis.mode == OperationMode.PROFILE_POSITION
+        }
         self._steady: tuple[object, ...] | None = None
         rpdos: dict[int, list[tuple[int, PdoLayout]]] = {}
         for i, axis in enumerate(axes):
@@ -462,10 +462,8 @@ class DriveTargets:
             self._steady = key if words == self._words else None
             self._words = words
         values = [*self._words, *targets, *self._constants]
-        for i, set_point in self._set_points.items():
-            follows = self._goal_of(drives.axes[i].node_id) is DriveState.OPERATION_ENABLED
-            word, values[len(self._words) + i] = set_point.step(drives.statuswords[i], targets[i], follows=follows)
-            values[i] |= word
+        for i, offer in self._offers.items():
+            values[i], values[len(self._words) + i] = offer.step(drives.statuswords[i], values[i], targets[i])
         heard_all = drives.heard_all
         commands = []
         for cob_id, every_cycle, packs, fetches, axes in self._plan:

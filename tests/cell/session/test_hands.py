@@ -109,7 +109,10 @@ def test_a_way_through_a_limit_or_a_keep_out_is_refused_with_joint_place_and_tim
                 [0, 0, 0, 0, 0, 300],
                 r"joint 6 would come to 29\d\.\d deg; it may go from -214.0 to 294.0 deg, .* s after",
             ),
-            ([90, -60, 15, 0, 100, 0], r"the (arm|probe) comes to -?\d+ mm, the floor is at 250 mm, .* % of the way"),
+            (
+                [90, -60, 15, 0, 100, 0],
+                r"the (link of joint \d|probe) comes to -?\d+ mm, the floor is at 250 mm, .* % of the way",
+            ),
         ):
             with pytest.raises(UsageError, match=said):
                 opened.move(np.radians(goal))
