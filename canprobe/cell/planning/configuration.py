@@ -31,7 +31,7 @@ from canprobe.cell.planning.units import (
     FOLLOWING_WINDOW,
     POLARITY,
     POSITION_LIMITS,
-    PROFILE_SPEED,
+    PROFILE_DECELERATION,
     PROFILE_SPEED_LIMIT,
     following_window,
     motor_speed_limit,
@@ -246,11 +246,14 @@ def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: De
 
 
 def _profile_writes(plan: Plan, node: PlannedNode, device: DeviceCapabilities) -> Iterator[Write]:
-    """Writes of profile position: it may not be faster than its joints, and lags by its acceleration."""
+    """Writes of profile position: it may not be faster than its joints, and stops as late as it decelerates.
+
+    A drive without 6084h decelerates as it accelerates. Source: CiA 402-2, object 6084h.
+    """
     for (index, subindex), value in profile_values(plan.setup, node.node_id, device).items():
-        absence = None if index == PROFILE_SPEED else "it accelerates and lags as the device has it"
-        yield Write(index, subindex, value, "limit of the joints in profile position", absence)
-    yield Write(PROFILE_TYPE, 0, 0, "trapezoidal speed", "it accelerates and lags as the device has it")
+        if index != PROFILE_DECELERATION or device.has(index):
+            yield Write(index, subindex, value, "profile position within the limits of [joints]")
+    yield Write(PROFILE_TYPE, 0, 0, "trapezoidal speed", "it accelerates as the device has it")
 
 
 def _homing_writes(arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:

@@ -147,6 +147,17 @@ def test_profile_position_holds_no_contact_and_the_plan_says_what_goes(tmp_path)
         assert problem.endswith("`canprobe console CELL`, `move CELL` and `home CELL` go by profile position")
 
 
+def test_profile_position_that_would_stop_late_is_refused(tmp_path):
+    """6084h of a drive is fixed; without the object the drive decelerates by 6083h."""
+    objects = dict(MAKES["no_cyclic_mode"]().objects)
+    changed(objects, 0x6084, access="ro", default=100)
+    make = replace(MAKES["no_cyclic_mode"](), objects=objects)
+    refusal = r"6084h:00 = \d+ \(profile position within the limits of \[joints\]\) is needed: it is ro, 100"
+    assert re.search(refusal, "\n".join(reasons(scene_of(make, tmp_path))))
+    without(objects, 0x6084)
+    assert canprobe.plan(scene_of(make, tmp_path)).nodes[0].mode is PP
+
+
 def test_profile_position_is_bounded_by_the_limits_whatever_else_a_fixed_pdo_writes(tmp_path):
     """607Ah and 6081h share an RPDO of PRBT drives: the default of the file would take the limit away in each cycle."""
     objects = dict(MAKES["no_cyclic_mode"]().objects)
