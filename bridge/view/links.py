@@ -1,32 +1,28 @@
 """The links of an arm: the solids of its URDF, with the meshes that are found beside it, or simple ones.
 
-Meshes (STL, DAE, OBJ) are read by trimesh (extra `view`). Where a link has nothing to show, or one of its
-meshes is missing or cannot be read, its simple solids are drawn (`description`), and a line says so.
+Where a link has nothing to show, or one of its meshes is missing or cannot be read, its simple solids are drawn
+(`description`), and a line says so.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from canprobe.cell.scene.hardware import ArmSettings
+from canprobe.cell.scene.urdf_solids import MeshError, read_mesh
 from canprobe.errors import PlanError
 from canprobe.lab.bridge.description import WHITE, simple_solids, urdf_solids
 from canprobe.lab.bridge.view.meshes import SECTORS, trimesh
-from canprobe.mechanics.robot.chain import Chain, link_transforms
-from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh
-from canprobe.mechanics.types import Floats
+from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.robot.urdf_visuals import Visual
 
 _NAMED = 3
 """Number of missing meshes that a line names."""
-_FORMATS = (".stl", ".dae", ".obj")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,19 +40,6 @@ class Part:
     frame: int
     mesh: Any
     colour: tuple[int, int, int]
-
-
-def link_frames(chain: Chain, q: ArrayLike) -> Floats:
-    """Frames of the base and of every link.
-
-    Args:
-        chain: the arm.
-        q: joint positions (n,), rad or m.
-
-    Returns:
-        Poses T_base_link (n + 1, 4, 4); the last is the flange.
-    """
-    return np.array([*accumulate(link_transforms(chain, q), np.matmul, initial=np.eye(4))])
 
 
 def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
@@ -82,7 +65,7 @@ def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
     for number, solid in enumerate(solids, start=1):
         try:
             parts += placed(f"solid_{number}", solid)
-        except _LostError as error:
+        except MeshError as error:
             lost.setdefault(str(error), []).append(solid)
     bare = {solid.joint for some in lost.values() for solid in some}
     bare |= set(range(chain.n + 1)) - {part.frame for part in parts}
@@ -99,10 +82,6 @@ def _lines(urdf: Path, lost: dict[str, list[Visual]]) -> Iterator[str]:
         yield f"{urdf.name}: {', '.join(names[:_NAMED])}{more}: {why}; simple links are drawn"
 
 
-class _LostError(Exception):
-    """Why a solid cannot be drawn."""
-
-
 def _meshes(arm: ArmSettings, solid: Visual) -> list[tuple[Any, tuple[int, int, int]]]:
     """Triangles and colours of one solid, in its own frame."""
     creation = trimesh().creation
@@ -112,23 +91,7 @@ def _meshes(arm: ArmSettings, solid: Visual) -> list[tuple[Any, tuple[int, int, 
         return [(creation.cylinder(*solid.size, sections=SECTORS), WHITE)]
     if solid.kind == "sphere":
         return [(creation.icosphere(radius=solid.size[0]), WHITE)]
-    if solid.kind != "mesh":
-        raise _LostError("not a solid of a URDF")
-    path = find_mesh(Path(arm.urdf or ""), solid.mesh)
-    if path is None:
-        raise _LostError("not found beside the URDF")
-    if path.suffix.lower() not in _FORMATS:
-        raise _LostError(f"expected {', '.join(_FORMATS)}")
-    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it logs tracebacks of what it does without
-    try:
-        bodies = [body for body in trimesh().load_scene(path).dump() if len(getattr(body, "faces", ()))]
-    except Exception as error:  # whatever a reader of foreign files raises, the view goes on
-        raise _LostError(f"cannot be read: {error or type(error).__name__}") from error
-    if not bodies:  # of a damaged STL, trimesh makes a body of nothing
-        raise _LostError("cannot be read: it holds no facet")
-    for body in bodies:
-        body.merge_vertices(merge_tex=True, merge_norm=True)
-    return [(body.apply_scale(solid.size), _colour(body)) for body in bodies]
+    return [(body, _colour(body)) for body in read_mesh(Path(arm.urdf or ""), solid)]
 
 
 def _colour(body: Any) -> tuple[int, int, int]:

@@ -16,9 +16,10 @@ from canprobe.lab.bridge.description import quaternion_of
 from canprobe.lab.bridge.view.array_dome import probe_parts, taxel_colours, taxel_poses, tile
 from canprobe.lab.bridge.view.colours import linear_light
 from canprobe.lab.bridge.view.instants import Moment
-from canprobe.lab.bridge.view.links import arm_links, link_frames
+from canprobe.lab.bridge.view.links import arm_links
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
 from canprobe.lab.bridge.view.path import AHEAD, PATH
+from canprobe.mechanics.robot.chain import link_frames
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.pad import Pad

@@ -407,6 +407,12 @@ def without_home_offset(folder):
     return path
 
 
+def in_profile_position_alone(folder):
+    path = folder / "mode_1.eds"
+    path.write_text(eds_path("prbt_joint.eds").read_text().replace("DefaultValue=0x43", "DefaultValue=0x01"))
+    return path
+
+
 @pytest.mark.parametrize(
     ("cell", "make"),
     [
@@ -418,6 +424,8 @@ def without_home_offset(folder):
         ("puma260", "fixed_mapping"),
         ("puma260", "bare"),
         ("puma260", without_home_offset),
+        ("puma260", "no_cyclic_mode"),  # profile position
+        ("prbt", in_profile_position_alone),  # at 100 Hz, without 6084h
     ],
 )
 def test_other_arms_and_drives_are_jogged_and_moved_in_the_same_way(cell, make, tmp_path):
@@ -466,9 +474,9 @@ def test_other_arms_and_drives_are_jogged_and_moved_in_the_same_way(cell, make, 
     assert not powered(typist.cell)
 
 
-def test_a_drive_without_a_cyclic_mode_is_refused_by_the_plan(tmp_path):
-    with pytest.raises(PlanError, match="6502h"):
-        Typist(**{"arm.eds": str(write_eds("no_cyclic_mode", tmp_path))})
+def test_a_drive_without_a_cyclic_mode_holds_no_contact(tmp_path):
+    with pytest.raises(PlanError, match=r"6502h.*too slow for .*\"press\".*`canprobe console CELL`"):
+        Typist("press", **{"arm.eds": str(write_eds("no_cyclic_mode", tmp_path))})
 
 
 def test_voltage_and_temperature_are_read_beside_the_cycle(tmp_path):

@@ -271,7 +271,7 @@ def tpdo_without_rtr() -> Make:
 
 
 def no_cyclic_mode() -> Make:
-    """Profile modes and homing alone: such a drive is refused by the plan.
+    """Profile modes and homing alone: such a drive is moved by hand, and holds no contact.
 
     Source: as Faulhaber MCDC V2.
     """

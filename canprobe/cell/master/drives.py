@@ -19,7 +19,10 @@ from canprobe.cell.planning.sync import TARGETS, Place
 from canprobe.cell.planning.units import lag_s
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.cia402 import (
+    CHANGE_IMMEDIATELY_BIT,
     ENABLE_INTERPOLATION_BIT,
+    NEW_SETPOINT_BIT,
+    SETPOINT_ACKNOWLEDGE_BIT,
     DriveState,
     OperationMode,
     controlword_toward,
@@ -41,7 +44,7 @@ DOUBTED_CYCLES = 2
 """TPDOs in a row whose statusword is not believed either, where their position cannot be: fewer than make a hold."""
 UNSTATED_LAG_S = 0.05
 """Longest usual lag of a drive without a feed-forward, s, where neither scene nor emulation states one."""
-_QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
+_QUICK_STOP, _DISABLE_VOLTAGE, _ENABLE = 0x0002, 0x0000, 0x000F
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
 """Bits of the statusword that encode the state, and their value in operation enabled; see `known_state` for others."""
 
@@ -108,12 +111,43 @@ def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
     return tuple(frames)
 
 
+class SetPointOffer:
+    """The handshake by which a drive in profile position takes targets (CiA 402-2, "Profile position mode").
+
+    Bit 4 of the controlword offers a target, until bit 12 of the statusword acknowledges it; then it falls, and the
+    next one is offered: a target takes two cycles at least, and a lost frame is made good by the next. Bit 5 puts it in
+    place of the one under way. An offered target stands until it is acknowledged, as a drive takes it when it likes.
+    """
+
+    def __init__(self) -> None:
+        self._target: int | None = None
+        self._offered = False
+
+    def step(self, statusword: int, word: int, target: int) -> tuple[int, int]:
+        """Controlword and target of a cycle.
+
+        Args:
+            statusword: the last one of the drive.
+            word: controlword towards the goal of the drive; it gets targets where that keeps it enabled.
+            target: where it is sent, counts.
+        """
+        if word & _ENABLE != _ENABLE or known_state(statusword) is not DriveState.OPERATION_ENABLED:
+            self._target, self._offered = None, False
+        elif statusword >> SETPOINT_ACKNOWLEDGE_BIT & 1:
+            self._offered = False
+        elif target != self._target and not self._offered:
+            self._target, self._offered = target, True
+        if not self._offered or self._target is None:
+            return word, target
+        return word | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT, self._target
+
+
 DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
 """One RPDO, for one drive or for two: COB-ID, what packs the part of each, and the values of each part."""
 
 
 class DriveGroup:
-    """The arm's CiA 402 drives as their TPDOs report them, in cyclic synchronous or interpolated position mode.
+    """The arm's CiA 402 drives as their TPDOs report them, in cyclic synchronous, interpolated or profile position.
 
     Args:
         axes: the drives, joint 1 first.
@@ -328,6 +362,9 @@ class DriveTargets:
         self._words = [0] * len(axes)
         self._constants: list[int] = []
         self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
+        self._offers = {
+            i: SetPointOffer() for i, axis in enumerate(axes) if axis.mode == OperationMode.PROFILE_POSITION
+        }
         self._steady: tuple[object, ...] | None = None
         rpdos: dict[int, list[tuple[int, PdoLayout]]] = {}
         for i, axis in enumerate(axes):
@@ -425,6 +462,8 @@ class DriveTargets:
             self._steady = key if words == self._words else None
             self._words = words
         values = [*self._words, *targets, *self._constants]
+        for i, offer in self._offers.items():
+            values[i], values[len(self._words) + i] = offer.step(drives.statuswords[i], values[i], targets[i])
         heard_all = drives.heard_all
         commands = []
         for cob_id, every_cycle, packs, fetches, axes in self._plan:
@@ -474,7 +513,8 @@ def make_drives(plan: Plan) -> DriveGroup | None:
         return None
     period_ns = plan.sync.period_ns
     repeat_cycles = max(1, COMMAND_REPEAT_NS // period_ns)
-    return DriveGroup(drive_axes(plan), arm.model, repeat_cycles, period_ns, lag_s(plan.setup) or UNSTATED_LAG_S)
+    lag = (lag_s(plan.setup) or UNSTATED_LAG_S) + arm.profile_lag
+    return DriveGroup(drive_axes(plan), arm.model, repeat_cycles, period_ns, lag)
 
 
 def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:

@@ -422,6 +422,8 @@ class Homing:
             speed = max(1, round(zero.speed * per_q / setup.speed_unit))
             with drive.left_disabled():
                 self._move(drive, target, speed, zero.timeout_s, self._tolerance(axis))
+            for write in (write for write in setup.writes if write.index == PROFILE_SPEED):  # the cycle needs it, too
+                drive.write(write)
             stands = f"it stands at {joint.text(inside, '.2f')}, inside its range"
         elif inside != zero.home:
             stands = "it stands there, outside its range: move it inside by hand before a run"

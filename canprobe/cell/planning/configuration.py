@@ -31,9 +31,11 @@ from canprobe.cell.planning.units import (
     FOLLOWING_WINDOW,
     POLARITY,
     POSITION_LIMITS,
+    PROFILE_DECELERATION,
     PROFILE_SPEED_LIMIT,
     following_window,
     motor_speed_limit,
+    profile_values,
     software_limits,
     speed_unit,
     turn_units,
@@ -58,7 +60,7 @@ from canprobe.mechanics.robot.model import coupled_joints, drive_position_at, jo
 SYNC_START_VALUE = 1
 EMCY_INHIBIT_100US = 1000
 """At most ten emergencies a second from a node: one for every late SYNC would make the next SYNC late too."""
-MODE = 0x6060
+MODE, PROFILE_TYPE = 0x6060, 0x6086
 HOME_OFFSET = 0x607C
 HOMES_HERE = frozenset({35, 37})
 """Homing methods that take the present position."""
@@ -232,6 +234,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: De
         Write(MODE, 0, node.mode, "mode of operation"),
         *([Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")] if interpolated else []),
         *(_interpolation_writes(device, node.interpolation[0]) if node.interpolation else []),
+        *(_profile_writes(plan, node, device) if node.mode is OperationMode.PROFILE_POSITION else []),
         Write(FOLLOWING_WINDOW, 0, following_window(model, axis), "following error window", following),
         Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag),
         *speed,
@@ -240,6 +243,17 @@ def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: De
         Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick),
         Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost),
     ]
+
+
+def _profile_writes(plan: Plan, node: PlannedNode, device: DeviceCapabilities) -> Iterator[Write]:
+    """Writes of profile position: it may not be faster than its joints, and stops as late as it decelerates.
+
+    A drive without 6084h decelerates as it accelerates. Source: CiA 402-2, object 6084h.
+    """
+    for (index, subindex), value in profile_values(plan.setup, node.node_id, device).items():
+        if index != PROFILE_DECELERATION or device.has(index):
+            yield Write(index, subindex, value, "profile position within the limits of [joints]")
+    yield Write(PROFILE_TYPE, 0, 0, "trapezoidal speed", "it accelerates as the device has it")
 
 
 def _homing_writes(arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:

@@ -34,6 +34,7 @@ from canprobe.cell.planning.sync import (
     choose_mode,
     early_stops,
     interpolations,
+    is_profiled,
     operation_problems,
     period_problem,
     plan_ratio,
@@ -213,7 +214,7 @@ def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: l
 
 def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
     sync, exact = plan_sync(setup)
-    drives = [devices[drive.node_id] for drive in setup.drives]
+    drives = [devices[drive.node_id] for drive in setup.drives if not is_profiled(devices[drive.node_id])]
     unset, periods = period_problem(setup.rate_hz, sync.period_us, exact, drives)
     ratio, untimed, image_rates = plan_ratio(setup)
     not_available = []
@@ -350,7 +351,7 @@ def _devices(setup: Setup) -> tuple[dict[int, DeviceCapabilities], list[str]]:
             continue
         if first:
             problems += lacks(device, kind, setup)
-            problems += operation_problems(device) if kind == "drive" else []
+            problems += operation_problems(device, setup) if kind == "drive" else []
     return devices, problems
 
 
@@ -373,7 +374,7 @@ def _nodes(
                 channel=node.channel,
                 switched_off=tuple(one for one in device.switchable_pdos if one not in used),
                 mode=choose_mode(device) if is_drive else None,
-                interpolation=interpolations(device, sync.period_us) if is_drive else (),
+                interpolation=interpolations(device, sync.period_us) if is_drive and not is_profiled(device) else (),
             )
         )
     return tuple(sorted(nodes, key=lambda node: node.node_id))

@@ -78,7 +78,7 @@ class PlannedNode:
         channel: channel of its bus.
         switched_off: PDOs of the EDS that the scene does not need, (direction, number).
         mode: mode of operation, 6060h; None: the node is no drive.
-        interpolation: values of 60C2h that express the period, the first is tried first; empty: the node is no drive.
+        interpolation: values of 60C2h that express the period, the first is tried first; empty: the node needs none.
         dictionary: object dictionary of the package canopen, as the EDS was read for this plan. Treat it as read-only.
     """
 

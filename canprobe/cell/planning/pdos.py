@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
-from canprobe.cell.planning.sync import TARGETS, Place, choose_mode
+from canprobe.cell.planning.sync import TARGETS, Place, choose_mode, is_profiled
+from canprobe.cell.planning.units import profile_values
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, WINDOW_SIZE, has_known
@@ -236,20 +237,21 @@ def _plan_commands(planning: PdoPlanning, node_id: int) -> None:
     mode = choose_mode(device)
     assert mode is not None  # else the plan has said no
     targets = set(TARGETS.values())
+    held = {MODE: int(mode), **(profile_values(planning.setup, node_id, device) if is_profiled(device) else {})}
     for base, one in zip(DRIVE_RPDOS, planning.choose(node_id, "rpdo", (CONTROLWORD, TARGETS[mode])), strict=False):
         constants: list[tuple[Place, int]] = []
         for entry in one.entries:
             place = entry.index, entry.subindex
             if entry.is_dummy or place == CONTROLWORD or place in targets:
                 continue
-            value = mode if place == MODE else device.number(*place)
+            value = held.get(place, device.number(*place))
             if value is None:
                 planning.problems.append(
                     f"node {node_id}: {device.eds}: RPDO{one.number} also writes {place[0]:04X}h:{place[1]:02X}, whose"
                     " EDS entry has no default: state a safe DefaultValue there"
                 )
             else:
-                constants.append((place, int(value)))
+                constants.append((place, value))
         cob_id = planning.cob_id(node_id, "rpdo", one.number, base + node_id)
         layout = PdoLayout(cob_id, one.entries, EVERY_SYNC)
         planning.add(node_id, "rpdo", one.number, layout, constants=tuple(constants))
@@ -259,6 +261,8 @@ def _ungrouped(device: DeviceCapabilities) -> str | None:
     """Why a drive cannot share a target RPDO with another; None where it can."""
     if device.dummy(DUMMY_INTEGER32, 32) is None:
         return f"DummyUsage excludes {DUMMY_INTEGER32:04X}h"
+    if is_profiled(device):
+        return "profile position takes a target with the controlword beside it"
     for number, count in ((1, 1), (2, 2)):
         free = number in device.pdo_numbers("rpdo") and device.fixed_cob_id("rpdo", number) is None
         if not free or device.capacity("rpdo", number) < count:

@@ -1,7 +1,8 @@
 """The cycle in CANopen's objects: SYNC, the SYNCs of one tactile frame, and its period as each drive takes it.
 
-Cyclic synchronous position is taken where the drive has it, else interpolated position. A drive takes the period of its
-targets by 60C2h (interpolation time period), value · 10^index s, or else by 1006h (period of SYNC). Devices take whole
+Cyclic synchronous position is taken where the drive has it, else interpolated position, else profile position, in which
+a drive goes to each target on a ramp of its own and needs no period. The others take the period of their targets by
+60C2h (interpolation time period), value · 10^index s, or else by 1006h (period of SYNC). Devices take whole
 milliseconds only, or anything down to microseconds. The default index of the device comes first, as it is the one that
 surely works; then the others from milliseconds down.
 Source: CiA 402-2, objects 6060h, 60C1h, 60C2h, 6502h; CiA 301, object 1006h.
@@ -24,6 +25,7 @@ Place = tuple[int, int]
 TARGETS: Mapping[OperationMode, Place] = {
     OperationMode.CYCLIC_SYNC_POSITION: (0x607A, 0),
     OperationMode.INTERPOLATED_POSITION: (0x60C1, 1),
+    OperationMode.PROFILE_POSITION: (0x607A, 0),
 }
 """Modes in which the cell can drive, the best first, with the object of their target."""
 INTERPOLATION_TIME = 0x60C2
@@ -57,11 +59,21 @@ def choose_mode(device: DeviceCapabilities) -> OperationMode | None:
     return None
 
 
-def operation_problems(device: DeviceCapabilities) -> list[str]:
+def is_profiled(device: DeviceCapabilities) -> bool:
+    """Whether a drive goes by profile position."""
+    return choose_mode(device) is OperationMode.PROFILE_POSITION
+
+
+def operation_problems(device: DeviceCapabilities, setup: Setup) -> list[str]:
     """Why a device cannot be driven in the cycle, whatever the rate."""
     problems = []
+    needed = f"needed: {_mode_text(8)}, or {_mode_text(7)}"
     if choose_mode(device) is None:
-        problems.append(f"{device.eds}: {_modes_offered(device)}; needed: {_mode_text(8)}, or {_mode_text(7)}")
+        problems.append(f"{device.eds}: {_modes_offered(device)}; {needed}, or {_mode_text(1)} for motions by hand")
+    elif is_profiled(device):
+        slow = f'in profile position it lags on ramps of its own, too slow for task.kind = "{setup.kind}"'
+        by_hand = "`canprobe console CELL`, `move CELL` and `home CELL` go by profile position"
+        return [f"{device.eds}: {_modes_offered(device)}; {slow}; {needed}; {by_hand}"] if setup.touch else []
     if not device.has(INTERPOLATION_TIME, 1) and not device.has(SYNC_PERIOD):
         missing = "objects 60C2h (interpolation time period) and 1006h (period of SYNC) are missing"
         problems.append(f"{device.eds}: {missing}; the drive needs one of them to know the period of its targets")
@@ -70,7 +82,7 @@ def operation_problems(device: DeviceCapabilities) -> list[str]:
 
 def follows_sync_period(device: DeviceCapabilities) -> bool:
     """Whether a drive knows the period of its targets only by 1006h."""
-    return not device.has(INTERPOLATION_TIME, 1) and device.has(SYNC_PERIOD)
+    return not is_profiled(device) and not device.has(INTERPOLATION_TIME, 1) and device.has(SYNC_PERIOD)
 
 
 def early_stops(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> Iterator[str]:
@@ -106,8 +118,8 @@ def homing_problems(device: DeviceCapabilities) -> list[str]:
 
 def _modes_offered(device: DeviceCapabilities) -> str:
     listed = device.description.modes
-    lacking = [f"{index:04X}h:{sub:02X}" for mode, (index, sub) in TARGETS.items() if listed is None or mode in listed]
-    if lacking:
+    wanted = {target for mode, target in TARGETS.items() if listed is None or mode in listed}
+    if lacking := [f"{index:04X}h:{sub:02X}" for index, sub in sorted(wanted) if not device.has(index, sub)]:
         return f"object {' or '.join(lacking)} (target position) is missing"
     return f"its modes (6502h) are {', '.join(map(_mode_text, sorted(listed or ()))) or 'none'}"
 

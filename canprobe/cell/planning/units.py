@@ -19,18 +19,25 @@ import numpy as np
 
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.node_configuration import TurnUnits
+from canprobe.cell.planning.sync import Place, is_profiled
 from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
-from canprobe.fieldbus.protocol.si_unit import VELOCITY_UNIT_INDEX, rate_unit
+from canprobe.fieldbus.protocol.si_unit import ACCELERATION_UNIT_INDEX, VELOCITY_UNIT_INDEX, rate_unit
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
 
 POSITION_LIMITS, POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607D, 0x607E, 0x608F, 0x6091, 0x6092
 PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT, FOLLOWING_WINDOW = 0x607F, 0x6080, 0x6065
+PROFILE_SPEED, PROFILE_ACCELERATION, PROFILE_DECELERATION = 0x6081, 0x6083, 0x6084
 FOLLOWING_WINDOW_DEG = 5.0
 NO_WINDOW = 0xFFFFFFFF
 """Value of 6065h where a drive does not watch the following error."""
 LAG_BANDWIDTH = math.sqrt(math.sqrt(2.0) - 1.0) / math.pi
 """Lag behind a ramp, times the -3 dB frequency, of a critically damped loop of second order: 2/w."""
+PROFILE_STOP_S = 0.02
+"""Longest time in which an arm in profile position brakes from the speed of a motion, s. A drive follows the targets of
+a ramp by its way to stop, half of that time behind: joints that lag by different times leave the straight way."""
+PROFILE_CYCLES = 2
+"""Cycles from a set-point to the next one: bit 4 of the controlword rises in one and falls in the other."""
 ROUNDING_COUNTS = 2
 """Counts by which rounding may move two targets apart."""
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
@@ -153,7 +160,30 @@ def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tu
         return setup, ()
     setup, ranges = _within_ranges(setup, setup.arm, devices)
     setup, speeds = _within_speeds(setup, setup.needed_arm(), devices)
-    return setup, (*ranges, *speeds)
+    if not (profiled := [drive.node_id for drive in setup.drives if is_profiled(devices[drive.node_id])]):
+        return setup, (*ranges, *speeds)
+    lag = 0.5 * PROFILE_STOP_S + PROFILE_CYCLES / setup.rate_hz
+    warning = (
+        f"nodes {', '.join(map(str, profiled))} have no mode for a target in every cycle (6502h) and go by profile"
+        f" position: motions by hand are no faster than the arm stops in {1e3 * PROFILE_STOP_S:g} ms; a higher"
+        " acceleration of its joints (acceleration_deg_s2) lets them be faster"
+    )
+    return setup.changed("arm", profile_lag=lag), (*ranges, *speeds, warning)
+
+
+def profile_values(setup: Setup, node_id: int, device: DeviceCapabilities) -> dict[Place, int]:
+    """Velocity, acceleration and deceleration of a drive in profile position, those of its joints at their limits.
+
+    A unit that the data of the cell cannot express gives the slowest.
+    """
+    arm = setup.needed_arm()
+    axis = arm.node_ids.index(node_id)
+    per_q, drive = np.abs(arm.model.units_per_q[axis]), arm.drives[axis]
+    speed = float(per_q @ arm.model.qd_max) * setup.limits.speed_share
+    rate = float(per_q @ arm.model.qdd_max) / (speed_unit(device, drive, ACCELERATION_UNIT_INDEX) or math.inf)
+    speed /= speed_unit(device, drive, VELOCITY_UNIT_INDEX) or math.inf
+    values = {PROFILE_SPEED: speed, PROFILE_ACCELERATION: rate, PROFILE_DECELERATION: rate}
+    return {(index, 0): max(1, int(value)) for index, value in values.items()}
 
 
 def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:

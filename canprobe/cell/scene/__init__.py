@@ -19,7 +19,8 @@ whole for its task).
 - `plugins` finds cells, scenes, arrays and estimators of other packages by their entry points.
 - `calibrations` reads and writes calibration files of arrays, which `sensor.calibration` names.
 - `geometry` turns the object, whose surface may be in a file, the probe and the path of a scene into frames and
-  surfaces; it is used by `resolve` and by those who show a scene.
+  surfaces; it is used by `resolve` and by those who show a scene. `urdf_solids` reads the meshes of an arm, and puts
+  spheres round its links.
 
 Invariant: behind `resolve` there is no optional part that "must be there"; a task's setup holds exactly what that
 task needs. To add a key: a field in `model`, a line in `resolve`, and its user. Start reading at `model`, then

@@ -159,7 +159,8 @@ class KeepOutSettings:
     boxes_mm: tuple[tuple[Vec3, Vec3], ...] = ()
     """Boxes in the base frame, each by its lowest and its highest corner."""
     link_radius_mm: Annotated[float, Range(0, 2000)] = 50.0
-    """Radius of the arm round the straight lines from joint to joint. The probe has that of `[probe]`."""
+    """Radius of links for which the URDF has no collision solids, round the straight lines from joint to joint, and of
+    what holds the probe. The probe has that of `[probe]`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint, posture_in_si
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, refuse_narrow, scan_axes, true_object
-from canprobe.cell.scene.hardware import MM, EmulateSettings, KeepOutSettings
+from canprobe.cell.scene.hardware import MM, EmulateSettings
 from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -44,6 +45,7 @@ from canprobe.cell.scene.setup import (
     Touch,
     Truth,
 )
+from canprobe.cell.scene.urdf_solids import link_spheres
 from canprobe.errors import PlanError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
@@ -90,6 +92,9 @@ def resolve(scene: Scene) -> Setup:
         radius = FLAT_RADIUS_M
     stiffness = array.calibration.image.stiffness if array is not None else LAYER_STIFFNESS
     bare = scene.probe is None and scene.sensor is None
+    keep_out, lacking = _keep_out(scene, arm, None if bare else settings)
+    if arm is not None:
+        arm = replace(arm, warnings=(*arm.warnings, *lacking))
     probe = Probe(np.eye(4), 0.0, stiffness, 0.0) if bare else Probe(T, radius, stiffness, settings.mass_kg)
     return Setup(
         scene=scene,
@@ -103,7 +108,7 @@ def resolve(scene: Scene) -> Setup:
         rate_hz=scene.cycle.rate_hz,
         realtime=scene.cycle.realtime,
         compute_ns=round(scene.cycle.compute_us * 1000),
-        limits=_limits(scene.limits, arm, _keep_out(scene.keep_out, None if bare else settings)),
+        limits=_limits(scene.limits, arm, keep_out),
         bring_up=scene.bring_up,
         bridge=scene.bridge or BridgeSettings(),
         arm=arm,
@@ -253,15 +258,20 @@ def _frame(text: str) -> Frame:
     return int(can_id, 16), bytes.fromhex(data)
 
 
-def _keep_out(settings: KeepOutSettings | None, probe: ProbeSettings | None) -> KeepOut | None:
-    if settings is None or (settings.floor_mm is None and not settings.boxes_mm):
-        return None
+def _keep_out(scene: Scene, arm: Arm | None, probe: ProbeSettings | None) -> tuple[KeepOut | None, tuple[str, ...]]:
+    """What the arm keeps out of, and warnings about the collision solids of its URDF."""
+    settings = scene.keep_out
+    if scene.arm is None or arm is None or settings is None or (settings.floor_mm is None and not settings.boxes_mm):
+        return None, ()
     floor = -math.inf if settings.floor_mm is None else settings.floor_mm * MM
     boxes = np.array(settings.boxes_mm, dtype=float).reshape(-1, 2, 3) * MM
     radius = settings.link_radius_mm * MM
-    if probe is None:
-        return KeepOut(floor, boxes, radius, np.zeros(3), radius)
-    return KeepOut(floor, boxes, radius, T_flange_probe(probe)[:3, 3], probe.radius_mm * MM)
+    centre, size = (np.zeros(3), radius) if probe is None else (T_flange_probe(probe)[:3, 3], probe.radius_mm * MM)
+    keep_out = KeepOut(floor, boxes, radius, centre, size)
+    if (urdf := scene.arm.urdf) is None:
+        return keep_out, ()
+    spheres, lacking = link_spheres(Path(urdf), scene.arm.base, scene.arm.tip, arm.model.chain)
+    return replace(keep_out, spheres=spheres), lacking
 
 
 def _limits(settings: LimitSettings, arm: Arm | None, keep_out: KeepOut | None) -> SafetyLimits:

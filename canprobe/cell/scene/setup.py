@@ -110,6 +110,7 @@ class Arm:
         postures: (n,) rad or m by name, that of the start among them.
         temperature: entry of the drives' temperature (index, sub-index), and its unit, °C; None: not stated.
         when_disabled: what it does when its drives are disabled, as the cell file says.
+        profile_lag: lag that profile position adds to that of the drives, s; 0 where no drive goes by it.
     """
 
     model: ArmModel
@@ -122,6 +123,7 @@ class Arm:
     postures: Mapping[str, Floats] = field(default_factory=dict)
     temperature: tuple[int, int, float] | None = None
     when_disabled: WhenDisabled = "unknown"
+    profile_lag: float = 0.0
 
     @property
     def left_alone(self) -> str:

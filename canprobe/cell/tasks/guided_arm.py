@@ -19,8 +19,12 @@ LIFETIME_S = 0.15
 """Time from the last renewal of a motion until the arm stands, s."""
 RENEWED_S = 0.02
 """Time in which a screen renews a motion."""
-SETTLE_LAGS = 3.0
-"""Time from the last motion of the targets until the joints stand, in lags of the drives."""
+SETTLE_LAGS, PROFILE_LAGS = 3.0, 1.3
+"""Time from the last motion of the targets until the joints stand, in lags of the drives and of profile position.
+
+In profile position a drive is its way to stop behind: v' = a (w / v - 1), where the speed w of the targets falls by a.
+By the solution it stands 0.55 v / a after them, and its lag was 0.5 v / a.
+"""
 USUAL_LAG_S = 6.8e-3
 """Lag of real drives for which nothing is stated, s, as `servo.drive_lag_ms` has it by default."""
 CYCLES = 3
@@ -46,7 +50,8 @@ class GuidedArm(Controller):
     def __init__(self, plan: Plan, attend: Callable[[Measurement], None], update: Callable[[], None] = nothing) -> None:
         self._plan, self._attend, self._update = plan, attend, update
         self.reader = make_patch_reader(plan.setup)
-        settle_ns = round(1e9 * SETTLE_LAGS * (lag_s(plan.setup) or USUAL_LAG_S))
+        settle_s = SETTLE_LAGS * (lag_s(plan.setup) or USUAL_LAG_S)
+        settle_ns = round(1e9 * (settle_s + PROFILE_LAGS * plan.setup.needed_arm().profile_lag))
         self._standing_ns = settle_ns + CYCLES * plan.sync.period_ns
         if 1e-9 * self._standing_ns + RENEWED_S >= LIFETIME_S:
             raise UsageError(

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.contact import blind_s, depth_at
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.planning.units import lag_s
+from canprobe.cell.planning.units import PROFILE_STOP_S, lag_s
 from canprobe.errors import PlanError, UsageError, did_you_mean
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.motion_profile import MotionProfile
@@ -178,9 +178,13 @@ class HandWay:
         model, self.slowed_by = self._model, None
         fastest = min(self._most, float((self._highest[moves] / rates[moves]).min()))
         acceleration = float((model.qdd_max[moves] / rates[moves]).min()) / self._growth
-        stopping = acceleration * (GUIDED_STOP_S - GUIDED_JERK_S)
-        if self._guided and fastest > stopping * (1.0 + 1e-6):
-            fastest, self.slowed_by = stopping, "no faster, as it has to stop at once where nobody renews it"
+        stop_s, why = math.inf, ""
+        if self._guided:
+            stop_s, why = GUIDED_STOP_S - GUIDED_JERK_S, "it has to stop at once where nobody renews it"
+        if self._plan.setup.needed_arm().profile_lag:
+            stop_s, why = PROFILE_STOP_S, "the drives lag by their way to stop (profile position)"
+        if fastest > acceleration * stop_s * (1.0 + 1e-6):
+            fastest, self.slowed_by = acceleration * stop_s, f"no faster, as {why}"
         tip_rate = float(np.linalg.norm(np.diff(self.tip, axis=0), axis=1).max())
         touch = touch_speed(self._plan) if self._bounded else None
         if touch is not None and fastest * tip_rate > touch:
@@ -342,4 +346,5 @@ def touch_speed(plan: Plan) -> float | None:
     shown = setup.limits.jog_force
     forces = (shown, 0.5 * (shown + setup.limits.force_max))
     depths = [depth_at(force, setup.probe, setup.array, (0.0, 0.0)) for force in forces]
-    return (depths[1] - depths[0]) / blind_s(setup.rate_hz, setup.array, lag_s(setup))
+    lag = lag_s(setup) + setup.needed_arm().profile_lag
+    return (depths[1] - depths[0]) / blind_s(setup.rate_hz, setup.array, lag)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from math import atan2, cos, sin
 from typing import Literal, NamedTuple
 
@@ -289,6 +290,19 @@ def link_transforms(chain: Chain, q: npt.ArrayLike) -> list[Floats]:
     moved = [_motion(slides, value) for slides, value in zip(chain.prismatic, np.asarray(q).tolist(), strict=True)]
     links = [motion @ T for motion, T in zip(moved, (*chain.fixed[1:], chain.T_last_flange), strict=True)]
     return [chain.fixed[0] @ links[0], *links[1:]]
+
+
+def link_frames(chain: Chain, q: npt.ArrayLike) -> Floats:
+    """Frames of the base and of every link.
+
+    Args:
+        chain: the arm.
+        q: joint positions (n,), rad or m.
+
+    Returns:
+        Poses T_base_link (n + 1, 4, 4); the last is the flange.
+    """
+    return np.array([*accumulate(link_transforms(chain, q), np.matmul, initial=np.eye(4))])
 
 
 def pose_of(at: Posture) -> Floats:

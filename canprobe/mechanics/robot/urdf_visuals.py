@@ -1,13 +1,13 @@
-"""The visuals of a URDF: solids of the links in the frames of `from_urdf`, and the files of their meshes.
+"""Solids of a URDF, visual or for collisions, in the frames of `from_urdf`, and the files of their meshes.
 
-Source: URDF specification (wiki.ros.org/urdf/XML, link, visual).
+Source: URDF specification (wiki.ros.org/urdf/XML, link, visual, collision).
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
@@ -23,7 +23,7 @@ from canprobe.mechanics.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visual:
-    """One visual solid of a URDF.
+    """One solid of a URDF.
 
     Attributes:
         joint: number of the joint that moves it, from 1; 0 where it stands with the base.
@@ -43,12 +43,15 @@ class Visual:
     colour: tuple[int, int, int] | None
 
 
-def visuals_of(source: str | Path, base: str | None = None, tip: str | None = None) -> list[Visual]:
+def visuals_of(
+    source: str | Path, base: str | None = None, tip: str | None = None, tag: str = "visual"
+) -> list[Visual]:
     """Solids of the links from base to tip, and of all that they carry.
 
     Args:
         source: path of the file, or its text.
         base, tip: names of links, as for `from_urdf`.
+        tag: element of the solids, "visual" or "collision".
 
     Raises:
         PlanError: `from_urdf` would raise it, or a solid lacks its numbers.
@@ -57,16 +60,16 @@ def visuals_of(source: str | Path, base: str | None = None, tip: str | None = No
     start = base or tree.root()
     path = tree.path(start, tip or tree.only_end(start))
     names = {edge.name for edge in path}
-    found = list(_visuals(tree, 0, start, names, np.eye(4)))
+    found = list(_visuals(tree, tag, 0, tree.carried(start, names, np.eye(4))))
     for number, edge in enumerate((edge for edge in path if edge.kind != "fixed"), start=1):
-        found += _visuals(tree, number, edge.child, names, z_along(tree.axis(edge)).T)
+        found += _visuals(tree, tag, number, tree.carried(edge.child, names, z_along(tree.axis(edge)).T))
     return found
 
 
-def _visuals(tree: UrdfTree, joint: int, link: str, path: set[str], T: Floats) -> Iterator[Visual]:
-    """Solids of a link and of what it carries, seen from the frame in which the link stands at T."""
-    for name, there in tree.carried(link, path, T):
-        for element in tree.links[name].iterfind("visual"):
+def _visuals(tree: UrdfTree, tag: str, joint: int, carried: Iterable[tuple[str, Floats]]) -> Iterator[Visual]:
+    """Solids of links that stand at places in the frame of a joint."""
+    for name, there in carried:
+        for element in tree.links[name].iterfind(tag):
             place = there @ tree.origin(f"link {name}", element.find("origin"))
             for solid in element.iterfind("geometry/*"):
                 size = _size(tree, f"link {name}", solid)

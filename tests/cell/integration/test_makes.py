@@ -27,7 +27,8 @@ from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 RATE_HZ = 333.333
 SWING = np.radians((3, -3, 3, 3, -3, 3))
 IP, CSP = OperationMode.INTERPOLATED_POSITION, OperationMode.CYCLIC_SYNC_POSITION
-MOVING = {name: IP if name == "interpolated" else CSP for name in MAKES if name != "no_cyclic_mode"}
+PP = OperationMode.PROFILE_POSITION
+MOVING = {name: CSP for name in MAKES} | {"interpolated": IP, "no_cyclic_mode": PP}
 
 
 def scene_of(make, folder):
@@ -102,7 +103,7 @@ def assert_first_targets_are_positions(plan, frames):
         enabling = next(order for order in orders if order[0] & 0x0F == 0x0F)
         assert enabling[1] == orders[0][1]
         bits = {order[0] & 0x10 for order in orders if order[0] & 0x0F == 0x0F}
-        assert (0x10 in bits) == (node.mode is IP)
+        assert (0x10 in bits) == (node.mode is not CSP)
 
 
 @pytest.mark.parametrize(
@@ -129,8 +130,50 @@ def test_a_rate_that_a_make_cannot_express_is_refused_with_the_nearest_that_all_
 
 
 def test_a_make_without_a_mode_for_targets_is_refused_with_the_modes_that_it_has(tmp_path):
-    modes = next(problem for problem in reasons(scene_of("no_cyclic_mode", tmp_path)) if "6502h" in problem)
-    assert "profile position (1), profile velocity (3), homing (6); needed: cyclic synchronous position (8)" in modes
+    objects = dict(MAKES["no_cyclic_mode"]().objects)
+    changed(objects, 0x6502, default=0x24)
+    make = replace(MAKES["no_cyclic_mode"](), objects=objects)
+    modes = next(problem for problem in reasons(scene_of(make, tmp_path)) if "6502h" in problem)
+    assert "profile velocity (3), homing (6); needed: cyclic synchronous position (8), or interpolated" in modes
+    assert modes.endswith("or profile position (1) for motions by hand")
+
+
+def test_profile_position_holds_no_contact_and_the_plan_says_what_goes(tmp_path):
+    path = write_eds("no_cyclic_mode", tmp_path)
+    for scene in ("press", "calibrate"):
+        (problem,) = reasons(change(canprobe.load_scene(scene), arm={"eds": str(path)}))
+        assert problem.startswith(f"{path}: its modes (6502h) are profile position (1), profile velocity (3), homing")
+        assert f'too slow for task.kind = "{scene}"; needed: cyclic synchronous position (8)' in problem
+        assert problem.endswith("`canprobe console CELL`, `move CELL` and `home CELL` go by profile position")
+
+
+def test_profile_position_that_would_stop_late_is_refused(tmp_path):
+    """6084h of a drive is fixed; without the object the drive decelerates by 6083h."""
+    objects = dict(MAKES["no_cyclic_mode"]().objects)
+    changed(objects, 0x6084, access="ro", default=100)
+    make = replace(MAKES["no_cyclic_mode"](), objects=objects)
+    refusal = r"6084h:00 = \d+ \(profile position within the limits of \[joints\]\) is needed: it is ro, 100"
+    assert re.search(refusal, "\n".join(reasons(scene_of(make, tmp_path))))
+    without(objects, 0x6084)
+    assert canprobe.plan(scene_of(make, tmp_path)).nodes[0].mode is PP
+
+
+def test_profile_position_is_bounded_by_the_limits_whatever_else_a_fixed_pdo_writes(tmp_path):
+    """607Ah and 6081h share an RPDO of PRBT drives: the default of the file would take the limit away in each cycle."""
+    objects = dict(MAKES["no_cyclic_mode"]().objects)
+    without(objects, 0x1006, *(base + number for base in (0x1400, 0x1600) for number in range(4)))
+    objects |= pdo("rpdo", 1, (word(0x6040, 0, 16),), fixed=True)
+    objects |= pdo("rpdo", 2, (word(0x607A, 0, 32), word(0x6081, 0, 32)), fixed=True)
+    make = replace(MAKES["no_cyclic_mode"](), name="speed", objects=objects)
+    plan = canprobe.plan(change(scene_of(make, tmp_path), arm={"grouped_rpdo": True}))  # neither 60C2h nor 1006h
+    model, (_, target) = plan.setup.arm.model, plan.pdos_of(1, "rpdo")
+    speed, rate = (int(model.units_per_q[0, 0] * most[0]) for most in (model.qd_max, model.qdd_max))
+    assert dict(target.constants) == {(0x6081, 0): speed}
+    writes = {write.index: write.value for write in plan.configurations[0].writes}
+    assert (writes[0x6060], writes[0x6081], writes[0x6083], writes[0x6084]) == (1, speed, rate, rate)
+    assert "two targets in one RPDO" in dict(plan.not_available)
+    assert any("go by profile position" in warning for warning in plan.warnings)
+    assert np.allclose(moved(plan, tmp_path / "run", at_cycles=300)[1], SWING, atol=np.radians(0.02))
 
 
 def test_what_a_bare_drive_lacks_is_listed_with_the_consequence(tmp_path):

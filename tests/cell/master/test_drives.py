@@ -4,11 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from puma_arm import MODELS
 
 import canprobe
 from canprobe.cell.master.array import TactileReceiver
-from canprobe.cell.master.drives import DriveAxis, DriveGroup
+from canprobe.cell.master.drives import DriveAxis, DriveGroup, SetPointOffer
 from canprobe.cell.master.position_track import MIN_REST_COUNTS, REST_NS, PositionTrack, rest_counts
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
@@ -222,6 +224,25 @@ def test_interpolated_position_sets_bit_4_while_operation_is_enabled():
 # Positions that a motor can and cannot have reached, and where it is when nobody says.
 
 PERIOD = 2_500_000
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=1, max_size=60))
+def test_a_set_point_is_taken_whatever_frames_are_lost_and_however_late_it_is_acknowledged(cycles):
+    """By CiA 402 a rising bit 4 takes the target, and bit 12 follows some cycles later. In the end nothing is lost."""
+    set_point, seen, word, acknowledged, taken = SetPointOffer(), 0, 0, False, []
+    for k, (heard, sent, prompt) in enumerate([*cycles, *[(True, True, True)] * 6]):
+        target = min(k, len(cycles)) // 3
+        bits, told = set_point.step(seen, 0x0F, target)
+        if sent:
+            if bits & 0x10 and not word & 0x10:
+                assert bits & 0x20, "at once"
+                taken.append(told)
+            word = bits
+        acknowledged = bool(word & 0x10) if prompt else acknowledged
+        seen = ENABLED | acknowledged << 12 if heard else seen
+    assert taken[-1] == target and taken == sorted(set(taken)), "each once, in their order"
+    assert set_point.step(ENABLED, 0x0F, target)[0] == 0x0F, "an arm at rest gets no set-points"
+    assert set_point.step(0x0007, 0x0F, 99) == (0x0F, 99) and set_point.step(ENABLED, 0x02, 99) == (0x02, 99)
 
 
 def moving(rate=10, cycles=20, track=None, period_ns=PERIOD):

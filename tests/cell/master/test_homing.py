@@ -125,6 +125,15 @@ def test_a_joint_goes_back_inside_its_range_and_one_that_is_homed_where_it_stand
     assert modes == {1: [8, 6, 8, 1, 8], 2: [8, 6, 8]}
 
 
+def test_homing_leaves_a_drive_in_profile_position_as_quick_as_it_was(tmp_path):
+    scene = change(scene_of([17]), arm={"eds": str(write_eds("no_cyclic_mode", tmp_path))})
+    bench = Bench(scene, tmp_path)
+    assert "inside its range" in bench.home()[0]
+    wanted = [write.value for write in bench.plan.configurations[0].writes if write.index == 0x6081]
+    written = [int.from_bytes(d[4:], "little") for i, d in bench.frames if i == 0x601 and d[:4].hex() == "23816000"]
+    assert written[0] == written[-1] == wanted[0] and len(written) == 3
+
+
 def test_a_record_without_a_schema_is_of_the_first_one(tmp_path):
     bench = Bench(scene_of([35]), tmp_path)
     bench.home()

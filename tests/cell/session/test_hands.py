@@ -5,9 +5,13 @@ import signal
 
 import numpy as np
 import pytest
+from makes import write_eds
 
 import canprobe
+from canprobe.cell.planning import make
 from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
+from canprobe.cell.planning.units import PROFILE_CYCLES, PROFILE_STOP_S, lag_s
 from canprobe.cell.scene.load import packaged
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks.hand_way import joint_way
@@ -47,6 +51,28 @@ def test_a_move_ends_within_a_count_of_its_posture_and_shows_the_way_before():
         assert opened.move("start", 0.5) is None and opened.move(np.radians(READY), 0.5) is None
 
 
+@pytest.mark.parametrize(("rate_hz", "quick"), [(400.0, True), (100.0, False)])
+def test_profile_position_ends_within_a_count_near_the_way_and_within_the_limits(rate_hz, quick, tmp_path):
+    """With an acceleration that lets it, at the limits of speed; else no faster than it stops in 20 ms."""
+    keys = {f"joints__joint_{i}__acceleration_deg_s2": 1e5 for i in range(1, 7)} if quick else {}
+    keys |= {"arm__eds": str(write_eds("no_cyclic_mode", tmp_path)), "sensor__rate_hz": 50.0}
+    with cell(cycle__rate_hz=rate_hz, **keys) as opened:
+        way = opened.way_to("ready", 1.0)
+        assert opened.move(way) is None
+        assert (np.abs(opened.read().q - np.radians(READY)) / counts(opened)).max() < 1.0
+        log, model = log_of(opened), opened.plan.setup.arm.model
+        nodes = opened.session.buses.world.nodes
+    assert (way.slowed_by is None) is quick and (quick or "way to stop (profile position)" in way.slowed_by)
+    ramps = [(node.application.parts.parameters, np.abs(model.units_per_q[i])) for i, node in enumerate(nodes[:6])]
+    for parameters, per_q in ramps:  # which no set-point exceeds, see test_profile_position
+        assert parameters.acceleration <= per_q @ model.qdd_max
+    rates = np.abs(np.diff(log["q_rad"], axis=0)) * rate_hz  # of axes that overshoot a sharp turn by a little
+    assert (rates <= 1.02 * model.qd_max).all() and (not quick or (rates / model.qd_max).max() > 0.9)
+    off = np.abs(log["q_target_rad"] - log["q_rad"])[np.isfinite(log["q_target_rad"]).all(axis=1)].max(axis=0)
+    lag = 0.5 * PROFILE_STOP_S + lag_s(opened.plan.setup) + (CYCLES_TO_EFFECT + PROFILE_CYCLES + 1) / rate_hz
+    assert (off <= lag * way.speed * np.abs(way.q[1] - way.q[0]) + 1e-3).all()
+
+
 def test_the_dynamic_arm_ends_within_its_droop():
     with cell(plant__fidelity="dynamic") as opened:
         opened.move("ready", 0.2)
@@ -83,7 +109,10 @@ def test_a_way_through_a_limit_or_a_keep_out_is_refused_with_joint_place_and_tim
                 [0, 0, 0, 0, 0, 300],
                 r"joint 6 would come to 29\d\.\d deg; it may go from -214.0 to 294.0 deg, .* s after",
             ),
-            ([90, -60, 15, 0, 100, 0], r"the (arm|probe) comes to -?\d+ mm, the floor is at 250 mm, .* % of the way"),
+            (
+                [90, -60, 15, 0, 100, 0],
+                r"the (link of joint \d|probe) comes to -?\d+ mm, the floor is at 250 mm, .* % of the way",
+            ),
         ):
             with pytest.raises(UsageError, match=said):
                 opened.move(np.radians(goal))
@@ -116,15 +145,18 @@ def turn_z(angle):
 
 
 @pytest.mark.parametrize(
-    ("way", "fidelity"),
+    ("way", "fidelity", "eds"),
     [
-        ({"along": (0, 0, 1), "in_probe_frame": True, "velocity": 0.1, "for_s": 1.0}, "ideal"),
-        ({"joint": 3, "velocity": 0.5, "for_s": 1}, "dynamic"),
+        ({"along": (0, 0, 1), "in_probe_frame": True, "velocity": 0.1, "for_s": 1.0}, "ideal", None),
+        ({"joint": 3, "velocity": 0.5, "for_s": 1}, "dynamic", None),
+        ({"joint": 3, "velocity": 0.5, "for_s": 1}, "ideal", "no_cyclic_mode"),
     ],
-    ids=["probe", "joint 3"],
+    ids=["probe", "joint 3", "profile position"],
 )
-def test_a_jog_goes_back_from_what_it_touches_at_half_of_the_limit(way, fidelity, tmp_path):
-    opened = cell("press", out=tmp_path / "run", plant__fidelity=fidelity)
+def test_a_jog_goes_back_from_what_it_touches_at_half_of_the_limit(way, fidelity, eds, tmp_path, monkeypatch):
+    monkeypatch.setattr(make, "operation_problems", lambda *_: [])  # the emulated array has its object in a press alone
+    keys = {} if eds is None else {"arm__eds": str(write_eds(eds, tmp_path))}
+    opened = cell("press", out=tmp_path / "run", plant__fidelity=fidelity, **keys)
     with opened:
         with pytest.raises(SafetyStop, match=r"showed 1\.\d\d N \(limits.jog_force_n = 1\) .* went back"):
             opened.jog(**way)
@@ -169,10 +201,15 @@ def test_an_arm_that_stands_beyond_a_limit_is_jogged_back_and_no_further_out():
         assert np.degrees(opened.read().q[2]) == pytest.approx(46.0, abs=0.02)
 
 
-@pytest.mark.parametrize("kind", ["brake-stuck", "encoder-frozen", "mute", "drive-fault", "emcy"])
-def test_a_fault_of_a_drive_ends_a_motion(kind):
+FAULTS = ["brake-stuck", "encoder-frozen", "mute", "drive-fault", "emcy"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "eds"), [*((kind, None) for kind in FAULTS), ("brake-stuck", "no_cyclic_mode"), ("mute", "no_cyclic_mode")]
+)
+def test_a_fault_of_a_drive_ends_a_motion(kind, eds, tmp_path):
     """The joint does not follow, or its drive is lost: the cell stops, and stays so until a person's word."""
-    opened = cell()
+    opened = cell(**({} if eds is None else {"arm__eds": str(write_eds(eds, tmp_path))}))
     faulty = opened.session.buses.world.make_faulty()
 
     def throw(measurement):

@@ -19,7 +19,7 @@ from canprobe.lab.bridge.view import colours, links
 from canprobe.lab.bridge.view import object_sheet as objects
 from canprobe.lab.bridge.view.path import PathAhead, deviation_scale
 from canprobe.lab.bridge.view.surface import LIFT_M, GrowingSurface, drawn, map_of_points
-from canprobe.mechanics.robot.chain import forward, posture
+from canprobe.mechanics.robot.chain import forward, link_frames, posture
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
 from canprobe.mechanics.touch.pad import Pad
@@ -54,7 +54,7 @@ def face_middles(mesh):
 @MODEL
 @pytest.mark.parametrize("q", QS[:6])
 def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
-    frames = links.link_frames(model.chain, q)
+    frames = link_frames(model.chain, q)
     assert frames[6] == pytest.approx(forward(model.chain, q), abs=1e-14)
     c = posture(model.chain, q)
     wrist = c.origins[4]
@@ -70,7 +70,7 @@ def test_every_link_has_a_closed_body_the_right_way_out_and_every_joint_lies_in_
     assert not lines and len({part.name for part in parts}) == len(parts)
     assert {part.frame for part in parts} >= set(range(arm.n)) and all(part.mesh.is_volume for part in parts)
     q = 0.5 * (arm.q_min + arm.q_max)
-    frames, at = links.link_frames(arm.chain, q), posture(arm.chain, q)
+    frames, at = link_frames(arm.chain, q), posture(arm.chain, q)
     bodies = [part.mesh.copy().apply_transform(frames[part.frame]) for part in parts]
     for origin in np.array(at.origins):
         assert max(winding(body, origin) for body in bodies) > 0.5

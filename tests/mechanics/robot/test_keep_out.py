@@ -22,7 +22,7 @@ def test_a_link_keeps_its_radius_above_the_floor(degrees, touches):
 def test_the_middle_of_a_link_does_not_pass_through_a_box_between_its_ends():
     box = np.array([[[0.45, -0.02, 0.4], [0.55, 0.02, 0.46]]])
     keep_out = KeepOut(-np.inf, box, 0.05, np.zeros(3), 0.05)
-    assert keep_out.touched(ARM, np.zeros(2)) == "the arm comes to -10 mm from box 1 of keep_out.boxes_mm"
+    assert keep_out.touched(ARM, np.zeros(2)) == "the link of joint 2 comes to -10 mm from box 1 of keep_out.boxes_mm"
     assert keep_out.touched(ARM, np.radians([90.0, 0.0])) is None
 
 
