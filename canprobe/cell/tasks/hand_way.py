@@ -116,12 +116,13 @@ class HandWay:
             UsageError: a joint would leave its range, the probe its workspace, or the arm would come near what it keeps
                 out of; with place and time.
         """
-        why = self.look(self.length)
-        if why is not None:
-            place = len(self.q)
-            percent = 100.0 * place / self.length
-            raise UsageError(f"{why}, {self._time_at(place):.2f} s after the start, {percent:.0f} % of the way")
-        return self
+        why = self.look(self.length) if self.length else self._forbidden(self.q[0])
+        if why is None:
+            return self
+        if (place := len(self.q)) == 1:
+            raise UsageError(f"{why}, at the start of the way")
+        percent = 100.0 * place / self.length
+        raise UsageError(f"{why}, {self._time_at(place):.2f} s after the start, {percent:.0f} % of the way")
 
     @property
     def looked_at(self) -> bool:
