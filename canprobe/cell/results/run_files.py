@@ -198,7 +198,7 @@ def _columns(file: Path, what: str) -> Columns:
 def _checked(columns: Columns, file: Path, shapes: _Shapes, setup: Setup | None) -> Columns:
     """The columns, after a check of their kinds and lengths; with a setup, of the shapes of known ones too."""
     sizes = _sizes(setup)
-    heads = columns.heads() if isinstance(columns, NpzColumns) else columns
+    heads = columns.heads if isinstance(columns, NpzColumns) else columns
     rows = next((len(column) for column in heads.values() if column.ndim), 0)
     for name, column in heads.items():
         known = setup is not None and rows and name in shapes
