@@ -54,6 +54,7 @@ COMMANDS = (
     "scan",
     "monitor",
     "replay",
+    "runs",
     "view",
     "export",
     "calibrate",
