@@ -8,13 +8,16 @@ holds anything that no run wrote, stays.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.argument_types import folder_path, whole
 from canprobe.cli.output import print_answer, print_table, say
 from canprobe.cli.parser import Parser
+from canprobe.cli.stdin import yes_typed
+from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
     from canprobe.cell.results.runs import RunEntry
@@ -41,35 +44,34 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the runs, or what differs between two; or delete them."""
-    from canprobe.cell.results.runs import compare_runs, find_runs
-    from canprobe.errors import UsageError
+    from canprobe.cell.results.runs import compare_runs, find_runs, remove_run
 
-    if not args.prune and (args.keep or args.yes):
-        raise UsageError("runs: --keep and --yes go with --prune")
     found = [entry for folder in args.runs or [Path("runs")] for entry in find_runs(folder)]
-    if args.prune:
-        return _prune(args, found)
-    if len(args.runs) == len(found) == 2:
-        differing = compare_runs(*found)
+    if not args.prune and len(args.runs) == len(found) == 2:
+        differing = compare_runs(*args.runs)
         print_answer(args, differing, lambda: _print_differing(args.runs, differing))
-    else:
-        print_answer(args, [entry.as_dict() for entry in found], lambda: _print_runs(found))
+        return 0
+    if args.prune:
+        found = sorted(found, key=lambda entry: entry.started)[: max(len(found) - args.keep, 0)]
+        for entry in found:
+            if entry.kept_for is not None:
+                say(f"{entry.folder}: stays: {entry.kept_for}")
+        found = [entry for entry in found if entry.kept_for is None]
+    print_answer(args, [asdict(entry) for entry in found], lambda: _print_runs(found))
+    if args.prune and found:
+        if not args.yes and not yes_typed(f"delete these {len(found)} runs?"):
+            raise UsageError("runs: --prune needs a yes at the terminal, or --yes; nothing was deleted")
+        for entry in found:
+            remove_run(Path(entry.folder))
     return 0
 
 
 def _print_runs(found: Sequence[RunEntry]) -> None:
-    rows = [one.as_dict() for one in found]
+    lengths = ["" if one.duration_s is None else f"{one.duration_s:.1f} s" for one in found]
     print_table(
         [
-            (
-                one["folder"],
-                one["scene"],
-                one["started"],
-                "" if one["duration_s"] is None else f"{one['duration_s']:.1f} s",
-                _size(one["size_bytes"]),
-                one["verdict"],
-            )
-            for one in rows
+            (one.folder, one.scene, one.started, length, _size(one.size_bytes), one.verdict)
+            for one, length in zip(found, lengths, strict=True)
         ]
     )
     print(f"{len(found)} runs, {_size(sum(one.size_bytes for one in found))}")
@@ -79,31 +81,6 @@ def _size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count < 1e9 else f"{count / 1e9:.2f} GB"
 
 
-def _print_differing(folders: Sequence[Path], differing: dict[str, dict[str, tuple[Any, Any]]]) -> None:
+def _print_differing(folders: Sequence[Path], differing: Mapping[str, Mapping[str, Sequence[Any]]]) -> None:
     for part, values in differing.items():
-        rows = [
-            (name, *(f"{v:.10g}" if isinstance(v, float) else str(v) for v in both)) for name, both in values.items()
-        ]
-        print_table([(part, *map(str, folders)), *(rows or [("none differs", "", "")])])
-
-
-def _prune(args: argparse.Namespace, found: Sequence[RunEntry]) -> int:
-    """Delete all but the newest, and say which stay and why."""
-    from canprobe.cell.results.runs import remove_run
-    from canprobe.cli.stdin import yes_typed
-    from canprobe.errors import UsageError
-
-    found = sorted(found, key=lambda entry: entry.started_s)
-    chosen = found[: max(len(found) - args.keep, 0)]
-    for entry in chosen:
-        if entry.kept_for is not None:
-            say(f"{entry.folder}: stays: {entry.kept_for}")
-    chosen = [entry for entry in chosen if entry.kept_for is None]
-    if not args.json:
-        _print_runs(chosen)
-    if chosen and not args.yes and not yes_typed(f"delete these {len(chosen)} runs?"):
-        raise UsageError("runs: --prune needs a yes at the terminal, or --yes; nothing was deleted")
-    for entry in chosen:
-        remove_run(entry)
-    print_answer(args, [entry.as_dict() for entry in chosen], f"deleted {len(chosen)} runs")
-    return 0
+        print_table([(part, *map(str, folders)), *((name, *map(str, of_runs)) for name, of_runs in values.items())])

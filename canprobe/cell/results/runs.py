@@ -6,12 +6,13 @@ holds anything else is listed, and never removed.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-import stat
 import time
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -33,32 +34,22 @@ class RunEntry:
     """The folder of a run.
 
     Attributes:
-        scene: content of ``scene.toml``.
-        summary: content of ``summary.json``; None where a run goes on, was killed, or left one that cannot be read.
-        started_s: time at which ``scene.toml`` was written, s since 1970.
+        folder: its path.
+        scene: name of the scene.
+        started: local date and time at which ``scene.toml`` was written.
+        duration_s: time of the cell; None without a summary.
         size_bytes: size of all files.
         verdict: ``done``, ``stopped`` with the reason, or why there is no summary.
         kept_for: why it is not removed; None where it may be.
     """
 
-    folder: Path
-    scene: dict[str, Any]
-    summary: dict[str, Any] | None
-    started_s: float
+    folder: str
+    scene: str
+    started: str
+    duration_s: float | None
     size_bytes: int
     verdict: str
     kept_for: str | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """What `canprobe runs` lists."""
-        return {
-            "folder": str(self.folder),
-            "scene": self.scene["scene"]["name"],
-            "started": time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.started_s)),
-            "duration_s": None if self.summary is None else self.summary.get("sim_time_s"),
-            "size_bytes": self.size_bytes,
-            "verdict": self.verdict,
-        }
 
 
 def read_entry(folder: Path) -> RunEntry:
@@ -70,12 +61,8 @@ def read_entry(folder: Path) -> RunEntry:
     saved = folder / SAVED_AS
     if folder.is_symlink() or not saved.is_file():
         raise UsageError(f"{folder}: expected the folder of a run, got one without {SAVED_AS}")
-    scene = read_document(saved, _MOST_SCENE_BYTES, tomllib.loads, "the scene of a run")
-    written, beside = (
-        str(scene.get("written_by")).startswith("canprobe "),
-        [one for one in folder.iterdir() if one != saved],
-    )
-    if not written or _OF_RUN.isdisjoint(one.name for one in beside):
+    scene, beside = _scene(folder), [one for one in folder.iterdir() if one != saved]
+    if not str(scene.get("written_by")).startswith("canprobe ") or _OF_RUN.isdisjoint(one.name for one in beside):
         raise UsageError(f"{folder}: expected the folder of a run, got a scene without files of its run")
     summary, verdict = None, "no summary: killed, or it goes on"
     try:
@@ -83,15 +70,16 @@ def read_entry(folder: Path) -> RunEntry:
             verdict = "done" if summary.get("completed") else f"stopped: {summary.get('stop_reason')}"
     except UsageError as error:
         verdict = str(error)
-    text = saved.read_text(encoding="utf-8")
+    text, stats = saved.read_text(encoding="utf-8"), [one.lstat() for one in folder.rglob("*")]
     named = {one.name for one in beside if one.is_file() and f'"{one.name}"' in text}
-    others = sorted({one.name for one in beside} - _OF_RUN - named)
-    stats = [one.lstat() for one in folder.rglob("*")]
-    kept_for = f"holds {', '.join(others)}, which no run wrote" if others else None
-    if summary is None and time.time() - max(one.st_mtime for one in stats) < _WRITING_S:
+    kept_for = None
+    if others := sorted({one.name for one in beside} - _OF_RUN - named):
+        kept_for = f"holds {', '.join(others)}, which no run wrote"
+    elif summary is None and time.time() - max(one.st_mtime for one in stats) < _WRITING_S:
         kept_for = f"changed less than {_WRITING_S:.0f} s ago and has no summary: the run may go on"
-    size = sum(one.st_size for one in stats if stat.S_ISREG(one.st_mode))
-    return RunEntry(folder, scene, summary, saved.stat().st_mtime, size, verdict, kept_for)
+    started = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(saved.stat().st_mtime))
+    size, duration_s = sum(one.st_size for one in stats), None if summary is None else summary.get("sim_time_s")
+    return RunEntry(str(folder), scene["scene"]["name"], started, duration_s, size, verdict, kept_for)
 
 
 def find_runs(folder: Path) -> list[RunEntry]:
@@ -106,41 +94,40 @@ def find_runs(folder: Path) -> list[RunEntry]:
         return [read_entry(folder)]
     found = []
     for one in folder.iterdir():
-        try:
+        with contextlib.suppress(UsageError):  # something else
             found.append(read_entry(one))
-        except UsageError:  # something else
-            continue
-    return sorted(found, key=lambda entry: entry.started_s)
+    return sorted(found, key=lambda entry: entry.started)
 
 
-def compare_runs(first: RunEntry, second: RunEntry) -> dict[str, dict[str, tuple[Any, Any]]]:
-    """Settings and figures that differ between two runs: both values by the name of the key."""
-    parts = {"settings": (first.scene, second.scene), "figures": (first.summary or {}, second.summary or {})}
+def compare_runs(*folders: Path) -> dict[str, dict[str, list[Any]]]:
+    """Settings and figures that differ between folders of runs: the value of each by the name of the key."""
+    parts = {"settings": map(_scene, folders), "figures": (read_summary(folder) or {} for folder in folders)}
     differing = {}
     for part, documents in parts.items():
-        one, other = (dict(_leaves(document)) for document in documents)
-        names = [name for name in one | other if one.get(name) != other.get(name)]
-        differing[part] = {name: (one.get(name), other.get(name)) for name in names}
+        leaves = [dict(_leaves(document)) for document in documents]
+        values = {name: [one.get(name) for one in leaves] for name in dict.fromkeys(chain(*leaves))}
+        differing[part] = {name: of_runs for name, of_runs in values.items() if of_runs[1:] != of_runs[:-1]}
     return differing
+
+
+def _scene(folder: Path) -> dict[str, Any]:
+    return read_document(folder / SAVED_AS, _MOST_SCENE_BYTES, tomllib.loads, "the scene of a run")
 
 
 def _leaves(document: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Names and values of a document, of which tables are a part of the name."""
     for name, value in document.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
+        yield from _leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else ((prefix + name, value),)
 
 
-def remove_run(entry: RunEntry) -> None:
+def remove_run(folder: Path) -> None:
     """Remove the folder of a run.
 
     Raises:
-        UsageError: it may go on, or holds what no run wrote.
+        UsageError: it is no folder of a run, may go on, or holds what no run wrote.
         ResultsError: the system refuses it.
     """
-    if (reason := read_entry(entry.folder).kept_for) is not None:
-        raise UsageError(f"{entry.folder}: not removed: {reason}")
-    with writing(entry.folder):
-        shutil.rmtree(entry.folder)
+    if (reason := read_entry(folder).kept_for) is not None:
+        raise UsageError(f"{folder}: not removed: {reason}")
+    with writing(folder):
+        shutil.rmtree(folder)
