@@ -9,18 +9,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from canprobe.cli.argument_types import folder_path, whole
 from canprobe.cli.output import print_answer, print_table, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.stdin import yes_typed
 from canprobe.errors import UsageError
-
-if TYPE_CHECKING:
-    from canprobe.cell.results.runs import RunEntry
 
 HELP = "list, compare or delete runs"
 EXAMPLE = """\
@@ -52,29 +48,27 @@ def run(args: argparse.Namespace) -> int:
         print_answer(args, differing, lambda: _print_differing(args.runs, differing))
         return 0
     if args.prune:
-        found = sorted(found, key=lambda entry: entry.started)[: max(len(found) - args.keep, 0)]
+        found = sorted(found, key=lambda entry: entry["started"])[: max(len(found) - args.keep, 0)]
         for entry in found:
-            if entry.kept_for is not None:
-                say(f"{entry.folder}: stays: {entry.kept_for}")
-        found = [entry for entry in found if entry.kept_for is None]
-    print_answer(args, [asdict(entry) for entry in found], lambda: _print_runs(found))
+            if entry["kept_for"] is not None:
+                say(f"{entry['folder']}: stays: {entry['kept_for']}")
+        found = [entry for entry in found if entry["kept_for"] is None]
+    print_answer(args, found, lambda: _print_runs(found))
     if args.prune and found:
         if not args.yes and not yes_typed(f"delete these {len(found)} runs?"):
             raise UsageError("runs: --prune needs a yes at the terminal, or --yes; nothing was deleted")
         for entry in found:
-            remove_run(Path(entry.folder))
+            remove_run(Path(entry["folder"]))
     return 0
 
 
-def _print_runs(found: Sequence[RunEntry]) -> None:
-    lengths = ["" if one.duration_s is None else f"{one.duration_s:.1f} s" for one in found]
-    print_table(
-        [
-            (one.folder, one.scene, one.started, length, _size(one.size_bytes), one.verdict)
-            for one, length in zip(found, lengths, strict=True)
-        ]
-    )
-    print(f"{len(found)} runs, {_size(sum(one.size_bytes for one in found))}")
+def _print_runs(found: Sequence[Mapping[str, Any]]) -> None:
+    rows = []
+    for one in found:
+        length = "" if one["duration_s"] is None else f"{one['duration_s']:.1f} s"
+        rows.append((one["folder"], one["scene"], one["started"], length, _size(one["size_bytes"]), one["verdict"]))
+    print_table(rows)
+    print(f"{len(found)} runs, {_size(sum(one['size_bytes'] for one in found))}")
 
 
 def _size(count: int) -> str:

@@ -1,4 +1,4 @@
-"""The folders of runs: what each holds, what differs between two, and their removal.
+"""The folders of runs: what each holds, what differs between several, and their removal.
 
 The folder of a run has a ``scene.toml`` that canprobe wrote, with the files that it names, and files of a run. One that
 holds anything else is listed, and never removed.
@@ -11,7 +11,6 @@ import shutil
 import time
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -29,61 +28,8 @@ _WRITING_S = 600.0
 """A run without a summary whose files changed within this time may go on."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunEntry:
-    """The folder of a run.
-
-    Attributes:
-        folder: its path.
-        scene: name of the scene.
-        started: local date and time at which ``scene.toml`` was written.
-        duration_s: time of the cell; None without a summary.
-        size_bytes: size of all files.
-        verdict: ``done``, ``stopped`` with the reason, or why there is no summary.
-        kept_for: why it is not removed; None where it may be.
-    """
-
-    folder: str
-    scene: str
-    started: str
-    duration_s: float | None
-    size_bytes: int
-    verdict: str
-    kept_for: str | None
-
-
-def read_entry(folder: Path) -> RunEntry:
-    """The folder of a run.
-
-    Raises:
-        UsageError: it is not the folder of a run.
-    """
-    saved = folder / SAVED_AS
-    if folder.is_symlink() or not saved.is_file():
-        raise UsageError(f"{folder}: expected the folder of a run, got one without {SAVED_AS}")
-    scene, beside = _scene(folder), [one for one in folder.iterdir() if one != saved]
-    if not str(scene.get("written_by")).startswith("canprobe ") or _OF_RUN.isdisjoint(one.name for one in beside):
-        raise UsageError(f"{folder}: expected the folder of a run, got a scene without files of its run")
-    summary, verdict = None, "no summary: killed, or it goes on"
-    try:
-        if (summary := read_summary(folder)) is not None:
-            verdict = "done" if summary.get("completed") else f"stopped: {summary.get('stop_reason')}"
-    except UsageError as error:
-        verdict = str(error)
-    text, stats = saved.read_text(encoding="utf-8"), [one.lstat() for one in folder.rglob("*")]
-    named = {one.name for one in beside if one.is_file() and f'"{one.name}"' in text}
-    kept_for = None
-    if others := sorted({one.name for one in beside} - _OF_RUN - named):
-        kept_for = f"holds {', '.join(others)}, which no run wrote"
-    elif summary is None and time.time() - max(one.st_mtime for one in stats) < _WRITING_S:
-        kept_for = f"changed less than {_WRITING_S:.0f} s ago and has no summary: the run may go on"
-    started = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(saved.stat().st_mtime))
-    size, duration_s = sum(one.st_size for one in stats), None if summary is None else summary.get("sim_time_s")
-    return RunEntry(str(folder), scene["scene"]["name"], started, duration_s, size, verdict, kept_for)
-
-
-def find_runs(folder: Path) -> list[RunEntry]:
-    """The runs in a folder, the newest last; the folder of a run is one.
+def find_runs(folder: Path) -> list[dict[str, Any]]:
+    """The runs in a folder, the newest last; the folder of a run is one. For their keys see `read_entry`.
 
     Raises:
         UsageError: there is no such folder.
@@ -96,7 +42,47 @@ def find_runs(folder: Path) -> list[RunEntry]:
     for one in folder.iterdir():
         with contextlib.suppress(UsageError):  # something else
             found.append(read_entry(one))
-    return sorted(found, key=lambda entry: entry.started)
+    return sorted(found, key=lambda entry: entry["started"])
+
+
+def read_entry(folder: Path) -> dict[str, Any]:
+    """The folder of a run.
+
+    Returns:
+        ``folder``, name of the ``scene``, local time at which it ``started``, ``duration_s`` (time of the cell, None
+        without a summary), ``size_bytes`` of all files, ``verdict`` (``done``, ``stopped`` with the reason, or why
+        there is no summary), and ``kept_for``: why it is not removed, None where it may be.
+
+    Raises:
+        UsageError: it is not the folder of a run.
+    """
+    saved = folder / SAVED_AS
+    if folder.is_symlink() or not saved.is_file():
+        raise UsageError(f"{folder}: expected the folder of a run, got one without {SAVED_AS}")
+    scene, beside = _scene(folder), {one.name: one for one in folder.iterdir() if one != saved}
+    if not str(scene.get("written_by")).startswith("canprobe ") or _OF_RUN.isdisjoint(beside):
+        raise UsageError(f"{folder}: expected the folder of a run, got a scene without files of its run")
+    summary, verdict = None, "no summary: killed, or it goes on"
+    try:
+        if (summary := read_summary(folder)) is not None:
+            verdict = "done" if summary.get("completed") else f"stopped: {summary.get('stop_reason')}"
+    except UsageError as error:
+        verdict = str(error)
+    text, stats, kept_for = saved.read_text(encoding="utf-8"), [one.lstat() for one in folder.rglob("*")], None
+    named = {name for name, one in beside.items() if one.is_file() and f'"{name}"' in text}
+    if others := sorted(beside.keys() - _OF_RUN - named):
+        kept_for = f"holds {', '.join(others)}, which no run wrote"
+    elif summary is None and time.time() - max(one.st_mtime for one in stats) < _WRITING_S:
+        kept_for = f"changed less than {_WRITING_S:.0f} s ago and has no summary: the run may go on"
+    return {
+        "folder": str(folder),
+        "scene": scene["scene"]["name"],
+        "started": time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(saved.stat().st_mtime)),
+        "duration_s": None if summary is None else summary.get("sim_time_s"),
+        "size_bytes": sum(one.st_size for one in stats),
+        "verdict": verdict,
+        "kept_for": kept_for,
+    }
 
 
 def compare_runs(*folders: Path) -> dict[str, dict[str, list[Any]]]:
@@ -127,7 +113,7 @@ def remove_run(folder: Path) -> None:
         UsageError: it is no folder of a run, may go on, or holds what no run wrote.
         ResultsError: the system refuses it.
     """
-    if (reason := read_entry(folder).kept_for) is not None:
+    if (reason := read_entry(folder)["kept_for"]) is not None:
         raise UsageError(f"{folder}: not removed: {reason}")
     with writing(folder):
         shutil.rmtree(folder)
