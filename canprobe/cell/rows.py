@@ -15,7 +15,6 @@ import errno
 import gzip
 import io
 import os
-import struct
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, MutableSequence, Sequence
@@ -37,8 +36,8 @@ _COLUMNS_MADE = 8
 """Columns that are made in one pass over the rows; those of an hour take 450 MB at most."""
 _GZIP_BITS = 31
 """Window of 32 kB in a gzip member. Source: zlib's manual, deflateInit2."""
-_MAGIC_BYTES, _SIZE = np.lib.format.MAGIC_LEN, struct.Struct("<I")
-"""Start of a header, and its size behind that. Source: numpy, NEP 1, version 2.0."""
+_MAGIC_BYTES = np.lib.format.MAGIC_LEN
+"""Start of an array; the size of its header in 4 bytes is next. Source: numpy, NEP 1, version 2.0."""
 FASTEST = 1
 """Level of compression; others save little of a run's floats and take several times as long."""
 
@@ -187,8 +186,8 @@ def read_blocks(path: Path) -> Iterator[NDArray[Any]]:
     with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:  # until 0.2 rows were not compressed
         try:
             while file.peek(1):
-                size = file.read(_MAGIC_BYTES + _SIZE.size)[_MAGIC_BYTES:]
-                count, dtype = _read_header(size + file.read(*_SIZE.unpack(size)))
+                size = file.read(_MAGIC_BYTES + 4)[_MAGIC_BYTES:]
+                count, dtype = _read_header(size + file.read(int.from_bytes(size, "little")))
                 data = file.read(count * dtype.itemsize)
                 if len(data) < count * dtype.itemsize:
                     return
@@ -196,7 +195,7 @@ def read_blocks(path: Path) -> Iterator[NDArray[Any]]:
                 read += count
         except EOFError:
             return
-        except (gzip.BadGzipFile, ValueError, struct.error, zlib.error) as error:
+        except (gzip.BadGzipFile, ValueError, zlib.error) as error:
             raise ValueError(f"{path}: damaged near row {read}: {error}") from error
 
 
