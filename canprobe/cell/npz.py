@@ -16,7 +16,6 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.rows import FASTEST
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file
 
@@ -27,11 +26,14 @@ _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays, one after the other, into exactly this file, whole: numpy would append ``.npz`` to a name."""
+    """Write arrays, one after the other, into exactly this file, whole: numpy would append ``.npz`` to a name.
+
+    Levels of compression above the first save little of floats, and take several times as long.
+    """
     with (
         whole_file(path) as part,
         part.open("wb") as file,
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=FASTEST) as saved,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as saved,
     ):
         for name, column in columns.items():
             with saved.open(f"{name}.npy", "w", force_zip64=True) as entry:

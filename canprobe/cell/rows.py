@@ -154,7 +154,8 @@ class Rows:
                 self._path.parent.rmdir()  # it goes with the last of them
 
     def _make(self, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        made = {name: np.empty(len(self), self.dtype[name]) for name in names}
+        heads = np.empty(0, self.dtype)
+        made = {name: np.empty((len(self), *heads[name].shape[1:]), heads[name].dtype) for name in names}
         first = 0
         for block in self.blocks():
             for name, column in made.items():

@@ -57,7 +57,7 @@ def test_a_value_of_another_shape_costs_only_itself_on_disk_too(tmp_path):
 
 
 def test_rows_of_one_type_in_blocks(tmp_path):
-    rows = Rows([("t_s", float), ("taxels", np.uint8, (2, 2))], tmp_path / "tactile.npy.gz")
+    rows = Rows([("t_s", float), ("taxels", np.uint8, (2, 2)), ("q", float, (0,))], tmp_path / "tactile.npy.gz")
     table = np.zeros(7, rows.dtype)
     table["t_s"], table["taxels"][:, 0, 1] = np.arange(7), np.arange(7)
     for some in (table[:3], table[3:4], table[4:]):
@@ -65,6 +65,7 @@ def test_rows_of_one_type_in_blocks(tmp_path):
         rows.flush()
         np.testing.assert_array_equal(loaded(tmp_path / "tactile.npy.gz"), table[: len(rows)])
     assert rows.columns()["taxels"].dtype == np.uint8
+    assert rows.columns()["q"].shape == (7, 0)  # an array without an arm
     np.testing.assert_array_equal(rows.columns()["taxels"], table["taxels"])
 
 

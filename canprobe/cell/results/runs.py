@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import time
 import tomllib
 from collections.abc import Iterator, Mapping
+from datetime import datetime
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -72,12 +72,12 @@ def read_entry(folder: Path) -> dict[str, Any]:
     named = {name for name, one in beside.items() if one.is_file() and f'"{name}"' in text}
     if others := sorted(beside.keys() - _OF_RUN - named):
         kept_for = f"holds {', '.join(others)}, which no run wrote"
-    elif summary is None and time.time() - max(one.st_mtime for one in stats) < _WRITING_S:
+    elif summary is None and datetime.now().timestamp() - max(one.st_mtime for one in stats) < _WRITING_S:
         kept_for = f"changed less than {_WRITING_S:.0f} s ago and has no summary: the run may go on"
     return {
         "folder": str(folder),
         "scene": scene["scene"]["name"],
-        "started": time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(saved.stat().st_mtime)),
+        "started": datetime.fromtimestamp(saved.stat().st_mtime).isoformat(" ", "seconds"),
         "duration_s": None if summary is None else summary.get("sim_time_s"),
         "size_bytes": sum(one.st_size for one in stats),
         "verdict": verdict,
