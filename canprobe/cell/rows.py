@@ -101,6 +101,7 @@ class Rows:
         self._path = file
         self._written = 0
         self._waiting: MutableSequence[bytes] = [] if kept is None else deque(maxlen=kept)
+        self._headers: dict[int, bytes] = {}
         self._level = level
         self._packer, self._packed = self._new_packer(), list[bytes]()
 
@@ -118,7 +119,7 @@ class Rows:
         if self._path is None or self.failure is not None or not self._waiting:
             return
         count = len(self) - self._written
-        block = b"".join((gzip.compress(self._header(count), FASTEST), *self._packed, self._packer.flush()))
+        block = b"".join((self._header(count), *self._packed, self._packer.flush()))
         try:
             self._path.parent.mkdir(exist_ok=True)
             with io.FileIO(self._path, "a" if self._written else "w") as file:
@@ -164,11 +165,13 @@ class Rows:
         return made
 
     def _header(self, rows: int) -> bytes:
-        """The header of an ``.npy`` file of so many rows."""
-        header = io.BytesIO()
-        descr = [(name.encode("ascii", "backslashreplace").decode(), *kind) for name, *kind in self.dtype.descr]
-        np.lib.format.write_array_header_2_0(header, {"descr": descr, "fortran_order": False, "shape": (rows,)})
-        return header.getvalue()
+        """The header of an ``.npy`` file of so many rows, compressed; that of most blocks is the same."""
+        if rows not in self._headers:
+            header = io.BytesIO()
+            descr = [(name.encode("ascii", "backslashreplace").decode(), *kind) for name, *kind in self.dtype.descr]
+            np.lib.format.write_array_header_2_0(header, {"descr": descr, "fortran_order": False, "shape": (rows,)})
+            self._headers[rows] = gzip.compress(header.getvalue(), FASTEST)
+        return self._headers[rows]
 
     def _new_packer(self) -> Any:
         return None if self._path is None else zlib.compressobj(self._level, zlib.DEFLATED, _GZIP_BITS)
