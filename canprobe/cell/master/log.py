@@ -169,7 +169,7 @@ class RunLog:
         """Columns of the rows from the row `first` on, in one pass."""
         made = {name: np.full((len(self), *self._shape(name, first)), np.nan) for name in names}
         misfits: Counter[str] = Counter()
-        for numbers, part in (p for way in self._ways() for p in way(first)):
+        for numbers, part in (part for way in self._ways(*names) for part in way(first)):
             for name in made.keys() & part.keys():
                 out, values = made[name], part[name]
                 if isinstance(values, np.ndarray) and values.shape[1:] == out.shape[1:]:
@@ -185,12 +185,15 @@ class RunLog:
             warnings.warn(f"log: {count} values of column {name!r} are no {wanted}: left NaN", stacklevel=3)
         return made
 
-    def _ways(self) -> list[Callable[[int], Iterator[_Part]]]:
-        return [way for kind in self._kinds.values() for way in (kind.stored, kind.single)]
+    def _ways(self, *names: str) -> list[Callable[[int], Iterator[_Part]]]:
+        """Iterators over the rows of kinds that have some of these columns."""
+        kinds = [kind for kind in self._kinds.values() if not set(names).isdisjoint(kind.names)]
+        return [way for kind in kinds for way in (kind.stored, kind.single)]
 
     def _shape(self, name: str, first: int) -> tuple[int, ...]:
         """Shape of a column's values; the first of all decides it."""
-        heads = [next(((n[0], part[name][0]) for n, part in way(first) if name in part), None) for way in self._ways()]
+        ways = self._ways(name)
+        heads = [next(((n[0], part[name][0]) for n, part in way(first) if name in part), None) for way in ways]
         known = [head for head in heads if head is not None]
         try:
             return np.shape(min(known, key=itemgetter(0))[1]) if known else ()
