@@ -1,4 +1,4 @@
-"""Columns in an ``.npz`` file, which is written whole and read with care.
+"""Columns in a compressed ``.npz`` file, which is written whole and read with care, a column at a time.
 
 A compressed file can hold a thousand times its size. What it unpacks to stands in its directory, and is refused before
 anything is unpacked; a directory that says less is found out, because no more is unpacked than it says.
@@ -7,9 +7,9 @@ anything is unpacked; a directory that says less is found out, because no more i
 from __future__ import annotations
 
 import math
-import struct
 import zipfile
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,15 +19,8 @@ from numpy.typing import NDArray
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file
 
-_MAPPED_BYTES = 1 << 20
-"""Size from which an array is mapped from its file instead of read into memory."""
 MAX_UNPACKED_BYTES = 1 << 30
-"""Most bytes of one file that are read into memory. The files of a run are not compressed, and their arrays are mapped
-where they are large: they take next to none of it."""
-_LOCAL_HEADER, _FIELD = struct.Struct("<26xHH"), struct.Struct("<HH")
-"""Header of an entry, which ends with the lengths of its name and its fields; head of a field. Source: PKWARE APPNOTE
-6.3.10, 4.3.7 and 4.5.1."""
-_ZIP64_FIELD_BYTES = 20
+"""Most bytes of one column: those of a matrix (4, 4) in the log of six hours."""
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Those of numpy. Of others zipfile unpacks all that it has read, whatever it was asked for."""
 
@@ -35,89 +28,112 @@ _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays, one after the other, into exactly this file, whole: numpy would append ``.npz`` to a name.
 
-    They are not compressed, which would take ten seconds a gigabyte, and lie so that they can be mapped.
+    Levels of compression above the first save little of floats, and take several times as long.
     """
-    with whole_file(path) as part, part.open("wb") as file, zipfile.ZipFile(file, "w") as saved:
+    with (
+        whole_file(path) as part,
+        part.open("wb") as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as saved,
+    ):
         for name, column in columns.items():
-            with saved.open(_aligned(f"{name}.npy", file.tell()), "w", force_zip64=True) as entry:
+            with saved.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, np.asanyarray(column), allow_pickle=False)
 
 
-def _aligned(name: str, place: int) -> zipfile.ZipInfo:
-    """The entry of an array, with a field that fills its header up so that the array begins at a multiple of 64."""
-    entry = zipfile.ZipInfo(name)
-    header = place + _LOCAL_HEADER.size + len(name.encode()) + _ZIP64_FIELD_BYTES + _FIELD.size
-    entry.extra = _FIELD.pack(0, size := -header % 64) + bytes(size)
-    return entry
+class NpzColumns(Mapping[str, NDArray[Any]]):
+    """The columns of an ``.npz`` file; each is read when it is first asked for, and then kept.
+
+    The file may be replaced or removed meanwhile. Pickled, the columns are a dict.
+
+    Args:
+        file: the file, open or its path.
+        where: start of the message of a column that cannot be read.
+
+    Attributes:
+        heads: arrays of the columns' shapes and types without their values, which are not read.
+
+    Raises:
+        UsageError: when a column is asked for that is damaged, or takes more than `MAX_UNPACKED_BYTES`.
+        Exception: what numpy and zipfile raise of a damaged file.
+    """
+
+    def __init__(self, file: Path | IO[bytes], where: str) -> None:
+        self._where, self._saved = where, zipfile.ZipFile(file)
+        self._entries: dict[str, zipfile.ZipInfo] = {}
+        self._kept: dict[str, NDArray[Any]] = {}
+        self.heads: dict[str, NDArray[Any]] = {}
+        for entry in self._saved.infolist():
+            name = entry.filename.removesuffix(".npy")
+            self._entries[name], self.heads[name] = entry, _head(self._saved, entry)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._kept:
+            entry = self._entries[name]
+            try:
+                self._kept[name] = self._read(entry)
+            except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+                raise UsageError(f"{self._where}{entry.filename} cannot be read: {_why(error)}") from error
+        return self._kept[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
+        return dict, (dict(self),)
+
+    def pop(self, name: str) -> NDArray[Any]:
+        """A column, which is no longer kept, nor one of the columns."""
+        column = self[name]
+        del self._kept[name], self._entries[name], self.heads[name]
+        return column
+
+    def _read(self, entry: zipfile.ZipInfo) -> NDArray[Any]:
+        if entry.file_size > MAX_UNPACKED_BYTES:
+            raise ValueError(f"it unpacks to {entry.file_size} bytes, expected {MAX_UNPACKED_BYTES} at most")
+        with self._saved.open(entry) as file:
+            array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+        return array
 
 
-def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArray[Any]]:
-    """Every array of an ``.npz`` file.
+def _head(saved: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+    """The shape and type of an array of plain values, whose header and size agree."""
+    if entry.compress_type not in _COMPRESSIONS:
+        raise ValueError(f"{entry.filename} is compressed in another way than numpy's")
+    with saved.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+        if dtype.hasobject:
+            raise ValueError(f"{entry.filename} holds Python objects")
+        if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
+            raise ValueError(f"{entry.filename} is no array of shape {shape}, as its header says")
+    return np.broadcast_to(np.empty((), dtype), shape)
+
+
+def read_npz(path: Path, expected: str = "an .npz of a run") -> NpzColumns:
+    """The arrays of an ``.npz`` file, each read when it is asked for.
 
     Args:
         path: path of the file.
         expected: what the file should be, in words, for the message.
 
     Raises:
-        UsageError: there is no such file, or it is cut off, empty or of another kind, or it unpacks to more than
-            `MAX_UNPACKED_BYTES`. Large arrays that are not compressed are mapped.
+        UsageError: there is no such file, or it is cut off, empty or of another kind.
     """
+    where = f"{path}: expected {expected}; "
     try:
-        with regular_file(path).open("rb") as opened:
-            return unpack_npz(opened)
+        with regular_file(path).open("rb") as file:
+            if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+                raise ValueError("a single array")
+        return NpzColumns(path, where)
     except Exception as error:  # zip files, their compression and numpy's headers each have their own
-        raise UsageError(f"{path}: expected {expected}; cannot be read: {_why(error)}") from error
-
-
-def unpack_npz(opened: IO[bytes], *, mapped: bool = True) -> dict[str, NDArray[Any]]:
-    """Every array of an open ``.npz`` file.
-
-    Args:
-        opened: the file.
-        mapped: whether large arrays that are not compressed are mapped; it has to be a file of the system then.
-
-    Raises:
-        Exception: what numpy and zipfile raise of a damaged file; ValueError where it unpacks to too much.
-    """
-    if opened.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
-        raise ValueError("a single array")
-    with zipfile.ZipFile(opened) as saved:
-        entries = saved.infolist()
-        if other := next((e for e in entries if e.compress_type not in _COMPRESSIONS), None):
-            raise ValueError(f"{other.filename} is compressed in another way than numpy's")
-        maps = [mapped and e.compress_type == zipfile.ZIP_STORED and e.file_size >= _MAPPED_BYTES for e in entries]
-        unpacked = sum(e.file_size for e, is_mapped in zip(entries, maps, strict=True) if not is_mapped)
-        if unpacked > MAX_UNPACKED_BYTES:
-            raise ValueError(f"it unpacks to {unpacked} bytes, expected {MAX_UNPACKED_BYTES} at most")
-        return {
-            entry.filename.removesuffix(".npy"): _read_array(opened, saved, entry, is_mapped)
-            for entry, is_mapped in zip(entries, maps, strict=True)
-        }
+        raise UsageError(f"{where}cannot be read: {_why(error)}") from error
 
 
 def _why(error: Exception) -> str:
     """The message of an error of a file reader, in a line."""
     text = error.strerror if isinstance(error, OSError) else None
     return (text or str(error) or type(error).__name__).partition("\n")[0]
-
-
-def _read_array(opened: IO[bytes], saved: zipfile.ZipFile, entry: zipfile.ZipInfo, is_mapped: bool) -> NDArray[Any]:
-    """One array of plain values, whose header and size agree; a large one is mapped."""
-    with saved.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(file)
-        if dtype.hasobject:
-            raise ValueError(f"{entry.filename} holds Python objects")
-        if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
-            raise ValueError(f"{entry.filename} is no array of shape {shape}, as its header says")
-        if not is_mapped:
-            left = entry.file_size - file.tell()  # without a number, zipfile unpacks all that there is
-            flat = np.frombuffer(bytearray(file.read(left)), dtype)
-        else:
-            header_bytes = file.tell()
-            opened.seek(entry.header_offset)
-            header = opened.read(_LOCAL_HEADER.size)
-            place = entry.header_offset + len(header) + sum(_LOCAL_HEADER.unpack(header)) + header_bytes
-            flat = np.asarray(np.memmap(opened, dtype, "c", place, math.prod(shape)))
-    return flat.reshape(shape, order="F" if fortran else "C")

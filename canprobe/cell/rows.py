@@ -1,19 +1,24 @@
-"""Rows of a run while it goes on: in memory, or in blocks in an ``.npy`` file that `numpy.load` reads at any moment.
+"""Rows of a run while it goes on: in memory, or in compressed blocks in a file that can be read at any moment.
 
 A run of an hour has 1.4 million cycles. Its rows go to disk, so that memory does not grow with them and a process that
-is killed leaves them. At the end columns are made of them, one after the other. Joints that turn and joints that slide
+is killed leaves them. At the end columns are made of them, some at a time. Joints that turn and joints that slide
 have columns of their own (`joint_columns`).
+
+A file of rows is a gzip file, and unpacked a sequence of arrays as `numpy.save` writes them, one a block. Each row is
+compressed as it comes, a few microseconds, so that no cycle carries the compression of a block.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import gzip
 import io
 import os
+import zlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, MutableSequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, MutableSequence, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,32 +27,47 @@ from numpy.typing import DTypeLike, NDArray
 
 ROWS_FOLDER = "rows"
 """Folder of the rows in the folder of a run; it is gone when the run has ended and its files are written."""
+ROWS_SUFFIX = ".npy.gz"
 BLOCK_ROWS = 200
 """Rows between two writes: a process that is killed loses half a second of a cell at 400 Hz."""
 NUMBER = "#"
 """Field of a row: its number, where rows of one table are in several files."""
-_ROWS_READ = 1 << 14
-"""Rows that are mapped at a time where columns are made."""
+_COLUMNS_MADE = 8
+"""Columns that are made in one pass over the rows; those of an hour take 450 MB at most."""
+_GZIP_BITS = 31
+"""Window of 32 kB in a gzip member. Source: zlib's manual, deflateInit2."""
+_MAGIC_BYTES = np.lib.format.MAGIC_LEN
+"""Start of an array; the size of its header in 4 bytes is next. Source: numpy, NEP 1, version 2.0."""
+FASTEST = 1
+"""Level of compression; others save little of a run's floats and take several times as long."""
 
 
 class LazyColumns(Mapping[str, NDArray[Any]]):
-    """Columns that are made when they are asked for, each time anew.
+    """Columns that are made when they are asked for, some at a time; those of the last time are kept.
 
     Args:
-        makers: functions that make the columns, by name.
+        names: names of the columns.
+        make: function that makes the columns of these names.
     """
 
-    def __init__(self, makers: Mapping[str, Callable[[], NDArray[Any]]]) -> None:
-        self._makers = makers
+    def __init__(self, names: Sequence[str], make: Callable[[Sequence[str]], Mapping[str, NDArray[Any]]]) -> None:
+        self._make = make
+        self._made: Mapping[str, NDArray[Any]] = {}
+        firsts = range(0, len(names), _COLUMNS_MADE)
+        self._group = {name: group for i in firsts for group in (names[i : i + _COLUMNS_MADE],) for name in group}
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        return self._makers[name]()
+        if name not in self._made:
+            group = self._group[name]
+            self._made = {}  # before others take their memory
+            self._made = self._make(group)
+        return self._made[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._makers)
+        return iter(self._group)
 
     def __len__(self) -> int:
-        return len(self._makers)
+        return len(self._group)
 
 
 class RowFiles(Protocol):
@@ -65,19 +85,25 @@ class Rows:
 
     Args:
         dtype: type of a row.
-        file: file that `flush` writes to; None keeps the rows in memory.
+        file: file that `flush` appends to; None keeps the rows in memory.
         kept: number of rows that are kept, the last ones, in memory; None for all.
+        level: level of compression; 0 for rows that come many at a time, which would hold a cycle up.
 
     Attributes:
         failure: why nothing more is written, None while there is no such reason; rows then stay in memory.
     """
 
-    def __init__(self, dtype: DTypeLike, file: Path | None = None, kept: int | None = None) -> None:
+    def __init__(
+        self, dtype: DTypeLike, file: Path | None = None, kept: int | None = None, level: int = FASTEST
+    ) -> None:
         self.dtype = np.dtype(dtype)
         self.failure: str | None = None
         self._path = file
         self._written = 0
         self._waiting: MutableSequence[bytes] = [] if kept is None else deque(maxlen=kept)
+        self._headers: dict[int, bytes] = {}
+        self._level = level
+        self._packer, self._packed = self._new_packer(), list[bytes]()
 
     def __len__(self) -> int:
         return self._written + sum(map(len, self._waiting)) // self.dtype.itemsize
@@ -85,31 +111,32 @@ class Rows:
     def add(self, row: bytes) -> None:
         """Append a row, or several that follow each other."""
         self._waiting.append(row)
+        if self._path is not None and self.failure is None:
+            self._packed.append(self._packer.compress(row))
 
     def flush(self) -> None:
         """Write the rows that wait into the file, where there is one."""
         if self._path is None or self.failure is not None or not self._waiting:
             return
-        data = b"".join(self._waiting)
-        header = self._header(self._written + len(data) // self.dtype.itemsize)
+        count = len(self) - self._written
+        block = b"".join((self._header(count), *self._packed, self._packer.flush()))
         try:
             self._path.parent.mkdir(exist_ok=True)
-            with io.FileIO(self._path, "r+" if self._written else "w") as file:
-                _write_at(file, len(header) + self._written * self.dtype.itemsize, data)
-                _write_at(file, 0, header)  # last: whoever is killed before has the rows before
+            with io.FileIO(self._path, "a" if self._written else "w") as file:
+                if file.write(block) < len(block):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             self.failure = f"{self._path}: cannot be written: {error.strerror or error}"
             return
-        self._written += len(data) // self.dtype.itemsize
+        self._written += count
         self._waiting.clear()
+        self._packer, self._packed = self._new_packer(), []
 
     def blocks(self) -> Iterator[NDArray[Any]]:
         """All rows, in structured arrays that follow each other."""
-        start = len(self._header(self._written)) if self._written else 0
-        for first in range(0, self._written, _ROWS_READ):
+        if self._written:
             assert self._path is not None
-            count = min(_ROWS_READ, self._written - first)
-            yield np.memmap(self._path, self.dtype, "r", start + first * self.dtype.itemsize, count)
+            yield from (block.view(self.dtype) for block in read_blocks(self._path))  # names as they are
         if self._waiting:
             data = b"".join(self._waiting)
             if isinstance(self._waiting, list):
@@ -118,7 +145,7 @@ class Rows:
 
     def columns(self) -> LazyColumns:
         """The fields as columns."""
-        return LazyColumns({name: partial(self._column, name) for name in self.dtype.names or ()})
+        return LazyColumns(self.dtype.names or (), self._make)
 
     def remove(self) -> None:
         """Remove the file; the rows are in another one by now."""
@@ -127,22 +154,60 @@ class Rows:
                 self._path.unlink(missing_ok=True)
                 self._path.parent.rmdir()  # it goes with the last of them
 
-    def _column(self, name: str) -> NDArray[Any]:
-        return np.concatenate([np.empty(0, self.dtype)[name], *(block[name] for block in self.blocks())])
+    def _make(self, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        heads = np.empty(0, self.dtype)
+        made = {name: np.empty((len(self), *heads[name].shape[1:]), heads[name].dtype) for name in names}
+        first = 0
+        for block in self.blocks():
+            for name, column in made.items():
+                column[first : first + len(block)] = block[name]
+            first += len(block)
+        return made
 
     def _header(self, rows: int) -> bytes:
-        """The header of an ``.npy`` file; numpy leaves room in it for any number of rows, so its length is the same."""
-        header = io.BytesIO()
-        descr = [(name.encode("ascii", "backslashreplace").decode(), *kind) for name, *kind in self.dtype.descr]
-        np.lib.format.write_array_header_2_0(header, {"descr": descr, "fortran_order": False, "shape": (rows,)})
-        return header.getvalue()
+        """The header of an ``.npy`` file of so many rows, compressed; that of most blocks is the same."""
+        if rows not in self._headers:
+            header = io.BytesIO()
+            descr = [(name.encode("ascii", "backslashreplace").decode(), *kind) for name, *kind in self.dtype.descr]
+            np.lib.format.write_array_header_2_0(header, {"descr": descr, "fortran_order": False, "shape": (rows,)})
+            self._headers[rows] = gzip.compress(header.getvalue(), FASTEST)
+        return self._headers[rows]
+
+    def _new_packer(self) -> Any:
+        return None if self._path is None else zlib.compressobj(self._level, zlib.DEFLATED, _GZIP_BITS)
 
 
-def _write_at(file: io.FileIO, place: int, data: bytes) -> None:
-    """Write all of some bytes at a place of a file."""
-    file.seek(place)
-    if file.write(data) < len(data):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+def read_blocks(path: Path) -> Iterator[NDArray[Any]]:
+    """The rows of a file, in structured arrays that follow each other, while it is written or after a kill.
+
+    A last block that is not whole is left out: it is being written, or was when the process was killed.
+
+    Raises:
+        ValueError: a block is damaged; the message says which rows come before it.
+        OSError: the file cannot be read.
+    """
+    read = 0
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:  # until 0.2 rows were not compressed
+        try:
+            while file.peek(1):
+                size = file.read(_MAGIC_BYTES + 4)[_MAGIC_BYTES:]
+                count, dtype = _read_header(size + file.read(int.from_bytes(size, "little")))
+                data = file.read(count * dtype.itemsize)
+                if len(data) < count * dtype.itemsize:
+                    return
+                yield np.frombuffer(data, dtype)
+                read += count
+        except EOFError:
+            return
+        except (gzip.BadGzipFile, ValueError, zlib.error) as error:
+            raise ValueError(f"{path}: damaged near row {read}: {error}") from error
+
+
+@lru_cache
+def _read_header(header: bytes) -> tuple[int, np.dtype[Any]]:
+    """Number and type of the rows behind a header; that of most blocks of a file is the same."""
+    (count,), _, dtype = np.lib.format.read_array_header_2_0(io.BytesIO(header))
+    return count, dtype
 
 
 def read_left_rows(folder: Path, table: str) -> dict[str, NDArray[Any]]:
@@ -155,20 +220,29 @@ def read_left_rows(folder: Path, table: str) -> dict[str, NDArray[Any]]:
     Raises:
         OSError, ValueError: a file cannot be read.
     """
-    files = sorted((folder / ROWS_FOLDER).glob(f"{table}*.npy"))
-    kinds = [kind for kind in (np.load(file, mmap_mode="r") for file in files) if len(kind)]
-    if not any(NUMBER in kind.dtype.names for kind in kinds):
-        return {name: np.array(kind[name]) for kind in kinds for name in kind.dtype.names}
-    numbers = [kind[NUMBER].astype(np.int64) for kind in kinds]
-    rows, place = np.unique(np.concatenate(numbers), return_inverse=True)
-    places = np.split(place, np.cumsum([len(of_kind) for of_kind in numbers])[:-1])
+    files = sorted((folder / ROWS_FOLDER).glob(f"{table}*.npy*"))
+    rows = np.unique(np.concatenate([np.empty(0), *(numbers for file in files for numbers, _ in _numbered(file))]))
     columns: dict[str, NDArray[Any]] = {}
-    for kind, at in zip(kinds, places, strict=True):
-        for name in kind.dtype.names[1:]:
-            column = columns.setdefault(name, np.full((len(rows), *kind[name].shape[1:]), np.nan))
-            if column.shape[1:] == kind[name].shape[1:]:
-                column[at] = kind[name]
+    for numbers, block in (part for file in files for part in _numbered(file)):
+        known = np.isin(numbers, rows)  # of a run that goes on, others may have come
+        at = np.searchsorted(rows, numbers[known])
+        for name in block.dtype.names or ():
+            values = block[name][known]
+            missing = np.nan if values.dtype.kind == "f" else 0
+            column = columns.setdefault(name, np.full((len(rows), *values.shape[1:]), missing, values.dtype))
+            if column.shape[1:] == values.shape[1:]:
+                column[at] = values
+    columns.pop(NUMBER, None)
     return columns
+
+
+def _numbered(path: Path) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """The blocks of a file, each with the numbers of its rows in their table."""
+    first = 0
+    for block in read_blocks(path):
+        named = NUMBER in (block.dtype.names or ())
+        yield block[NUMBER].copy() if named else np.arange(first, first + len(block)), block
+        first += len(block)
 
 
 def joint_columns(name: str, q: NDArray[Any], prismatic: NDArray[np.bool_] | None) -> dict[str, NDArray[Any]]:

@@ -35,7 +35,7 @@ COMMANDS = (
     "scenes", "cells", "schema", "init", "plan", "check", "run", "up",
     "console", "move", "home", "tare", "listen", "posture",
     "emulate", "inject", "conform", "judge", "adapters", "scan", "monitor",
-    "replay", "view", "export", "calibrate", "study", "vcan", "eds",
+    "replay", "runs", "view", "export", "calibrate", "study", "vcan", "eds",
 )  # fmt: skip
 
 ELSEWHERE = {

@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import seconds, whole, word
-from canprobe.cli.output import print_answer, print_json, print_table, say
+from canprobe.cli.output import print_answer, print_json, print_table
 from canprobe.cli.parser import Parser
 from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
+from canprobe.cli.stdin import yes_typed
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.port import nothing
@@ -120,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
             bitrate=args.bitrate or 1_000_000,
             fd=virtual or args.data_bitrate is not None,
             times=BenchTimes() if virtual else times,
-            ask=_ask if sys.stdin.isatty() else None,
+            ask=yes_typed if sys.stdin.isatty() else None,
         )
         from canprobe.fieldbus.tools.conform import Examination
 
@@ -247,14 +248,8 @@ def _confirm(args: argparse.Namespace) -> None:
     """
     if args.yes or args.bus == "lockstep":
         return
-    if not _ask(f"node {args.node} will be switched on and its axis will move: is everybody out of its way?"):
+    if not yes_typed(f"node {args.node} will be switched on and its axis will move: is everybody out of its way?"):
         raise UsageError("conform: --motion needs a yes at the terminal, or --yes")
-
-
-def _ask(question: str) -> bool:
-    """Ask at the terminal; only yes is yes."""
-    say(f"{question} [yes or no]")
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def _list(args: argparse.Namespace) -> int:

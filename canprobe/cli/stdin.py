@@ -7,6 +7,7 @@ import os
 import stat
 import sys
 
+from canprobe.cli.output import say
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns
 from canprobe.fieldbus.bus.system import system
@@ -27,6 +28,12 @@ def need_terminal(yes: bool, asks: str) -> None:
     """
     if not yes and not sys.stdin.isatty():
         raise UsageError(f"{asks} and needs a terminal; --yes leaves that out")
+
+
+def yes_typed(question: str) -> bool:
+    """Ask at the terminal; only yes is yes."""
+    say(f"{question} [yes or no]")
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 class InputOpen:

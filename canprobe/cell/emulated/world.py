@@ -20,7 +20,7 @@ from canprobe.cell.plant.config import PlantConfig, PressMotion
 from canprobe.cell.plant.contact import PlantState, TruthRow
 from canprobe.cell.plant.plant import Plant, truth_columns
 from canprobe.cell.plant.taxels import TaxelConfig
-from canprobe.cell.rows import BLOCK_ROWS, LazyColumns, Rows, joint_columns
+from canprobe.cell.rows import BLOCK_ROWS, ROWS_SUFFIX, LazyColumns, Rows, joint_columns
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
@@ -66,7 +66,7 @@ class TruthRecorder(Participant):
         plant: plant whose truth is recorded.
         at_once: whether what is true is computed at each SYNC. In real time it would make the nodes' next answers late,
             and is computed afterwards.
-        folder: folder for the blocks, in a file ``truth.npy``; None keeps them in memory.
+        folder: folder for the blocks, in a file ``truth.npy.gz``; None keeps them in memory.
 
     Attributes:
         origin_ns: time on the bus's clock that is 0 in the column ``t_s``.
@@ -80,7 +80,7 @@ class TruthRecorder(Participant):
     def __init__(self, plant: Plant, *, at_once: bool = False, folder: Path | None = None) -> None:
         self._plant = plant
         self._at_once = at_once
-        self._file = folder / "truth.npy" if folder is not None else None
+        self._file = folder / f"truth{ROWS_SUFFIX}" if folder is not None else None
         self.origin_ns = 0
         self.rows: Rows | None = None
         self._stamps: list[tuple[int, int]] = []
@@ -125,7 +125,7 @@ class TruthRecorder(Participant):
         named = with_units(columns, () if model is None else model.chain.prismatic)
         if self.rows is None:
             fields = [(name, column.dtype, column.shape[1:]) for name, column in named.items()]
-            self.rows = Rows(fields, self._file)
+            self.rows = Rows(fields, self._file, level=0)
         table = np.empty(len(stamps), self.rows.dtype)
         for name in self.rows.dtype.names or ():
             table[name] = named[name]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
-from collections.abc import Iterable, Iterator, MutableSequence, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableSequence, Sequence
 from copy import copy
 from dataclasses import astuple
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.tactile_frame import TactileSample
-from canprobe.cell.rows import BLOCK_ROWS, NUMBER, LazyColumns, Rows
+from canprobe.cell.rows import BLOCK_ROWS, NUMBER, ROWS_SUFFIX, LazyColumns, Rows
 from canprobe.mechanics.types import Floats
 
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
-_Part = tuple[NDArray[np.int64], Sequence[Any] | Floats]
-"""Numbers of rows in the log, and the values of a column there."""
+_Part = tuple[NDArray[np.int64], Mapping[str, Sequence[Any] | Floats]]
+"""Numbers of rows in the log, and the values of each column there."""
 
 
 class _RowKind:
@@ -69,24 +70,24 @@ class _RowKind:
             self._views.append(self._block[start : start + value.size].reshape(value.shape))
             start += value.size
 
-    def stored(self, name: str, first: int) -> Iterator[_Part]:
-        """Values of a column from the row `first` of the log on, in blocks."""
+    def stored(self, first: int) -> Iterator[_Part]:
+        """The rows from the row `first` of the log on, in blocks."""
         for block in self.rows.blocks() if self.rows is not None else ():
             numbers = block[NUMBER].astype(np.int64)
             start = int(np.searchsorted(numbers, first))
             if start < len(numbers):
-                yield numbers[start:], block[name][start:]
+                yield numbers[start:], {name: block[name][start:] for name in self.names}
 
-    def single(self, name: str, first: int) -> Iterator[_Part]:
-        """Values of a column from the row `first` on in odd rows, without None."""
-        place = self.names.index(name)
+    def single(self, first: int) -> Iterator[_Part]:
+        """The odd rows from the row `first` on, without values that are None."""
         for number, values in self.odd:
-            if number >= first and values[place] is not None:
-                yield np.array([number]), [values[place]]
+            if number >= first:
+                known = zip(self.names, values, strict=True)
+                yield np.array([number]), {name: [value] for name, value in known if value is not None}
 
     def has_rows(self, first: int) -> bool:
         """Whether there are rows from the row `first` on."""
-        return any(True for _ in self.stored(NUMBER, first)) or any(number >= first for number, _ in self.odd)
+        return any(True for _ in self.stored(first)) or any(number >= first for number, _ in self.odd)
 
 
 def since_first_sync(t_s: Floats, start_s: float) -> Floats:
@@ -103,7 +104,7 @@ class RunLog:
 
     Args:
         kept: how many rows are kept, the last ones: a cell that is left running for days must not grow; None for all.
-        folder: folder for the rows, in a file for each kind of row (``log-0.npy``); None keeps them in memory.
+        folder: folder for the rows, in a file for each kind of row (``log-0.npy.gz``); None keeps them in memory.
 
     Attributes:
         start_s: time of the first SYNC on the clock of the rows.
@@ -124,7 +125,7 @@ class RunLog:
         names = tuple(row)
         kind = self._kinds.get(names)
         if kind is None:
-            file = self._folder / f"log-{len(self._kinds)}.npy" if self._folder is not None else None
+            file = self._folder / f"log-{len(self._kinds)}{ROWS_SUFFIX}" if self._folder is not None else None
             kind = self._kinds[names] = _RowKind(names, file, self._kept)
         kind.add(self._added, row.values())
         self._added += 1
@@ -157,37 +158,47 @@ class RunLog:
         """
         first = self._added - len(self)
         names = dict.fromkeys(name for kind in self._kinds.values() if kind.has_rows(first) for name in kind.names)
-        return LazyColumns({name: partial(self._column, name, first) for name in names or ("t_s",)})
+        return LazyColumns(tuple(names or ("t_s",)), partial(self._make, first))
 
     def arrays(self) -> dict[str, Floats]:
         """The columns in memory, with ``t_s`` since the first SYNC."""
         columns = dict(self.columns())
         return columns | {"t_s": since_first_sync(columns["t_s"], self.start_s)} if "t_s" in columns else columns
 
-    def _column(self, name: str, first: int) -> Floats:
-        """A column; the first value of all decides the shape."""
-        kinds = [kind for kind in self._kinds.values() if name in kind.names]
-        ways = [way(name, first) for kind in kinds for way in (kind.stored, kind.single)]
-        heads = [head for head in (next(way, None) for way in ways) if head is not None]
+    def _make(self, first: int, names: Sequence[str]) -> dict[str, Floats]:
+        """Columns of the rows from the row `first` on, in one pass."""
+        made = {name: np.full((len(self), *self._shape(name, first)), np.nan) for name in names}
+        misfits: Counter[str] = Counter()
+        for numbers, part in (part for way in self._ways(*names) for part in way(first)):
+            for name in made.keys() & part.keys():
+                out, values = made[name], part[name]
+                if isinstance(values, np.ndarray) and values.shape[1:] == out.shape[1:]:
+                    out[numbers - first] = values
+                    continue
+                for i, value in zip(numbers - first, values, strict=True):
+                    try:
+                        out[i] = value
+                    except _NO_NUMBERS:
+                        misfits[name] += 1
+        for name, count in misfits.items():
+            wanted = f"numbers of shape {made[name].shape[1:]}, as its first is"
+            warnings.warn(f"log: {count} values of column {name!r} are no {wanted}: left NaN", stacklevel=3)
+        return made
+
+    def _ways(self, *names: str) -> list[Callable[[int], Iterator[_Part]]]:
+        """Iterators over the rows of kinds that have some of these columns."""
+        kinds = [kind for kind in self._kinds.values() if not set(names).isdisjoint(kind.names)]
+        return [way for kind in kinds for way in (kind.stored, kind.single)]
+
+    def _shape(self, name: str, first: int) -> tuple[int, ...]:
+        """Shape of a column's values; the first of all decides it."""
+        ways = self._ways(name)
+        heads = [next(((n[0], part[name][0]) for n, part in way(first) if name in part), None) for way in ways]
+        known = [head for head in heads if head is not None]
         try:
-            shape = np.shape(min(heads, key=lambda head: int(head[0][0]))[1][0]) if heads else ()
+            return np.shape(min(known, key=itemgetter(0))[1]) if known else ()
         except ValueError:  # rows of unequal length
-            shape = ()
-        out = np.full((len(self), *shape), np.nan)
-        misfits = 0
-        for numbers, values in (p for kind in kinds for way in (kind.stored, kind.single) for p in way(name, first)):
-            if isinstance(values, np.ndarray) and values.shape[1:] == shape:
-                out[numbers - first] = values
-                continue
-            for i, value in zip(numbers - first, values, strict=True):
-                try:
-                    out[i] = value
-                except _NO_NUMBERS:
-                    misfits += 1
-        if misfits:
-            wanted = f"numbers of shape {shape}, as its first is"
-            warnings.warn(f"log: {misfits} values of column {name!r} are no {wanted}: left NaN", stacklevel=3)
-        return out
+            return ()
 
 
 _NO_FEATURES = (math.nan,) * 7
@@ -198,13 +209,13 @@ class TactileLog:
 
     Args:
         kept: how many frames are kept, the last ones; None for all.
-        folder: folder for their file, ``tactile.npy``; None keeps them in memory.
+        folder: folder for their file, ``tactile.npy.gz``; None keeps them in memory.
     """
 
     def __init__(self, kept: int | None = None, folder: Path | None = None) -> None:
         self.rows: Rows | None = None
         self._kept = kept
-        self._file = folder / "tactile.npy" if folder is not None else None
+        self._file = folder / f"tactile{ROWS_SUFFIX}" if folder is not None else None
         self._added = 0
 
     def add(self, t_s: float, start_s: float, sample: TactileSample) -> None:
@@ -228,7 +239,7 @@ class TactileLog:
 
     def columns(self) -> LazyColumns:
         """A row for each frame (m, ...): when it was usable and sampled, s, taxels, their window, features."""
-        return LazyColumns({}) if self.rows is None else self.rows.columns()
+        return LazyColumns((), lambda _: {}) if self.rows is None else self.rows.columns()
 
     def remove(self) -> None:
         """Remove the file; its rows are in ``tactile.npz`` by now."""

@@ -7,7 +7,7 @@ and the scene's task is stepped through them again.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -302,8 +302,8 @@ class RunFolder:
     """
 
     path: Path
-    log: dict[str, NDArray[Any]]
-    tactile: dict[str, NDArray[Any]]
+    log: Mapping[str, NDArray[Any]]
+    tactile: Mapping[str, NDArray[Any]]
 
     @property
     def start_s(self) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -138,7 +138,7 @@ def _summarise(
     }
 
 
-def _truth(file: Path, setup: Setup) -> dict[str, Floats]:
+def _truth(file: Path, setup: Setup) -> Mapping[str, Floats]:
     """The plant's truth, one row per SYNC; empty without the file, or where nothing happened."""
     columns = read_truth(file, setup) if is_recorded(file) else {}
     if not columns or not len(next(iter(columns.values()))):

@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ SHOWN_FORCE_N = 0.0
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 
-Columns = dict[str, NDArray[Any]]
+Columns = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,7 +237,7 @@ def rows_of_run(source: Path, fps: int | None = None) -> RunRows:
     every = _divisor(scene.cycle.rate_hz, fps)
     _refuse_gaps(source / LOG, log["t_s"], scene.cycle.rate_hz)
     rows = slice(None, None, every)
-    kept = {name: values[rows] for name, values in log.items()}
+    kept = {name: log[name][rows] for name in ("t_s", "force_n", "phase") if name in log}
     features = dict(_arm_features(setup, log, rows))
     if "force_n" in log:
         features |= _contact_features(kept)

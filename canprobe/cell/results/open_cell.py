@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -348,7 +348,7 @@ class OpenCell:
                 failure.add_note(line)
 
     def _score(
-        self, log: dict[str, Floats], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
+        self, log: Mapping[str, Floats], tactile: Mapping[str, npt.NDArray[Any]], failure: BaseException | None
     ) -> RunData:
         """The data of the run with the estimator in the loop, scored by the plan that it ran with."""
         record, start_s, setup = record_of(self._last), self.cell.cycles.start_ns * 1e-9, self.plan.setup

@@ -8,7 +8,7 @@ import os
 import sys
 import tempfile
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,11 +115,11 @@ class RunResult:
 
     plan: Plan
     summary: dict[str, Any]
-    log: dict[str, Floats]
-    truth: dict[str, Floats]
+    log: Mapping[str, Floats]
+    truth: Mapping[str, Floats]
     estimates: dict[str, list[ShapeRecord]]
     taxels: NDArray[np.uint8] | None
-    tactile: dict[str, NDArray[Any]]
+    tactile: Mapping[str, NDArray[Any]]
     surface_map: SurfaceMap | None
     out: Path | None
     contacts: Contacts | None
@@ -274,7 +274,7 @@ class RunResult:
     def _attrs(self) -> dict[str, Any]:
         return {name: self.summary[name] for name in ("scene", "bus", "seed")}
 
-    def _columns(self, what: str) -> dict[str, Floats]:
+    def _columns(self, what: str) -> Mapping[str, Floats]:
         if what == "estimates":
             from canprobe.cell.results.scores import estimate_columns
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -32,11 +33,11 @@ class RunData:
 
     plan: Plan
     summary: dict[str, Any]
-    log: dict[str, Floats]
-    truth: dict[str, Floats]
+    log: Mapping[str, Floats]
+    truth: Mapping[str, Floats]
     estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
     taxels: NDArray[np.uint8] | None = None
-    tactile: dict[str, NDArray[Any]] = field(default_factory=dict)
+    tactile: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     surface_map: SurfaceMap | None = None
     out: Path | None = None
     tracker: ShapeTracker | None = None

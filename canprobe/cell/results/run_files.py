@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.npz import read_npz
+from canprobe.cell.npz import NpzColumns, read_npz
 from canprobe.cell.rows import ROWS_FOLDER, read_left_rows
 from canprobe.cell.scene.load import SAVED_AS, load_scene
 from canprobe.cell.scene.model import Scene
@@ -33,7 +33,7 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.cell.scene.toml_files import written_by_other
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import SceneError, UsageError, check_schema, needed_module, regular_file
-from canprobe.fieldbus.bus.files import whole_file
+from canprobe.fieldbus.bus.files import read_document, whole_file
 
 if TYPE_CHECKING:
     import pandas
@@ -47,7 +47,7 @@ _LATEST_S = 1e9
 _WHOLE_NUMBERS = {"q_age": 1 << 31, "statusword": 0xFFFF, "tactile_age": 1 << 31, "phase": max(Phase)}
 """Columns of ``log.npz`` and their largest value."""
 
-Columns = dict[str, NDArray[Any]]
+Columns = dict[str, NDArray[Any]] | NpzColumns
 _Shapes = Mapping[str, tuple[int | str, ...]]
 """By column: the shape of a row; sizes of the cell stand there by name."""
 
@@ -86,10 +86,7 @@ def read_summary(folder: Path) -> dict[str, Any] | None:
     file = folder / SUMMARY
     if not file.exists():
         return None
-    try:
-        summary = json.loads(regular_file(file, _MOST_SUMMARY_BYTES).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(f"{file}: expected the summary of a run; cannot be read: {error}") from error
+    summary = read_document(file, _MOST_SUMMARY_BYTES, json.loads, "the summary of a run")
     if not isinstance(summary, dict):
         raise UsageError(f"{file}: expected the summary of a run, got {type(summary).__name__}")
     where = f"{file}{written_by_other(summary.get('written_by'))}"
@@ -185,7 +182,7 @@ READERS = {LOG: read_log, TACTILE: read_tactile, TRUTH: read_truth}
 
 def is_recorded(file: Path) -> bool:
     """Whether a run has written a file of columns, or was killed and has left its rows."""
-    return file.exists() or any((file.parent / ROWS_FOLDER).glob(f"{file.stem}*.npy"))
+    return file.exists() or any((file.parent / ROWS_FOLDER).glob(f"{file.stem}*.npy*"))
 
 
 def _columns(file: Path, what: str) -> Columns:
@@ -201,8 +198,9 @@ def _columns(file: Path, what: str) -> Columns:
 def _checked(columns: Columns, file: Path, shapes: _Shapes, setup: Setup | None) -> Columns:
     """The columns, after a check of their kinds and lengths; with a setup, of the shapes of known ones too."""
     sizes = _sizes(setup)
-    rows = next((len(column) for column in columns.values() if column.ndim), 0)
-    for name, column in columns.items():
+    heads = columns.heads if isinstance(columns, NpzColumns) else columns
+    rows = next((len(column) for column in heads.values() if column.ndim), 0)
+    for name, column in heads.items():
         known = setup is not None and rows and name in shapes
         kinds, row = (_OF_INTEGERS.get(name, "f"), shapes[name]) if known else ("biuf", column.shape[1:])
         wanted = (rows, *(sizes.get(size) if isinstance(size, str) else size for size in row))

@@ -138,7 +138,7 @@ def _traffic(session: Session) -> dict[str, Any]:
     return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
 
 
-def truth_of(session: Session) -> dict[str, Floats]:
+def truth_of(session: Session) -> Mapping[str, Floats]:
     """The plant's truth; empty where nothing was emulated, or nothing happened."""
     return session.buses.truth if "force_n" in session.buses.truth else {}
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.npz import unpack_npz
+from canprobe.cell.npz import NpzColumns
 from canprobe.cell.scene.hardware import MM, Vec3
 from canprobe.cell.scene.model import ObjectSettings, ProbeSettings, TaskSettings
 from canprobe.errors import needed_module, regular_file
@@ -282,7 +282,7 @@ def _grid(path: Path) -> tuple[Floats, float | None]:
         if kind in (".csv", ".txt"):
             return _of_text(content.decode("utf-8-sig")), None
         if content.startswith(b"PK"):
-            return _of_archive(unpack_npz(BytesIO(content), mapped=False))
+            return _of_archive(NpzColumns(BytesIO(content), ""))
         return np.asarray(np.load(BytesIO(content)), dtype=np.float64), None
     except UnicodeDecodeError as error:
         why = f"byte {error.start} is {error.object[error.start]:#04x}, which is no text"
@@ -309,7 +309,7 @@ def _of_text(text: str) -> Floats:
     return np.array(grid)
 
 
-def _of_archive(arrays: dict[str, Any]) -> tuple[Floats, float | None]:
+def _of_archive(arrays: NpzColumns) -> tuple[Floats, float | None]:
     heights = arrays.get("heights", next(iter(arrays.values())) if len(arrays) == 1 else None)
     if heights is None:
         raise ValueError(f'expected an array "heights", got {", ".join(arrays) or "none"}')

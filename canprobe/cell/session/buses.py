@@ -6,7 +6,7 @@ Their traffic is counted, written into ``bus.log`` and shown to the observers.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property, partial
 from pathlib import Path
@@ -186,7 +186,7 @@ class SessionBuses(ABC):
         self.ports: dict[str, Port] = {}
         self.lockstep: LockstepBus | None = None
         self.make_cycle: Callable[..., Cycle] | None = None
-        self.truth: dict[str, Floats] = {}
+        self.truth: Mapping[str, Floats] = {}
         self._child: EmulatorChild | None = None
         self._plan, self._options, self._files, self._stack = plan, options, files, stack
 
@@ -230,7 +230,7 @@ class SessionBuses(ABC):
 
     def _keep_truth(self) -> None:
         if self.world.recorder is not None:
-            self.truth = dict(self._files.keep("truth.npz", self.world.recorder))
+            self.truth = self._files.keep("truth.npz", self.world.recorder)
 
     def _joined(self, ports: dict[str, Port]) -> Port:
         if len(ports) == 1:

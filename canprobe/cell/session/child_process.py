@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -204,7 +204,7 @@ class EmulatorChild(ChildProcess):
             return True
         return SERVING_WORD.encode() in (self.folder / ERRORS).read_bytes()  # leaves the child's place in it
 
-    def end(self) -> dict[str, NDArray[np.float64]]:
+    def end(self) -> Mapping[str, NDArray[np.float64]]:
         """Stop the process, by stronger signals where it does not end; the plant's truth where it left any."""
         if self._process is not None:
             patience_s = END_TIMEOUT_S + TRUTH_SHARE * (self._clock.now_ns() - self._started_ns) * 1e-9
@@ -213,9 +213,9 @@ class EmulatorChild(ChildProcess):
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
                     self._process.wait(patience_s)
                     break
-        truth: dict[str, NDArray[np.float64]] = {}
+        truth: Mapping[str, NDArray[np.float64]] = {}
         with contextlib.suppress(UsageError):  # none was written, or it was cut off by a full disk
-            truth.update(read_npz(self._truth))
+            truth = read_npz(self._truth)
         words = self.last_words()
         self.unwritten = words if words.startswith(str(self._truth)) else None
         self.remove()

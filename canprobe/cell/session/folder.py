@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +52,8 @@ class KeptFiles:
             self.unwritten.append(failure)
             self.note(failure)
 
-    def keep(self, name: str, rows: RowFiles) -> dict[str, NDArray[Any]]:
-        """Write the columns of rows into a file of the folder, and read them back: large ones are mapped.
+    def keep(self, name: str, rows: RowFiles) -> Mapping[str, NDArray[Any]]:
+        """Write the columns of rows into a file of the folder; each is read back when it is asked for.
 
         A failure is noted, and the files of the rows stay. The columns then are in memory, as without a folder.
         """

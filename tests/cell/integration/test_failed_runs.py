@@ -92,4 +92,4 @@ def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
     assert read_json(tmp_path / "summary.json")["stop_reason"] == "stopped"
     kept = {"bus.log", "scene.toml", "summary.json", "rows"}  # the rows of the run, which found no other place
     assert {path.name for path in tmp_path.iterdir()} <= kept
-    assert (tmp_path / "rows" / "truth.npy").exists()
+    assert (tmp_path / "rows" / "truth.npy.gz").exists()

@@ -13,7 +13,7 @@ from full_disk import room_for
 
 import canprobe
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.rows import BLOCK_ROWS, ROWS_FOLDER
+from canprobe.cell.rows import BLOCK_ROWS, ROWS_FOLDER, read_left_rows
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cli import main
@@ -25,7 +25,7 @@ def started(out, *words):
     """A run in a process, once some blocks of its rows are on disk."""
     process = subprocess.Popen([*COMMAND, *words, "--duration", "3000", "--out", str(out)], stderr=subprocess.PIPE)
     rows = out / ROWS_FOLDER
-    while not rows.is_dir() or sum(len(np.load(file)) for file in rows.glob("log-*.npy")) < 2 * BLOCK_ROWS:
+    while not rows.is_dir() or len(read_left_rows(out, "log").get("t_s", ())) < 2 * BLOCK_ROWS:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
     return process

@@ -39,7 +39,7 @@ def folder(scan: Path, tmp_path: Path) -> Path:
 
 def with_columns(name: str, change: Callable[[dict[str, np.ndarray]], object]) -> Callable[[Path], None]:
     def rewrite(folder: Path) -> None:
-        columns = read_npz(folder / name)
+        columns = dict(read_npz(folder / name))
         change(columns)
         np.savez(folder / name, **columns)
 
@@ -129,7 +129,7 @@ SHAPED = {
     ),
     "brackets": (
         with_bytes("summary.json", lambda _: b"[" * 100_000),
-        "summary.json: expected the summary of a run; ",
+        "summary.json: expected the summary of a run: ",
     ),
 }
 
