@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -45,21 +45,54 @@ DOUBT_WINDOW_SAMPLES = 160
 """Number of last contacts whose doubts an estimate reports."""
 
 
-class Estimator(Protocol):
-    """Local shape from a stream of contacts."""
+T = TypeVar("T")
+Steps: TypeAlias = Generator[None, None, T]
+"""Work in steps with its result."""
 
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by reason."""
+
+def at_once(steps: Steps[T]) -> T:
+    """The result of all steps."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+
+class Estimator:
+    """Local shape from a stream of contacts.
+
+    `adding` and `answering` are `add` and `estimate` in steps of half a millisecond, for a loop that has no time for
+    all at once: each `yield` is a pause. Before the last step nothing else may be asked of the estimator.
+
+    Attributes:
+        dropped: samples that were not used, by reason.
+    """
+
+    dropped: Dropped
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
+        raise NotImplementedError
+
+    def adding(self, sample: ContactSample) -> Steps[None]:
+        """Take one contact, in steps."""
+        self.add(sample)
+        yield from ()
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
+        raise NotImplementedError
+
+    def answering(self) -> Steps[SurfaceEstimate | None]:
+        """The answer at the last contact, in steps."""
+        yield from ()
+        return self.estimate()
 
     def reset(self) -> None:
         """Forget everything but the settings: contact was lost, or the array was reset."""
+        raise NotImplementedError
 
 
 class Gate:
