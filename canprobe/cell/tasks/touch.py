@@ -227,7 +227,7 @@ class TouchTask(ProbingTask):
         self._search: Search | None = None
         self._asked: ProbePose | None = None
         self._velocity: Floats = np.zeros(3)
-        self._scan_t = self._searched_before = 0.0
+        self._now_s = self._scan_t = self._searched_before = 0.0
         self._contact: ContactSample | None = None
         self._at_rest = AtRest()
         self._updated = True
@@ -242,13 +242,16 @@ class TouchTask(ProbingTask):
         scan = None
         if self._scan_start is not None:
             scan = self._scan_start, self._cycle if self._scan_end is None else self._scan_end
+        if self.shape is not None:
+            self.shape.answer_at_once(self._now_s)
         return replace(super().record(), shape=self.shape, losses=self.losses, scan_cycles=scan)
 
     def step(self, measurement: Measurement) -> Command:
         self.update()
         self._updated = False
         self._images = [self._images[-1], measurement.tactile is not None]
-        self._estimate = self.shape.answer(measurement.t_ns * 1e-9) if self.shape is not None else None
+        self._now_s = measurement.t_ns * 1e-9
+        self._estimate = self.shape.answer(self._now_s) if self.shape is not None else None
         command = super().step(measurement)
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
