@@ -17,7 +17,8 @@ from canprobe.cell.scene.plugins import Plugin
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.mechanics.touch import ContactSample, SurfaceEstimate, indentation_from_force
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth
-from canprobe.mechanics.touch.estimate.gate import Dropped, Estimator, Steps, at_once
+from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps, at_once
+from canprobe.mechanics.touch.estimate.gate import Dropped
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch import SurfaceMap

@@ -10,7 +10,7 @@ import pytest
 from canprobe.cell.tasks.shape import MAX_CURVATURE, ShapeRecord, ShapeTracker, replay_samples
 from canprobe.mechanics.touch import NoiseLevel, OnlineEstimator, PadLayer, SurfaceMap, make_estimator
 from canprobe.mechanics.touch.contact import contact_sample, indentation_from_force
-from canprobe.mechanics.touch.estimate.gate import Estimator
+from canprobe.mechanics.touch.estimate.estimator import Estimator
 from canprobe.mechanics.touch.map.noise import PAD_NOISE
 from canprobe.mechanics.touch.online.estimator import AnswerStage
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation

@@ -1,17 +1,16 @@
-"""The interface of an online estimator, the gate that every sample passes, and the errors that it has behind it."""
+"""The gate that every sample of an online estimator passes, and the errors that it has behind it."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample, Doubt
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.noise import Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.path_length import PathLength
 from canprobe.mechanics.touch.linear_algebra import positive
@@ -43,56 +42,6 @@ DOUBT_SIGMA_SCALE = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Dou
 """Factor on both standard deviations of a contact whose image is in doubt."""
 DOUBT_WINDOW_SAMPLES = 160
 """Number of last contacts whose doubts an estimate reports."""
-
-
-T = TypeVar("T")
-Steps: TypeAlias = Generator[None, None, T]
-"""Work in steps with its result."""
-
-
-def at_once(steps: Steps[T]) -> T:
-    """The result of all steps."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
-
-
-class Estimator:
-    """Local shape from a stream of contacts.
-
-    `adding` and `answering` are `add` and `estimate` in steps of half a millisecond, for a loop that has no time for
-    all at once: each `yield` is a pause. Before the last step nothing else may be asked of the estimator.
-
-    Attributes:
-        dropped: samples that were not used, by reason.
-    """
-
-    dropped: Dropped
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
-        raise NotImplementedError
-
-    def adding(self, sample: ContactSample) -> Steps[None]:
-        """Take one contact, in steps."""
-        self.add(sample)
-        yield from ()
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
-        raise NotImplementedError
-
-    def answering(self) -> Steps[SurfaceEstimate | None]:
-        """The answer at the last contact, in steps."""
-        yield from ()
-        return self.estimate()
-
-    def reset(self) -> None:
-        """Forget everything but the settings: contact was lost, or the array was reset."""
-        raise NotImplementedError
 
 
 class Gate:

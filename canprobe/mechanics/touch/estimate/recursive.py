@@ -19,16 +19,8 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
-from canprobe.mechanics.touch.estimate.gate import (
-    Dropped,
-    Estimator,
-    Gate,
-    MeasuredContact,
-    PadPathLength,
-    Steps,
-    at_once,
-    slow_errors,
-)
+from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength, slow_errors
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
@@ -139,10 +131,6 @@ class RecursiveEstimator(Estimator):
         self._start: Start | None = Start(self._memory, self._prior)
         self._steady = False
         self._doubtful = 0.0
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        at_once(self.adding(sample))
 
     def adding(self, sample: ContactSample) -> Steps[None]:
         if not self._gate.passes(sample, self.dropped):

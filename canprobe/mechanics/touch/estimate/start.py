@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.mechanics.touch.estimate.gate import MeasuredContact, Steps, slow_errors
+from canprobe.mechanics.touch.estimate.estimator import Steps
+from canprobe.mechanics.touch.estimate.gate import MeasuredContact, slow_errors
 from canprobe.mechanics.touch.estimate.information import batch_design
 from canprobe.mechanics.touch.estimate.noise import SlowErrors
 from canprobe.mechanics.touch.estimate.nonlinear import linear_start, robust, solve_rows

@@ -6,7 +6,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.gate import Estimator, Steps, at_once
+from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps
 from canprobe.mechanics.types import Floats
 
 
@@ -61,10 +61,6 @@ class OnlineEstimator(Estimator):
         self._stages = stages
         self._last: ContactSample | None = None
 
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        at_once(self.adding(sample))
-
     def adding(self, sample: ContactSample) -> Steps[None]:
         before = self.dropped.total
         yield from self._motion.adding(sample)
@@ -72,10 +68,6 @@ class OnlineEstimator(Estimator):
             self._last = sample
             for stage in self._stages:
                 stage.take(sample)
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
-        return at_once(self.answering())
 
     def answering(self) -> Steps[SurfaceEstimate | None]:
         if self._last is None:

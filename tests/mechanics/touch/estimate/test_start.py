@@ -7,7 +7,8 @@ import pytest
 
 from canprobe.mechanics.touch import ContactSample, Prior, make_estimator
 from canprobe.mechanics.touch.estimate import start as first_stretch
-from canprobe.mechanics.touch.estimate.gate import MeasuredContact, at_once
+from canprobe.mechanics.touch.estimate.estimator import at_once
+from canprobe.mechanics.touch.estimate.gate import MeasuredContact
 from canprobe.mechanics.touch.estimate.information import batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
 from canprobe.mechanics.touch.estimate.start import MAX_CONTACTS, TAKEOVER_SHARE, Start, isolation
