@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.gate import Dropped
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.contact import ContactSample
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.gate import Dropped
 
 T = TypeVar("T")
 Steps: TypeAlias = Generator[None, None, T]
@@ -57,4 +58,3 @@ class Estimator:
 
     def reset(self) -> None:
         """Forget everything but the settings: contact was lost, or the array was reset."""
-        raise NotImplementedError
