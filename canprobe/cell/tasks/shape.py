@@ -17,10 +17,11 @@ from canprobe.cell.scene.plugins import Plugin
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.mechanics.touch import ContactSample, SurfaceEstimate, indentation_from_force
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth
+from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps, at_once
 from canprobe.mechanics.touch.estimate.gate import Dropped
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import Estimator, SurfaceMap
+    from canprobe.mechanics.touch import SurfaceMap
 
 
 GAP_S = 0.1
@@ -29,7 +30,7 @@ SAMPLES_KEPT, RECORDS_KEPT = 40_000, 10_000
 """Contacts that a tracker keeps, the last ones, and answers, evenly over the scan: 200 s and 400 s of a scan with an
 array of 200 Hz and an answer every 40 ms. A longer scan takes no more memory, and no more time at its end."""
 MAPPED_AT_ONCE = 16
-"""Contacts that the map takes at once, in a cycle of some tens of ms: 0.3 ms, half of what they cost one by one."""
+"""Contacts that the map takes at once, in a step of its own: 0.3 ms, half of what they cost one by one."""
 MAX_CURVATURE = 1e3
 """Largest curvature of an answer, 1/m: no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
 
@@ -59,6 +60,10 @@ def on_run_clock(records: Sequence[ShapeRecord], start_s: float) -> list[ShapeRe
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps its answers.
 
+    An answer costs as much as a whole cycle and is due once in many. So the work is cut into steps, and a cycle carries
+    one. The next contacts wait meanwhile: each answer is what it would be at once. Why not as many steps as there is
+    time: in virtual time the same seed must give the same run.
+
     Args:
         estimator: the online estimator.
         every: samples between two answers.
@@ -82,12 +87,13 @@ class ShapeTracker:
         self._estimator = estimator
         self._every = max(1, every)
         self._map = surface_map
-        self._waiting: list[ContactSample] = []
+        self._waiting: deque[tuple[ContactSample, float]] = deque()  # with the path up to each
         self._unmapped: list[ContactSample] = []
         self._added = self._taken = self._answers = 0
         self._record_stride = 1
-        self._found: tuple[SurfaceEstimate, float] | None = None
+        self._found: tuple[SurfaceEstimate, float, float] | None = None
         self._last_withheld = False
+        self._steps = self._work()
 
     def add(self, sample: ContactSample) -> None:
         """Note one contact; `work` takes it."""
@@ -96,12 +102,12 @@ class ShapeTracker:
             if sample.t_s - last.t_s > GAP_S:
                 self._estimator.reset()
                 self._waiting.clear()
-                self._taken, self._found = self._added, None
+                self._taken, self._found, self._steps = self._added, None, self._work()
             else:
                 self.travelled_m += math.dist(sample.p_base.tolist(), last.p_base.tolist())
         self._added += 1
         self.samples.append(sample)
-        self._waiting.append(sample)
+        self._waiting.append((sample, self.travelled_m))
 
     def settled(self, radius: float) -> list[ContactSample]:
         """The contacts, placed anew by what is known by now: one stiffness for all, and the curvature at each.
@@ -123,30 +129,51 @@ class ShapeTracker:
         return [at_depth(sample, depth, radius) for sample, depth in zip(self.samples, depths.tolist(), strict=True)]
 
     def work(self) -> SurfaceEstimate | None:
-        """Take the contacts that wait, and answer where one is due; the estimate that `answer` has yet to report.
+        """Do one step, and more where an answer would be late by another; the estimate that `answer` has to report.
 
         An answer that cannot be computed is withheld; an estimator that cannot take a contact starts afresh.
         """
-        for sample in self._waiting:
-            self._taken += 1
-            try:
-                self._estimator.add(sample)
-            except np.linalg.LinAlgError:
-                self._start_afresh()
+        self._step()
+        while len(self._waiting) >= self._every:
+            self._step()
+        return None if self._found is None else self._found[0]
+
+    def _step(self) -> None:
+        if next(self._steps, True):  # it has come to its end
+            self._steps = self._work()
+
+    def _work(self) -> Steps[None]:
+        """The work on the contacts that wait, in steps."""
+        while self._waiting:
+            sample, travelled = self._waiting.popleft()
+            yield from self._take(sample)
             if self._taken % self._every == 0:
-                self._answer_at(sample.t_s)
-        if self._map is not None:
-            self._unmapped += [sample for sample in self._waiting if all(map(math.isfinite, sample.p_base.tolist()))]
+                yield
+                yield from self._answer_at(sample.t_s, travelled)
+                yield
             if len(self._unmapped) >= MAPPED_AT_ONCE:
                 self._extend_map()
-        self._waiting.clear()
-        return None if self._found is None else self._found[0]
+                yield
+
+    def _take(self, sample: ContactSample) -> Steps[None]:
+        self._taken += 1
+        try:
+            yield from self._estimator.adding(sample)
+        except np.linalg.LinAlgError:
+            self._start_afresh()
+        if self._map is not None and all(map(math.isfinite, sample.p_base.tolist())):
+            self._unmapped.append(sample)
 
     @property
     def surface_map(self) -> SurfaceMap | None:
-        """The map with every contact that was worked on."""
+        """The map with every contact; all work that waits is done first."""
+        self._finish()
         self._extend_map()
         return self._map
+
+    def _finish(self) -> None:
+        at_once(self._steps)
+        self._steps = self._work()
 
     def _extend_map(self) -> None:
         if self._map is not None:
@@ -161,24 +188,24 @@ class ShapeTracker:
         """
         if self._found is None:
             return None
-        (estimate, at_s), self._found = self._found, None
+        (estimate, at_s, travelled), self._found = self._found, None
         self._answers += 1
         if self._answers % self._record_stride == 0:
-            self.records.append(ShapeRecord(at_s, self.travelled_m, estimate, t_s))
+            self.records.append(ShapeRecord(at_s, travelled, estimate, t_s))
             if len(self.records) > RECORDS_KEPT:
                 self._record_stride *= 2
                 del self.records[::2]
         return estimate
 
     def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:
-        """Take the contacts that wait; the estimate, if one is due, in the cycle at an instant (s)."""
-        self.work()
+        """Do all work that waits; the estimate, if one is due, in the cycle at an instant (s)."""
+        self._finish()
         return self.answer(t_s)
 
-    def _answer_at(self, at_s: float) -> None:
-        """An answer at an instant (s); the estimator starts afresh where two in a row cannot be computed."""
+    def _answer_at(self, at_s: float, travelled: float) -> Steps[None]:
+        """An answer at an instant (s) and path (m); the estimator starts afresh where two in a row fail."""
         try:
-            self._keep(self._estimator.estimate(), at_s)
+            self._keep((yield from self._estimator.answering()), at_s, travelled)
         except np.linalg.LinAlgError:
             self.withheld += 1
             if self._last_withheld:
@@ -187,7 +214,7 @@ class ShapeTracker:
         else:
             self._last_withheld = False
 
-    def _keep(self, estimate: SurfaceEstimate | None, at_s: float) -> None:
+    def _keep(self, estimate: SurfaceEstimate | None, at_s: float, travelled: float) -> None:
         """An estimate to be reported; where it has diverged the estimator starts afresh."""
         if estimate is None:
             return
@@ -198,7 +225,7 @@ class ShapeTracker:
             from canprobe.mechanics.touch.online.regions import scaled  # only where a shape is asked for
 
             estimate = scaled(estimate)
-        self._found = estimate, at_s
+        self._found = estimate, at_s, travelled
 
     def _start_afresh(self) -> None:
         self.restarts += 1
@@ -231,7 +258,7 @@ class OwnEstimator(Protocol):
         """The shape at the last contact; None before there is an answer."""
 
 
-class RenewedEstimator:
+class RenewedEstimator(Estimator):
     """A user's estimator in the loop: a new one is made after each loss of contact; dropped samples are not counted.
 
     Args:
@@ -245,8 +272,13 @@ class RenewedEstimator:
 
     def reset(self) -> None:
         """Make a new one."""
-        inner = self._make()
-        self.add, self.estimate = inner.add, inner.estimate
+        self._inner = self._make()
+
+    def add(self, sample: ContactSample) -> None:
+        self._inner.add(sample)
+
+    def estimate(self) -> SurfaceEstimate | None:
+        return self._inner.estimate()
 
 
 class OfferedEstimator:

@@ -110,11 +110,13 @@ class ContactLearning:
         surface.raise_by(self.sensing.depth(contact.force_n) - before)
         return True
 
-    def doubt(self) -> None:
-        """Answer with less certainty where the array is not as its calibration says."""
+    def doubt(self) -> bool:
+        """Answer with less certainty where the array is not as its calibration says; whether there was work to do."""
         check = self.check
-        if check is None or not check.work() or (finding := check.finding) is None:
-            return
+        if check is None or not check.work():
+            return False
+        if (finding := check.finding) is None:
+            return True
         self.sensing.reader.widen(check.force_spread)
         if self._shape is not None:
             self._shape.doubted = check.image_model_off
@@ -123,6 +125,7 @@ class ContactLearning:
         if not self.remarks:
             wider = "forces and regions" if check.image_model_off else "forces"
             self.remarks.append(f"{finding}: {wider} are stated wider from here on; {CALIBRATE}")
+        return True
 
 
 class Search:
@@ -224,10 +227,11 @@ class TouchTask(ProbingTask):
         self._search: Search | None = None
         self._asked: ProbePose | None = None
         self._velocity: Floats = np.zeros(3)
-        self._scan_t = self._searched_before = 0.0
+        self._now_s = self._scan_t = self._searched_before = 0.0
         self._contact: ContactSample | None = None
         self._at_rest = AtRest()
         self._updated = True
+        self._images = [False, False]  # whether the last two cycles have read one
 
     @property
     def restarts(self) -> int:  # type: ignore[override]
@@ -238,23 +242,32 @@ class TouchTask(ProbingTask):
         scan = None
         if self._scan_start is not None:
             scan = self._scan_start, self._cycle if self._scan_end is None else self._scan_end
+        if self.shape is not None:
+            self.shape.answer_at_once(self._now_s)
         return replace(super().record(), shape=self.shape, losses=self.losses, scan_cycles=scan)
 
     def step(self, measurement: Measurement) -> Command:
         self.update()
         self._updated = False
-        self._estimate = self.shape.answer(measurement.t_ns * 1e-9) if self.shape is not None else None
+        self._images = [self._images[-1], measurement.tactile is not None]
+        self._now_s = measurement.t_ns * 1e-9
+        self._estimate = self.shape.answer(self._now_s) if self.shape is not None else None
         command = super().step(measurement)
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
         return command
 
     def update(self) -> None:
-        """The estimator's work after a step, once: when the commands are out, or else before the next step."""
+        """One step of what is learned, once a cycle: when the commands are out, or else before the next step.
+
+        A cycle that reads an image leaves it to the next one, unless that reads one too.
+        """
         if self._updated:
             return
         self._updated = True
         learned, contact = self.learned, self._contact
+        if self._images == [False, True] or learned.doubt():
+            return
         if self.shape is not None and (estimate := self.shape.work()) is not None:
             if learned.check is not None:
                 learned.check.take(estimate, self.sensing.slope)
@@ -263,7 +276,6 @@ class TouchTask(ProbingTask):
                 self._columns = self._columns | learned.columns
                 if all_observed and self.phase not in LEAVING and is_too_hollow(estimate, self.sensing.radius):
                     self._at_hollow(-1.0 / float(estimate.kappa[1]))
-        learned.doubt()
 
     # sensing and supervision
 

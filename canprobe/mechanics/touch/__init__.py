@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.array_calibration.calibration_check import CalibrationCheck
     from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope, contact_sample, indentation_from_force
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.estimator import Estimator
     from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
-    from canprobe.mechanics.touch.estimate.gate import Estimator
     from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
     from canprobe.mechanics.touch.estimate.noise import Correlation
     from canprobe.mechanics.touch.estimate.prior import Prior
@@ -84,7 +84,7 @@ __getattr__, __dir__, _ = door(
         "touch.contact": ("ContactSample", "Doubt", "Slope", "contact_sample", "indentation_from_force"),
         "touch.estimate.answer": ("SurfaceEstimate",),
         "touch.estimate.fit": ("fit_surface", "make_estimator"),
-        "touch.estimate.gate": ("Estimator",),
+        "touch.estimate.estimator": ("Estimator",),
         "touch.estimate.likelihood": ("cramer_rao",),
         "touch.estimate.noise": ("Correlation",),
         "touch.estimate.prior": ("Prior",),

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from injected import HOLD_CYCLE, Injected
 from wrapped import Wrapped
 
 import canprobe
-from canprobe.cell.master.controller import Command, Controller
+from canprobe.cell.master.controller import Command, Controller, as_controller
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.probing import Phase
 
 
 class Working(Controller):
@@ -64,6 +67,44 @@ def test_what_it_raises_ends_the_run_off_the_object():
     assert run.session.buses.truth["force_n"][run.at] == pytest.approx(2.0, abs=0.2)
     assert run.session.buses.truth["force_n"][-1] == 0.0
     np.testing.assert_allclose(np.diff(run.session.cell.log.arrays()["t_s"]), 5e-3, rtol=1e-6)
+
+
+def test_a_scan_carries_its_learning_one_step_a_cycle_and_none_where_an_image_is_read():
+    """The steps: updates of the filter and its answers, pieces of the map, images for the check of the calibration.
+
+    Stopped in mid-scan, the task has in its record every answer that was due.
+    """
+    overrides = {"bus.interface": "direct", "task.duration_s": 1.0, "task.clearance_mm": 0.5}
+    session = Session(canprobe.load_scene("cylinder", overrides))
+    task, steps, images = make_task(session.plan), Counter(), set()
+    motion, surface_map, check = task.shape._estimator._motion, task.shape._map, task.learned.check
+    for owner, name in ((motion, "_step"), (motion, "estimate"), (surface_map, "add_samples"), (check, "work")):
+        call = getattr(owner, name)
+
+        def noted(*args, call=call, name=name):
+            found = call(*args)
+            if name != "work" or found:
+                steps[session.cell.cycle.number] += 1
+            return found
+
+        setattr(owner, name, noted)
+
+    def step(measurement):
+        if measurement.tactile is not None:
+            images.add(measurement.cycle)
+        if task.phase is Phase.SCAN and len(task.shape.samples) == 153:  # an answer is due at 152
+            return Command(done=True)
+        return task.step(measurement)
+
+    with session:
+        controller = as_controller(step)
+        controller.update = task.update
+        session.run(controller)
+    assert max(steps.values()) == 1 and len(steps) > 60
+    assert images.isdisjoint(steps)
+    due = [sample.t_s for sample in list(task.shape.samples)[7::8]]
+    assert task.shape.records[-1].t_s == due[-2]
+    assert task.record().shape.records[-1].t_s == due[-1]
 
 
 def scanned(wrap):

@@ -21,7 +21,8 @@ Fits of a batch:
 
 Estimators, one sample after another:
 
-    gate                their interface (`add`, `estimate`, `reset`), the gate of every sample, and its errors behind it
+    estimator           their interface: `add`, `estimate`, `reset`, and the first two in steps
+    gate                the gate of every sample, and its errors behind it
     window              over the last samples: `ml`, `chord`, and `chen1996`, the scheme of the paper
     recursive           what runs in the loop: forgets per millimetre, starts afresh where the surface changes
     information         the square-root information filter under it
@@ -36,6 +37,6 @@ Answers:
     answer              a solution carried to the contact frame: the estimate
     fit                 the entry: `fit_surface` for recorded points, `make_estimator` by name
 
-An answer is computed in one piece: 0.4 ms, after the cycle's commands are out. In the loop the stages of `touch.online`
-refine it. Start reading at `quadric`, then `fit`.
+An answer takes 0.4 ms. In the loop the stages of `touch.online` refine it, and the work is cut into steps, of which a
+cycle carries one after its commands are out (`estimator`). Start reading at `quadric`, then `fit`.
 """

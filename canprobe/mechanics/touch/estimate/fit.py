@@ -14,7 +14,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, lag_pairs, solve_pairs, usable_lag
-from canprobe.mechanics.touch.estimate.gate import Estimator
+from canprobe.mechanics.touch.estimate.estimator import Estimator
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, checked_arrays, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
 from canprobe.mechanics.touch.estimate.prior import Prior

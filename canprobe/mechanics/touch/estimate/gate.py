@@ -1,4 +1,4 @@
-"""The interface of an online estimator, the gate that every sample passes, and the errors that it has behind it."""
+"""The gate that every sample of an online estimator passes, and the errors that it has behind it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample, Doubt
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.noise import Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.path_length import PathLength
 from canprobe.mechanics.touch.linear_algebra import positive
@@ -43,23 +42,6 @@ DOUBT_SIGMA_SCALE = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Dou
 """Factor on both standard deviations of a contact whose image is in doubt."""
 DOUBT_WINDOW_SAMPLES = 160
 """Number of last contacts whose doubts an estimate reports."""
-
-
-class Estimator(Protocol):
-    """Local shape from a stream of contacts."""
-
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by reason."""
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
-
-    def reset(self) -> None:
-        """Forget everything but the settings: contact was lost, or the array was reset."""
 
 
 class Gate:

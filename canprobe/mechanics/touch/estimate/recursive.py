@@ -19,6 +19,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
+from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps
 from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength, slow_errors
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
@@ -68,7 +69,7 @@ class _Compared(NamedTuple):
     weights: Floats
 
 
-class RecursiveEstimator:
+class RecursiveEstimator(Estimator):
     """Square-root information filter over the contact's path.
 
     Args:
@@ -131,8 +132,7 @@ class RecursiveEstimator:
         self._steady = False
         self._doubtful = 0.0
 
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
+    def adding(self, sample: ContactSample) -> Steps[None]:
         if not self._gate.passes(sample, self.dropped):
             return
         touch = self._pad.measured(sample, self._gate, self._coupling)
@@ -142,7 +142,8 @@ class RecursiveEstimator:
         if self._last is None or self._path_length.weight == 1.0:
             self._last = touch
         if moved > 0.0:
-            self._step(moved)
+            yield
+            yield from self._step(moved)
             self._pending.clear()
 
     def estimate(self) -> SurfaceEstimate | None:
@@ -213,7 +214,7 @@ class RecursiveEstimator:
         notes += [f"{doubtful} samples with reduced weight"] if doubtful else []
         return (*notes, *self._gate.notes(), *((CHANGING_NOTE,) if self._change.changing else ()))
 
-    def _step(self, moved: float) -> None:
+    def _step(self, moved: float) -> Steps[None]:
         """Add the pending samples to the filter or its start; after a change of the surface, to a new start."""
         compared = self._compared() if self._steady else None
         caution = self._caution if self._start is None else START_ALARM_SCALE * self._caution
@@ -229,7 +230,7 @@ class RecursiveEstimator:
             else:
                 compared = explained
         if self._start is not None:
-            self._beginning(self._start, moved)
+            yield from self._beginning(self._start, moved)
         elif compared:
             slow = slow_errors([p.touch for p in self._pending])
             root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
@@ -268,11 +269,11 @@ class RecursiveEstimator:
         weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
         return _Compared(rows, residuals, squares, weights)
 
-    def _beginning(self, start: Start, moved: float) -> None:
+    def _beginning(self, start: Start, moved: float) -> Steps[None]:
         """Add a step (m) to the solution of the first stretch, and give the filter the solution so far."""
         wider = 1.0 / math.sqrt(self._weigh(moved, np.ones(len(self._pending))))
         touches = [p.touch for p in self._pending]
-        start.add([touch.widened(wider) for touch in touches], moved)
+        yield from start.adding([touch.widened(wider) for touch in touches], moved)
         self._steady = start.steady
         found = start.solution
         if found is None:

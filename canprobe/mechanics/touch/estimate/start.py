@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.mechanics.touch.estimate.estimator import Steps
 from canprobe.mechanics.touch.estimate.gate import MeasuredContact, slow_errors
 from canprobe.mechanics.touch.estimate.information import batch_design
 from canprobe.mechanics.touch.estimate.noise import SlowErrors
@@ -72,7 +73,7 @@ class Start:
             share >= LATEST_TAKEOVER_SHARE or (share >= TAKEOVER_SHARE and self.steady)
         )
 
-    def add(self, touches: Sequence[MeasuredContact], moved: float) -> None:
+    def adding(self, touches: Sequence[MeasuredContact], moved: float) -> Steps[None]:
         """Take in the contacts of a step of the path (m), and improve the solution by a Gauss–Newton step."""
         self._touches += touches
         if len(self._touches) > MAX_CONTACTS:
@@ -89,9 +90,9 @@ class Start:
         d = batch_design(self.T, self._length, self._touches)
         if share < TAKEOVER_SHARE and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < MIN_SPREAD:
             return
-        self._improve(d, share >= TAKEOVER_SHARE)
+        yield from self._improve(d, share >= TAKEOVER_SHARE)
 
-    def _improve(self, d: Design, stretch_over: bool) -> None:
+    def _improve(self, d: Design, stretch_over: bool) -> Steps[None]:
         """Take a step from the last solution or, until that is steady, from a linear one where that costs less."""
         now = None if self.solution is None else solved_once(self.solution.target, d, self._prior)
         if now is None or not self.steady:
@@ -99,6 +100,7 @@ class Start:
             plain = linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
             fresh = solved_once(plain, d, self._prior)
             now = fresh if now is None or fresh.cost < now.cost else now
+        yield
         better = gauss_newton(now, d, self._prior)
         self.solution, self.slow = better, slow_errors(self._touches)
         known = self.steady or better.decision.rank == 3 or stretch_over

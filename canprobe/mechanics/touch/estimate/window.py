@@ -16,6 +16,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
 from canprobe.mechanics.touch.estimate.differences import Pairs, chord_pairs, solve_pairs, usable_lag
+from canprobe.mechanics.touch.estimate.estimator import Estimator
 from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, batch_of, fit_ml, working_frame
 from canprobe.mechanics.touch.estimate.noise import Correlation
@@ -25,7 +26,7 @@ from canprobe.mechanics.touch.tangent_frames import rotation_vectors
 from canprobe.mechanics.types import Floats
 
 
-class WindowEstimator:
+class WindowEstimator(Estimator):
     """Base of the estimators that keep their last samples and solve them as a batch when asked.
 
     Args:

@@ -4,8 +4,9 @@
                estimate/  patch_fusion   noise_level   systematic_errors   map_fusion
 
 One `OnlineEstimator` holds the motion (`recursive` or `ml`) and the stages; a stage takes every contact that the motion
-has used, and refines every answer. There is one answer object: a stage changes some fields of it and leaves the rest,
-`with_solution` where the curvature changes, `regions` where its errors do.
+has used, and refines every answer. A stage that works long is a step by itself: a cycle carries one step of the work.
+There is one answer object: a stage changes some fields of it and leaves the rest, `with_solution` where the curvature
+changes, `regions` where its errors do.
 
     estimator           the estimator, the interface of a stage, and the path from answer to answer
     patch_fusion        the contact patch as a second sensor; before the contact moves, the patch's answer alone

@@ -6,12 +6,18 @@ import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.gate import Dropped, Estimator
+from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps
 from canprobe.mechanics.types import Floats
 
 
 class AnswerStage:
-    """One step of the way of an answer."""
+    """One stage of the way of an answer.
+
+    Attributes:
+        is_step: whether its work is a step by itself; else it is a part of the step before it.
+    """
+
+    is_step = False
 
     def take(self, sample: ContactSample) -> None:
         """Take a contact that the motion has used."""
@@ -41,7 +47,7 @@ class AnswerPath:
         return 0.0 if before is None else float(np.linalg.norm(answer.point - before))
 
 
-class OnlineEstimator:
+class OnlineEstimator(Estimator):
     """An estimator of the motion with stages that refine its answers, in order.
 
     Args:
@@ -50,30 +56,26 @@ class OnlineEstimator:
     """
 
     def __init__(self, motion: Estimator, *stages: AnswerStage) -> None:
+        self.dropped = motion.dropped
         self._motion = motion
         self._stages = stages
         self._last: ContactSample | None = None
 
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by reason."""
-        return self._motion.dropped
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        before = self._motion.dropped.total
-        self._motion.add(sample)
-        if self._motion.dropped.total == before:
+    def adding(self, sample: ContactSample) -> Steps[None]:
+        before = self.dropped.total
+        yield from self._motion.adding(sample)
+        if self.dropped.total == before:
             self._last = sample
             for stage in self._stages:
                 stage.take(sample)
 
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
+    def answering(self) -> Steps[SurfaceEstimate | None]:
         if self._last is None:
             return None
-        answer = self._motion.estimate()
+        answer = yield from self._motion.answering()
         for stage in self._stages:
+            if stage.is_step:
+                yield
             answer = stage.refine(answer, self._last)
         return answer
 

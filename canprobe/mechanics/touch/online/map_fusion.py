@@ -63,6 +63,8 @@ class MapFusion(AnswerStage):
         memory_m: path that the motion remembers, m.
     """
 
+    is_step = True
+
     def __init__(self, surface_map: SurfaceMap, memory_m: float) -> None:
         self._map = surface_map
         self._between = MEMORIES_BETWEEN * memory_m

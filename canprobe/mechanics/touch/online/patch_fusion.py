@@ -31,6 +31,8 @@ class PatchFusion(AnswerStage):
         length: memory of the motion, m.
     """
 
+    is_step = True
+
     def __init__(self, patch: PatchCurvature, length: float) -> None:
         self.patch = patch
         self._length = length

@@ -7,6 +7,7 @@ import pytest
 
 from canprobe.mechanics.touch import ContactSample, Prior, make_estimator
 from canprobe.mechanics.touch.estimate import start as first_stretch
+from canprobe.mechanics.touch.estimate.estimator import at_once
 from canprobe.mechanics.touch.estimate.gate import MeasuredContact
 from canprobe.mechanics.touch.estimate.information import batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
@@ -25,7 +26,7 @@ def touches(truth, name, seed, n=72):
 def stepwise(found, each=4):
     start = Start(MEMORY, PRIOR)
     for i in range(0, len(found), each):
-        start.add(found[i : i + each], each * 0.125e-3)
+        at_once(start.adding(found[i : i + each], each * 0.125e-3))
     return start
 
 
