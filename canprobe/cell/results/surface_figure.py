@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from canprobe.cell.results.picture import BLUE, FAINT, GREY, INK, ORANGE, Part, box, drawn_rows, legend, parts, picture
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation

@@ -33,8 +33,6 @@ from canprobe.cell.scene.toml_files import (
     written_by_line,
 )
 from canprobe.errors import PlanError, SceneError, UsageError, did_you_mean
-from canprobe.mechanics.robot.urdf import from_urdf
-from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
@@ -111,7 +109,12 @@ def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
                 files[name] = f"{written_by_line()}\n{dump_scene(cell)}".encode()
                 continue
             try:
-                files[name] = with_meshes_found(path) if key == "urdf" else path.read_bytes()
+                if key == "urdf":
+                    from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
+
+                    files[name] = with_meshes_found(path)
+                else:
+                    files[name] = path.read_bytes()
             except OSError as error:
                 raise SceneError([f"{path}: cannot be read: {error.strerror}"]) from error
         return dataclasses.replace(section, **names) if names else section
@@ -246,6 +249,8 @@ def _complain_of_names(reader: Reader, arm: ArmSettings | None, joints: object) 
     """Complain of joints that the URDF does not have; without other problems `arm_model` does, with the order."""
     if not reader.problems or arm is None or not arm.urdf or not isinstance(joints, dict):
         return
+    from canprobe.mechanics.robot.urdf import from_urdf
+
     with contextlib.suppress(PlanError):  # the URDF's own faults come once the cell can be read
         names = from_urdf(arm.urdf, arm.base, arm.tip).chain.joints
         for name in joints:

@@ -23,7 +23,7 @@ from canprobe.errors import UsageError
 from canprobe.lab.gym.episode import Episode
 from canprobe.lab.gym.observations import KINDS, Kind, Observations
 from canprobe.lab.gym.randomise import START_MM, Values, overrides_of
-from canprobe.mechanics.touch.linear_algebra import checked
+from canprobe.mechanics.touch.checks import checked
 
 DEFAULT_SCENE: Mapping[str, Any] = {
     "object.position_mm": START_MM,
