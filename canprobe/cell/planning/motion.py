@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.planning.contact import contact_problems, first_touch_problems, force_problems, saturation_problem
 from canprobe.cell.planning.model import JointSpeeds
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.errors import PlanError, at_least, at_most
@@ -47,7 +48,6 @@ def check_motion(setup: Setup, arm: Arm) -> tuple[JointSpeeds | None, list[str]]
             case Free() as task:
                 speeds, found = _check_swing(task, stops, starts=not problems)
             case Calibrate() as task:
-                from canprobe.cell.planning.contact import first_touch_problems, force_problems, saturation_problem
                 from canprobe.cell.planning.surface_path import joints_on_way, round_ball
 
                 ball, q_start = task, _beginning(setup, task, _over_ball(task))
@@ -58,7 +58,6 @@ def check_motion(setup: Setup, arm: Arm) -> tuple[JointSpeeds | None, list[str]]
                 found += [problem] if (problem := saturation_problem(task, kappas, lambda _: True)) is not None else []
                 found += [*force_problems(setup, task), *first_touch_problems(setup, task, kappas[0].tolist())]
             case Touch() as task:
-                from canprobe.cell.planning.contact import first_touch_problems, force_problems
                 from canprobe.cell.planning.surface_path import surface_path
 
                 path = surface_path(task, setup.truth.object)
@@ -219,7 +218,6 @@ def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose])
 def _check_touch(
     task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats
 ) -> tuple[JointSpeeds | None, list[str]]:
-    from canprobe.cell.planning.contact import contact_problems
     from canprobe.cell.planning.surface_path import joints_on_way, over_path
     from canprobe.mechanics.touch.strategies import Rectangle
 

@@ -71,6 +71,10 @@ class OpenCell:
         self.plan = plan = warned(plan)
         folder = None if options.out is None or options.rows_kept is not None else options.out / ROWS_FOLDER
         self.session = Session(plan, replace(options, rows_folder=folder))
+        if task is None and plan.setup.arm is not None and not self.session.virtual:
+            # for `move` and `home`: they take longer to load than a node waits for its master's heartbeat
+            from canprobe.cell.session import up  # noqa: F401
+            from canprobe.cell.tasks import hand_motion  # noqa: F401
         self._out, self._say, self._early_summary = options.out, options.say, options.early_summary
         self._bridges = Bridges(plan, options.out, virtual=self.session.virtual, say=options.say)
         self._task = task

@@ -108,13 +108,10 @@ def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
                 cell = moved(dataclasses.replace(read_cell(path), plant=None))
                 files[name] = f"{written_by_line()}\n{dump_scene(cell)}".encode()
                 continue
-            try:
-                if key == "urdf":
-                    from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
+            from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
-                    files[name] = with_meshes_found(path)
-                else:
-                    files[name] = path.read_bytes()
+            try:
+                files[name] = with_meshes_found(path) if key == "urdf" else path.read_bytes()
             except OSError as error:
                 raise SceneError([f"{path}: cannot be read: {error.strerror}"]) from error
         return dataclasses.replace(section, **names) if names else section

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, refuse_narrow, scan_axes, true_object
-from canprobe.cell.scene.hardware import MM, EmulateSettings, KeepOutSettings
+from canprobe.cell.scene.hardware import MM, EmulateSettings, JointSettings, KeepOutSettings
 from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -42,6 +43,7 @@ from canprobe.cell.scene.setup import (
     Touch,
     Truth,
 )
+from canprobe.cell.scene.units import in_si
 from canprobe.errors import PlanError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.keep_out import KeepOut
     from canprobe.mechanics.robot.model import ArmModel
     from canprobe.mechanics.touch import ArrayCalibration
+    from canprobe.mechanics.types import Floats
 
 SEARCH = 8e-3
 """Distance beyond the expected place at which an approach gives up, m."""
@@ -378,8 +381,14 @@ def _dead_taxels(plant: PlantSettings, array: Array | None) -> tuple[tuple[int, 
     return tuple(sorted(dead))
 
 
+def _joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
+    """(n,) compliance of the joints, rad/(N m) or m/N; None where all are rigid."""
+    stiffness = [in_si(section).get("stiffness") for section in sections.values()]
+    return np.array([0.0 if k is None else 1.0 / k for k in stiffness]) if any(stiffness) else None
+
+
 def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, probe: Probe) -> Truth:
-    plant, shape, compliance = scene.plant or PlantSettings(), None, None
+    plant, shape = scene.plant or PlantSettings(), None
     if scene.object is not None:
         from canprobe.mechanics.touch.heights import Heights
 
@@ -389,10 +398,6 @@ def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, p
                 refuse_narrow(scene.object, shape, array.pad)
         except ValueError as error:
             raise PlanError([f"object: {error}"]) from error
-    if arm is not None:
-        from canprobe.cell.scene.arms import joint_compliance
-
-        compliance = joint_compliance(scene.joints)
     T_flange_there = probe.T_flange_probe.copy()
     T_flange_there[:3, 3] += np.array(plant.tool_error_mm) * MM
     model, bodies = _true_arm(scene, arm, bodies)
@@ -400,7 +405,7 @@ def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, p
         object=shape,
         model=model,
         bodies=bodies,
-        compliance=compliance,
+        compliance=_joint_compliance(scene.joints),
         T_flange_probe=T_flange_there,
         stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_STIFFNESS,
         damping=plant.contact_damping_s_m,

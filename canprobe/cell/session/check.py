@@ -12,8 +12,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.first_second import link_limits
-from canprobe.cell.session.session import Session
+from canprobe.cell.session.session import Session, link_limits
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.fieldbus.bus.clock import wake_lateness
 from canprobe.fieldbus.bus.port import ControllerState, Port, stamps_text

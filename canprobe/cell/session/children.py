@@ -14,6 +14,7 @@ from typing import Any
 from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.tasks.free_and_listen import HoldTask
 
 
 class Bridges:
@@ -71,8 +72,6 @@ class Bridges:
             task: the task; None holds the arm still.
             make: makes a new task at every start; None where the task runs once, from the beginning.
         """
-        from canprobe.cell.tasks.free_and_listen import HoldTask
-
         settings = self._plan.scene.bridge
         if settings is None or not settings.ros2_commands or not self.observers:
             return task if task is not None else HoldTask()

@@ -1,6 +1,7 @@
 """A cell with everything round it: buses, recording, emulated nodes, and the way out of all of them.
 
-The composition root: the only place, besides studies and tests, that sees both sides of the bus.
+The composition root: the only place, besides studies and tests, that sees both sides of the bus. In real time the first
+second of a run is judged as a link, by the figures of its own cycle.
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.observers import Observers
-from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
+from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions, Say
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
@@ -25,6 +26,7 @@ from canprobe.cell.session.buses import BusRecord, RealBuses, make_buses
 from canprobe.cell.session.folder import STEPS, KeptFiles, StepLog, zeros_file
 from canprobe.cell.session.joint_record import exchanged
 from canprobe.cell.session.links import need_controllers
+from canprobe.cell.session.recovery import VIRTUAL_WAIT_S, Recovery
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError, SafetyStop, UsageError
@@ -32,9 +34,7 @@ from canprobe.fieldbus.bus.clock import elapsed_ns
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
-
-if TYPE_CHECKING:
-    from canprobe.cell.session.recovery import Recovery
+from canprobe.fieldbus.tools.link import AnswerFigures, Fitness, LinkFigures, LinkLimits, judge_link
 
 REHEARSED_S = 0.3
 """Length of the scene's phase in a rehearsal, s: an estimator answers several times in it."""
@@ -129,8 +129,6 @@ class Session:
             self._stack.enter_context(garbage_collection_paused(collect=not self.virtual))
             self._stack.callback(self._observe_frames, port)
             if self.options.recover:
-                from canprobe.cell.session.recovery import VIRTUAL_WAIT_S, Recovery
-
                 self._stack.callback(port.close)
                 self._cell.__enter__()
                 self._recovery = Recovery(
@@ -177,8 +175,6 @@ class Session:
             )
         after, runner = progress, self.cell if self._recovery is None else self._recovery
         if not self.virtual:
-            from canprobe.cell.session.first_second import FirstSecond
-
             first_second = FirstSecond(self.cell, self.plan, self.steps)
 
             def after(measurement: Measurement) -> None:
@@ -294,3 +290,56 @@ def shortened(scene: Scene) -> Scene:
         joints={name: replace(joint, emulated=None) for name, joint in scene.joints.items()},
         sensor=replace(scene.sensor, emulated=True) if scene.sensor is not None else None,
     )
+
+
+def link_limits(plan: Plan) -> LinkLimits:
+    """Limits of a plan's cell for the link."""
+    missed = plan.setup.arm.missed_syncs if plan.setup.arm is not None else 5
+    return LinkLimits(missed, plan.setup.limits.late_share)
+
+
+class FirstSecond:
+    """Judges the first second of a run in real time by the figures of the cycle itself, and says where it is not fit.
+
+    Args:
+        cell: the cell, brought up.
+        plan: its plan.
+        say: called with the verdict, if it is not fit.
+    """
+
+    def __init__(self, cell: Cell, plan: Plan, say: Say) -> None:
+        self._cell, self._plan, self._say = cell, plan, say
+        patient = plan.setup.limits.late_share >= 1.0  # late cycles are expected, and stop nothing
+        self._left: int | None = None if patient else round(1e9 / plan.sync.period_ns)
+        self._begin = self._counts()
+
+    def __call__(self, _: Measurement) -> None:
+        """Count a cycle."""
+        if self._left is None:
+            return
+        self._left -= 1
+        if self._left > 0:
+            return
+        self._left = None
+        cell, period_ns = self._cell, self._plan.sync.period_ns
+        assert cell.cycle is not None
+        missed, late, full = (now - then for now, then in zip(self._counts(), self._begin, strict=True))
+        lateness = sorted(list(cell.cycle.statistics.period_error_ns)[-round(1e9 / period_ns) :])
+        answers: tuple[AnswerFigures, ...] = ()
+        if cell.drives is not None:
+            number = len(lateness) * len(cell.drives.axes)
+            answers = (AnswerFigures(0, number, (), min(late, missed), max(0, missed - late), (1,) * missed),)
+        wait_ns = self._plan.traffic.budget.looks_ns[-1]
+        figures = LinkFigures(period_ns, lateness, wait_ns, answers, queue_full=full)
+        verdict = judge_link(figures, link_limits(self._plan))
+        if verdict.fitness is not Fitness.FIT:
+            self._say(
+                f"warning: in its first second the link was {verdict.fitness} for {verdict.rate_hz:g} Hz: {late}"
+                f" answers late, {missed} missed, {100 * figures.late_share():.1f} % overruns; canprobe check"
+                f" {self._plan.setup.name} says why"
+            )
+
+    def _counts(self) -> tuple[int, int, int]:
+        drives = self._cell.drives
+        missed, late = (drives.missed, drives.late) if drives is not None else (0, 0)
+        return missed, late, self._cell.port.counters.transmit_full

@@ -13,6 +13,7 @@ from itertools import count
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation  # before a cell is live: it takes longer to load than nodes wait
 
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.contact import blind_s, depth_at
@@ -293,8 +294,6 @@ def _probe_places(plan: Plan, start: Floats, way: Floats, turn: Floats) -> Itera
     Raises:
         UsageError: the arm cannot go there, as at the end of its reach.
     """
-    from scipy.spatial.transform import Rotation  # late: it takes long to load
-
     arm, guard, q = plan.setup.needed_arm(), JointGuard(plan), start
     T = guard.T_base_tip(start)
     for place in count(1):

@@ -5,14 +5,18 @@ import sys
 
 import pytest
 
-ROOMS = ("canprobe.mechanics", "canprobe.fieldbus.drive", "canprobe.fieldbus.tools", "canprobe.cell.tasks", "scipy")
-TASKS = {f"canprobe.cell.tasks.{name}" for name in ("free_and_listen", "from_plan", "shape", "task")}
+ROOMS = (
+    "canprobe.mechanics",
+    "canprobe.fieldbus.drive",
+    "canprobe.fieldbus.tools.faults",
+    "canprobe.cell.tasks",
+    "scipy",
+)
+TASKS = {f"canprobe.cell.tasks.{name}" for name in ("free_and_listen", "from_plan", "paused", "shape", "task")}
 ARM = {"chain", "denavit_hartenberg", "model", "motion_profile", "tool_calibration"}
-LIMITS = {"depth_witness", "image.force_errors", "pad", "shapes", "stops"}
+LIMITS = {"depth_witness", "image.force_creep", "image.force_errors", "pad", "shapes", "stops"}
 """Limits and geometry that the supervision and the emulated contact have in every cell: no image, no estimator."""
-IMAGES = {
-    f"image.{name}" for name in ("calibration", "force_creep", "force_reading", "image_model", "moments", "patch")
-}
+IMAGES = {f"image.{name}" for name in ("calibration", "force_reading", "image_model", "moments", "patch")}
 DRIVE = {"cyclic_modes", "drive", "homing", "mode", "parameters", "parts", "profile", "profile_position"}
 DRIVE |= {"reference", "units"}
 OBJECTS = {"checks", "contact", "heights", "mesh_curvature", "mesh_fit", "mesh_repair", "objects"}
@@ -45,3 +49,10 @@ def test_a_scene_loads_the_modules_of_its_task_only(scene, tmp_path):
     doors |= {f"canprobe.mechanics.{room}" for room in ("robot", "touch", "touch.image")}
     assert sorted(loaded - doors - TASKS - NEEDED[scene]) == []
     assert loaded >= TASKS | NEEDED[scene]  # no line of the list is out of date
+
+
+def test_a_cell_on_a_real_bus_has_loaded_what_moves_by_hand_need_before_nodes_wait_for_it():
+    made = "import canprobe, sys; canprobe.open_cell('free', bus='virtual'); print(*sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", made], capture_output=True, text=True, check=True)
+    wanted = {"canprobe.cell.tasks.hand_motion", "canprobe.cell.session.up", "scipy.spatial.transform"}
+    assert wanted <= set(ran.stdout.split())

@@ -12,8 +12,7 @@ from canprobe.cell.master.controller import Command
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.check import measure_link, options_of_check
-from canprobe.cell.session.first_second import FirstSecond
-from canprobe.cell.session.session import Session
+from canprobe.cell.session.session import FirstSecond, Session
 from canprobe.cli import main
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
