@@ -12,7 +12,7 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtState

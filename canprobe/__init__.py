@@ -5,8 +5,9 @@ Public names are imported when they are first used, so that `import canprobe` co
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from canprobe.errors import door
 
 if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.api import open_cell as open_cell
@@ -46,40 +47,30 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.mechanics.touch.surface import SurfaceMatrix as SurfaceMatrix
 
 __version__ = "0.2.0"
-_MODULES = {
-    "canprobe.api": ("open_cell", "plan", "run"),
-    "canprobe.cell.master.controller": ("Command", "Controller", "Measurement"),
-    "canprobe.errors": (
-        *("BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError", "ProtocolError"),
-        *("ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
-    ),
-    "canprobe.cell.recorded.reestimate": ("ReplayResult", "replay"),
-    "canprobe.cell.scene.load": ("load_scene",),
-    "canprobe.lab.studies.many": ("Runs", "run_many"),
-    "canprobe.cell.results.scores": ("Contacts",),
-    "canprobe.cell.results.run_files": ("load_table",),
-    "canprobe.cell.results.surface_file": ("load_surface_map",),
-    "canprobe.mechanics.touch.contact": ("ContactSample",),
-    "canprobe.mechanics.touch.estimate.likelihood": ("cramer_rao",),
-    "canprobe.mechanics.touch.estimate.answer": ("SurfaceEstimate",),
-    "canprobe.mechanics.touch.estimate.fit": ("fit_surface",),
-    "canprobe.mechanics.touch.map.surface_map": ("SurfaceMap",),
-    "canprobe.mechanics.touch.map.fit": ("fit_map",),
-    "canprobe.mechanics.touch.surface": ("SurfaceMatrix",),
-    "canprobe.cell.results.result": ("RunResult",),
-    "canprobe.cell.results.traffic": ("measure_traffic",),
-}
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-__all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604 - they are strings
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562)."""
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'canprobe' has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULE_OF})
+__getattr__, __dir__, __all__ = door(
+    __name__,
+    {
+        "api": ("open_cell", "plan", "run"),
+        "cell.master.controller": ("Command", "Controller", "Measurement"),
+        "errors": (
+            *("BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError", "ProtocolError"),
+            *("ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
+        ),
+        "cell.recorded.reestimate": ("ReplayResult", "replay"),
+        "cell.scene.load": ("load_scene",),
+        "lab.studies.many": ("Runs", "run_many"),
+        "cell.results.scores": ("Contacts",),
+        "cell.results.run_files": ("load_table",),
+        "cell.results.surface_file": ("load_surface_map",),
+        "mechanics.touch.contact": ("ContactSample",),
+        "mechanics.touch.estimate.likelihood": ("cramer_rao",),
+        "mechanics.touch.estimate.answer": ("SurfaceEstimate",),
+        "mechanics.touch.estimate.fit": ("fit_surface",),
+        "mechanics.touch.map.surface_map": ("SurfaceMap",),
+        "mechanics.touch.map.fit": ("fit_map",),
+        "mechanics.touch.surface": ("SurfaceMatrix",),
+        "cell.results.result": ("RunResult",),
+        "cell.results.traffic": ("measure_traffic",),
+    },
+)
+__all__ += ["__version__"]

@@ -19,39 +19,32 @@ from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.bus_tools import commission, emulate, monitor, scan
-from canprobe.cell.session.check import check
-from canprobe.cell.session.served import emulate_eds
 from canprobe.cell.session.session import with_bridges
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.terminal import Progress
-from canprobe.cell.session.up import check_joints, home, up
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, door
 from canprobe.fieldbus.bus.real.adapters import interface_of
 
 if TYPE_CHECKING:
     from can import BusABC
 
-__all__ = [
-    "Command",
-    "Measurement",
-    "Observation",
-    "OpenCell",
-    "RunResult",
-    "Target",
-    "check",
-    "check_joints",
-    "commission",
-    "emulate",
-    "emulate_eds",
-    "home",
-    "monitor",
-    "open_cell",
-    "run",
-    "scan",
-    "up",
-]
+    from canprobe.cell.session.bus_tools import commission, emulate, monitor, scan
+    from canprobe.cell.session.check import check
+    from canprobe.cell.session.served import emulate_eds
+    from canprobe.cell.session.up import check_joints, home, up
+
+__getattr__, __dir__, _ = door(
+    __name__,
+    {
+        "cell.session.bus_tools": ("commission", "emulate", "monitor", "scan"),
+        "cell.session.check": ("check",),
+        "cell.session.served": ("emulate_eds",),
+        "cell.session.up": ("check_joints", "home", "up"),
+    },
+)
+__all__ = ["Command", "Measurement", "Observation", "OpenCell", "RunResult", "Target", "open_cell", "run"]
+__all__ += ["check", "check_joints", "commission", "emulate", "emulate_eds", "home", "monitor", "scan", "up"]
 
 
 def run(

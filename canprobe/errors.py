@@ -23,7 +23,6 @@ import os
 import stat
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from pathlib import Path
 from typing import Any
 
@@ -246,12 +245,12 @@ def door(
     """`__getattr__`, `__dir__` and `__all__` of a package whose names are imported on first use (PEP 562).
 
     Args:
-        package: the package.
+        package: the package, or a module of canprobe itself.
         modules: names by the module that has them, below the package's wing, or below canprobe itself.
     """
     import importlib
 
-    wing = ".".join(package.split(".")[:2])
+    wing = ".".join(package.split(".")[:2]) if hasattr(sys.modules[package], "__path__") else "canprobe"
     module_of = {name: module for module, names in modules.items() for name in names}
 
     def load(name: str) -> Any:
@@ -273,15 +272,17 @@ def _tool() -> str:
 
 def at_most(value: float, digits: int = 3) -> str:
     """An advised upper bound as text: so many significant digits, rounded down, so that the number itself fits."""
-    return _advised(value, digits, ROUND_FLOOR)
+    return _advised(value, digits, "ROUND_FLOOR")
 
 
 def at_least(value: float, digits: int = 3) -> str:
     """An advised lower bound as text: so many significant digits, rounded up, so that the number itself fits."""
-    return _advised(value, digits, ROUND_CEILING)
+    return _advised(value, digits, "ROUND_CEILING")
 
 
 def _advised(value: float, digits: int, rounding: str) -> str:
+    from decimal import Decimal
+
     exact = Decimal(f"{value:.12g}")  # without the rounding error of a float, which would cost 0.3 a digit
     return f"{float(exact.quantize(Decimal((0, (1,), exact.adjusted() - digits + 1)), rounding)):.12g}"
 

@@ -14,7 +14,7 @@ from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.fieldbus.tools.faults import Fault
 from canprobe.lab.studies import recover
 from canprobe.lab.studies.fault_cases import FaultCase

@@ -325,8 +325,10 @@ def gym() -> Entry:
     steps = {
         "step without the estimate": (ms["test_step[without]"], 40.0),
         "step with it": (ms["test_step[estimate]"], 40.0),
-        "step of two environments in two processes, without it": (ms["test_step_of_two_processes"], 80.0),
     }
+    for n in (1, 2, 4):
+        what = f"step of {n} environment{'s' * (n > 1)} in {n} process{'es' * (n > 1)} (`make_vec`), without it"
+        steps[what] = ms[f"test_step_in_processes[{n}]"], 40.0 * n
     rows = [[what, f"{each:.1f} ms", f"{of / each:.1f}"] for what, (each, of) in steps.items()]
     reset = ["reset: plan, bring-up, approach, touch-down, settling", f"{ms['test_reset']:.0f} ms", ""]
     return {"command": f"{BENCH}{file}", "table": [["", "median", "× real time"], *rows, reset]}

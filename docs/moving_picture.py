@@ -14,7 +14,7 @@ from PIL import Image
 from canprobe.cell.results.picture import BLUE, FAINT, GREY, INK, ORANGE
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.surface_figure import MapPlane, true_surface
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 
 FRAMES, FRAME_MS, DPI = 48, 90, 90
 

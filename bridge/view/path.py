@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.scene.setup import Scan
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.lab.bridge.view.colours import Colours, scale
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Rectangle

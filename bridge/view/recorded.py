@@ -28,7 +28,7 @@ from canprobe.cell.rows import joint_positions
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.lab.bridge.view.instants import JudgedAnswer, Moment, judge

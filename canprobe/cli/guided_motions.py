@@ -13,7 +13,8 @@ from canprobe.cell.master.controller import Measurement
 from canprobe.cell.results.open_cell import OpenCell
 from canprobe.cell.tasks.guided_arm import LIFETIME_S, GuidedArm
 from canprobe.cell.tasks.hand_motion import UNWANTED
-from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_way, joint_way
+from canprobe.cell.tasks.hand_way import HandWay, goal_of, jog_way, joint_way
+from canprobe.cell.tasks.task import USUAL_SPEED
 from canprobe.cli.console_view import ConsoleView
 from canprobe.cli.hand_questions import Questions
 from canprobe.cli.move import described, positions_of, standing

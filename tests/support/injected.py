@@ -13,7 +13,7 @@ from canprobe.cell.master.options import RunOptions
 from canprobe.cell.master.supervision import limits_of
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of

@@ -6,15 +6,13 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import RawArray, TactileApplication
-from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.planning.model import Plan, PlannedNode
-from canprobe.cell.planning.motion import parked_posture
 from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.cell.plant.config import PlantConfig, PressMotion
 from canprobe.cell.plant.contact import PlantState, TruthRow
@@ -23,17 +21,16 @@ from canprobe.cell.plant.taxels import TaxelConfig
 from canprobe.cell.rows import BLOCK_ROWS, ROWS_SUFFIX, LazyColumns, Rows, joint_columns
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.drive.from_eds import set_serial_number
-from canprobe.fieldbus.drive.units import Delivery
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_known, load_eds
-from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.node.slave_node import SlaveNode, set_serial_number
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
-from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
 from canprobe.mechanics.robot.chain import Chain, forward
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.fieldbus.tools.faults import Fault, FaultyNodes
 
 NAMES = {
     "probe_centre": "probe_centre_m",
@@ -168,6 +165,9 @@ class World:
 
     def make_faulty(self, faults: Iterable[Fault] = ()) -> FaultyNodes:
         """Let the nodes have faults, these and others that are thrown later; called before the buses open."""
+        from canprobe.cell.emulated.array_faults import CELL_FAULTS
+        from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
+
         thrown = tuple(faults)
         faulty = [FaultyNode(node, thrown) for node in self.nodes]
         self.participants[: len(faulty)] = faulty
@@ -220,6 +220,9 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
     speaks_lss = node_id == UNCONFIGURED_ID or dictionary.device_information.LSS_supported
     od_of = partial(load_eds, planned.eds) if speaks_lss else None
     if planned.kind == "drive":
+        from canprobe.fieldbus.drive.drive import make_drive_node
+        from canprobe.fieldbus.drive.units import Delivery
+
         assert setup.arm is not None
         axis = setup.arm.node_ids.index(planned.node_id)
         drive = setup.arm.drives[axis]
@@ -268,6 +271,8 @@ def _plant_config(setup: Setup) -> PlantConfig:
     )
     if setup.arm is None or truth.model is None:
         return config
+    from canprobe.cell.planning.motion import parked_posture
+
     q0 = parked_posture(setup, setup.arm)
     return replace(
         config,

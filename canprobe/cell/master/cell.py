@@ -8,16 +8,14 @@ from dataclasses import replace
 from functools import partial
 from itertools import repeat
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from canprobe.cell.master.arm_power import ArmPower
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
 from canprobe.cell.master.bringup import BringUp, FoundNodes
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
-from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.held_arm import HeldArm
 from canprobe.cell.master.homing import Homing
-from canprobe.cell.master.lift_off import lift_off
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.master.readings import Readings
@@ -27,11 +25,15 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import BusError, CanprobeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.arm_power import ArmPower
+    from canprobe.cell.master.drives import DriveGroup
 
 TARE_S = 0.3
 """Time in which an array takes the images of a tare, s."""
@@ -86,7 +88,11 @@ class Cell:
     ) -> None:
         setup = plan.setup
         self.port = port
-        self.drives = make_drives(plan)
+        self.drives: DriveGroup | None = None
+        if setup.arm is not None:
+            from canprobe.cell.master.drives import make_drives
+
+            self.drives = make_drives(plan)
         self.tactile: ArrayReceiver | None = make_tactile(plan) if before is None else before.tactile
         self.watch = NodeWatch(plan.node_ids)
         seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
@@ -112,9 +118,15 @@ class Cell:
         self.found = FoundNodes(self._network, self.watch, setups, settings) if check else None
         self.stopped_by: Condition | None = None
         self.doubted: frozenset[int] = frozenset()
-        self._stopped = False
-        self._before = before
-        self._power = ArmPower(plan, self.drives, self.cycles, self.bring_up) if self.drives is not None else None
+        self._stopped, self._before = False, before
+        self._power: ArmPower | None = None
+        self._lift_off: Callable[[BaseException], None] = nothing
+        if self.drives is not None:
+            from canprobe.cell.master.arm_power import ArmPower
+            from canprobe.cell.master.lift_off import lift_off
+
+            self._power = ArmPower(plan, self.drives, self.cycles, self.bring_up)
+            self._lift_off = partial(lift_off, plan, self.cycles)
         self.homing = (
             Homing(plan, setups, self._network, self.watch, self._supervise_homing, record=zeros, say=self._say)
             if any(one.homing for one in setups)
@@ -320,7 +332,7 @@ class Cell:
         try:
             yield
         except BaseException as error:
-            lift_off(self._plan, self.cycles, error)
+            self._lift_off(error)
             raise
 
     # supervision
@@ -362,7 +374,7 @@ class Cell:
             controller.retreat(str(finding.error))
             return
         if reaction in (Reaction.RETREAT, Reaction.LIFT):
-            lift_off(self._plan, self.cycles, finding.error)
+            self._lift_off(finding.error)
         raise finding.error
 
     # the way out

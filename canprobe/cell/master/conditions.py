@@ -12,12 +12,12 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from canprobe.cell.master.image_witness import UNSTATED_NS
-from canprobe.cell.master.push_witness import MEAN_NS
 from canprobe.cell.master.supervision import (
     CONTACT_LOST_NS,
     FORCE_HIDDEN_NS,
     HOLD_CYCLES,
     MAX_HOLD_NS,
+    TORQUE_MEAN_NS,
     Condition,
     CycleState,
     Finding,
@@ -407,7 +407,7 @@ def _depth(contact: TouchState) -> SafetyStop | None:
     "push_unfelt",
     "push in the drives' torques that the array does not measure",
     Reaction.RETREAT,
-    _after(4 * MEAN_NS, 2),
+    _after(4 * TORQUE_MEAN_NS, 2),
     blind=True,
 )
 def _push_unfelt(seen: CycleState) -> SafetyStop | None:

@@ -13,7 +13,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.cell.master.array import PatchReader
+    from canprobe.cell.master.patch_reader import PatchReader
     from canprobe.cell.master.trail import TakenWay
     from canprobe.mechanics.touch import SurfaceEstimate
 

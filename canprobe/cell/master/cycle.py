@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, MutableSequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from canprobe.cell.master.array import ArrayReceiver
 from canprobe.cell.master.controller import Command, Measurement
-from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.fieldbus.bus.clock import elapsed_ns
 from canprobe.fieldbus.bus.joined import send_on
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.protocol.frames import NmtState, SyncCounter, pack_heartbeat, pack_sync
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.array import ArrayReceiver
+    from canprobe.cell.master.drives import DriveGroup
 
 SYNCS_REMEMBERED = 240
 """Number of SYNCs that are remembered where SYNC has no counter."""

@@ -91,9 +91,11 @@ class Following:
             if (was := before[motor]) is None:
                 continue
             moved = counts - was
-            end, start = last + 1 - self._usual, last + 1 - self._usual - span
-            asked = cycles[max(end, 0)][1][motor] - cycles[max(start, 0)][1][motor]
-            if abs(moved - asked) <= margin:
+            few = [  # mostly the motion lies between these, and thus between the least and the largest of all
+                cycles[max(last + 1 - delay, 0)][1][motor] - cycles[max(last + 1 - delay - span, 0)][1][motor]
+                for delay in (self._delays[0], self._usual, self._delays[-1])
+            ]
+            if min(few) - margin <= moved <= max(few) + margin:
                 continue
             ends = [cycles[max(last + 1 - delay, 0)][1][motor] for delay in self._delays]
             starts = [cycles[max(last + 1 - delay - span, 0)][1][motor] for delay in self._delays]

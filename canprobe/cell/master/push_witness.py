@@ -11,12 +11,11 @@ from collections import deque
 import numpy as np
 
 from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.supervision import TORQUE_MEAN_NS
 from canprobe.mechanics.robot.model import ArmModel, units_per_motor
 from canprobe.mechanics.robot.tool_push import PushGeometry, TorqueMean, push_since
 from canprobe.mechanics.types import Floats
 
-MEAN_NS = 25_000_000
-"""Time over which torques are averaged; two in a row must show a push."""
 LATEST, OLDEST = 4, 20
 """Ages of the means that the present one is compared with, in means: 0.1 to 0.5 s."""
 LEAST_LIKE, MOST_LIKE, LIKE_SHARE, LIKE_COUNTS = 3, 8, 0.3, 1.5
@@ -62,7 +61,7 @@ class PushWitness:
         self._torques.append(measurement.torque_permille)
         self._force += force
         since_ns = measurement.t_ns - self._since.t_ns
-        if since_ns < MEAN_NS:
+        if since_ns < TORQUE_MEAN_NS:
             return
         torques = np.array(self._torques) * self._geometry.newton_metres
         x = self._geometry.motors(q)
@@ -75,7 +74,7 @@ class PushWitness:
                 q,
                 x,
                 x - earlier.x if earlier is not None else np.full_like(x, np.nan),
-                LATEST * MEAN_NS * 1e-9,
+                LATEST * TORQUE_MEAN_NS * 1e-9,
                 x - self._means[-1].x if self._means else np.full_like(x, np.nan),
                 self._force / len(torques),
                 since_ns * 1e-9,

@@ -6,17 +6,17 @@ It is the same whether a controller runs, the drives are enabled or stopped, or 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.cell.master.array import PatchReader, make_patch_reader
+from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.log import RunLog, TactileLog
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions, Say
-from canprobe.cell.master.push_witness import PushWitness
 from canprobe.cell.master.supervision import CycleState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.tactile_frame import TactileSample
@@ -24,7 +24,10 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.rows import joint_columns
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.mechanics.touch import Patch
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.patch_reader import PatchReader
+    from canprobe.mechanics.touch import Patch
 
 SILENT_TAXELS = (
     ": interpolated; have the array repaired, or state the taxels as `dead` in [taxels] of its calibration file"
@@ -74,6 +77,8 @@ class SupervisedCycle:
         guard = JointGuard(plan) if plan.setup.arm is not None else None
         push, patch_from = None, None
         if guard is not None and self.reader is not None:
+            from canprobe.cell.master.push_witness import PushWitness
+
             push, patch_from = PushWitness(guard.model, guard.T_flange_tip, plan.setup.limits.force_max), self.patch
         self.supervisor = Supervisor(seen, guard, patch_from, push)
         self._observers, self._log_failure, self._origin_ns = observers, log_failure, origin_ns

@@ -10,11 +10,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from canprobe.cell.master.array import ArrayReceiver
 from canprobe.cell.master.controller import Measurement
-from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.image_witness import ImageWitness
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.watch import NodeWatch
@@ -24,12 +22,16 @@ from canprobe.cell.planning.units import lag_s
 from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
-from canprobe.mechanics.touch import Patch
-from canprobe.mechanics.touch.depth_witness import DepthWitness
 from canprobe.mechanics.touch.image.force_errors import upper_end
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.array import ArrayReceiver
+    from canprobe.cell.master.drives import DriveGroup
+    from canprobe.mechanics.touch import Patch
+    from canprobe.mechanics.touch.depth_witness import DepthWitness
 
 HOLD_CYCLES = 3
 """Cycles without a TPDO of one drive after which all of them hold."""
@@ -39,6 +41,8 @@ CONTACT_LOST_NS = 30_000_000
 """Time without contact force in a touch after which the contact is lost."""
 FORCE_HIDDEN_NS = 20_000_000
 """Time with a force that the array shows only in part, after which the force may be above the limit."""
+TORQUE_MEAN_NS = 25_000_000
+"""Time over which torques are averaged for the push that they show; two in a row must show a push."""
 TACTILE_TIMEOUT_PERIODS = 6
 """Periods of the array without a sample after which it counts as silent."""
 

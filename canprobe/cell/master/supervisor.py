@@ -6,21 +6,24 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.master.controller import Command, Measurement
-from canprobe.cell.master.push_witness import PushWitness
 from canprobe.cell.master.supervision import CycleState, Finding, Reaction, TouchState
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.robot.chain import forward
-from canprobe.mechanics.touch import Patch
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.push_witness import PushWitness
+    from canprobe.mechanics.touch import Patch
 
 MAX_SPEED_SHARE = 1.5
 """Share of the speed limit above which a measured motion is no motion of the arm; SYNCs may be late by a period."""

@@ -20,10 +20,6 @@ from canprobe.cell.scene.setup import Arm, Array, Setup, Touch, Touching
 from canprobe.errors import install_line
 from canprobe.fieldbus.bus.real.adapters import bus_open_to_others
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
-from canprobe.mechanics.robot.inverse import FIXED_POLE, FULL_POSE, rolls_last, task_rows
-from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
-from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED
-from canprobe.mechanics.touch.mesh_fit import MeshHeights
 
 _NO_SHAPE = {
     "press": "one touch without motion shows no shape",
@@ -167,8 +163,16 @@ def _open_to_others(setup: Setup) -> Iterator[str]:
         )
 
 
-def _unstated(array: Array) -> list[str]:
-    """What the calibration of an array does not state, and what is taken for it."""
+def _calibration_warnings(array: Array) -> Iterator[str]:
+    """Warnings of what the calibration of an array does not state, and of what is taken for it."""
+    from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
+    from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED
+
+    if array.newtons == NO_FORCE_REFERENCE:
+        yield (
+            "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
+            " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
+        )
     lacking = []
     if array.calibration.force is UNSTATED:
         lacking.append(
@@ -178,7 +182,17 @@ def _unstated(array: Array) -> list[str]:
         )
     if array.calibration.noise.assumed:
         lacking.append("without slow_um and height_um the noise of contacts is taken to be that of the emulated array")
-    return lacking
+    if array.calibrated and lacking:
+        yield (
+            f"sensor.calibration: a file of an earlier form: {'; '.join(lacking)};"
+            " `canprobe calibrate array CELL` measures what is missing"
+        )
+    if array.calibration.serial_number not in (None, array.serial):
+        yield (
+            f"sensor.calibration: of the array {array.calibration.serial_number:#x} (1018h:04), and this one is"
+            f" {array.serial:#x}: its forces are known to {100 * MAKE_SPREAD:g} % (1σ), as of any array of the make;"
+            " type: canprobe calibrate array CELL"
+        )
 
 
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
@@ -187,30 +201,19 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     yield from _open_to_others(setup)
     if setup.arm is not None:
         yield from setup.arm.warnings
-    if isinstance(setup.truth.object, MeshHeights):
-        yield from mesh_warnings(setup.truth.object.fit)
+    if setup.truth.object is not None:
+        from canprobe.mechanics.touch.mesh_fit import MeshHeights
+
+        if isinstance(setup.truth.object, MeshHeights):
+            yield from mesh_warnings(setup.truth.object.fit)
     if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
         yield from _long_waits(setup.arm.missed_syncs, setup.rate_hz)
-    if setup.array is not None and setup.array.newtons == NO_FORCE_REFERENCE:
-        yield (
-            "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
-            " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
-        )
-    if setup.array is not None and setup.array.calibrated and (lacking := _unstated(setup.array)):
-        yield (
-            f"sensor.calibration: a file of an earlier form: {'; '.join(lacking)};"
-            " `canprobe calibrate array CELL` measures what is missing"
-        )
-    if setup.array is not None and setup.array.calibration.serial_number not in (None, setup.array.serial):
-        yield (
-            f"sensor.calibration: of the array {setup.array.calibration.serial_number:#x} (1018h:04), and this one is"
-            f" {setup.array.serial:#x}: its forces are known to {100 * MAKE_SPREAD:g} % (1σ), as of any array of the"
-            " make; type: canprobe calibrate array CELL"
-        )
+    if setup.array is not None:
+        yield from _calibration_warnings(setup.array)
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
-    if setup.arm is not None and setup.touch is not None and task_rows(setup.arm.model) < FULL_POSE:
-        yield _held_rows(setup.arm)
+    if setup.arm is not None and setup.touch is not None:
+        yield from _held_rows(setup.arm)
     if bus.bit_error_rate > 0 and pdos:
         longest = max(pdo.bits_worst for pdo in pdos)
         lost = 1.0 - (1.0 - bus.bit_error_rate) ** longest
@@ -233,13 +236,20 @@ def _long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
     )
 
 
-def _held_rows(arm: Arm) -> str:
+def _held_rows(arm: Arm) -> Iterator[str]:
+    """The part of the probe's pose that an arm of less than six joints leaves open."""
+    from canprobe.mechanics.robot.inverse import FIXED_POLE, FULL_POSE, rolls_last, task_rows
+
+    rows = task_rows(arm.model)
+    if rows >= FULL_POSE:
+        return
     name = f"the {arm.model.name} arm of {arm.model.n} joints"
-    if task_rows(arm.model) == FIXED_POLE:
+    if rows == FIXED_POLE:
         rolls = arm.model.n > FIXED_POLE and rolls_last(arm.model)
         last = f"; joint {arm.model.n} only turns the probe about its pole, and stays where it starts"
-        return (
+        yield (
             f"{name} holds the place of the probe, not its tilt: task.rolling_share is 1, and the contact wanders "
             f"on the array{last * rolls}"
         )
-    return f"{name} holds position and pole of the probe and leaves the turn about the pole free"
+    else:
+        yield f"{name} holds position and pole of the probe and leaves the turn about the pole free"

@@ -21,6 +21,7 @@ from canprobe.cell.planning.identifiers import (
 from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
     Choice,
+    JointSpeeds,
     NodeKind,
     Plan,
     PlannedNode,
@@ -28,7 +29,6 @@ from canprobe.cell.planning.model import (
     SyncPlan,
     Traffic,
 )
-from canprobe.cell.planning.motion import check_motion
 from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.cell.planning.sync import (
     choose_mode,
@@ -44,7 +44,6 @@ from canprobe.cell.planning.traffic import PlannedTraffic, plan_traffic
 from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
-from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
 
 SYNC_COUNTER = 0x1019
 
@@ -77,10 +76,12 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
     if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
         problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
-    joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
+    joint_speeds, unreachable = _check_motion(setup) if not unsuited else (None, [])
     problems += [*unreachable, *narrowed] if unreachable else []
     truth, arm = setup.truth, setup.arm
     if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in setup.drives):
+        from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
+
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
@@ -130,7 +131,16 @@ def _problems_beside_bus(setup: Setup) -> list[str]:
     devices, _ = _devices(setup)
     found = [*speed_over_array_problems(setup), *range_problems(setup), *speed_problems(setup, devices)]
     found += _cut_problems(setup)
-    return [*found, *([*array_problems(setup)] or check_motion(within_drives(setup, devices)[0])[1])]
+    return [*found, *([*array_problems(setup)] or _check_motion(within_drives(setup, devices)[0])[1])]
+
+
+def _check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
+    """As `check_motion`; of a cell without an arm nothing moves."""
+    if setup.arm is None:
+        return None, []
+    from canprobe.cell.planning.motion import check_motion
+
+    return check_motion(setup, setup.arm)
 
 
 def _cut_problems(setup: Setup) -> list[str]:

@@ -6,28 +6,22 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.planning.contact import contact_problems, first_touch_problems, force_problems, saturation_problem
 from canprobe.cell.planning.model import JointSpeeds
-from canprobe.cell.planning.surface_path import (
-    SurfacePath,
-    in_mm,
-    joints_on_way,
-    over_path,
-    poles_at_contacts,
-    round_ball,
-    surface_path,
-)
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.errors import PlanError, at_least, at_most
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
-from canprobe.mechanics.touch.strategies import Rectangle, turn_radius
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.planning.surface_path import SurfacePath
 
 _METRES_GUESS_M = 6e-3
 """Distance from the origin of the base below which a place was hardly meant in mm; the lifted start may add some mm."""
@@ -42,11 +36,9 @@ PARKED_ABOVE_M = 5e-3
 """Height of an emulated arm above the approach's first point at power on, m."""
 
 
-def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
+def check_motion(setup: Setup, arm: Arm) -> tuple[JointSpeeds | None, list[str]]:
     """Joint speeds that the task needs, and why the arm cannot do it; empty where it can."""
-    if setup.arm is None:
-        return None, []
-    stops = _Stops(setup.arm, setup.limits)
+    stops = _Stops(arm, setup.limits)
     problems = stops.start_problems()
     if (lacking := _lacking_rows(setup)) is not None:
         return None, [*problems, lacking]
@@ -56,6 +48,8 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
             case Free() as task:
                 speeds, found = _check_swing(task, stops, starts=not problems)
             case Calibrate() as task:
+                from canprobe.cell.planning.surface_path import joints_on_way, round_ball
+
                 ball, q_start = task, _beginning(setup, task, _over_ball(task))
                 _follow(task.arm, task.probe, _over_ball(task), q_start)
                 joints = joints_on_way(task.arm, task.probe, q_start, lambda pose: round_ball(ball, pose))
@@ -64,6 +58,8 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
                 found += [problem] if (problem := saturation_problem(task, kappas, lambda _: True)) is not None else []
                 found += [*force_problems(setup, task), *first_touch_problems(setup, task, kappas[0].tolist())]
             case Touch() as task:
+                from canprobe.cell.planning.surface_path import surface_path
+
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
                 contacts = [*_along_path(task, path)][_POSES_BEFORE_CONTACT:]
@@ -221,6 +217,9 @@ def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose])
 def _check_touch(
     task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats
 ) -> tuple[JointSpeeds | None, list[str]]:
+    from canprobe.cell.planning.surface_path import joints_on_way, over_path
+    from canprobe.mechanics.touch.strategies import Rectangle
+
     if (unreached := _unreached(task, path, stops, q_start)) is not None:
         return None, [unreached]
     joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
@@ -248,6 +247,8 @@ def _check_touch(
 
 def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> str | None:
     """Problem with the part of an explored rectangle that the arm cannot reach; None without such a part."""
+    from canprobe.mechanics.touch.strategies import Rectangle, turn_radius
+
     if task.scan is None or not isinstance(rectangle := task.scan.strategy, Rectangle):
         return None
     if min(rectangle.length, rectangle.width) < (least := 4.0 * turn_radius(task.scan.speed, task.gains.tilt_hz)):
@@ -324,6 +325,8 @@ _POSES_BEFORE_CONTACT = 2
 
 def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
     """The beginning of the approach and the lifted start, then the contacts."""
+    from canprobe.cell.planning.surface_path import in_mm, poles_at_contacts
+
     radius, poles, approach = task.probe.radius, poles_at_contacts(task, path), task.approach
     above = approach.start + approach.normal * approach.clearance
     lifted = path.points[0] + path.normals[0] * approach.clearance

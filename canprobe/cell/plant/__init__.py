@@ -4,8 +4,7 @@
 
 - Both arms have 1 to 8 joints that turn or slide. `ideal_arm`: each drive is a second-order system, solved exactly.
   `dynamic_arm`: rigid links, friction, drive cascade and the object's push, by `equations` and one of the
-  `integrators` on dynamics held over a cycle; `pushing` is the contact forces near one posture. `make_arm`
-  makes the arm that a configuration asks for.
+  `integrators` on dynamics held over a cycle; `pushing` is the contact forces near one posture.
 - `contact` finds the contact of a state: where the probe's ball is, what it touches and what presses. `elastic_contact`
   has the laws of its elastic layer (Winkler, Hunt–Crossley damping), in one place and in several.
 - `pressure` averages the contact over each taxel; `taxels` makes counts of it: blur, gains, saturation, hysteresis,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.equations import ArmEquations, DriveLoops, Effects
-from canprobe.cell.plant.ideal_arm import NEVER, PEAK_PERMILLE, IdealArm, Ramp
+from canprobe.cell.plant.ideal_arm import NEVER, PEAK_PERMILLE, Ramp
 from canprobe.cell.plant.integrators import STEPS
 from canprobe.cell.plant.pushing import Neighbourhood, Rubbing
 from canprobe.errors import PlanError
@@ -217,18 +217,16 @@ class DynamicArm:
         return self._step(self.equations, 1e-9 * self._y_ns, self._y, 1e-9 * (end_ns - self._y_ns))
 
 
-def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:
-    """An ideal or a dynamic arm.
+def make_dynamic_arm(config: PlantConfig) -> DynamicArm:
+    """A dynamic arm.
 
     Args:
         config: configuration of a plant with an arm.
 
     Raises:
-        PlanError: a dynamic arm without bodies, or without the extra `dynamics`.
+        PlanError: the arm has no bodies, or the extra `dynamics` is missing.
     """
     assert config.model is not None
-    if config.fidelity == "ideal":
-        return IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
     d = config.dynamics
     return DynamicArm(config.model, config.q0, make_equations(config), Stepping(d.integrator, d.step_ns, d.hold_ns))
 
@@ -242,7 +240,7 @@ def make_equations(config: PlantConfig, effects: Effects | None = None, *, held:
         held: see ``ArmEquations``.
 
     Raises:
-        PlanError: see ``make_arm``.
+        PlanError: see ``make_dynamic_arm``.
     """
     assert config.model is not None
     model, d, T_probe, effects = config.model, config.dynamics, config.T_flange_probe_centre, effects or Effects()

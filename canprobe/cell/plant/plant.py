@@ -13,18 +13,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.contact import ContactSolver, PlantState, SolvedContact, TruthRow
-from canprobe.cell.plant.dynamic_arm import DynamicArm, make_arm
 from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.taxels import Image, TaxelArray
-from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.mechanics.robot.model import units_to_joints
-from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.plant.dynamic_arm import DynamicArm
+    from canprobe.fieldbus.drive.profile import MotorDynamics
+    from canprobe.mechanics.touch.shapes import PlacedShape
 
 Truth = dict[str, float | bool | Floats]
 SWITCH_DISTANCE_SHARE = 0.01
@@ -55,7 +58,12 @@ class Plant:
         self.arm: IdealArm | DynamicArm | None = None
         self._solver = ContactSolver(config)
         if config.model is not None:
-            self.arm = make_arm(config)
+            if config.fidelity == "ideal":
+                self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
+            else:
+                from canprobe.cell.plant.dynamic_arm import make_dynamic_arm
+
+                self.arm = make_dynamic_arm(config)
             self.motor_counts, self.torque_permille = self.arm.motor_counts, self.arm.torque_permille
             if isinstance(self.arm, IdealArm) and config.object is not None:
                 self.arm.push = lambda: self._solver.torques(self._solution())
@@ -134,6 +142,8 @@ class Plant:
         Raises:
             RuntimeError: without an arm.
         """
+        from canprobe.fieldbus.drive.profile import MotorDynamics
+
         model = self._need_arm().model
         joint, units = model.joints[axis], abs(float(model.units_per_q[axis, axis]))
         return MotorDynamics(

@@ -29,8 +29,8 @@ from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.scores import TWO_SIGMA
 from canprobe.cell.results.surface_figure import MapPlane, add_sheet, map_surface, true_surface
 from canprobe.cell.rows import joint_positions
-from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.types import Floats

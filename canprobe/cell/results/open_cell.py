@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy.typing as npt
 
-from canprobe.cell.master.array import PatchReader, make_patch_reader
+from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.master.log import since_first_sync
@@ -26,18 +26,17 @@ from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.joint_record import warned
 from canprobe.cell.session.session import Session
-from canprobe.cell.session.up import home_joints
 from canprobe.cell.tasks.from_plan import estimates_of
-from canprobe.cell.tasks.hand_motion import HandMotion
-from canprobe.cell.tasks.hand_way import USUAL_SPEED, HandWay, goal_of, jog_speed, jog_way, joint_way, share_of_speed
 from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
-from canprobe.cell.tasks.task import record_of
+from canprobe.cell.tasks.task import USUAL_SPEED, record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
-from canprobe.mechanics.robot.chain import forward_jacobian
-from canprobe.mechanics.touch import Patch
-from canprobe.mechanics.touch.linear_algebra import checked
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.patch_reader import PatchReader
+    from canprobe.cell.tasks.hand_way import HandWay
+    from canprobe.mechanics.touch import Patch
 
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,
@@ -72,6 +71,10 @@ class OpenCell:
         self.plan = plan = warned(plan)
         folder = None if options.out is None or options.rows_kept is not None else options.out / ROWS_FOLDER
         self.session = Session(plan, replace(options, rows_folder=folder))
+        if task is None and plan.setup.arm is not None and not self.session.virtual:
+            # for `move` and `home`: they take longer to load than a node waits for its master's heartbeat
+            from canprobe.cell.session import up  # noqa: F401
+            from canprobe.cell.tasks import hand_motion  # noqa: F401
         self._out, self._say, self._early_summary = options.out, options.say, options.early_summary
         self._bridges = Bridges(plan, options.out, virtual=self.session.virtual, say=options.say)
         self._task = task
@@ -132,6 +135,8 @@ class OpenCell:
         Raises:
             UsageError: the scene has no arm.
         """
+        from canprobe.mechanics.robot.chain import forward_jacobian
+
         setup = self.plan.setup
         return forward_jacobian(setup.needed_arm().model.chain, q, setup.probe.T_flange_probe)
 
@@ -184,6 +189,8 @@ class OpenCell:
         Raises:
             UsageError: there is no such posture, or the way leads through a limit or what the arm keeps out of.
         """
+        from canprobe.cell.tasks.hand_way import goal_of, joint_way, share_of_speed
+
         return joint_way(self.plan, self._stands(), goal_of(self.plan, to), share_of_speed(speed)).whole()
 
     def move(
@@ -212,6 +219,9 @@ class OpenCell:
             SafetyStop: the arm has touched something, or the cell was stopped.
             BusError: as in `run`.
         """
+        from canprobe.cell.tasks.hand_motion import HandMotion
+        from canprobe.cell.tasks.hand_way import HandWay
+
         way = to if isinstance(to, HandWay) else self.way_to(to, speed)
         motion = HandMotion(self.plan, way, wanted)
         self.run(motion, progress)
@@ -247,6 +257,9 @@ class OpenCell:
             UsageError: not one of joint, along and about, or as `way_to`.
             SafetyStop, BusError: as `move`.
         """
+        from canprobe.cell.tasks.hand_way import jog_speed, jog_way
+        from canprobe.mechanics.touch.checks import checked
+
         length = float(checked("jog: velocity", velocity, ())) * float(checked("jog: for_s", for_s, ()))
         if velocity == 0.0 or for_s <= 0.0:
             raise UsageError(f"jog: expected a velocity and a time above 0, got {velocity:g} for {for_s:g} s")
@@ -283,6 +296,8 @@ class OpenCell:
             UsageError: one of them is not homed.
             NodeError: a drive did not find its home position; it is stopped and disabled.
         """
+        from canprobe.cell.session.up import home_joints
+
         home_joints(self.plan, self.cell, joints, say=self._say)
 
     def _stands(self) -> Floats:

@@ -15,10 +15,10 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.scores import Contacts, contacts_of
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
-from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
+    from canprobe.mechanics.touch.contact import ContactSample
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 

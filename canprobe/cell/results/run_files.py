@@ -31,7 +31,7 @@ from canprobe.cell.scene.load import SAVED_AS, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.scene.toml_files import written_by_other
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import SceneError, UsageError, check_schema, needed_module, regular_file
 from canprobe.fieldbus.bus.files import read_document, whole_file
 

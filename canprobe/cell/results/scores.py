@@ -9,7 +9,7 @@ import html
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,13 +18,12 @@ from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, m
 from canprobe.cell.tasks.shape import OwnEstimator, RenewedEstimator, ShapeRecord, replay_samples
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.mechanics.touch import ContactSample, Correlation, Estimator, SurfaceMap, SurfaceMatrix
-from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
-from canprobe.mechanics.touch.linear_algebra import rms
-from canprobe.mechanics.touch.map import nodes as column
-from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch import ContactSample, Correlation, Estimator, SurfaceMap
+    from canprobe.mechanics.touch.shapes import PlacedShape
 
 RUN_IN_M = 0.020
 """Path after which the answers of an estimator count."""
@@ -198,6 +197,8 @@ def bound_of_scan(
         correlation: correlation of the noise along the path.
         coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
+    from canprobe.mechanics.touch import SurfaceMatrix
+    from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
     from canprobe.mechanics.touch.estimate.likelihood import batch_of, osculating_bound
 
     points = np.array([s.p_base for s in samples])
@@ -241,6 +242,9 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
         surface_map: map of the scan.
         shape: true object; None where nobody knows it.
     """
+    from canprobe.mechanics.touch.linear_algebra import rms
+    from canprobe.mechanics.touch.map import nodes as column
+
     names = ("sigma_um", "disagree_fraction", "stiffness_n_m3", "stiffness_sigma_percent", "common")
     found: dict[str, Any] = {"contacts": 0, "nodes": len(surface_map)} | dict.fromkeys(names)
     found |= dict.fromkeys(("rms_error_um", "within_2_sigma_fraction"))
@@ -326,6 +330,8 @@ class Contacts:
 
 def contacts_of(samples: Sequence[ContactSample], task: Touch, start_s: float) -> Contacts:
     """The contacts of a scan whose first SYNC was due at `start_s` on the run's clock."""
+    from canprobe.mechanics.touch.estimate.gate import Gate
+
     n = len(samples)
     normals = np.array([s.n_base for s in samples]).reshape(n, 3)
     gate, coupling = Gate(1.0, SIGMA_NORMAL_RAD), centroid_coupling(task.probe)

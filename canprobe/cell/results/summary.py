@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.log import since_first_sync
-from canprobe.cell.planning.contact import reports_torque
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import (
@@ -171,6 +170,8 @@ def _witnesses(session: Session, record: TaskRecord) -> dict[str, Any] | None:
     """What else than the array knew of the force; None without a touch."""
     if session.plan.setup.touch is None:
         return None
+    from canprobe.cell.planning.contact import reports_torque
+
     return {
         "array_seen_alive": session.cell.supervisor.array_alive,
         "depth_watched_fraction": record.depth_watched,

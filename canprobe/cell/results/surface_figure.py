@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -11,16 +11,17 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import SubFigure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from scipy.spatial import cKDTree
 
 from canprobe.cell.results.picture import BLUE, FAINT, GREY, INK, ORANGE, Part, box, drawn_rows, legend, parts, picture
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.scores import TWO_SIGMA
-from canprobe.cell.tasks.probing import Phase
-from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
-from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.cell.tasks.task import Phase
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+    from canprobe.mechanics.touch.shapes import PlacedShape
 
 MARGIN_M, TRUE_POINTS = 5e-3, 34
 """Margin of a true surface beyond the path, m, and its points on each side."""
@@ -77,6 +78,10 @@ def map_surface(surface_map: SurfaceMap, plane: MapPlane) -> tuple[Floats, Float
 
     A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
     """
+    from scipy.spatial import cKDTree
+
+    from canprobe.mechanics.touch.map.surface_map import REACH_M
+
     contacts = plane.mm(surface_map.points)
     low, high = contacts.min(axis=0)[:2] - 1e3 * REACH_M, contacts.max(axis=0)[:2] + 1e3 * REACH_M
     counts = np.ceil(MAP_POINTS * (high - low) / (high - low).max()).astype(int)

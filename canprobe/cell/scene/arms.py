@@ -173,12 +173,6 @@ def _body(section: JointSettings, row: tuple[float, float, float, float], arm: A
     return Body(section.mass_kg or 0.0, np.array(section.com_mm) * MM, _tensor(section)).moved(T)
 
 
-def joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
-    """(n,) compliance of the joints, rad/(N m) or m/N; None where all are rigid."""
-    stiffness = [in_si(section).get("stiffness") for section in sections.values()]
-    return np.array([0.0 if k is None else 1.0 / k for k in stiffness]) if any(stiffness) else None
-
-
 def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Floats:
     """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
     return np.array([in_si(section)[key] for section in sections.values()])

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,13 +25,14 @@ from canprobe.cell.scene.hardware import MM, Vec3
 from canprobe.cell.scene.model import ObjectSettings, ProbeSettings, TaskSettings
 from canprobe.errors import needed_module, regular_file
 from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy, tool_z_offset
-from canprobe.mechanics.touch.heights import Heights
-from canprobe.mechanics.touch.mesh_curvature import CurvatureError
-from canprobe.mechanics.touch.mesh_fit import HeightGrid, MeshHeights, fit_mesh
-from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
-from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.heights import Heights
+    from canprobe.mechanics.touch.mesh_curvature import CurvatureError
+    from canprobe.mechanics.touch.mesh_fit import HeightGrid
+    from canprobe.mechanics.touch.pad import Pad
+    from canprobe.mechanics.touch.shapes import PlacedShape
 
 
 def transform(position_mm: Vec3, rotation_deg: Vec3) -> Floats:
@@ -55,6 +56,8 @@ def true_object(settings: ObjectSettings) -> PlacedShape:
             holds none.
         UsageError: a mesh, and no trimesh is installed.
     """
+    from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
+
     if settings.file is not None:
         return object_of_file(settings, T_base_object(settings))
     values: dict[str, object] = {"matrix": np.array(settings.matrix), "angle": math.radians(settings.angle_deg or 0.0)}
@@ -116,6 +119,9 @@ def object_of_file(settings: ObjectSettings, T_base_object: Floats) -> PlacedSha
         ValueError: the file cannot be read, or holds no surface; with what was expected and found.
         UsageError: a mesh, and no trimesh is installed.
     """
+    from canprobe.mechanics.touch.mesh_fit import MeshHeights
+    from canprobe.mechanics.touch.objects import make_object
+
     assert settings.file is not None
     path = Path(settings.file)
     if settings.kind == "heights":
@@ -191,6 +197,8 @@ def _mesh(
     path: Path, changed_ns: int, unit: float, spacing: float | None, origin_mm: tuple[float, float] | None
 ) -> HeightGrid:
     """The surface of a mesh; of a file that has not changed it is fitted once."""
+    from canprobe.mechanics.touch.mesh_fit import fit_mesh
+
     trimesh = needed_module("trimesh", "mesh", "object.file: a mesh needs trimesh:")
     content = _content(path)
     if path.suffix.lower() == ".stl" and (damage := stl_damage(content)) is not None:

@@ -34,8 +34,6 @@ from canprobe.cell.scene.toml_files import (
     written_by_line,
 )
 from canprobe.errors import PlanError, SceneError, UsageError, did_you_mean
-from canprobe.mechanics.robot.urdf import from_urdf
-from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
@@ -111,6 +109,8 @@ def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
                 cell = moved(dataclasses.replace(read_cell(path), plant=None))
                 files[name] = f"{written_by_line()}\n{dump_scene(cell)}".encode()
                 continue
+            from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
+
             try:
                 files[name] = with_meshes_found(path) if key == "urdf" else path.read_bytes()
             except OSError as error:
@@ -247,6 +247,8 @@ def _complain_of_names(reader: Reader, arm: ArmSettings | None, joints: object) 
     """Complain of joints that the URDF does not have; without other problems `arm_model` does, with the order."""
     if not reader.problems or arm is None or not arm.urdf or not isinstance(joints, dict):
         return
+    from canprobe.mechanics.robot.urdf import from_urdf
+
     with contextlib.suppress(PlanError):  # the URDF's own faults come once the cell can be read
         names = from_urdf(arm.urdf, arm.base, arm.tip).chain.joints
         for name in joints:

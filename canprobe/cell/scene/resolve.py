@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint, posture_in_si
-from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, refuse_narrow, scan_axes, true_object
-from canprobe.cell.scene.hardware import MM, EmulateSettings
+from canprobe.cell.scene.hardware import MM, EmulateSettings, JointSettings
 from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -45,21 +44,17 @@ from canprobe.cell.scene.setup import (
     Touch,
     Truth,
 )
-from canprobe.cell.scene.urdf_solids import link_spheres
+from canprobe.cell.scene.units import in_si
 from canprobe.errors import PlanError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
-from canprobe.mechanics.robot.keep_out import KeepOut
-from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.robot.tool_calibration import ball_approaches
-from canprobe.mechanics.touch import ArrayCalibration, Pad
-from canprobe.mechanics.touch.heights import Heights
-from canprobe.mechanics.touch.image.force_errors import UNSTATED
-from canprobe.mechanics.touch.pad import FLAT_RADIUS_M
-from canprobe.mechanics.touch.servo import SurfaceGains
-from canprobe.mechanics.touch.stops import depth_on_plane
-from canprobe.mechanics.touch.strategies import Rectangle, make_strategy
+
+if TYPE_CHECKING:
+    from canprobe.cell.scene.arms import Bodies
+    from canprobe.mechanics.robot.keep_out import KeepOut
+    from canprobe.mechanics.robot.model import ArmModel
+    from canprobe.mechanics.touch import ArrayCalibration
+    from canprobe.mechanics.types import Floats
 
 SEARCH = 8e-3
 """Distance beyond the expected place at which an approach gives up, m."""
@@ -88,6 +83,8 @@ def resolve(scene: Scene) -> Setup:
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
     T, radius = T_flange_probe(settings), settings.radius_mm * MM
     if array is not None and array.pad.is_flat:  # it is a sphere of a very large radius; the point of its pole stays
+        from canprobe.mechanics.touch.pad import FLAT_RADIUS_M
+
         T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
         radius = FLAT_RADIUS_M
     stiffness = array.calibration.image.stiffness if array is not None else LAYER_STIFFNESS
@@ -124,6 +121,8 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
     """The arm, and the bodies of its links."""
     if scene.arm is None:
         return None, None
+    from canprobe.cell.scene.arms import arm_model, homing_of, per_joint, posture_in_si
+
     settings, joints = scene.arm, scene.joints
     model, bodies, warnings = arm_model(scene.cell.name, settings, joints)
     each = zip(scene.drives.items(), joints.values(), strict=True)
@@ -182,6 +181,10 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
     settings = scene.sensor
     if settings is None:
         return None
+    from canprobe.cell.scene.calibrations import load_calibration
+    from canprobe.mechanics.touch.image.force_errors import UNSTATED
+    from canprobe.mechanics.touch.pad import Pad
+
     calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
     calibrated = settings.calibration is not None or settings.emulated
     serial = settings.serial_number if settings.serial_number is not None else calibration.serial_number
@@ -263,6 +266,9 @@ def _keep_out(scene: Scene, arm: Arm | None, probe: ProbeSettings | None) -> tup
     settings = scene.keep_out
     if scene.arm is None or arm is None or settings is None or (settings.floor_mm is None and not settings.boxes_mm):
         return None, ()
+    from canprobe.cell.scene.urdf_solids import link_spheres
+    from canprobe.mechanics.robot.keep_out import KeepOut
+
     floor = -math.inf if settings.floor_mm is None else settings.floor_mm * MM
     boxes = np.array(settings.boxes_mm, dtype=float).reshape(-1, 2, 3) * MM
     radius = settings.link_radius_mm * MM
@@ -294,11 +300,16 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     """The setup of the task; `canprobe.cell.scene.rules` has checked that the scene has what it needs."""
     settings = scene.task
     if settings.kind == "free":
+        from canprobe.cell.scene.arms import per_joint
+
         assert arm is not None
         return Free(arm, per_joint(scene.joints, "swing"), settings.swing_period_s, settings.duration_s)
     assert array is not None
     if settings.kind == "listen":
         return Listen(array, probe, settings.duration_s)
+    from canprobe.mechanics.touch.servo import SurfaceGains
+    from canprobe.mechanics.touch.stops import depth_on_plane
+
     assert arm is not None
     servo = scene.servo or ServoSettings()
     pressed = depth_on_plane(scene.limits.force_max_n, probe.stiffness, probe.radius)  # a blind search goes no deeper
@@ -319,6 +330,8 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
         "lag_s": servo.drive_lag_ms * 1e-3,
     }
     if settings.kind == "calibrate":
+        from canprobe.mechanics.robot.tool_calibration import ball_approaches
+
         centre, radius = expected_ball(settings)
         tilt, beside = math.radians(settings.tilt_deg), math.radians(settings.beside_deg)
         return Calibrate(
@@ -338,6 +351,9 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:
+    from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
+    from canprobe.mechanics.touch.strategies import Rectangle, make_strategy
+
     length, width = settings.length_mm * MM, settings.width_mm * MM
     return Scan(
         strategy=Rectangle(length, width, settings.target_sigma_um * 1e-6)
@@ -357,6 +373,8 @@ def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel |
     other = scene.plant.true_cell if scene.plant is not None else None
     if other is None:
         return arm.model, bodies
+    from canprobe.cell.scene.arms import arm_model
+
     cell = read_cell(other)
     if cell.arm is None or len(cell.joints) != arm.model.n:
         raise PlanError([f"plant.true_cell: expected a cell with an arm of {arm.model.n} joints, got {other}"])
@@ -376,14 +394,23 @@ def _dead_taxels(plant: PlantSettings, array: Array | None) -> tuple[tuple[int, 
     return tuple(sorted(dead))
 
 
+def _joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
+    """(n,) compliance of the joints, rad/(N m) or m/N; None where all are rigid."""
+    stiffness = [in_si(section).get("stiffness") for section in sections.values()]
+    return np.array([0.0 if k is None else 1.0 / k for k in stiffness]) if any(stiffness) else None
+
+
 def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, probe: Probe) -> Truth:
-    plant = scene.plant or PlantSettings()
-    try:
-        shape = true_object(scene.object) if scene.object is not None else None
-        if scene.object is not None and isinstance(shape, Heights) and array is not None:
-            refuse_narrow(scene.object, shape, array.pad)
-    except ValueError as error:
-        raise PlanError([f"object: {error}"]) from error
+    plant, shape = scene.plant or PlantSettings(), None
+    if scene.object is not None:
+        from canprobe.mechanics.touch.heights import Heights
+
+        try:
+            shape = true_object(scene.object)
+            if isinstance(shape, Heights) and array is not None:
+                refuse_narrow(scene.object, shape, array.pad)
+        except ValueError as error:
+            raise PlanError([f"object: {error}"]) from error
     T_flange_there = probe.T_flange_probe.copy()
     T_flange_there[:3, 3] += np.array(plant.tool_error_mm) * MM
     model, bodies = _true_arm(scene, arm, bodies)
@@ -391,7 +418,7 @@ def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, p
         object=shape,
         model=model,
         bodies=bodies,
-        compliance=joint_compliance(scene.joints),
+        compliance=_joint_compliance(scene.joints),
         T_flange_probe=T_flange_there,
         stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_STIFFNESS,
         damping=plant.contact_damping_s_m,

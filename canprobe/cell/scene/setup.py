@@ -15,7 +15,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName, WhenDisabled
 from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
@@ -23,15 +23,16 @@ from canprobe.errors import UsageError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
-from canprobe.mechanics.robot.keep_out import KeepOut
-from canprobe.mechanics.robot.model import ArmModel, Body
-from canprobe.mechanics.robot.tool_calibration import BallApproach
-from canprobe.mechanics.touch import ArrayCalibration, Pad
-from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
-from canprobe.mechanics.touch.servo import SurfaceGains
-from canprobe.mechanics.touch.shapes import PlacedShape
-from canprobe.mechanics.touch.strategies import Rectangle, Strategy
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.robot.keep_out import KeepOut
+    from canprobe.mechanics.robot.model import ArmModel, Body
+    from canprobe.mechanics.robot.tool_calibration import BallApproach
+    from canprobe.mechanics.touch import ArrayCalibration, Pad
+    from canprobe.mechanics.touch.servo import SurfaceGains
+    from canprobe.mechanics.touch.shapes import PlacedShape
+    from canprobe.mechanics.touch.strategies import Rectangle, Strategy
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +199,8 @@ class Array(Node):
     @property
     def newtons(self) -> str:
         """What the array's newtons rest on, in words."""
+        from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
+
         return self.calibration.newtons if self.calibrated else NO_FORCE_REFERENCE
 
 

@@ -30,7 +30,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import LOCKSTEP, Target
 from canprobe.cell.tasks.calibrate import Press, RollRecord, RollTask
 from canprobe.cell.tasks.from_plan import make_sensing
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import PlanError, UsageError
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import task_rows

@@ -12,16 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.emulated.world import World
-from canprobe.cell.master.array import TactileReceiver
 from canprobe.cell.master.cycle import Cycle
-from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
@@ -29,7 +27,6 @@ from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.sync import INTERPOLATION_TIME
 from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
-from canprobe.fieldbus.drive.drive import DriveApplication
 from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.rpdo import Rpdo
@@ -37,6 +34,11 @@ from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
 from canprobe.fieldbus.protocol.sdo import SdoAbort
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.array import TactileReceiver
+    from canprobe.cell.master.drives import DriveGroup
+    from canprobe.fieldbus.drive.drive import DriveApplication
 
 HEARTBEAT_CONSUMER = 0x1016
 
@@ -61,8 +63,6 @@ def tactile_frame(
 def configure(node: SlaveNode, setup: NodeConfiguration) -> None:
     """Write a node's configuration into its dictionary, as bring-up does by SDO.
 
-    A node does not watch for its master, which is in the same process and cannot fall silent.
-
     Raises:
         NodeError: when the node refuses a required value.
     """
@@ -76,8 +76,6 @@ def configure(node: SlaveNode, setup: NodeConfiguration) -> None:
             taken = write is not times[0][0] or any(all(_takes(node.dictionary, w) for w in time) for time in times)
         if not taken:
             raise setup.error(f"refuses {write.place} = {write.value:#x} ({write.purpose})")
-    if isinstance(node.application, DriveApplication):
-        node.application.parts.parameters.patience_ns = 0
 
 
 def _takes(dictionary: Dictionary, write: Write) -> bool:
@@ -124,8 +122,8 @@ class DirectCycle(Cycle):
         self._see = tactile.put if tactile is not None else nothing
         self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
         self._nodes, self._recorder = world.nodes, world.recorder
-        self._start({setup.node_id: setup for setup in plan.configurations}, port.clock.now_ns())
         by_id, of_drives = {node.node_id: node for node in self._nodes}, [drive.node_id for drive in plan.setup.drives]
+        self._start({setup.node_id: setup for setup in plan.configurations}, of_drives, port.clock.now_ns())
         self._stations = [(node.core, node.pdos.exchange, node.node_id in of_drives) for node in self._nodes]
         self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
         for node_id in of_drives:
@@ -133,13 +131,18 @@ class DirectCycle(Cycle):
                 rpdo = by_id[node_id].pdos.rpdo(pdo.cob_id)
                 self._rpdos.setdefault(pdo.cob_id, []).append((by_id[node_id].core, rpdo))
 
-    def _start(self, setups: Mapping[int, NodeConfiguration], t_ns: int) -> None:
-        """Power on, configure and start all nodes, so that they are operational at `t_ns`."""
+    def _start(self, setups: Mapping[int, NodeConfiguration], of_drives: Sequence[int], t_ns: int) -> None:
+        """Power on, configure and start all nodes, so that they are operational at `t_ns`.
+
+        A drive does not watch for its master, which is in the same process and cannot fall silent.
+        """
         power_on_ns = t_ns - max(node.core.quirks.boot_ns for node in self._nodes)
         for node in self._nodes:
             node.start(power_on_ns)
             node.advance(t_ns)
             configure(node, setups[node.node_id])
+            if node.node_id in of_drives:
+                cast("DriveApplication", node.application).parts.parameters.patience_ns = 0
             if isinstance(node.application, TactileApplication):
                 node.application.publish = partial(self._publish, node)
         for node in self._nodes:

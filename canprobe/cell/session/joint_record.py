@@ -10,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.folder import record_file
-from canprobe.cell.tasks.joint_check import JointFinding
 from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.cell.tasks.joint_check import JointFinding
 
 WHAT_CHANGED = {
     "joint": "node id",

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Calibrate, Touch
-from canprobe.cell.tasks.probing import Phase, ProbingTask, felt_columns
+from canprobe.cell.tasks.probing import ProbingTask, felt_columns
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.task import TaskRecord
+from canprobe.cell.tasks.task import Phase, TaskRecord
 from canprobe.mechanics.robot.tool_calibration import BallModel, BallTouch, ToolEstimate, calibrate_tool
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.layer_stiffness import PushFit

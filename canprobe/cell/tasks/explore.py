@@ -17,8 +17,7 @@ import numpy as np
 
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.contact import edge_margin
-from canprobe.cell.tasks.probing import Phase
-from canprobe.cell.tasks.task import TaskRecord
+from canprobe.cell.tasks.task import Phase, TaskRecord
 from canprobe.cell.tasks.touch import RAMP_S, SEARCH_SPEED, Search, TouchTask
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer

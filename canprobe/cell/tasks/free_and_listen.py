@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import PatchReader, sample_columns
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.tasks.task import Task, TaskRecord
-from canprobe.mechanics.touch import PatchCalibration
-from canprobe.mechanics.touch.probe_motion import smooth_step
+from canprobe.mechanics.robot.motion_profile import smooth_step
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.patch_reader import PatchReader
+    from canprobe.mechanics.touch import PatchCalibration
 
 
 class FreeTask(Task):
@@ -57,7 +60,10 @@ class ListenTask(Task):
     resumable = True
 
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
+        from canprobe.cell.master.patch_reader import PatchReader, sample_columns
+
         self.reader: PatchReader = PatchReader(calibration)
+        self._columns_of = sample_columns
         self._left = duration_s
         self._period = period_s
         self.taxels: NDArray[np.uint8] | None = None
@@ -70,7 +76,7 @@ class ListenTask(Task):
         self._left -= self._period
         if measurement.tactile is not None:
             self.taxels = measurement.tactile.frame.taxels
-            self._columns = sample_columns(measurement.tactile, self.reader.read(measurement.tactile))
+            self._columns = self._columns_of(measurement.tactile, self.reader.read(measurement.tactile))
         return Command(done=self._left <= 0, columns=self._columns)
 
 

@@ -10,22 +10,12 @@ from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.plugins import find_plugin
 from canprobe.cell.scene.setup import Array, Calibrate, Free, Probe, Setup, Touch
-from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
-from canprobe.cell.tasks.touch import TouchTask
+from canprobe.cell.tasks.shape import OfferedEstimator, RenewedEstimator, ShapeRecord, ShapeTracker, replay_samples
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
-from canprobe.mechanics.touch import (
-    CalibrationCheck,
-    ContactSample,
-    MomentImage,
-    indentation_from_force,
-    make_image_model,
-    make_patch_calibration,
-)
-from canprobe.mechanics.touch.strategies import Rectangle
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import Correlation, Estimator, ImageModel, SurfaceMap
+    from canprobe.cell.tasks.sensing import ContactSensing
+    from canprobe.mechanics.touch import ContactSample, Correlation, Estimator, ImageModel, SurfaceMap
     from canprobe.mechanics.touch.online.estimator import AnswerStage
 
 
@@ -44,6 +34,9 @@ REFINED_METHODS = ("recursive", "ml")
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
     """The contact sensing of a task, for its arm, probe and array."""
+    from canprobe.cell.tasks.sensing import ContactSensing
+    from canprobe.mechanics.touch import MomentImage, make_patch_calibration
+
     calibration = make_patch_calibration(task.array.calibration, task.array.pad)
     return ContactSensing(
         task.arm.model,
@@ -87,8 +80,6 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         "coupling": centroid_coupling(task.probe),
     }
     if method not in METHODS and (plugin := find_plugin("estimator", method)) is not None:
-        from canprobe.cell.tasks.shape import OfferedEstimator, RenewedEstimator
-
         return RenewedEstimator(lambda: OfferedEstimator(plugin, settings))
     motion = make_estimator(method, **settings)
     if method not in REFINED_METHODS:
@@ -111,12 +102,16 @@ def _stages(task: Touch, memory: float, rolling_share: float) -> Iterator[Answer
 
 def _typical_sigma(task: Touch) -> float:
     """Standard deviation of a contact at the wanted force on a plane, m, for contacts that state none."""
+    from canprobe.mechanics.touch import indentation_from_force
+
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
     return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
 
 
 def _image_model(task: Touch) -> ImageModel:
+    from canprobe.mechanics.touch import make_image_model, make_patch_calibration
+
     array = task.array
     patch = make_patch_calibration(array.calibration, array.pad)
     windowed = array.mode == "window" and int(array.window) <= DEFAULT_WINDOW
@@ -179,6 +174,10 @@ def make_task(plan: Plan) -> Controller:
     """The controller of the plan's task; what the task does not need is not even imported."""
     period_s, task = plan.sync.period_ns * 1e-9, plan.setup.task
     if isinstance(task, Touch):
+        from canprobe.cell.tasks.touch import TouchTask
+        from canprobe.mechanics.touch import CalibrationCheck
+        from canprobe.mechanics.touch.strategies import Rectangle
+
         array = task.array
         check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
         parts = plan, task, make_sensing(task), make_shape_tracker(plan.setup), check
@@ -196,6 +195,7 @@ def make_task(plan: Plan) -> Controller:
 
         return FreeTask(task.swing, task.period_s, task.duration_s, period_s)
     from canprobe.cell.tasks.free_and_listen import ListenTask
+    from canprobe.mechanics.touch import make_patch_calibration
 
     patch = make_patch_calibration(task.array.calibration, task.array.pad)
     return ListenTask(patch, task.duration_s, period_s)

@@ -11,8 +11,9 @@ from copy import copy
 
 import numpy as np
 
-from canprobe.cell.master.array import PatchReader, make_patch_reader
+from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.patch_reader import PatchReader
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.tasks.hand_way import HandWay
 from canprobe.cell.tasks.task import MotionTime

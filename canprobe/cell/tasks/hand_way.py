@@ -13,16 +13,17 @@ from itertools import count
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation  # before a cell is live: it takes longer to load than nodes wait
 
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.contact import blind_s, depth_at
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import PROFILE_STOP_S, lag_s
+from canprobe.cell.tasks.task import USUAL_SPEED
 from canprobe.errors import PlanError, UsageError, did_you_mean
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.motion_profile import MotionProfile
-from canprobe.mechanics.touch.linear_algebra import checked
+from canprobe.mechanics.touch.checks import checked
 from canprobe.mechanics.types import Floats
 
 FAR = 1e6
@@ -35,8 +36,6 @@ GUIDED_STOP_S = 0.06
 """Longest time in which a guided motion brakes, s: no faster than it can."""
 JOG_GROWTH = 4.0
 """How many times quicker a joint may become in a jog of the probe: beyond it is near a singular pose."""
-USUAL_SPEED = 0.1
-"""Share of the speed limits that a motion by hand has where nothing else is asked for."""
 STEP_RAD, STEP_M = math.radians(0.5), 1e-3
 """Largest distance of two places of a way: of a joint or of the probe's orientation, and of the probe."""
 MAX_MOVE_RAD = 0.2

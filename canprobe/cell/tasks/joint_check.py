@@ -24,7 +24,7 @@ from canprobe.cell.master.position_track import rest_counts
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.model import Plan
 from canprobe.mechanics.robot.chain import forward
-from canprobe.mechanics.touch.probe_motion import smooth_step
+from canprobe.mechanics.robot.motion_profile import smooth_step
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
-from canprobe.cell.master.array import sample_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement
+from canprobe.cell.master.patch_reader import sample_columns
 from canprobe.cell.master.supervision import Finding, TouchState, limits_of
 from canprobe.cell.master.supervisor import outside_workspace
 from canprobe.cell.master.tactile_frame import TactileSample
@@ -23,7 +22,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.scene.setup import Approach, Arm, Probe, SafetyLimits
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
+from canprobe.cell.tasks.task import MotionTime, Phase, Task, TaskRecord
 from canprobe.mechanics.robot.chain import pose_of
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.depth_witness import DepthWitness
@@ -119,18 +118,6 @@ class ProbeMotion:
         joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])
         self.limit = f"joint {joint + 1} at {self._model.joints[joint].text(self.q[joint])}, its stop"
         self.q = np.clip(self.q, self._low, self._high)
-
-
-class Phase(IntEnum):
-    """Phases of a touch task, in their order; a scan that loses its contact goes to and fro between it and REGAIN."""
-
-    MOVE = 0
-    APPROACH = 1
-    SETTLE = 2
-    SCAN = 3
-    RETREAT = 4
-    DONE = 5
-    REGAIN = 6
 
 
 COMING = (Phase.MOVE, Phase.APPROACH, Phase.SETTLE)

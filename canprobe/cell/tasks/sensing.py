@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.cell.master.array import PatchReader
 from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.patch_reader import PatchReader
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.mechanics.robot.chain import ending_in, forward
 from canprobe.mechanics.robot.model import ArmModel, position_sigma

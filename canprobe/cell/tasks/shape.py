@@ -15,13 +15,10 @@ import numpy as np
 
 from canprobe.cell.scene.plugins import Plugin
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.mechanics.touch import ContactSample, SurfaceEstimate, indentation_from_force
-from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth
 from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps, at_once
-from canprobe.mechanics.touch.estimate.gate import Dropped
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import SurfaceMap
+    from canprobe.mechanics.touch import ContactSample, SurfaceEstimate, SurfaceMap
 
 
 GAP_S = 0.1
@@ -121,6 +118,8 @@ class ShapeTracker:
         known = [r for r in self.records if r.estimate.rank == 3 and r.estimate.stiffness is not None]
         if not known:
             return list(self.samples)
+        from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, at_depth, indentation_from_force
+
         stiffness, least = known[-1].estimate.stiffness, -HOLLOW_LIMIT_SHARE / radius
         assert stiffness is not None
         at_1_n = [indentation_from_force(1.0, stiffness, radius, np.maximum(r.estimate.kappa, least)) for r in known]
@@ -266,6 +265,8 @@ class RenewedEstimator(Estimator):
     """
 
     def __init__(self, make: Callable[[], OwnEstimator]) -> None:
+        from canprobe.mechanics.touch.estimate.gate import Dropped
+
         self._make = make
         self.dropped = Dropped()
         self.reset()
@@ -310,6 +311,8 @@ class OfferedEstimator:
     def estimate(self) -> SurfaceEstimate | None:
         """The shape at the last contact; None before there is an answer."""
         answer = self._guarded(self._estimate)
+        from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+
         if answer is not None and not isinstance(answer, SurfaceEstimate):
             raise UsageError(f"{self._plugin}: expected a SurfaceEstimate or None from estimate(), got {answer!r:.60}")
         return answer

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,10 +17,24 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.tool_calibration import ToolEstimate
 
 
+USUAL_SPEED = 0.1
+"""Share of the speed limits that a motion by hand has where nothing else is asked for."""
 MAX_STEP_PERIODS = 4
 """Largest step of a motion in a cycle, and largest time that it makes up later, in periods; the rest is lost."""
 STEP_GROWTH_DIVISOR = 8
 """A step of a motion is longer than the one before by at most a period over this."""
+
+
+class Phase(IntEnum):
+    """Phases of a touch task, in their order; a scan that loses its contact goes to and fro between it and REGAIN."""
+
+    MOVE = 0
+    APPROACH = 1
+    SETTLE = 2
+    SCAN = 3
+    RETREAT = 4
+    DONE = 5
+    REGAIN = 6
 
 
 class MotionTime:

@@ -17,13 +17,14 @@ from canprobe.cell.master.supervision import Reaction
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Approach, Touch
-from canprobe.cell.tasks.probing import LEAVING, Phase, ProbingTask, felt_columns
+from canprobe.cell.tasks.probing import LEAVING, ProbingTask, felt_columns
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
-from canprobe.cell.tasks.task import Loss, TaskRecord
+from canprobe.cell.tasks.task import Loss, Phase, TaskRecord
+from canprobe.mechanics.robot.motion_profile import smooth_step
 from canprobe.mechanics.touch import CalibrationCheck, ContactSample, Patch, Slope, SurfaceEstimate
 from canprobe.mechanics.touch.layer_stiffness import PushFit
-from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, SETTLE_S, LineMotion, smooth_step
+from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, SETTLE_S, LineMotion
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
 from canprobe.mechanics.touch.strategies import PathFollower, Rectangle

@@ -16,7 +16,7 @@ from canprobe.cell.scene.setup import SafetyLimits
 from canprobe.cell.tasks.task import MotionTime
 from canprobe.errors import UsageError
 from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.touch.linear_algebra import checked, instance, real_numbers
+from canprobe.mechanics.touch.checks import checked, instance, real_numbers
 from canprobe.mechanics.types import Floats
 
 FIRST_POINT_TOLERANCE_RAD = 0.01

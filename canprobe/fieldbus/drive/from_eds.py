@@ -13,8 +13,7 @@ from canprobe.fieldbus.drive.profile import MotorDynamics
 from canprobe.fieldbus.drive.reference import AxisPlant
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.eds.reading import is_drive
-from canprobe.fieldbus.node.dictionary import key_of
-from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.node.slave_node import SlaveNode, set_serial_number
 
 
 class IdealAxis(AxisPlant):
@@ -59,12 +58,6 @@ class IdealAxis(AxisPlant):
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         self._start, self._end, self._t0, self._t1 = start_counts, end_counts, t0_ns, t1_ns
-
-
-def set_serial_number(node: SlaveNode, serial: int) -> None:
-    """Give a device its serial number, in which two devices of one EDS differ; without 1018h:04 it has none."""
-    if key_of(0x1018, 4) in node.dictionary:
-        node.dictionary.set_default(0x1018, 4, serial)
 
 
 def make_eds_node(

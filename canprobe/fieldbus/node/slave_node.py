@@ -19,7 +19,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
-from canprobe.fieldbus.node.dictionary import Dictionary
+from canprobe.fieldbus.node.dictionary import Dictionary, key_of
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding
 from canprobe.fieldbus.node.lss import LssSlave
@@ -269,3 +269,9 @@ class SlaveNode(Participant):
         elif self.lss is not None and self.lss.unconfigured:
             routes.update(self.lss.routes())
         self._rerouted()
+
+
+def set_serial_number(node: SlaveNode, serial: int) -> None:
+    """Give a device its serial number, in which two devices of one EDS differ; without 1018h:04 it has none."""
+    if key_of(0x1018, 4) in node.dictionary:
+        node.dictionary.set_default(0x1018, 4, serial)

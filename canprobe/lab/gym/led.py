@@ -12,7 +12,7 @@ from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.contact import direction_to_pad

@@ -28,8 +28,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.summary import summarise
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.probing import Phase
-from canprobe.cell.tasks.task import record_of
+from canprobe.cell.tasks.task import Phase, record_of
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of

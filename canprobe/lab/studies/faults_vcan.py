@@ -36,7 +36,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.child_process import EmulatorChild, with_our_imports
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import CanprobeError, InterfaceError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.clock import MonotonicClock

@@ -12,6 +12,12 @@ import math
 from collections.abc import Iterable
 
 
+def smooth_step(u: float) -> float:
+    """Quintic from 0 to 1 over ``u`` in 0…1, with zero slope and bend at both ends; constant outside."""
+    u = min(max(u, 0.0), 1.0)
+    return u * u * u * (10 - 15 * u + 6 * u * u)
+
+
 class MotionProfile:
     """Place and speed along a way, by time.
 

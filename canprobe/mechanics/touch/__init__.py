@@ -21,7 +21,7 @@ Shape:
     online/           the estimator in the loop: the stages that refine an answer, and what widens its region
     map/              one surface from all contacts of a scan, with its uncertainty
     meshing           triangles of any surface that gives the closest point to a place
-    linear_algebra, tangent_frames   small matrices, input checks, frames on a tangent plane
+    linear_algebra, checks, tangent_frames   small matrices, input checks, frames on a tangent plane
 
 Motion:
 

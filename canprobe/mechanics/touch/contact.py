@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import positive
+from canprobe.mechanics.touch.checks import positive
 from canprobe.mechanics.types import Floats
 
 HOLLOW_LIMIT_SHARE = 0.9

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from canprobe.mechanics.touch.linear_algebra import positive
+from canprobe.mechanics.touch.checks import positive
 
 ROOT_FORCE_SIGMA = 0.03
 """Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""

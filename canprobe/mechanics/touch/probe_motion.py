@@ -17,6 +17,7 @@ import numpy as np
 from canprobe.mechanics.robot.chain import Posture, ending_in, jacobian, pose_of, posture
 from canprobe.mechanics.robot.inverse import damped_step, in_rows, task_rows
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.robot.motion_profile import smooth_step
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.tangent_frames import transported
 from canprobe.mechanics.types import Floats, Vec
@@ -114,12 +115,6 @@ def _pose_error(at: Posture, centre: list[float], pole: list[float], x_reference
         0.5 * (r20 * x0 - r00 * x2 + r21 * y0 - r01 * y2 + r22 * p0 - r02 * p2),
         0.5 * (r00 * x1 - r10 * x0 + r01 * y1 - r11 * y0 + r02 * p1 - r12 * p0),
     )
-
-
-def smooth_step(u: float) -> float:
-    """Quintic from 0 to 1 over ``u`` in 0…1, with zero slope and bend at both ends; constant outside."""
-    u = min(max(u, 0.0), 1.0)
-    return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
 class LineMotion:

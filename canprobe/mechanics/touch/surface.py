@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import MAX_MAGNITUDE, checked, instance, read_only, real
+from canprobe.mechanics.touch.checks import MAX_MAGNITUDE, checked, instance, read_only, real
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 

@@ -12,7 +12,7 @@ import canprobe
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import SafetyStop
 
 LIMIT_N = 5.0

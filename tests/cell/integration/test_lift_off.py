@@ -16,7 +16,7 @@ from canprobe.cell.master.controller import Command
 from canprobe.cell.master.trail import WAY_BACK
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.bus.real.interrupts import Terminated

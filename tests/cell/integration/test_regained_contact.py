@@ -10,7 +10,7 @@ import canprobe
 from canprobe.cell.scene.model import PlantSettings
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.lab.studies.witnessed_run import Witness
 
 TARGET = 2.0

@@ -25,7 +25,7 @@ from canprobe.cell.master.supervision import Reaction
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.port import ControllerState

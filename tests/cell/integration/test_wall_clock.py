@@ -16,7 +16,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.npz import read_npz
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import NMT_ID, SYNC_ID

@@ -11,7 +11,7 @@ from injected import SCAN_CYCLE, Injected
 import canprobe
 from canprobe.cell.master.trail import WAY_BACK
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.errors import NodeError, SafetyStop, UsageError
 
 

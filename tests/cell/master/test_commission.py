@@ -21,9 +21,8 @@ from canprobe.fieldbus.bus.lss import Lss
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.bus.virtual.timed import TimedBus
-from canprobe.fieldbus.drive.from_eds import set_serial_number
 from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.node.slave_node import SlaveNode, set_serial_number
 from canprobe.fieldbus.protocol.lss import LssAddress, LssState
 
 EDS = "puma260_joint"

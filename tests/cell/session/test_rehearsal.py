@@ -12,7 +12,7 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session, rehearse, run_beginning, shortened
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.task import Phase
 from canprobe.fieldbus.eds.packaged import eds_path
 
 MOST_CYCLES = 1200

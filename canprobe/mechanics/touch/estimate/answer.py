@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from canprobe.mechanics.touch.checks import checked, read_only
 from canprobe.mechanics.touch.estimate.observed import CurvatureInformation, Decision, outside, tensor
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import transport
-from canprobe.mechanics.touch.linear_algebra import checked, principal, read_only
+from canprobe.mechanics.touch.linear_algebra import principal
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats, Vec

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.checks import whole
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, lag_pairs, solve_pairs, usable_lag
@@ -20,7 +21,6 @@ from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.recursive import RecursiveEstimator
 from canprobe.mechanics.touch.estimate.window import Chen1996Estimator, ChordEstimator, MlEstimator
-from canprobe.mechanics.touch.linear_algebra import whole
 
 METHODS = ("chen1996", "chord", "ml", "recursive")
 """Names of the methods."""

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.mechanics.touch.checks import positive
 from canprobe.mechanics.touch.contact import ContactSample, Doubt
 from canprobe.mechanics.touch.estimate.noise import Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.path_length import PathLength
-from canprobe.mechanics.touch.linear_algebra import positive
 from canprobe.mechanics.types import Floats
 
 

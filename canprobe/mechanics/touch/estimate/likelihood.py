@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.checks import MAX_LENGTH, checked, instance
 from canprobe.mechanics.touch.estimate.answer import (
     Solution,
     SurfaceEstimate,
@@ -31,7 +32,7 @@ from canprobe.mechanics.touch.estimate.observed import (
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise
-from canprobe.mechanics.touch.linear_algebra import MAX_LENGTH, checked, instance, inverted, solved, upper_root
+from canprobe.mechanics.touch.linear_algebra import inverted, solved, upper_root
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats

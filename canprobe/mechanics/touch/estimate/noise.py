@@ -10,15 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import (
-    MAX_LENGTH,
-    MAX_MAGNITUDE,
-    checked,
-    inverted_upper,
-    lower_root,
-    positive,
-    real_numbers,
-)
+from canprobe.mechanics.touch.checks import MAX_LENGTH, MAX_MAGNITUDE, checked, positive, real_numbers
+from canprobe.mechanics.touch.linear_algebra import inverted_upper, lower_root
 from canprobe.mechanics.types import Floats
 
 CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27

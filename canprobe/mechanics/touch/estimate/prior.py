@@ -9,7 +9,7 @@ from numbers import Real
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import checked, positive
+from canprobe.mechanics.touch.checks import checked, positive
 from canprobe.mechanics.types import Floats
 
 NUISANCE_SIGMA = (0.15, 0.15, 0.5)

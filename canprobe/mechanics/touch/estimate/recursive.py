@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.checks import instance, positive
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
@@ -31,7 +32,7 @@ from canprobe.mechanics.touch.estimate.path_length import PathLength, Spread
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q_SQUARED, size_of
 from canprobe.mechanics.touch.estimate.start import Start
-from canprobe.mechanics.touch.linear_algebra import instance, inverted, inverted_upper, lower_root, positive, upper_root
+from canprobe.mechanics.touch.linear_algebra import inverted, inverted_upper, lower_root, upper_root
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 

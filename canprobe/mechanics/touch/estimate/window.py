@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from canprobe.mechanics.touch.checks import whole
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
@@ -21,7 +22,6 @@ from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContac
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, batch_of, fit_ml, working_frame
 from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.linear_algebra import whole
 from canprobe.mechanics.touch.tangent_frames import rotation_vectors
 from canprobe.mechanics.types import Floats
 

@@ -21,11 +21,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from canprobe.mechanics.touch.checks import positive, read_only
 from canprobe.mechanics.touch.image.calibration import ArrayCalibration, ImageParameters, MomentErrors
 from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, Moments
 from canprobe.mechanics.touch.image.patch import PatchCalibration
-from canprobe.mechanics.touch.linear_algebra import positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
 from canprobe.mechanics.types import Floats
 

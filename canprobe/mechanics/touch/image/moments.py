@@ -21,8 +21,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.mechanics.touch.checks import read_only
 from canprobe.mechanics.touch.image.patch import PatchCalibration
-from canprobe.mechanics.touch.linear_algebra import read_only
 
 LEVEL_COUNTS = 6
 """Counts that are subtracted from every taxel: the first count above the sensor's threshold of 2 %."""

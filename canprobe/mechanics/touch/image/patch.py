@@ -16,13 +16,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.checks import checked, positive, read_only
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.image.force_errors import UNSTATED, ForceErrors, ForceSigma
 from canprobe.mechanics.touch.image.silent_taxels import mended
-from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
 from canprobe.mechanics.touch.stops import OFF_PAD_ACROSS_SHARE, OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 from canprobe.mechanics.types import Floats
@@ -155,10 +154,13 @@ class Continuation:
             return pressure
         weights = self._weights[strip]
         used_weights = (weights * used[:, None]).T
-        _, quadratic, singular = dposv(used_weights.dot(weights), used_weights.dot(self._area[strip] * seen))
+        try:
+            quadratic = np.linalg.solve(used_weights.dot(weights), used_weights.dot(self._area[strip] * seen))
+        except np.linalg.LinAlgError:
+            return pressure
         _, _, _, uu, uv, vv = quadratic.tolist()
         least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * self._corner
-        if singular or not least_fall > MIN_FALL_SHARE * peak_pa:
+        if not least_fall > MIN_FALL_SHARE * peak_pa:
             return pressure
         whole: Floats = np.maximum(self._terms.dot(quadratic), 0.0).reshape(pressure.shape)
         inside = slice(row, row + rows), slice(column, column + columns)

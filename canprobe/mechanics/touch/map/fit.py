@@ -7,7 +7,7 @@ import math
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import positive, real
+from canprobe.mechanics.touch.checks import positive, real
 from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.noise import USUAL_SIGMA_M, MapNoise
 from canprobe.mechanics.touch.map.surface_map import SurfaceMap

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.checks import checked, positive, real
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, ContactSample, at_depth, indentation_from_force
 from canprobe.mechanics.touch.image.image_model import ImageModel
-from canprobe.mechanics.touch.linear_algebra import checked, positive, real
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.cells import Cells, LayerEvidence, solve_cells
 from canprobe.mechanics.touch.map.discs import one_sheet

@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.mechanics.touch.checks import positive
 from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad
 from canprobe.mechanics.touch.estimate.noise import CHI2_999
 from canprobe.mechanics.touch.estimate.observed import CurvatureInformation, turned
@@ -30,7 +31,7 @@ from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.touch.image.image_model import ImageModel
 from canprobe.mechanics.touch.image.moments import Moments, PadMemory, overlapping
 from canprobe.mechanics.touch.layer_stiffness import ScanStiffness, stiffness_from_slope
-from canprobe.mechanics.touch.linear_algebra import inverted, positive, principal_of, solved
+from canprobe.mechanics.touch.linear_algebra import inverted, principal_of, solved
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation, transported
 from canprobe.mechanics.types import Floats, Vec
 
