@@ -2,15 +2,11 @@
 
 | step | order | for |
 |---|---|---|
-| ``semi_implicit_euler`` | 1 | mechanics that is not stiff; velocities first, positions with the new ones |
 | ``runge_kutta_4`` | 4 | smooth and not stiff |
-| ``implicit_euler`` | 1 | stiff; linearly implicit, one linear solve |
 | ``rosenbrock2`` | 2 | stiff; two stages, one matrix, L-stable; second order whatever matrix the problem gives |
-| ``exponential`` | 2 | exact where f is linear in y and t; else the exponential Rosenbrock-Euler step |
 | ``adaptive`` | 2 | ``rosenbrock2`` in as many parts as its own error estimate asks for |
 
-Source: Hairer & Wanner, Solving ODEs II, IV.7; Verwer, Spee, Blom & Hundsdorfer, SIAM J. Sci. Comput. 20, 1999
-(ROS2); Hochbruck & Ostermann, Acta Numerica 2010 (exponential).
+Source: Hairer & Wanner, Solving ODEs II, IV.7; Verwer, Spee, Blom & Hundsdorfer, SIAM J. Sci. Comput. 20, 1999 (ROS2).
 """
 
 from __future__ import annotations
@@ -43,11 +39,7 @@ class Linearised(NamedTuple):
 
 
 class Problem(Protocol):
-    """The equations that a step needs. States begin with n positions, then their n rates, then anything."""
-
-    @property
-    def positions(self) -> int:
-        """n."""
+    """The equations that a step needs."""
 
     def rate(self, t: float, y: Floats) -> Floats:
         """f(t, y)."""
@@ -55,22 +47,11 @@ class Problem(Protocol):
     def drift(self, t: float, y: Floats) -> Floats:
         """Partial derivative of f by t."""
 
-    def jacobian(self, t: float, y: Floats) -> Floats:
-        """Partial derivative of f by y."""
-
     def linearised(self, t: float, y: Floats, g: float) -> Linearised:
         """All that a linearly implicit step asks for at one place."""
 
 
 Step = Callable[[Problem, float, Floats, float], Floats]
-
-
-def semi_implicit_euler(problem: Problem, t: float, y: Floats, h: float) -> Floats:
-    """Explicit Euler, but positions advance with the new rates."""
-    n = problem.positions
-    new = y + h * problem.rate(t, y)
-    new[:n] = y[:n] + h * new[n : 2 * n]
-    return new
 
 
 def runge_kutta_4(problem: Problem, t: float, y: Floats, h: float) -> Floats:
@@ -80,12 +61,6 @@ def runge_kutta_4(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     k3 = problem.rate(t + 0.5 * h, y + 0.5 * h * k2)
     k4 = problem.rate(t + h, y + h * k3)
     return y + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-
-
-def implicit_euler(problem: Problem, t: float, y: Floats, h: float) -> Floats:
-    """Backward Euler by one Newton iteration."""
-    rate, drift, solve = problem.linearised(t, y, h)
-    return y + h * solve(rate + h * drift)
 
 
 def rosenbrock2(problem: Problem, t: float, y: Floats, h: float) -> Floats:
@@ -100,19 +75,6 @@ def _rosenbrock2(problem: Problem, t: float, y: Floats, h: float) -> tuple[Float
     k1 = solve(rate + drift)
     k2 = solve(problem.rate(t + h, y + h * k1) - 2.0 * k1 - drift)
     return y + (1.5 * h) * k1 + (0.5 * h) * k2, (0.5 * h) * (k1 + k2)
-
-
-def exponential(problem: Problem, t: float, y: Floats, h: float) -> Floats:
-    """y + h phi1(hJ) f + h^2 phi2(hJ) f_t, both from one matrix exponential."""
-    from scipy.linalg import expm
-
-    size = len(y)
-    augmented = np.zeros((size + 2, size + 2))
-    augmented[:size, :size] = h * problem.jacobian(t, y)
-    augmented[:size, size] = h * h * problem.drift(t, y)
-    augmented[:size, size + 1] = h * problem.rate(t, y)
-    augmented[size, size + 1] = 1.0
-    return y + expm(augmented)[:size, size + 1]
 
 
 def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1e-3, atol: float = 1e-5) -> Floats:
@@ -135,12 +97,5 @@ def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1
     raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MAX_PARTS} parts")
 
 
-STEPS: Mapping[str, Step] = {
-    "semi-implicit": semi_implicit_euler,
-    "rk4": runge_kutta_4,
-    "implicit": implicit_euler,
-    "rosenbrock": rosenbrock2,
-    "exponential": exponential,
-    "adaptive": adaptive,
-}
+STEPS: Mapping[str, Step] = {"rk4": runge_kutta_4, "rosenbrock": rosenbrock2, "adaptive": adaptive}
 """Name in a scene -> step."""

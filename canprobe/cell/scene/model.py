@@ -49,7 +49,7 @@ ObjectKind = Literal[
     "heights",
     "mesh",
 ]
-Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
+Integrator = Literal["rk4", "rosenbrock", "adaptive"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
 Vec2 = tuple[float, float]

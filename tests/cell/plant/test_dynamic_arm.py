@@ -67,7 +67,7 @@ def ramps(arm, cycles=60, counts=0.5, extra=lambda t: None):
 def test_motors_alone_are_the_ideal_arm():
     c = config(integral_s=0.0)
     ideal = ramps(IdealArm(UPENN, c.q0))
-    exact = ramps(DynamicArm(UPENN, c.q0, make_equations(c, NOTHING), Stepping("exponential")))
+    exact = ramps(DynamicArm(UPENN, c.q0, make_equations(c, NOTHING), Stepping("rk4", 25_000)))
     assert exact == pytest.approx(ideal, abs=1e-9)
     close = ramps(DynamicArm(UPENN, c.q0, make_equations(c, NOTHING), Stepping()))
     assert 1e-6 < np.abs(close - ideal).max() < 0.01
