@@ -488,16 +488,16 @@ def test_a_measured_jump_that_no_joint_can_make():
 def test_an_estimator_that_diverges_starts_afresh():
     def diverge(run):
         estimator = run.task.shape._estimator
-        original, done = estimator.estimate, []
+        original, done = estimator.answering, []
 
         def once():
-            estimate = original()
+            estimate = yield from original()
             if not done and estimate is not None and estimate.observed.all():
                 done.append(True)
                 return replace(estimate, kappa=np.array([5e3, 0.0]))
             return estimate
 
-        estimator.estimate = once
+        estimator.answering = once
 
     run = Injected("cylinder", SCAN_CYCLE, diverge, until=200, shape={"also": ()})
     assert run.error is None
