@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         found = [entry for entry in found if entry["kept_for"] is None]
     print_answer(args, found, lambda: _print_runs(found))
     if args.prune and found:
-        if not args.yes and not yes_typed(f"delete these {len(found)} runs?"):
+        if not args.yes and not yes_typed(f"delete {_count(found)}?"):
             raise UsageError("runs: --prune needs a yes at the terminal, or --yes; nothing was deleted")
         for entry in found:
             remove_run(Path(entry["folder"]))
@@ -68,7 +68,11 @@ def _print_runs(found: Sequence[Mapping[str, Any]]) -> None:
         length = "" if one["duration_s"] is None else f"{one['duration_s']:.1f} s"
         rows.append((one["folder"], one["scene"], one["started"], length, _size(one["size_bytes"]), one["verdict"]))
     print_table(rows)
-    print(f"{len(found)} runs, {_size(sum(one['size_bytes'] for one in found))}")
+    print(f"{_count(found)}, {_size(sum(one['size_bytes'] for one in found))}")
+
+
+def _count(found: Sequence[object]) -> str:
+    return f"{len(found)} run{'s' * (len(found) != 1)}"
 
 
 def _size(count: int) -> str:
