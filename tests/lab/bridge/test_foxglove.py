@@ -118,12 +118,14 @@ def test_a_client_that_does_not_read_holds_up_no_end(recorded, bridge):
     with socket.socket() as narrow:
         narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         narrow.connect(("127.0.0.1", int(address.rpartition(":")[2])))
-        client = connect(address, sock=narrow, subprotocols=[PROTOCOL], max_queue=1)
+        client = connect(address, sock=narrow, subprotocols=[PROTOCOL], max_queue=1, ping_interval=None)
         _, channels = advertised(client)
         subscriptions = [{"id": i, "channelId": channel["id"]} for i, channel in enumerate(channels.values())]
         client.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
-        messages(client, fed(recorded, one), {0})  # and from here on nothing is read
-        for part in itertools.islice(fed(recorded, one), 300):  # some 6 MB
+        feed = fed(recorded, one)
+        while not messages(client, itertools.islice(feed, 1), set()):
+            pass  # and from here on nothing is read
+        for part in itertools.islice(feed, 300):  # some 6 MB
             part()
         clock = MonotonicClock()
         started_ns = clock.now_ns()
