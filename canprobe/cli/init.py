@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from canprobe.cli.argument_types import folder_path
-from canprobe.cli.parser import Parser
+from canprobe.cli.parser import Parser, option_for
 from canprobe.errors import UsageError
 
 HELP = "write a cell file and a first scene for your own arm"
@@ -54,8 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
     folder: Path = args.folder
-    option = {".urdf": "--urdf", ".eds": "--eds", ".dcf": "--eds", ".xdd": "--eds", ".xdc": "--eds"}.get(folder.suffix)
-    if option is not None:
+    if (option := option_for(folder.name, ("--urdf", "--eds"))) is not None:
         raise UsageError(f"{folder}: DIR is the folder to write into; type: canprobe init my-cell {option} {folder}")
     for name in ("cell.toml", "first.toml", schema_name("cell"), schema_name("scene")):
         if (folder / name).exists():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import Any, NoReturn
 
 from canprobe.cli.argument_types import channel, folder_path, node_id, seconds, seed, setting, whole, word
@@ -86,6 +86,12 @@ _FORMS = {
     "--record": r".+\.(log|asc|blf|trc)",
 }
 """What arguments without their option look like."""
+
+
+def option_for(word: str, known: Container[str]) -> str | None:
+    """The option, of those that are known, that is missing before an argument which looks like its own."""
+    fits = (option for option, form in _FORMS.items() if option in known and re.fullmatch(form, word, re.IGNORECASE))
+    return next(fits, None)
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
@@ -188,9 +194,8 @@ class Parser(argparse.ArgumentParser):
         """Report unknown arguments and exit; where the command takes --set, the key of an option of other commands."""
         key = _KEYS.get(words[0].partition("=")[0]) if "--set" in self._option_string_actions else None
         hint = did_you_mean(words[0], self._option_string_actions, 0.7) if words[0].startswith("-") else ""
-        for option, form in _FORMS.items():
-            if option in self._option_string_actions and re.fullmatch(form, words[0], re.IGNORECASE):
-                hint = f"; did you mean {option} {words[0]}?"
+        if (option := option_for(words[0], self._option_string_actions)) is not None:
+            hint = f"; did you mean {option} {words[0]}?"
         if key is not None:
             given = words[0].partition("=")[2] or next(
                 (word for word in words[1:2] if not word.startswith("-")), "true"

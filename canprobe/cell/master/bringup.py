@@ -23,7 +23,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.master.node_bringup import IDENTITY, NodeBringUp, read_entry, write_entry
+from canprobe.cell.master.node_bringup import IDENTITY, SERIAL_SUBINDEX, NodeBringUp, read_entry, write_entry
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import TARE, TARE_COMMAND
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
@@ -36,7 +36,6 @@ from canprobe.fieldbus.protocol.cia402 import MODE_DISPLAY, POWERED_STATES, STAT
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, pack_nmt
 
 HEARTBEAT_CONSUMER = 0x1016
-SERIAL_SUBINDEX = 4
 RELEASE_S = 0.1
 """Longest time to an answer of a node that is released."""
 

@@ -21,6 +21,7 @@ from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.cia402 import (
     CHANGE_IMMEDIATELY_BIT,
     ENABLE_INTERPOLATION_BIT,
+    ENABLE_WORD,
     NEW_SETPOINT_BIT,
     SETPOINT_ACKNOWLEDGE_BIT,
     DriveState,
@@ -44,7 +45,7 @@ DOUBTED_CYCLES = 2
 """TPDOs in a row whose statusword is not believed either, where their position cannot be: fewer than make a hold."""
 UNSTATED_LAG_S = 0.05
 """Longest usual lag of a drive without a feed-forward, s, where neither scene nor emulation states one."""
-_QUICK_STOP, _DISABLE_VOLTAGE, _ENABLE = 0x0002, 0x0000, 0x000F
+_QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
 """Bits of the statusword that encode the state, and their value in operation enabled; see `known_state` for others."""
 
@@ -131,7 +132,7 @@ class SetPointOffer:
             word: controlword towards the goal of the drive; it gets targets where that keeps it enabled.
             target: where it is sent, counts.
         """
-        if word & _ENABLE != _ENABLE or known_state(statusword) is not DriveState.OPERATION_ENABLED:
+        if word & ENABLE_WORD != ENABLE_WORD or known_state(statusword) is not DriveState.OPERATION_ENABLED:
             self._target, self._offered = None, False
         elif statusword >> SETPOINT_ACKNOWLEDGE_BIT & 1:
             self._offered = False

@@ -30,6 +30,7 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
+from canprobe.cell.planning.units import PROFILE_SPEED
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.port import nothing
@@ -40,6 +41,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     CHANGE_IMMEDIATELY_BIT,
     CONTROLWORD,
     DISABLED_STATES,
+    ENABLE_WORD,
     HOMING_ATTAINED_BIT,
     HOMING_ERROR_BIT,
     HOMING_START_BIT,
@@ -48,6 +50,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     POSITION,
     SETPOINT_ACKNOWLEDGE_BIT,
     STATUSWORD,
+    TARGET_POSITION,
     TARGET_REACHED_BIT,
     UNPOWERED_STATES,
     DriveState,
@@ -238,8 +241,6 @@ class LedDrive:
 
 TOLERANCE_RAD = math.radians(1.0)
 """Largest difference of a position from the record, and at home from the home offset, rad; of a slide in proportion."""
-TARGET, PROFILE_SPEED = 0x607A, 0x6081
-_ENABLE = 0x0F
 _MOVES = {
     **{1: (-1, "the index pulse at the negative limit switch"), 2: (1, "the index pulse at the positive limit switch")},
     **{17: (-1, "the negative limit switch"), 18: (1, "the positive limit switch")},
@@ -404,7 +405,7 @@ class Homing:
             for write in setup.homing:
                 drive.write(replace(write, value=-home) if write.index == HOME_OFFSET else write)
             drive.enable(OperationMode.HOMING)
-            drive.command(_ENABLE | 1 << HOMING_START_BIT)
+            drive.command(ENABLE_WORD | 1 << HOMING_START_BIT)
             what = f"find its home position by method {zero.method}"
             late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
             found_bits = HOMING_ATTAINED_BIT, TARGET_REACHED_BIT
@@ -444,11 +445,11 @@ class Homing:
         """Move a drive to a target in profile position."""
         drive.write(Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         drive.enable(OperationMode.PROFILE_POSITION)
-        drive.write(Write(TARGET, 0, target, "target position"))
-        drive.command(_ENABLE | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT)
+        drive.write(Write(TARGET_POSITION, 0, target, "target position"))
+        drive.command(ENABLE_WORD | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT)
         what, late = "move back into its range", f"is homed, but did not reach {target} (607Ah), inside its range"
         drive.wait_for_bits((SETPOINT_ACKNOWLEDGE_BIT,), self.link.times.enable_s, what, late)
-        drive.command(_ENABLE)
+        drive.command(ENABLE_WORD)
         drive.wait_for_bits((TARGET_REACHED_BIT,), timeout_s, what, late)
         # Bit 10 may still be that of the homing, or of a drive whose position window (6067h) is switched off.
         drive.wait_until(lambda: abs(drive.read(POSITION) - target) <= tolerance, timeout_s, lambda: late)
@@ -457,4 +458,4 @@ class Homing:
 def _has_profile_position(setup: NodeConfiguration) -> bool:
     drive = Description(setup.dictionary)
     listed = drive.modes is None or OperationMode.PROFILE_POSITION in drive.modes
-    return listed and drive.entry(TARGET) is not None and drive.entry(PROFILE_SPEED) is not None
+    return listed and drive.entry(TARGET_POSITION) is not None and drive.entry(PROFILE_SPEED) is not None

@@ -104,7 +104,7 @@ def _variable(setup: NodeConfiguration, index: int, subindex: int) -> Any:  # ca
 ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
 SAVE_SIGNATURE = int.from_bytes(b"save", "little")
-IDENTITY, REVISION_SUBINDEX = 0x1018, 3
+IDENTITY, REVISION_SUBINDEX, SERIAL_SUBINDEX = 0x1018, 3, 4
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 
 
@@ -177,7 +177,8 @@ class NodeBringUp:
                 )
             elif got != expected:
                 place = f"1018h:{subindex:02X} {IDENTITY_NAMES[subindex]}"
-                meant = f"; if it is meant, its serial_number is {got:#x} in the cell file" if subindex == 4 else ""
+                is_serial = subindex == SERIAL_SUBINDEX
+                meant = f"; if it is meant, its serial_number is {got:#x} in the cell file" if is_serial else ""
                 raise setup.error(
                     f"is not the device of {setup.eds}: {place} expected {expected:#x}, got {got:#x}{meant}"
                 )

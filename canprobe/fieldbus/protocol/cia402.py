@@ -33,6 +33,8 @@ CHANGE_IMMEDIATELY_BIT = 5  # PP
 RELATIVE_BIT = 6  # PP
 FAULT_RESET_BIT = 7
 HALT_BIT = 8
+ENABLE_WORD = 0x000F
+"""Controlword that enables the operation, and keeps it."""
 
 # Objects of the first axis, by index.
 CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY = 0x6040, 0x6041, 0x6060, 0x6061
@@ -194,8 +196,8 @@ _WORDS_TOWARD: dict[DriveState, dict[DriveState, int]] = {
     | {
         _S.SWITCH_ON_DISABLED: 0x0006,
         _S.READY_TO_SWITCH_ON: 0x0007,
-        _S.SWITCHED_ON: 0x000F,
-        _S.OPERATION_ENABLED: 0x000F,
+        _S.SWITCHED_ON: ENABLE_WORD,
+        _S.OPERATION_ENABLED: ENABLE_WORD,
         _S.FAULT: 0x0080,
     },
 }
