@@ -206,6 +206,8 @@ class ProbeSettings:
     """Distance of the centre of the sphere from the flange along tool z. `canprobe run calibrate` finds it."""
     centre_lateral_mm: Vec2 = (0.0, 0.0)
     """Offset of the centre along tool x and y. `canprobe run calibrate` finds it."""
+    position_sd_mm: Annotated[float, Range(0, 10)] = 0.2
+    """Standard deviation of where the centre is on the flange, along each axis. `canprobe run calibrate` finds it."""
     mass_kg: Annotated[float, Range(0, 5)] = 0.3
     """Mass of the probe; the dynamic arm carries it."""
     stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, refuse_narrow, scan_axes, true_object
-from canprobe.cell.scene.hardware import MM, EmulateSettings, JointSettings
+from canprobe.cell.scene.hardware import MM, ArmSettings, EmulateSettings, JointSettings
 from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -60,6 +60,9 @@ SEARCH = 8e-3
 """Distance beyond the expected place at which an approach gives up, m."""
 LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
+ARM_ACCURACY_MM = 0.5
+"""Standard deviation of the flange's place of a real arm whose file states none: arms of this size whose chain nobody
+has calibrated are off by some tenths of a millimetre."""
 EMULATED_ARRAY = "inch16"
 """Calibration of the emulated array."""
 LATENCY_SIGMAS = 3.0
@@ -92,7 +95,10 @@ def resolve(scene: Scene) -> Setup:
     keep_out, lacking = _keep_out(scene, arm, None if bare else settings)
     if arm is not None:
         arm = replace(arm, warnings=(*arm.warnings, *lacking))
-    probe = Probe(np.eye(4), 0.0, stiffness, 0.0) if bare else Probe(T, radius, stiffness, settings.mass_kg)
+    probe = Probe(np.eye(4), 0.0, stiffness, 0.0)
+    if not bare:
+        sd = settings.position_sd_mm * MM
+        probe = Probe(T, radius, stiffness, settings.mass_kg, sd, math.hypot(sd, _arm_accuracy(scene.arm)))
     return Setup(
         scene=scene,
         saved=saved,
@@ -115,6 +121,14 @@ def resolve(scene: Scene) -> Setup:
         task=_task(scene, arm, array, probe),
         truth=_truth(scene, arm, array, bodies, probe),
     )
+
+
+def _arm_accuracy(settings: ArmSettings | None) -> float:
+    """Standard deviation of the flange's place in base, per axis, m."""
+    if settings is None:
+        return 0.0
+    stated = 0.0 if settings.emulated else ARM_ACCURACY_MM
+    return (stated if settings.accuracy_mm is None else settings.accuracy_mm) * MM
 
 
 def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
