@@ -245,9 +245,9 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
     from canprobe.mechanics.touch.linear_algebra import rms
     from canprobe.mechanics.touch.map import nodes as column
 
-    names = ("sigma_um", "sigma_relative_um", "disagree_fraction", "stiffness_n_m3", "stiffness_sigma_percent", "common")
+    names = ["sigma_um", "sigma_relative_um", "disagree_fraction", "stiffness_n_m3", "stiffness_sigma_percent"]
+    names += ["common", "rms_error_um", "within_2_sigma_fraction", "within_2_sigma_relative_fraction"]
     found: dict[str, Any] = {"contacts": 0, "nodes": len(surface_map)} | dict.fromkeys(names)
-    found |= dict.fromkeys(("rms_error_um", "within_2_sigma_fraction", "within_2_sigma_relative_fraction"))
     if not len(surface_map):
         return found
     found["contacts"] = int(surface_map.nodes.rows[:, column.COUNT].sum())

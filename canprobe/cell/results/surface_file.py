@@ -131,7 +131,8 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
     lateral, height, normal = (float(values[name]) for name in _OF_NOISE)
     lag, scale, x, y = values["sigma_common"].tolist()
     of_height, of_normal, of_image = values["path_per_sample_m"].tolist()
-    noise = MapNoise(lateral, height, normal, of_height, of_normal, of_image, (lag, scale, x, y), float(values["sigma_place_m"]))
+    common, place = (lag, scale, x, y), float(values["sigma_place_m"])
+    noise = MapNoise(lateral, height, normal, of_height, of_normal, of_image, common, place)
     return SurfaceMap.of_nodes(
         rows,
         None if math.isnan(radius) else PadLayer(radius, stated),

@@ -79,7 +79,7 @@ def test_a_scan_with_a_wrong_tool_gets_better_by_it(calibrated):
     np.testing.assert_allclose(believed + better.plant.tool_error_mm, real, atol=1e-9)  # the real tool stays
     runs = [canprobe.run(each, bus="direct", files=False, duration_s=3.0) for each in (scene, better)]
     wrong, right = (result.summary["shape"] for result in runs)
-    assert right["map"]["sigma_um"] < 0.3 * wrong["map"]["sigma_um"]  # of 0.2 mm that nobody measured
+    assert right["map"]["sigma_um"] < 0.7 * wrong["map"]["sigma_um"]  # five touches, and 0.2 mm that nobody measured
     assert right["map"]["within_2_sigma_fraction"] > 0.9
     assert wrong["map"]["within_2_sigma_relative_fraction"] > 0.9
     assert wrong["position_rms_mm"] > 0.4
