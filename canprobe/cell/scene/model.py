@@ -143,8 +143,10 @@ class SensorSettings:
     """Rate of the images. A SYNC triggers each, or what `wire.sampling` names."""
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
     """Pressure at the largest count of a taxel."""
-    serial_number: SerialNumber | None = None
-    """Serial number (1018h:04) that the array must have. Left out: that of its calibration file, or any."""
+    serial_number: SerialNumber | str | None = None
+    """Serial number (1018h:04) that the array must have; of an array that is no CANopen node, its name, as on its
+    label. Left out: the number of its calibration file, or any; an array without a name is another one than its
+    file's."""
     calibration: Annotated[str | None, ScenePath()] = None
     """Calibration file of the array, by `canprobe calibrate array`: a packaged name, or a path relative to the file.
     Left out: that of the emulated array; a real array then measures in nominal newtons."""

@@ -201,11 +201,13 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
 
     calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
     calibrated = settings.calibration is not None or settings.emulated
-    serial = settings.serial_number if settings.serial_number is not None else calibration.serial_number
-    if calibration.serial_number not in (None, serial):
-        calibration = calibration.of_another()
+    serial = settings.serial_number
+    if serial is None and scene.array_is_node:  # which bring-up asks
+        serial = calibration.serial_number
     if not calibrated:  # creep of the emulated array says nothing about a real one
         calibration = replace(calibration, force=UNSTATED)
+    if not calibrated or calibration.serial_number not in (None, serial):
+        calibration = calibration.of_another()
     positions, normals = (
         np.array(one) if one is not None else None for one in (settings.positions_mm, settings.normals)
     )
@@ -237,7 +239,7 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
         channel=settings.channel or scene.bus.channel,
         eds=settings.eds,
         emulated=settings.emulated,
-        serial=serial if scene.array_is_node else None,
+        serial=serial if scene.array_is_node and isinstance(serial, int) else None,
         name=settings.array,
         mode=settings.mode,
         window=settings.window,
