@@ -16,7 +16,7 @@ from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.scene.geometry import mesh_warnings
-from canprobe.cell.scene.setup import Arm, Array, Setup, Touch, Touching
+from canprobe.cell.scene.setup import Arm, Array, Calibrate, Setup, Touch, Touching
 from canprobe.errors import install_line
 from canprobe.fieldbus.bus.real.adapters import bus_open_to_others
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
@@ -213,6 +213,8 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
         yield from _long_waits(setup.arm.missed_syncs, setup.rate_hz)
     if setup.array is not None:
         yield from _calibration_warnings(setup.array)
+    if setup.touch is not None:
+        yield from _beyond_the_calibration(setup.touch)
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
     if setup.arm is not None and setup.touch is not None:
@@ -224,6 +226,18 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
         yield (
             f"bus.bit_error_rate = {bus.bit_error_rate:g}: response times hold for a wire without errors; each error "
             f"adds up to {each_us:.0f} µs, and up to {100 * lost:.2g} % of the frames have one"
+        )
+
+
+def _beyond_the_calibration(task: Touch | Calibrate) -> Iterator[str]:
+    """Warning of a force that the calibration has not seen."""
+    from canprobe.mechanics.touch.image.force_errors import BEYOND_SIGMA
+
+    errors = task.array.calibration.force
+    if more := errors.beyond(task.force):
+        yield (
+            f"task.force_n = {task.force:g}: the calibration of the array has forces up to {errors.highest:g} N; beyond"
+            f" them the force errs by {100 * BEYOND_SIGMA * more:.1f} % more (1σ), and regions are wider"
         )
 
 

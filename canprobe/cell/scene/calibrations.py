@@ -166,6 +166,8 @@ class ForceKeys:
     """Decades of creep in the touches that newtons rest on."""
     spread_percent: Percent = 0.0
     """Error from one array of a make to the next. 0 in the file of a single array."""
+    highest_n: Annotated[float, Range(0.01, 1000)] | None = None
+    """Largest force of the touches. Left out: it is not known, and errors do not grow beyond it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,6 +65,7 @@ class ShapeTracker:
         estimator: the online estimator.
         every: samples between two answers.
         surface_map: map that takes the contacts, too; None: none.
+        beyond: how far the force is above all that the calibration of the array has seen (`ForceErrors.beyond`).
 
     Attributes:
         records: the answers; of more than `RECORDS_KEPT` every second, every fourth and so on.
@@ -75,7 +76,9 @@ class ShapeTracker:
         doubted: whether images mean another curvature than the calibration says, so that regions are wider.
     """
 
-    def __init__(self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None) -> None:
+    def __init__(
+        self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None, beyond: float = 0.0
+    ) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: deque[ContactSample] = deque(maxlen=SAMPLES_KEPT)
         self.travelled_m = 0.0
@@ -83,7 +86,7 @@ class ShapeTracker:
         self.doubted = False
         self._estimator = estimator
         self._every = max(1, every)
-        self._map = surface_map
+        self._map, self._beyond = surface_map, beyond
         self._waiting: deque[tuple[ContactSample, float]] = deque()  # with the path up to each
         self._unmapped: list[ContactSample] = []
         self._added = self._taken = self._answers = 0
@@ -220,10 +223,11 @@ class ShapeTracker:
         if has_diverged(estimate):
             self._start_afresh()
             return
-        if self.doubted:
-            from canprobe.mechanics.touch.online.regions import scaled  # only where a shape is asked for
+        if self.doubted or self._beyond:
+            from canprobe.mechanics.touch.online import regions  # only where a shape is asked for
 
-            estimate = scaled(estimate)
+            factor = regions.beyond_factor(self._beyond) * (regions.FOREIGN_ARRAY_FACTOR if self.doubted else 1.0)
+            estimate = regions.scaled(estimate, factor)
         self._found = estimate, at_s, travelled
 
     def _start_afresh(self) -> None:

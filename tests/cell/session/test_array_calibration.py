@@ -113,6 +113,26 @@ def test_an_array_that_is_no_node_has_a_name_in_the_cell_file(tmp_path):
         load_scene("press", {"sensor.serial_number": "left"})
 
 
+def test_a_force_beyond_the_calibration_is_less_certain():
+    within, beyond = (
+        make_plan(
+            resolve(
+                load_scene("press", {"task.force_n": force, "limits.force_max_n": 20.0, "sensor.full_scale_kpa": 300.0})
+            )
+        )
+        for force in (3.0, 6.0)
+    )
+    assert not any("has forces up to" in line for line in within.warnings)
+    assert any(
+        "task.force_n = 6: the calibration of the array has forces up to 3 N; beyond them the force errs by 3.5 %"
+        in line
+        for line in beyond.warnings
+    )
+    errors = beyond.setup.array.calibration.force
+    at_3, at_6 = (errors.sigma(force, 0.05, 0.0).total / force for force in (3.0, 6.0))
+    assert math.hypot(at_3, 0.05 * math.log(2.0)) == pytest.approx(at_6)
+
+
 def test_there_are_at_most_forty_touches_and_forces_only_grow_on_an_object():
     every = list(visits(0.025, 0.025, loads=True, one_by_one=True))
     assert sum(len(v.presses) for v in every) <= 40

@@ -64,6 +64,7 @@ def fit_force(
         creep_decades=float(decades[used].mean()),
         array=max(array, MIN_ARRAY_SIGMA),
         spread=spread,
+        highest=float(corrected.max()),
     )
 
 

@@ -29,6 +29,11 @@ CUT_SIGMA = 0.05
 """Error of the force of a patch that reaches the pad's edge, relative: a part of it lies beyond."""
 
 
+BEYOND_SIGMA = 0.05
+"""Error of a force above those of the calibration, relative, for each unit of `ForceErrors.beyond`: of scans with 5 to
+15 N by a calibration up to 3 N forces are 1 to 6 % too small for each, by the window and the form of a large patch."""
+
+
 def upper_end(force: float, sigma: float) -> float:
     """Upper end of a force with a standard deviation, both in N: the true force is above it once in fifty."""
     return force + UPPER_SIGMAS * sigma
@@ -65,6 +70,7 @@ class ForceErrors:
         creep_decades: decades of creep in the touches that newtons rest on.
         array: standard deviation of the force at `USUAL_LIGHTNESS`.
         spread: standard deviation of the force from array to array, where the calibration stands for a make.
+        highest: largest force of the touches that the calibration was fitted to, N; infinite where it is not known.
     """
 
     creep: float
@@ -72,6 +78,11 @@ class ForceErrors:
     creep_decades: float
     array: float
     spread: float
+    highest: float = math.inf
+
+    def beyond(self, force: float) -> float:
+        """How far a force (N) is above all that the calibration has seen: logarithm of their ratio, at least 0."""
+        return math.log(max(force / self.highest, 1.0))
 
     def sigma(
         self,
@@ -103,7 +114,7 @@ class ForceErrors:
         late = force * late_decades * math.hypot(self.creep, self.creep_sigma)
         return ForceSigma(
             reference * force,
-            force * math.hypot(light, self.spread),
+            force * math.hypot(light, self.spread, BEYOND_SIGMA * self.beyond(force)),
             math.hypot(self.creep_sigma * creep_n, late),
             force * math.hypot(BRIDGED_SIGMA * bridged, BENT_SIGMA * bent, CUT_SIGMA * cut),
         )

@@ -18,6 +18,7 @@ region of curvature holds, in the order in which it comes in:
 6. Lag of the answer, scale, error of the tool, drag of the pad, each an error that is added: `systematic_errors`.
 7. Ground that was touched before narrows it, less where the curvature changes there: `map_fusion`.
 8. An array that is not as its calibration says, a factor: `FOREIGN_ARRAY_FACTOR`, once `CalibrationCheck` has found it.
+9. A force above those of the calibration, a factor: `beyond_factor`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,16 @@ FOREIGN_ARRAY_FACTOR = 2.0
 draw of study `regions`."""
 
 
-def scaled(answer: SurfaceEstimate, factor: float = FOREIGN_ARRAY_FACTOR) -> SurfaceEstimate:
+BEYOND_FACTOR = 0.6
+"""Growth of that factor for each unit of `ForceErrors.beyond`, from scans of spheres and planes with 5 to 15 N."""
+
+
+def beyond_factor(beyond: float) -> float:
+    """Factor of the standard deviations of curvature where the force is beyond those of the calibration."""
+    return 1.0 + BEYOND_FACTOR * beyond
+
+
+def scaled(answer: SurfaceEstimate, factor: float) -> SurfaceEstimate:
     """An answer whose standard deviations of curvature are `factor` times as large."""
     f, evidence, root = factor, answer.evidence, answer.model_root
     covariance = answer.covariance * f**2
