@@ -25,11 +25,11 @@ from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.protocol.pdo import RPDOS
 from canprobe.fieldbus.tools.conform import outcome
-from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
+from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 from canprobe.fieldbus.tools.conform.permits import Permits, WriteList, is_object
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
@@ -87,7 +87,7 @@ class Examination:
         journal: the snapshot; it is there once the device was read.
     """
 
-    bench: Bench
+    bench: PdoBench
     journal: Journal
 
     def __init__(
@@ -148,7 +148,7 @@ class Examination:
         written = settings.written.with_motion() if settings.motion else settings.written
         permits = Permits(self._node_id, surroundings, written)
         device = ExaminedDevice(self._node_id, self._description)
-        self.bench = bench = Bench(self._port, device, permits, settings.times)
+        self.bench = bench = PdoBench(self._port, device, permits, settings.times)
         bench.bitrate, bench.fd, bench.by_hand = settings.bitrate, settings.fd, self._by_hand
         try:
             bench.first_answer = bench.ask(READ_TYPE)
