@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping, Sequence
 
-from canprobe.fieldbus.node.core import NO_ROUTES, DelayedFrames, NodeCore, Route, Service
+from canprobe.fieldbus.node.core import DelayedFrames, NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Value, key_of
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.pdo_rules import PdoRules
@@ -44,6 +44,8 @@ class PdoEngine(Service):
         emcy: EMCY producer for errors of an RPDO.
         on_sync: function that is called as `on_sync(t_ns, counter)` at a SYNC in operational, before TPDOs are packed.
     """
+
+    states = frozenset({NmtState.OPERATIONAL})
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int], None]) -> None:
         self._core, self._on_sync = core, on_sync
@@ -105,9 +107,7 @@ class PdoEngine(Service):
                 tpdo.started(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
-        """Identifiers of RPDOs and of remote requests for TPDOs, in operational; PDOs may share an identifier."""
-        if self._core.state is not NmtState.OPERATIONAL:
-            return NO_ROUTES
+        """Identifiers of RPDOs and of remote requests for TPDOs; PDOs may share an identifier."""
         routes: dict[int, Route] = {}
         for rpdo in self._rpdos:
             if rpdo.cob_id is not None:

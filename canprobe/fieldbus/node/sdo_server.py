@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node import sdo_transfers
-from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, DelayedFrames, NodeCore, Route, Service, check_cob_id
+from canprobe.fieldbus.node.core import TALKING_STATES, DelayedFrames, NodeCore, Route, Service, check_cob_id
 from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
 from canprobe.fieldbus.node.sdo_transfers import Transfer
@@ -28,6 +28,8 @@ class SdoServer(Service):
     Attributes:
         state: state, which says for what frame of the client it waits.
     """
+
+    states = TALKING_STATES
 
     def __init__(self, core: NodeCore, index: int = 0x1200) -> None:
         self._core = core
@@ -60,12 +62,10 @@ class SdoServer(Service):
             self.reset(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
-        """The request identifier, in pre-operational and operational."""
+        """The request identifier."""
         cob_id, answer_id = self._cob_id(1, SDO_RX_BASE), self._cob_id(2, SDO_TX_BASE)
         self._answer_id = answer_id & 0x7FF
-        if self._core.state not in TALKING_STATES or (cob_id | answer_id) & INVALID_FLAG:
-            return NO_ROUTES
-        return {cob_id & 0x7FF: self._receive}
+        return {} if (cob_id | answer_id) & INVALID_FLAG else {cob_id & 0x7FF: self._receive}
 
     def _cob_id(self, subindex: int, base: int) -> int:
         default = base + self._core.node_id if self._index == 0x1200 else INVALID_FLAG

@@ -63,10 +63,8 @@ def target_at_enable(case: Case, node: SeenNode) -> Watch[events.ControlSeen | e
         if target is None or position is None:
             continue
         command, armed, off = armed, None, abs(target.value - position.value)
-        allowed, where = (
-            node.tolerance(case.bus.period_ns),
-            f"target {target.value} while the axis is at {position.value}",
-        )
+        allowed = node.tolerance(case.bus.period_ns)
+        where = f"target {target.value} while the axis is at {position.value}"
         case.expect(node, off <= allowed, f"{where}: {off} off, {allowed:.0f} allowed", position, target, command)
 
 

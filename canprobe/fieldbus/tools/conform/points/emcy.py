@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, Emcy, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE
-from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
+from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
@@ -46,7 +46,7 @@ def history(bench: PdoBench) -> None:
 def write_to_history(bench: PdoBench) -> None:
     """1003h:00 takes nothing but 0."""
     bench.need((0x1003, 0))
-    bench.must_refuse(pack_write(0x1003, 0, b"\1"), (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
+    bench.must_refuse_write(0x1003, 0, b"\1", (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
 
 
 @point(42, "empty entry", "1003h", accepted.text(accepted.NO_DATA) + ", or 06090011h")

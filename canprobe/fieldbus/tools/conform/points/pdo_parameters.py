@@ -36,8 +36,7 @@ def _refused_entry(bench: PdoBench, pdo: int, what: str) -> int:
     """Write another word to the first mapped entry, which must be refused; the word that is there."""
     first = bench.number(pdo + TO_MAPPING, 1)
     other = _IDENTITY_WORD if first != _IDENTITY_WORD else _ABSENT_WORD
-    request = pack_write(pdo + TO_MAPPING, 1, other.to_bytes(4, "little"))
-    bench.must_refuse(request, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), what)
+    bench.must_refuse_write(pdo + TO_MAPPING, 1, other, (*accepted.MAPPING_LOCKED, *accepted.NOT_MAPPABLE), what)
     return first
 
 
@@ -59,7 +58,7 @@ def mapping_while_valid(bench: PdoBench) -> None:
 def count_while_valid(bench: PdoBench) -> None:
     """The count of a PDO in use gets 0."""
     pdo = _valid(bench, TPDOS, mapping=True)
-    bench.must_refuse(pack_write(pdo + TO_MAPPING, 0, b"\0"), accepted.MAPPING_LOCKED, "the count of a PDO in use")
+    bench.must_refuse_write(pdo + TO_MAPPING, 0, b"\0", accepted.MAPPING_LOCKED, "the count of a PDO in use")
 
 
 @point(25, "mapping while counted", MAPPING, accepted.MAPPING_LOCKED, needs="nmt")
@@ -124,7 +123,7 @@ def identifier_while_valid(bench: PdoBench) -> None:
     for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = _valid(bench, area)
         word = bench.number(pdo, 1) ^ _CHANGED_BIT
-        bench.must_refuse(pack_write(pdo, 1, word.to_bytes(4, "little")), accepted.PDO_LOCKED, "another identifier")
+        bench.must_refuse_write(pdo, 1, word, accepted.PDO_LOCKED, "another identifier")
 
 
 @point(28, "times while valid", "18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
@@ -135,7 +134,7 @@ def times_while_valid(bench: PdoBench) -> None:
         if bench.device.writable(pdo, subindex):
             tried += 1
             value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
-            bench.must_refuse(pack_write(pdo, subindex, value), accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
+            bench.must_refuse_write(pdo, subindex, value, accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
     bench.require(tried, "the TPDOs have neither inhibit time nor start value")
 
 
@@ -145,8 +144,7 @@ def restricted_identifiers_of_pdos(bench: PdoBench) -> None:
     for area in filter(bench.device.pdos, (RPDOS, TPDOS)):
         pdo = bench.idle_pdo(area)
         for cob_id in RESTRICTED_IDS:
-            request = pack_write(pdo, 1, cob_id.to_bytes(4, "little"))
-            bench.must_refuse(request, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
+            bench.must_refuse_write(pdo, 1, cob_id, accepted.VALUE, f"identifier {cob_id:03X}h for {pdo:04X}h")
 
 
 @point(29, "reserved types", "transmission type", accepted.VALUE, needs="nmt")
@@ -156,7 +154,7 @@ def reserved_types(bench: PdoBench) -> None:
         pdo = bench.idle_pdo(area)
         bench.need((pdo, 2))
         for kind in _RESERVED_TYPES[area]:
-            bench.must_refuse(pack_write(pdo, 2, bytes((kind,))), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
+            bench.must_refuse_write(pdo, 2, bytes((kind,)), accepted.VALUE, f"type {kind:02X}h for {pdo:04X}h")
 
 
 @point(38, "dummies", MAPPING, "an RPDO takes the dummies that the EDS allows", needs="nmt eds")

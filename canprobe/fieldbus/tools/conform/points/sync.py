@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
-from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -20,7 +19,7 @@ def reserved_overflow(bench: PdoBench) -> None:
     if bench.device.number(0x1006):
         bench.put(0x1006, 0, 0)
     for value in _RESERVED:
-        bench.must_refuse(pack_write(0x1019, 0, bytes((value,))), accepted.VALUE, f"{value} for 1019h")
+        bench.must_refuse_write(0x1019, 0, bytes((value,)), accepted.VALUE, f"{value} for 1019h")
 
 
 @point(39, "overflow while a period is set", "1019h", accepted.SYNC_LOCKED, needs="sync")
@@ -29,7 +28,7 @@ def overflow_while_period(bench: PdoBench) -> None:
     bench.need((0x1019, 0), (0x1006, 0))
     bench.put(0x1006, 0, _PERIOD_US)
     value = bytes((10 if bench.device.number(0x1019) != 10 else 20,))
-    bench.must_refuse(pack_write(0x1019, 0, value), accepted.SYNC_LOCKED, "1019h while 1006h is not 0")
+    bench.must_refuse_write(0x1019, 0, value, accepted.SYNC_LOCKED, "1019h while 1006h is not 0")
     bench.put(0x1006, 0, 0)
     bench.put(0x1019, 0, value[0])
 
