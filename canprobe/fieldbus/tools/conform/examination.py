@@ -181,23 +181,19 @@ class Examination:
             self._check_power()
         except outcome.BenchFailure as error:
             self._ended = f"not examined: {error}"
-        else:
-            self._put_back()
-            self._look_for_standing_errors()
+            return
+        self._put_back()
+        if not self.bench.permits.surroundings.lacks("nmt"):
+            with contextlib.suppress(CanprobeError):  # a device that fails here fails the points that are about it
+                self._look_for_standing_errors()
+            with contextlib.suppress(CanprobeError):
+                self._put_back()
 
     def _look_for_standing_errors(self) -> None:
         """Find the errors that the device has already, and whether they keep it out of operational.
 
         An error that stays would otherwise fail every point that needs operational, and each for another reason.
         """
-        if self.bench.permits.surroundings.lacks("nmt"):
-            return
-        with contextlib.suppress(CanprobeError):  # a device that fails here fails the points that are about it
-            self._start_once()
-        with contextlib.suppress(CanprobeError):
-            self._put_back()
-
-    def _start_once(self) -> None:
         bench = self.bench
         state: int | None = None
         with contextlib.suppress(outcome.Deviation, outcome.PointNotApplicable):

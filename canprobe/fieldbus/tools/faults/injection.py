@@ -54,7 +54,8 @@ class FaultyNodes:
     def end(self, fault: Fault) -> None:
         """End a fault at the next frame or deadline of its node."""
         for node in self.nodes:
-            node.remove(fault)
+            if node.node_id == fault.node_id:
+                node.remove(fault)
 
     def clear(self) -> list[Fault]:
         """End all faults; return them."""
