@@ -161,7 +161,7 @@ class FaultRun:
             failures += self._rest_problems()
         noticed_ns = self._noticed_ns()
         return {
-            "hits": sum(node.hits for node in self.faulty.nodes),
+            "hits": sum(node.host.hits for node in self.faulty.nodes),
             "outcome": self.outcome,
             "reason": reason,
             "named": bool(reason) and self._is_named(reason),

@@ -5,10 +5,11 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from heapq import heappush
 from pathlib import Path
 from random import Random
 from types import MappingProxyType
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import Frame
@@ -97,25 +98,30 @@ def number_text(name: str, value: float) -> str:
     return f"{name}=0x{int(value):X}" if name in ("index", "code") else f"{name}={value:g}"
 
 
-class Host(Protocol):
-    """A node with faults, as an effect sees it; `faulty_node` has the class.
+class Host:
+    """A node with faults, as their effects see it: beside its own frames it has those that they hold back or make up.
+
+    Args:
+        node: the node.
 
     Attributes:
-        node: the node.
-        hits: number of frames and events so far.
+        hits: number of frames that were changed, lost, moved or made up, and of reboots.
+        late: heap of the frames that go on later: time, number, whether the node receives it, frame.
+        swapped: frames to send behind those that the node sends next.
+        said: frames that the node did not make, to send with its next answers.
     """
 
-    node: SlaveNode
-    hits: int
+    def __init__(self, node: SlaveNode) -> None:
+        self.node, self.hits = node, 0
+        self.late: list[tuple[int, int, bool, Frame]] = []
+        self.swapped: list[Frame] = []
+        self.said: list[Frame] = []
+        self._count = 0
 
     def later(self, frame: Frame, t_ns: int, *, incoming: bool) -> None:
         """Let a frame go on at `t_ns`."""
-
-    def swap(self, frame: Frame) -> None:
-        """Send a frame behind those that the node sends next."""
-
-    def say(self, frame: Frame) -> None:
-        """Send a frame that the node did not make, with its next answers."""
+        self._count += 1
+        heappush(self.late, (t_ns, self._count, incoming, frame))
 
 
 class Effect:

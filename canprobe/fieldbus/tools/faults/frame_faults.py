@@ -90,7 +90,7 @@ class Reorder(FrameFault):
     name = "reorder"
 
     def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        self.host.swap(frame)
+        self.host.swapped.append(frame)
         return ()
 
 

@@ -58,7 +58,7 @@ class ObjectAborted(FrameFault):
         index, subindex = place_of(data)
         if data[0] >> 5 not in _INITIATE_REQUESTS or index != self.index(data):
             return None
-        self.host.say((frames.SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
+        self.host.said.append((frames.SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
         return ()
 
     def index(self, data: bytes) -> int:
