@@ -93,6 +93,27 @@ class Fault:
         return f"{self.kind.name}{way}{given} at node {self.node_id}, {begins}{lasts}, {100 * self.share:.0f} %"
 
 
+@dataclass(slots=True)
+class FaultSpan:
+    """When a fault held, on the clock of the bus.
+
+    Attributes:
+        fault: the fault.
+        begin_ns: its beginning.
+        end_ns: its end; `FOREVER_NS` while it holds.
+    """
+
+    fault: Fault
+    begin_ns: int
+    end_ns: int = FOREVER_NS
+
+    @property
+    def text(self) -> str:
+        """Node, kind and values of the fault."""
+        given = "".join(f" {name}={value:g}" for name, value in self.fault.values.items())
+        return f"node {self.fault.node_id}: {self.fault.kind.name}{given}"
+
+
 def number_text(name: str, value: float) -> str:
     """A number of a fault as it is typed: indices and codes of CANopen in hexadecimal."""
     return f"{name}=0x{int(value):X}" if name in ("index", "code") else f"{name}={value:g}"
@@ -149,6 +170,7 @@ class Effect:
         dark: whether the node neither sends nor hears nor computes.
         due_ns: time at which `advance` is called next; None: never.
         end_ns: time at which it ends.
+        span: when it held.
         left: number of frames that it may still hit.
     """
 
@@ -181,6 +203,7 @@ class Effect:
         self.fault, self.host, self.node = fault, host, host.node
         self.rng = Random(fault.seed)
         self.end_ns = fault.end_ns
+        self.span = FaultSpan(fault, fault.start_ns)
         self.left = fault.hits
 
     def begin(self, t_ns: int) -> Sequence[Frame] | None:

@@ -13,7 +13,7 @@ from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID, Frame, NmtState
-from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Effect, Fault, Host
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Effect, Fault, FaultSpan, Host
 
 EVENTS = ("boot-up", "operational", "enabled", "sync")
 """Events of a node at which a fault may begin: its next boot-up, NMT start, operation enabled, or SYNC."""
@@ -29,13 +29,13 @@ class FaultyNode(Participant):
     Attributes:
         host: the node as its faults see it, with what they hold back.
         now_ns: time of the last frame or deadline.
-        history: what happened: (time in ns, ``begins`` or ``ends``, fault).
+        spans: when its faults held, in the order of their beginnings.
     """
 
     def __init__(self, node: SlaveNode, faults: Iterable[Fault] = ()) -> None:
         self.node, self.host = node, Host(node)
         self.now_ns = 0
-        self.history: list[tuple[int, str, Fault]] = []
+        self.spans: list[FaultSpan] = []
         self._pending: list[Fault] = []
         self._effects: list[Effect] = []
         self._acts: list[Callable[[SlaveNode], object]] = []
@@ -165,14 +165,14 @@ class FaultyNode(Participant):
             out += self._begin(fault, t_ns)
         for effect in [one for one in self._effects if one.end_ns <= t_ns or one.left <= 0]:
             self._effects.remove(effect)
-            self.history.append((t_ns, "ends", effect.fault))
+            effect.span.end_ns = t_ns
             out += effect.end(t_ns) or ()
         return [] if self._is_dark() else out
 
     def _begin(self, fault: Fault, t_ns: int) -> Sequence[Frame]:
-        self.history.append((t_ns, "begins", fault))
         effect = fault.kind(fault, self.host)
-        effect.end_ns = t_ns + fault.duration_ns
+        effect.span.begin_ns, effect.end_ns = t_ns, t_ns + fault.duration_ns
+        self.spans.append(effect.span)
         self._effects.append(effect)
         frames = effect.begin(t_ns)
         self.host.hits += frames is not None

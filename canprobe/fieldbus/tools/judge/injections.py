@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
+from canprobe.fieldbus.tools.faults import FaultSpan, FaultyNode, FaultyNodes
 
 STANDARD_FAULTS = (
     "sdo-slow ms=200 for 2 s",
@@ -21,20 +20,6 @@ STANDARD_FAULTS = (
 """The standard sequence, from what a master may bear to what it must bring up anew."""
 _CALM_NS = 2_000_000_000
 """Time for which the nodes must have been at work before the next fault."""
-
-
-@dataclass(frozen=True, slots=True)
-class Thrown:
-    """A fault that was thrown.
-
-    Attributes:
-        text: node, kind and values of the fault.
-        begin_ns, end_ns: when it held.
-    """
-
-    text: str
-    begin_ns: int
-    end_ns: int
 
 
 class Injections:
@@ -59,14 +44,9 @@ class Injections:
         """Faults of the sequence that were not thrown."""
         return list(self._queue)
 
-    def thrown(self, start_ns: int = 0) -> list[Thrown]:
+    def thrown(self, start_ns: int = 0) -> list[FaultSpan]:
         """Faults that held, in order, with times from a beginning; one that holds ends at the last look."""
-        found = []
-        for fault, begin_ns, end_ns in self._nodes.spans():
-            given = "".join(f" {name}={value:g}" for name, value in fault.values.items())
-            text = f"node {fault.node_id}: {fault.kind.name}{given}"
-            found.append(Thrown(text, begin_ns - start_ns, min(end_ns, self._now_ns) - start_ns))
-        return found
+        return self._nodes.spans(start_ns, self._now_ns)
 
     def look(self, now_ns: int) -> None:
         """Throw the next fault of the sequence when no other holds and the nodes are at work."""
