@@ -239,11 +239,9 @@ class Examination:
                 if unasked and verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE):
                     code = unasked[0].code
                     verdict, detail = Verdict.FAIL, f"EMCY {code:04X}h ({describe(code)}) that nobody asked for"
-            except outcome.PowerStageOn as error:
-                verdict, detail, self._ended = Verdict.ERROR, str(error), f"not examined: {error}"
             except CanprobeError as error:
-                detail = f"{detail}; then {error}" if verdict is Verdict.FAIL else str(error)
-                verdict = verdict if verdict is Verdict.FAIL else Verdict.ERROR
+                fails = verdict is Verdict.FAIL and not self._ended
+                verdict, detail = (verdict, f"{detail}; then {error}") if fails else (Verdict.ERROR, str(error))
         if verdict is Verdict.PASS:
             detail = "; ".join(bench.notes)
         seconds = (bench.now_ns - began_ns) * 1e-9
@@ -255,9 +253,6 @@ class Examination:
         try:
             self._prepare()
             point.run(self.bench)
-        except outcome.PowerStageOn as error:
-            self._ended = f"not examined: {error}"
-            return Verdict.ERROR, str(error)
         except outcome.PointNotApplicable as error:
             if isinstance(error, outcome.NotPermitted):
                 self.report.left_out.append((f"{point.group} {point.title}", str(error)))
@@ -313,14 +308,21 @@ class Examination:
             self._port.drain()
 
     def _check_power(self) -> None:
-        """Check that the power stage of each axis is off. Raises BenchFailure, or PowerStageOn where one is on."""
+        """Check that the power stage of each axis is off.
+
+        Raises:
+            BenchFailure: it cannot be read.
+            PowerStageOn: one is on; the examination has ended.
+        """
         for index in self.bench.device.statuswords:
             try:
                 word = self.bench.number(index)
             except outcome.Deviation as error:
                 raise outcome.BenchFailure(f"{index:04X}h cannot be read: {error}") from error
             if known_state(word) in POWERED_STATES:
-                raise outcome.PowerStageOn(f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)")
+                why = f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)"
+                self._ended = f"not examined: {why}"
+                raise outcome.PowerStageOn(why)
 
     def _put_back(self) -> list[str]:
         """Put back what the point wrote, and all of it where the device booted; it is pre-operational afterwards."""
