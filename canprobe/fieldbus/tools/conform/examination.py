@@ -226,9 +226,8 @@ class Examination:
             return _row(point, Verdict.NOT_APPLICABLE, why)
         bench, began_ns = self.bench, self.bench.now_ns
         verdict, detail = self._run(point)
-        sent, came = (
-            tuple(frame_text(*frame, self._node_id) for frame in frames) for frames in (bench.sent, bench.came)
-        )
+        sent = tuple(frame_text(*frame, self._node_id) for frame in bench.sent)
+        came = tuple(frame_text(*frame, self._node_id) for frame in bench.came)
         written: list[str] = []
         if not self._ended:
             try:

@@ -77,10 +77,7 @@ class FaultyNodes:
             now_ns: present time on that clock.
         """
         spans = sorted((span for node in self.nodes for span in node.spans), key=attrgetter("begin_ns"))
-        return [
-            replace(span, begin_ns=span.begin_ns - start_ns, end_ns=min(span.end_ns, now_ns) - start_ns)
-            for span in spans
-        ]
+        return [FaultSpan(one.fault, one.begin_ns - start_ns, min(one.end_ns, now_ns) - start_ns) for one in spans]
 
     def _node(self, node_id: int, text: str) -> FaultyNode:
         for node in self.nodes:

@@ -66,19 +66,11 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind], now_ns: int = 0) -> F
     incoming = _direction(text, kind, given.pop("direction", None))
     known = {**kind.parameters, **_COMMON}
     values = {name: _number(text, name, value, known) for name, value in given.items()}
-    common = {name: values.pop(name, parameter.default) for name, parameter in _COMMON.items()}
-    return Fault(
-        kind,
-        int(match["node"]),
-        now_ns + (_time(text, match["at"], match["at_unit"]) if match["at"] else 0),
-        _time(text, match["long"], match["long_unit"]) if match["long"] else kind.lasts_ns,
-        values,
-        common["share"],
-        int(common["count"]),
-        incoming,
-        int(common["seed"]),
-        event,
-    )
+    share, count, seed = (values.pop(name, parameter.default) for name, parameter in _COMMON.items())
+    start_ns = now_ns + (_time(text, match["at"], match["at_unit"]) if match["at"] else 0)
+    lasts_ns = _time(text, match["long"], match["long_unit"]) if match["long"] else kind.lasts_ns
+    node_id = int(match["node"])
+    return Fault(kind, node_id, start_ns, lasts_ns, values, share, int(count), incoming, int(seed), event)
 
 
 def _direction(text: str, kind: FaultKind, given: str | None) -> bool | None:

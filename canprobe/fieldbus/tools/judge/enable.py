@@ -40,11 +40,9 @@ _LONGEST_START_NS = 500_000_000
 
 def enables(event: events.ControlSeen) -> bool:
     """Whether a controlword is the first to enable a drive that is not enabled yet."""
-    was = command_of(event.before) if event.before is not None else None
-    is_first = was is not DriveCommand.ENABLE_OPERATION
-    return command_of(event.word, event.before or 0) is DriveCommand.ENABLE_OPERATION and (
-        is_first and not event.node.enabled
-    )
+    enable = DriveCommand.ENABLE_OPERATION
+    enabled_before = event.before is not None and command_of(event.before) is enable
+    return command_of(event.word, event.before or 0) is enable and not enabled_before and not event.node.enabled
 
 
 @rule(1)

@@ -87,11 +87,10 @@ def mapping_too_long(bench: PdoBench) -> None:
     places = sum(bench.device.has(pdo + TO_MAPPING, n) for n in range(1, 65))
     count = min(64 // max(word & 0xFF, 1) + 1, _LONG_ENTRIES)
     if count > max(places, bench.device.number(pdo + TO_MAPPING)):
-        _refused_at_last(
-            bench, pdo, [word] * count, (*accepted.MAPPING_LENGTH, *accepted.NO_ENTRY), "more than the places"
-        )
+        codes, what = (*accepted.MAPPING_LENGTH, *accepted.NO_ENTRY), "more than the places"
     else:
-        _refused_at_last(bench, pdo, [word] * count, accepted.MAPPING_LENGTH, f"{count} entries of {word & 0xFF} bits")
+        codes, what = accepted.MAPPING_LENGTH, f"{count} entries of {word & 0xFF} bits"
+    _refused_at_last(bench, pdo, [word] * count, codes, what)
 
 
 @point(27, "absent object", MAPPING, accepted.NOT_MAPPABLE, needs="nmt")
