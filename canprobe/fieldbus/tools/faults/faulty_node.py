@@ -116,7 +116,7 @@ class FaultyNode(Participant):
 
     def start(self, t_ns: int) -> Sequence[Frame]:
         self.now_ns = t_ns
-        return self._finished(self.node.start(t_ns), (), t_ns)
+        return self._finished(self.node.start(t_ns), t_ns)
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
         self.now_ns = t_ns
@@ -129,7 +129,7 @@ class FaultyNode(Participant):
         out: list[Frame] = []
         for frame in self._through([(can_id, data)], t_ns, incoming=True):
             out += self.node.receive(*frame, t_ns)
-        return [*ready, *self._finished(out, (), t_ns, synchronised=can_id == SYNC_ID)]
+        return [*ready, *self._finished(out, t_ns, synchronised=can_id == SYNC_ID)]
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
         self.now_ns = t_ns
@@ -150,7 +150,8 @@ class FaultyNode(Participant):
         for act in acts:
             answers += self.node.act(t_ns, act)
         made = [f for e in self._effects if e.due_ns is not None and e.due_ns <= t_ns for f in e.advance(t_ns)]
-        out = [*ready, *self._finished(answers, made, t_ns)]
+        self.host.said = made + self.host.said
+        out = [*ready, *self._finished(answers, t_ns)]
         self._busy = bool(self._pending or self._effects or self.host.late or self.host.swapped or self._acts)
         return out
 
@@ -178,13 +179,11 @@ class FaultyNode(Participant):
         self.host.hits += frames is not None
         return frames or ()
 
-    def _finished(
-        self, frames: Sequence[Frame], made: Sequence[Frame], t_ns: int, *, synchronised: bool = False
-    ) -> list[Frame]:
-        """What the bus gets of the node's frames, of those that faults make, and of those said in its name."""
+    def _finished(self, frames: Sequence[Frame], t_ns: int, *, synchronised: bool = False) -> list[Frame]:
+        """What the bus gets of the node's frames, and of those said in its name."""
         sent = self._sent(frames, t_ns)
         said, self.host.said = self.host.said, []
-        out = [*sent, *made, *said, *(frame for effect in self._effects for frame in effect.watch(t_ns))]
+        out = [*sent, *said, *(frame for effect in self._effects for frame in effect.watch(t_ns))]
         if any(fault.event for fault in self._pending):
             booted = any(can_id == HEARTBEAT_BASE + self.node_id and data == b"\0" for can_id, data in frames)
             now = self._events()

@@ -236,11 +236,10 @@ def homing_start(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
         first, asked = first or event.frame, node.known(cia402.MODE)
         if asked is None or asked.value != OperationMode.HOMING:
             continue
+        waited_ns = event.frame.t_ns - asked.t_ns
         if first is event.frame:
             shown = node.known(cia402.MODE_DISPLAY)
             what = f"bit 4 rises while 6061h is {shown.value if shown is not None else 'not read'}"
             case.expect(node, node.mode_confirmed, what, asked, shown, event)
-        elif case.in_a_row(
-            node, first.t_ns < asked.t_ns and event.frame.t_ns - asked.t_ns > _LONGEST_START_NS and node.enabled
-        ):
+        elif case.in_a_row(node, first.t_ns < asked.t_ns and waited_ns > _LONGEST_START_NS and node.enabled):
             case.blame(node, "bit 4 was set before mode 6, and has no edge", first, asked, event)
