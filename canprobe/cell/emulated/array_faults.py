@@ -10,7 +10,7 @@ import numpy as np
 from canprobe.cell.emulated.array import Raw, TactileApplication
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter, numbers
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host
 from canprobe.fieldbus.tools.faults.frame_faults import tactile_ids
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS, kinds_of
 from canprobe.mechanics.touch.pad import COUNTS_MAX
@@ -61,10 +61,6 @@ class DeadRows(ImageFault):
     """Some rows of taxels measure nothing."""
 
     name = "dead-rows"
-    parameters = numbers(
-        first=Parameter(7, 0, 255, "first row, 0-based"),
-        rows=Parameter(1, 1, 256, "number of rows"),
-    )
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
         image = raw.copy()
@@ -90,10 +86,6 @@ class ReplayedImage(ImageFault):
     """
 
     name = "replayed-image"
-    parameters = numbers(
-        images=Parameter(1, 1, 1000, "images of the recorded stretch"),
-        noise=Parameter(1.3, 0, 255, "standard deviation of the fresh noise, counts"),
-    )
 
     def begin(self, t_ns: int) -> None:
         self._recorded: list[Raw] = []
@@ -114,7 +106,6 @@ class GainLost(ImageFault):
     """Every taxel measures a share of its load."""
 
     name = "gain-lost"
-    parameters = numbers(gain=Parameter(0.3, 0, 10, "measured over true load"))
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
         return _as_sampled(self.fault.value("gain") * raw.astype(np.float64), raw)
@@ -124,10 +115,6 @@ class StuckRows(ImageFault):
     """Some rows of taxels keep their last values; the others go on."""
 
     name = "stuck-rows"
-    parameters = numbers(
-        first=Parameter(6, 0, 255, "first row, 0-based"),
-        rows=Parameter(4, 1, 256, "number of rows"),
-    )
     _kept: Raw | None = None
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
@@ -141,7 +128,6 @@ class Drift(ImageFault):
     """All taxels drift upward, in whole counts where the array has such."""
 
     name = "drift"
-    parameters = numbers(counts_s=Parameter(5, 0, 1e6, "rate, counts/s"))
 
     def changed(self, raw: Raw, held_s: float) -> Raw:
         image = raw.copy()

@@ -18,7 +18,7 @@ from canprobe.fieldbus.drive.cyclic_modes import CyclicPosition, CyclicTorque, C
 from canprobe.fieldbus.drive.homing import HomingMode
 from canprobe.fieldbus.drive.mode import DriveMode
 from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS, DriveParameters, check_among
-from canprobe.fieldbus.drive.parts import DriveParts
+from canprobe.fieldbus.drive.parts import DriveFeedback, DriveLoop, DriveParts, Supervision
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
@@ -87,8 +87,11 @@ class DriveApplication(Application):
         self._node, self._core, self._values = node, node.core, node.dictionary.values
         self._parameters = parameters = DriveParameters(node.dictionary, self._delivery)
         self._motion = motion = Motion(self._axis, self._plant, node.core.timers)
-        fault, on_loss, show = self._find_fault, self._abort_connection, self._show
-        self.parts = DriveParts(node, motion, parameters, self._noise, fault=fault, on_loss=on_loss, show=show)
+        feedback = DriveFeedback(node, motion, parameters.units, self._noise)
+        supervision = Supervision(node, parameters, self._abort_connection)
+        loop = DriveLoop(node, motion, parameters)
+        fault, show = self._find_fault, self._show
+        self.parts = DriveParts(node, motion, parameters, feedback, loop, supervision, fault, show)
         self._modes = _make_modes(self.parts)
         self._mode = self._modes[0]
         self._take_word_soon = node.core.timers.new(self._take_word)

@@ -18,6 +18,8 @@ Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah.
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import suppress
 from enum import Enum, auto
 from functools import partial
 from math import ceil, floor
@@ -34,7 +36,8 @@ PRESENT_POSITION_METHODS = frozenset({35, 37})
 INDEX_DIRECTIONS = {33: -1, 34: 1}
 SWITCH_DIRECTIONS = {1: -1, 2: 1, 17: -1, 18: 1}
 SWITCH_AND_INDEX_METHODS = frozenset({1, 2})
-HOMING_METHODS = frozenset({0, *PRESENT_POSITION_METHODS, *INDEX_DIRECTIONS, *SWITCH_DIRECTIONS})
+_SEARCHING_METHODS = frozenset({*INDEX_DIRECTIONS, *SWITCH_DIRECTIONS})
+HOMING_METHODS = frozenset({0, *PRESENT_POSITION_METHODS, *_SEARCHING_METHODS})
 MAX_SEARCH_TURNS = 2.0
 MAX_SEARCH_S = 180.0
 """Longest time at full speed to find a limit switch, or to leave it."""
@@ -46,16 +49,14 @@ class HomingPhase(Enum):
     """Phases of a homing run."""
 
     IDLE = auto()
-    TO_SWITCH = auto()
-    OFF_SWITCH = auto()
-    TO_PULSE = auto()
+    SEARCHING = auto()
     RETURNING = auto()
     DONE = auto()
     FAILED = auto()
 
 
 _PHASE_BITS = {HomingPhase.DONE: REACHED_FLAG | 1 << HOMING_ATTAINED_BIT, HomingPhase.FAILED: 1 << HOMING_ERROR_BIT}
-_MOVING_PHASES = frozenset({HomingPhase.TO_SWITCH, HomingPhase.OFF_SWITCH, HomingPhase.TO_PULSE, HomingPhase.RETURNING})
+_MOVING_PHASES = frozenset({HomingPhase.SEARCHING, HomingPhase.RETURNING})
 
 
 class HomingMode(ProfiledMode):
@@ -68,8 +69,7 @@ class HomingMode(ProfiledMode):
         super().__init__(parts)
         self._phase = HomingPhase.IDLE
         self._method = 0
-        self._direction = 1  # direction of the motor in which it passes the edge or the pulse
-        self._passed = self._home = 0.0  # counts: position before the pulse; the home position
+        self._home = 0.0  # counts
         parts.node.dictionary.on_check(0x6098, partial(check_among, HOMING_METHODS))
 
     def reset(self) -> None:
@@ -118,58 +118,56 @@ class HomingMode(ProfiledMode):
 
     def _begin(self, t_ns: int) -> None:
         self._method, self._standstill = int(self._values.get(_METHOD_KEY, 0)), False
-        positive = 1 if self._units.scale > 0.0 else -1
         here = self.parts.feedback.measure(t_ns)
+        speeds = (_SWITCH_SPEED_SUB, _ZERO_SPEED_SUB) if self._method in SWITCH_DIRECTIONS else (_ZERO_SPEED_SUB,)
         if self._method in PRESENT_POSITION_METHODS:
             self._motion.decelerate(t_ns, self._parameters.homing_acceleration)
             self._home = here
             self._attain(t_ns)
-        elif self._method in INDEX_DIRECTIONS and self._speed(_ZERO_SPEED_SUB) > 0.0:
-            self._direction = INDEX_DIRECTIONS[self._method] * positive
-            self._seek_pulse(here, t_ns)
-        elif self._method in SWITCH_DIRECTIONS and all(map(self._speed, (_SWITCH_SPEED_SUB, _ZERO_SPEED_SUB))):
-            self._direction = -SWITCH_DIRECTIONS[self._method] * positive  # away from the switch
-            if self._on_switch():
-                self._leave_switch(here, t_ns)
-            else:
-                self._phase = HomingPhase.TO_SWITCH
-                reach = MAX_SEARCH_S * self._speed(_SWITCH_SPEED_SUB)
-                self._drive_to(here - self._direction * reach, t_ns, _SWITCH_SPEED_SUB)
+        elif self._method in _SEARCHING_METHODS and all(map(self._speed, speeds)):
+            self._phase = HomingPhase.SEARCHING
+            self._search = self._find_home(here, t_ns)
+            next(self._search)
+            self._timer.arm(t_ns + STEP_NS)
         else:
             self._stop(HomingPhase.FAILED, t_ns)
-        if self._phase in _MOVING_PHASES:
-            self._timer.arm(t_ns + STEP_NS)
 
     def watch(self, t_ns: int, counts: float) -> None:
         """Catch the switch, its edge, and the index pulse."""
-        if self._phase is HomingPhase.TO_SWITCH and self._on_switch():
-            self._leave_switch(counts, t_ns)
-        elif self._phase is HomingPhase.OFF_SWITCH and not self._on_switch():
-            edge = self.parts.feedback.switch_positions()[SWITCH_DIRECTIONS[self._method] > 0]
-            if self._method in SWITCH_AND_INDEX_METHODS:
-                self._seek_pulse(edge, t_ns)
-            else:
-                self._return_to(edge, t_ns)
-        if self._phase is HomingPhase.TO_PULSE:
-            pulse = next_pulse(self._passed, self._direction, self._units.turn)
-            if (counts - pulse) * self._direction >= 0.0:
-                self._return_to(pulse, t_ns)
+        if self._phase is HomingPhase.SEARCHING:
+            with suppress(StopIteration):
+                self._search.send((t_ns, counts))
+
+    def _find_home(self, counts: float, t_ns: int) -> Generator[None, tuple[int, float], None]:
+        """Drive to the switch, off it and to the pulse, as far as the method has them, and turn round.
+
+        It gets the time and the position of the motor, counts, at each look.
+        """
+        direction = 1 if self._units.scale > 0.0 else -1  # in which the motor passes the edge or the pulse
+        if self._method in SWITCH_DIRECTIONS:
+            direction *= -SWITCH_DIRECTIONS[self._method]  # away from the switch
+            if not self._on_switch():
+                reach = MAX_SEARCH_S * self._speed(_SWITCH_SPEED_SUB)
+                self._drive_to(counts - direction * reach, t_ns, _SWITCH_SPEED_SUB)
+            while not self._on_switch():
+                t_ns, counts = yield
+            self._drive_to(counts + direction * MAX_SEARCH_S * self._speed(_ZERO_SPEED_SUB), t_ns)
+            while self._on_switch():
+                t_ns, counts = yield
+            home = self.parts.feedback.switch_positions()[SWITCH_DIRECTIONS[self._method] > 0]
+        else:
+            direction, home = direction * INDEX_DIRECTIONS[self._method], counts
+        if self._method in SWITCH_AND_INDEX_METHODS or self._method in INDEX_DIRECTIONS:
+            self._drive_to(home + direction * MAX_SEARCH_TURNS * self._units.turn, t_ns)
+            home = next_pulse(home, direction, self._units.turn)
+            while (counts - home) * direction < 0.0:
+                t_ns, counts = yield
+        self._phase, self._home = HomingPhase.RETURNING, home
+        self._drive_to(home, t_ns)
 
     def _on_switch(self) -> bool:
         wanted = NEGATIVE_SWITCH_FLAG if SWITCH_DIRECTIONS[self._method] < 0 else POSITIVE_SWITCH_FLAG
         return bool(self.parts.feedback.switches() & wanted)
-
-    def _leave_switch(self, counts: float, t_ns: int) -> None:
-        self._phase = HomingPhase.OFF_SWITCH
-        self._drive_to(counts + self._direction * MAX_SEARCH_S * self._speed(_ZERO_SPEED_SUB), t_ns)
-
-    def _seek_pulse(self, passed: float, t_ns: int) -> None:
-        self._phase, self._passed = HomingPhase.TO_PULSE, passed
-        self._drive_to(passed + self._direction * MAX_SEARCH_TURNS * self._units.turn, t_ns)
-
-    def _return_to(self, home: float, t_ns: int) -> None:
-        self._phase, self._home = HomingPhase.RETURNING, home
-        self._drive_to(home, t_ns)
 
     def _drive_to(self, counts: float, t_ns: int, speed: int = _ZERO_SPEED_SUB) -> None:
         rate = self._parameters.homing_acceleration

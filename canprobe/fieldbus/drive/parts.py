@@ -8,6 +8,7 @@ CiA 301, error codes 8100h and 8250h.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, DriveParameters
@@ -220,31 +221,24 @@ class Supervision:
         self._on_loss(code, t_ns)
 
 
+@dataclass(frozen=True, slots=True)
 class DriveParts:
     """The parts of one drive, which its application and its modes share.
 
-    Args:
+    Attributes:
         node: node of the drive.
         motion: reference of the axis.
         parameters: parameters of the drive.
-        noise: function for the noise of the encoder, counts; None: there is none.
+        feedback, loop, supervision: the parts above.
         fault: function that is called as `fault(code, t_ns)` when a mode has found a fault.
-        on_loss: function that is called as `on_loss(code, t_ns)` when the master counts as lost.
         show: function that is called when the mode's part of the statusword may have changed.
     """
 
-    def __init__(
-        self,
-        node: SlaveNode,
-        motion: Motion,
-        parameters: DriveParameters,
-        noise: Callable[[], float] | None,
-        *,
-        fault: Callable[[int, int], None],
-        on_loss: Callable[[int, int], None],
-        show: Callable[[], None],
-    ) -> None:
-        self.node, self.motion, self.parameters, self.fault, self.show = node, motion, parameters, fault, show
-        self.feedback = DriveFeedback(node, motion, parameters.units, noise)
-        self.supervision = Supervision(node, parameters, on_loss)
-        self.loop = DriveLoop(node, motion, parameters)
+    node: SlaveNode
+    motion: Motion
+    parameters: DriveParameters
+    feedback: DriveFeedback
+    loop: DriveLoop
+    supervision: Supervision
+    fault: Callable[[int, int], None]
+    show: Callable[[], None]

@@ -39,10 +39,8 @@ class Piece(NamedTuple):
 
     def at(self, t_s: float) -> tuple[float, float]:
         """Position and velocity `t_s` after the piece began."""
-        return (
-            self.position + t_s * (self.velocity + 0.5 * t_s * self.acceleration),
-            self.velocity + t_s * self.acceleration,
-        )
+        position = self.position + t_s * (self.velocity + 0.5 * t_s * self.acceleration)
+        return position, self.velocity + t_s * self.acceleration
 
 
 class Decay(NamedTuple):
@@ -118,9 +116,8 @@ def trapezoid(position: float, velocity: float, target: float, rates: Rates) -> 
         pieces.append(Piece(abs(velocity) / deceleration, position, velocity, sign * deceleration))
         position, velocity = stop, 0.0
     way, v0 = sign * (target - position), abs(velocity)
-    peak = min(
-        speed, sqrt((2 * acceleration * deceleration * way + deceleration * v0**2) / (acceleration + deceleration))
-    )
+    within = sqrt((2 * acceleration * deceleration * way + deceleration * v0**2) / (acceleration + deceleration))
+    peak = min(speed, within)
     change = acceleration if peak >= v0 else -deceleration
     lengths = ((peak - v0) / change, 0.0, peak / deceleration)
     used = 0.5 * (v0 + peak) * lengths[0] + 0.5 * peak * lengths[2]

@@ -8,7 +8,7 @@ Each service of the standard is one module:
     timers              the deadlines of one node
     dictionary          its entries: type, rights, limits, bytes; all values, with the checks of an access over the bus
     sdo_states          the state machine of an SDO server as a table
-    sdo_transfers       segmented and block transfers, each an object with its state
+    sdo_transfers       segmented and block transfers, each a generator
     sdo_server          expedited transfers, and the beginning and end of the others
     pdo                 all PDOs of a node: which frame goes where, and what a SYNC does
     rpdo, tpdo          one RPDO, one TPDO

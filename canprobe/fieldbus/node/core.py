@@ -15,7 +15,7 @@ from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, PDO_OBJECTS, TPDOS, is_m
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 Route = Callable[[bytes, int], None]
-NO_ROUTES: Mapping[int, Route] = {}
+BOOTED_STATES = frozenset(NmtState) - {NmtState.INITIALISING}
 TALKING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 """States with SDO, SYNC and EMCY."""
 
@@ -105,7 +105,13 @@ class DelayedFrames:
 
 
 class Service:
-    """One CiA 301 service of a node. The base class has no state and no routes."""
+    """One CiA 301 service of a node. The base class has no state and no routes.
+
+    Attributes:
+        states: NMT states in which the node receives its routes.
+    """
+
+    states = BOOTED_STATES
 
     def reset(self, t_ns: int) -> None:
         """Forget everything and read the parameters again; the dictionary holds its defaults."""
@@ -114,8 +120,8 @@ class Service:
         """Act on the new NMT state, which is `core.state`."""
 
     def routes(self) -> Mapping[int, Route]:
-        """Receivers by CAN-ID, in the present NMT state."""
-        return NO_ROUTES
+        """Receivers by CAN-ID."""
+        return {}
 
 
 def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
+from canprobe.fieldbus.node.core import NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.timers import Timer
@@ -72,8 +72,6 @@ class HeartbeatConsumer(Service):
 
     def routes(self) -> Mapping[int, Route]:
         """Heartbeat identifiers of the producers that are watched."""
-        if self._core.state is NmtState.INITIALISING:
-            return NO_ROUTES
         return {HEARTBEAT_BASE + node_id: partial(self._heard, node_id) for node_id in self._watched}
 
     def _entries(self) -> dict[int, tuple[int, int]]:
@@ -133,8 +131,6 @@ class NodeGuarding(Service):
 
     def routes(self) -> Mapping[int, Route]:
         """The remote request for this node's error control identifier."""
-        if self._core.state is NmtState.INITIALISING:
-            return NO_ROUTES
         return {HEARTBEAT_BASE + self._core.node_id | RTR_FLAG: self._guarded}
 
     def _configure(self) -> None:

@@ -159,11 +159,8 @@ class LssSearch:
         if not numbers:
             return False
         vendor, product, revision_low, revision_high, serial_low, serial_high = numbers
-        return (
-            (vendor, product) == (mine.vendor_id, mine.product_code)
-            and revision_low <= mine.revision_number <= revision_high
-            and serial_low <= mine.serial_number <= serial_high
-        )
+        low, high = (vendor, product, revision_low, serial_low), (vendor, product, revision_high, serial_high)
+        return all(first <= number <= last for first, number, last in zip(low, mine.numbers, high, strict=True))
 
     def fastscan(self, data: bytes, mine: LssAddress) -> tuple[bool, bool]:
         """Whether the asked bits of one number are mine, and whether the whole address is found."""

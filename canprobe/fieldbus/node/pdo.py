@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping, Sequence
 
-from canprobe.fieldbus.node.core import NO_ROUTES, DelayedFrames, NodeCore, Route, Service
+from canprobe.fieldbus.node.core import DelayedFrames, NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Value, key_of
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.pdo_rules import PdoRules
@@ -45,12 +45,11 @@ class PdoEngine(Service):
         on_sync: function that is called as `on_sync(t_ns, counter)` at a SYNC in operational, before TPDOs are packed.
     """
 
+    states = frozenset({NmtState.OPERATIONAL})
+
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int], None]) -> None:
         self._core, self._on_sync = core, on_sync
         self._samplers: dict[int, Sampler] = {}
-        self._rpdos: list[Rpdo] = []
-        self._tpdos: list[Tpdo] = []
-        self._all: list[Rpdo | Tpdo] = []
         self._waiting: list[Rpdo] = []
         self._groups: list[_Group] = []
         self._on_event: list[Tpdo] = []
@@ -58,18 +57,16 @@ class PdoEngine(Service):
         self._delay_ns = core.quirks.tpdo_delay_ns
         self._late = DelayedFrames(core, self._delay_ns)
         self._count = self._sync_ns = self._window_ns = 0
-        for index in core.dictionary.indices_in(RPDOS):
-            rules = PdoRules(core.dictionary, index, transmits=False)
-            self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
-            self._watch(rules, rpdo)
-        for index in core.dictionary.indices_in(TPDOS):
-            rules = PdoRules(core.dictionary, index, transmits=True)
-            self._tpdos.append(tpdo := Tpdo(core, rules))
-            self._watch(rules, tpdo)
-        core.dictionary.written = self._written
-        core.dictionary.on_change(self._rebuild, 0x1007)
+        dictionary = core.dictionary
+        self._rpdos = [Rpdo(core, emcy, PdoRules(dictionary, i, transmits=False)) for i in dictionary.indices_in(RPDOS)]
+        self._tpdos = [Tpdo(core, PdoRules(dictionary, i, transmits=True)) for i in dictionary.indices_in(TPDOS)]
+        self._all: list[Rpdo | Tpdo] = [*self._rpdos, *self._tpdos]
+        for pdo in self._all:
+            self._watch(pdo)
+        dictionary.written = self._written
+        dictionary.on_change(self._rebuild, 0x1007)
 
-    def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
+    def _watch(self, pdo: Rpdo | Tpdo) -> None:
         def reconfigure(subindex: int, value: Value) -> None:
             pdo.configure()
             if isinstance(pdo, Tpdo) and self._core.state is NmtState.OPERATIONAL:
@@ -77,8 +74,7 @@ class PdoEngine(Service):
             self._rebuild()
             self._core.reroute()
 
-        self._all.append(pdo)
-        dictionary = self._core.dictionary
+        rules, dictionary = pdo.rules, self._core.dictionary
         dictionary.on_check(rules.communication, rules.check_communication)
         dictionary.on_check(rules.mapping, rules.check_mapping)
         dictionary.on_write(rules.communication, reconfigure)
@@ -105,9 +101,7 @@ class PdoEngine(Service):
                 tpdo.started(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
-        """Identifiers of RPDOs and of remote requests for TPDOs, in operational; PDOs may share an identifier."""
-        if self._core.state is not NmtState.OPERATIONAL:
-            return NO_ROUTES
+        """Identifiers of RPDOs and of remote requests for TPDOs; PDOs may share an identifier."""
         routes: dict[int, Route] = {}
         for rpdo in self._rpdos:
             if rpdo.cob_id is not None:

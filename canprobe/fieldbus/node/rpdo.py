@@ -18,6 +18,7 @@ class Rpdo:
     """One receive PDO, compiled from its parameters by `configure`.
 
     Attributes:
+        rules: rules for its parameters.
         cob_id: identifier, or None while the PDO is not valid.
         keys: mapped dictionary keys, without dummies.
         synchronous: whether values are stored at the next SYNC (types 0–240).
@@ -25,7 +26,7 @@ class Rpdo:
     """
 
     def __init__(self, core: NodeCore, emcy: Emergency, rules: PdoRules) -> None:
-        self._core, self._emcy, self._rules = core, emcy, rules
+        self._core, self._emcy, self.rules = core, emcy, rules
         self._timer = core.timers.new(lambda _due_ns: emcy.report(RPDO_TIMEOUT_CODE, source=self))
         self._layout = PdoLayout(0, ())
         self._unpack = self._layout.raw_unpack
@@ -38,12 +39,12 @@ class Rpdo:
 
     def configure(self) -> None:
         """Read the parameters. A PDO with an impossible mapping has no values."""
-        dictionary, index = self._core.dictionary, self._rules.communication
+        dictionary, index = self._core.dictionary, self.rules.communication
         self.stop()
         if self._emcy.any:
             self._forgive()  # the errors of the old parameters
-        self.cob_id = dictionary.number(index, PdoSub.COB_ID) & 0x7FF if self._rules.valid else None
-        self._layout = PdoLayout(self.cob_id or 0, self._rules.present(), dictionary.number(index, PdoSub.TYPE))
+        self.cob_id = dictionary.number(index, PdoSub.COB_ID) & 0x7FF if self.rules.valid else None
+        self._layout = PdoLayout(self.cob_id or 0, self.rules.present(), dictionary.number(index, PdoSub.TYPE))
         self._unpack = self._layout.raw_unpack  # the length is checked before
         self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
         self._slots = tuple(dictionary.slot(key) for key in self.keys)

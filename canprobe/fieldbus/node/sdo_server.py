@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node import sdo_transfers
-from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, DelayedFrames, NodeCore, Route, Service, check_cob_id
+from canprobe.fieldbus.node.core import TALKING_STATES, DelayedFrames, NodeCore, Route, Service, check_cob_id
 from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
 from canprobe.fieldbus.node.sdo_transfers import Transfer
@@ -23,7 +23,13 @@ SDO_TIMEOUT_NS = 1_000_000_000
 
 
 class SdoServer(Service):
-    """The server of one channel, 1200h by default; `index` 1201h… makes an additional one."""
+    """The server of one channel, 1200h by default; `index` 1201h… makes an additional one.
+
+    Attributes:
+        state: state, which says for what frame of the client it waits.
+    """
+
+    states = TALKING_STATES
 
     def __init__(self, core: NodeCore, index: int = 0x1200) -> None:
         self._core = core
@@ -34,7 +40,8 @@ class SdoServer(Service):
         self._slow_ns = core.quirks.sdo_ns
         self._late = DelayedFrames(core, self._slow_ns)
         self._transfer: Transfer | None = None
-        self._initiate: dict[SdoRequest, Callable[[bytes], bytes]] = {
+        self.state = SdoState.IDLE
+        self._initiate: dict[SdoRequest, Callable[[bytes], Transfer]] = {
             SdoRequest.INITIATE_DOWNLOAD: self._download,
             SdoRequest.INITIATE_UPLOAD: self._upload,
             SdoRequest.INITIATE_BLOCK_DOWNLOAD: self._block_download,
@@ -43,11 +50,6 @@ class SdoServer(Service):
         if index != 0x1200:
             core.dictionary.on_check(index, self._check_cob_id)
         core.dictionary.on_write(index, lambda _sub, _value: core.reroute())
-
-    @property
-    def state(self) -> SdoState:
-        """Which frame the server waits for."""
-        return SdoState.IDLE if self._transfer is None else self._transfer.state
 
     def reset(self, t_ns: int) -> None:
         """Drop the open transfer and the answers that wait."""
@@ -60,12 +62,10 @@ class SdoServer(Service):
             self.reset(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
-        """The request identifier, in pre-operational and operational."""
+        """The request identifier."""
         cob_id, answer_id = self._cob_id(1, SDO_RX_BASE), self._cob_id(2, SDO_TX_BASE)
         self._answer_id = answer_id & 0x7FF
-        if self._core.state not in TALKING_STATES or (cob_id | answer_id) & INVALID_FLAG:
-            return NO_ROUTES
-        return {cob_id & 0x7FF: self._receive}
+        return {} if (cob_id | answer_id) & INVALID_FLAG else {cob_id & 0x7FF: self._receive}
 
     def _cob_id(self, subindex: int, base: int) -> int:
         default = base + self._core.node_id if self._index == 0x1200 else INVALID_FLAG
@@ -92,58 +92,61 @@ class SdoServer(Service):
 
     def _answer(self, data: bytes) -> list[bytes]:
         """What is answered to a request. Raises SdoAbort when the client breaks the protocol."""
-        state = self.state
-        request = request_of(state, data[0])
+        request = request_of(self.state, data[0])
         initiate = self._initiate.get(request)
-        if initiate is not None or (state is SdoState.IDLE and request is not SdoRequest.ABORT):
+        if initiate is not None or (self.state is SdoState.IDLE and request is not SdoRequest.ABORT):
             self._place = sdo.place_of(data)
-        if initiate is not None:
-            self._transfer = None
-            return [initiate(data)]
-        if (state, request) not in SDO_TRANSITIONS:
+        if (self.state, request) not in SDO_TRANSITIONS:
             raise SdoAbort(Abort.COMMAND)
-        if request is SdoRequest.ABORT or self._transfer is None:
-            self._transfer = None
-            return []
-        return self._transfer.step(data)
+        try:
+            if initiate is not None:
+                self._transfer = initiate(data)
+                self.state, answers = next(self._transfer)
+            elif request is not SdoRequest.ABORT and self._transfer is not None:
+                self.state, answers = self._transfer.send(data)
+            else:
+                self.state, answers = SdoState.IDLE, []
+        except StopIteration as over:
+            self.state, answers = SdoState.IDLE, over.value
+        return answers
 
-    def _download(self, data: bytes) -> bytes:
-        dictionary = self._core.dictionary
+    def _download(self, data: bytes) -> Transfer:
+        dictionary, answer = self._core.dictionary, sdo.pack_request(0x60, *self._place)
         entry = dictionary.find_writable(*self._place)
-        if data[0] & 2:
-            dictionary.write_value(entry, entry.from_bytes(sdo.expedited_value(data, entry.bits // 8 or 4)))
-            dictionary.configured(self._place[0])
-        else:
-            self._transfer = sdo_transfers.SegmentedDownload(entry, sdo.stated_size(data), self._store)
-        return sdo.pack_request(0x60, *self._place)
+        if not data[0] & 2:
+            return (yield from sdo_transfers.segmented_download(answer, entry, sdo.stated_size(data), self._store))
+        dictionary.write_value(entry, entry.from_bytes(sdo.expedited_value(data, entry.bits // 8 or 4)))
+        dictionary.configured(self._place[0])
+        return [answer]
 
-    def _block_download(self, data: bytes) -> bytes:
+    def _block_download(self, data: bytes) -> Transfer:
         entry = self._core.dictionary.find_writable(*self._place)
         announced = int.from_bytes(data[4:8], "little") if data[0] & 2 else None
-        self._transfer = sdo_transfers.BlockDownload(entry, announced, self._store, with_crc=bool(data[0] & 4))
-        return sdo.pack_request(0xA4, *self._place, bytes((sdo_transfers.MAX_BLOCK_SEGMENTS,)))
+        answer = sdo.pack_request(0xA4, *self._place, bytes((sdo_transfers.MAX_BLOCK_SEGMENTS,)))
+        with_crc = bool(data[0] & 4)
+        return (yield from sdo_transfers.block_download(answer, entry, announced, self._store, with_crc=with_crc))
 
     def _store(self, value: bytes) -> None:
         self._core.dictionary.write(*self._place, value)
         self._core.dictionary.configured(self._place[0])
 
-    def _upload(self, data: bytes) -> bytes:
+    def _upload(self, data: bytes) -> Transfer:
         value = self._core.dictionary.read(*self._place)
         if 1 <= len(value) <= 4:
-            return sdo.pack_request(0x43 | (4 - len(value)) << 2, *self._place, value)
-        self._transfer = sdo_transfers.SegmentedUpload(value)
-        return sdo.pack_request(0x41, *self._place, len(value).to_bytes(4, "little"))
+            return [sdo.pack_request(0x43 | (4 - len(value)) << 2, *self._place, value)]
+        answer = sdo.pack_request(0x41, *self._place, len(value).to_bytes(4, "little"))
+        return (yield from sdo_transfers.segmented_upload(answer, value))
 
-    def _block_upload(self, data: bytes) -> bytes:
+    def _block_upload(self, data: bytes) -> Transfer:
         value = self._core.dictionary.read(*self._place)
         block_size = sdo_transfers.check_block_size(data[4])
         if 0 < len(value) <= data[5]:  # the protocol switch threshold
-            return self._upload(data)
-        self._transfer = sdo_transfers.BlockUpload(value, block_size, with_crc=bool(data[0] & 4))
-        return sdo.pack_request(0xC6, *self._place, len(value).to_bytes(4, "little"))
+            return (yield from self._upload(data))
+        answer = sdo.pack_request(0xC6, *self._place, len(value).to_bytes(4, "little"))
+        return (yield from sdo_transfers.block_upload(answer, value, block_size, with_crc=bool(data[0] & 4)))
 
     def _drop(self) -> None:
-        self._transfer = None
+        self._transfer, self.state = None, SdoState.IDLE
         self._timer.cancel()
 
     def _abort(self, code: Abort) -> None:

@@ -264,7 +264,8 @@ class SlaveNode(Participant):
         routes.clear()
         if self.core.state is not NmtState.INITIALISING:
             for service in self._services:
-                routes.update(service.routes())
+                if self.core.state in service.states:
+                    routes.update(service.routes())
             routes[NMT_ID] = self._nmt
         elif self.lss is not None and self.lss.unconfigured:
             routes.update(self.lss.routes())

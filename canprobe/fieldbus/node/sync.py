@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from canprobe.fieldbus.node.core import NO_ROUTES, TALKING_STATES, NodeCore, Route, Service
+from canprobe.fieldbus.node.core import TALKING_STATES, NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Value
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
@@ -19,6 +19,8 @@ _PRODUCER_FLAG = 1 << 30
 
 class SyncConsumer(Service):
     """Checks each SYNC and passes it to the PDOs as `on_sync(t_ns, counter, elapsed)` in operational."""
+
+    states = TALKING_STATES
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int, int], None]) -> None:
         self._core, self._emcy, self._on_sync = core, emcy, on_sync
@@ -47,9 +49,7 @@ class SyncConsumer(Service):
         self._timer.cancel()
 
     def routes(self) -> Mapping[int, Route]:
-        """The SYNC identifier, in pre-operational and operational."""
-        if self._core.state not in TALKING_STATES:
-            return NO_ROUTES
+        """The SYNC identifier."""
         return {self._core.dictionary.number(0x1005, 0, SYNC_ID) & 0x7FF: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:

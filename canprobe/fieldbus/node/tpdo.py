@@ -34,6 +34,7 @@ class Tpdo:
     """One transmit PDO, compiled from its parameters by `configure`.
 
     Attributes:
+        rules: rules for its parameters.
         active: whether the PDO is valid and maps something.
         samplers: functions that bring mapped values up to date, each called as `sampler(t_ns)`.
         layout: its mapping, while it is active.
@@ -46,7 +47,7 @@ class Tpdo:
     """
 
     def __init__(self, core: NodeCore, rules: PdoRules) -> None:
-        self._core, self._rules = core, rules
+        self._core, self.rules = core, rules
         self._event_timer = core.timers.new(self._event_due)
         self._inhibit_timer = core.timers.new(self._send_now)
         self.layout = PdoLayout(0, ())
@@ -61,11 +62,11 @@ class Tpdo:
 
     def configure(self) -> None:
         """Read the parameters. A PDO with an impossible mapping stays silent."""
-        number, index, entries = self._core.dictionary.number, self._rules.communication, self._rules.present()
+        number, index, entries = self._core.dictionary.number, self.rules.communication, self.rules.present()
         self.stop()
         cob_id = number(index, PdoSub.COB_ID)
         self._cob_id = cob_id & 0x7FF
-        self.active = self._rules.valid and bool(entries)
+        self.active = self.rules.valid and bool(entries)
         self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & NO_RTR_FLAG else None
         self.keys = tuple(key_of(entry.index, entry.subindex) for entry in entries)
         self.type, self.start = number(index, PdoSub.TYPE), number(index, PdoSub.SYNC_START)

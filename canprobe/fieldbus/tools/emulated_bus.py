@@ -110,9 +110,7 @@ class EmulatedBus(ABC):
 
     def end(self, fault: Fault) -> None:
         """End a fault at the next frame or deadline of its node."""
-        for node in self.faulty.nodes:
-            if node.node_id == fault.node_id:
-                self._act(node.node_id, partial(node.remove, fault))
+        self._act(fault.node_id, partial(self.faulty.end, fault))
 
     def act(self, node: FaultyNode, do: Callable[[SlaveNode], T]) -> T:
         """Let a device do something by itself, now; return what `do` returns. Its frames are sent."""

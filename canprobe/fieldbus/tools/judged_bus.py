@@ -27,8 +27,7 @@ class JudgedBus:
         """What is to be said of the master until now; faults that were thrown excuse what follows them."""
         self._bus.flush()
         frames = read_record(self._bus.log, self._bus.channel)
-        start_ns = self._bus.start_ns
-        charges_ns = [(begin_ns - start_ns, end_ns - start_ns) for _, begin_ns, end_ns in self._bus.faulty.spans()]
+        charges_ns = [(span.begin_ns, span.end_ns) for span in self._bus.faulty.spans(self._bus.start_ns)]
         judge = Judge(self._bus.descriptions, bitrate=self._bitrate, charges_ns=charges_ns).hear(frames)
         return judge.report("the master", {"bit rate": f"{self._bitrate} bit/s"}, log=str(self._bus.log))
 

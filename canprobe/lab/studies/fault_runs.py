@@ -161,7 +161,7 @@ class FaultRun:
             failures += self._rest_problems()
         noticed_ns = self._noticed_ns()
         return {
-            "hits": sum(node.hits for node in self.faulty.nodes),
+            "hits": sum(node.host.hits for node in self.faulty.nodes),
             "outcome": self.outcome,
             "reason": reason,
             "named": bool(reason) and self._is_named(reason),
@@ -177,7 +177,7 @@ class FaultRun:
 
     def _noticed_ns(self) -> int | None:
         """Time from the beginning of the fault until it was noticed, ns; None where it was not, or never began."""
-        begun = [t_ns for node in self.faulty.nodes for t_ns, what, _ in node.history if what == "begins"]
+        begun = [span.begin_ns for node in self.faulty.nodes for span in node.spans]
         begin_ns = min(begun, default=None) if self.faults else 0
         if begin_ns is None:
             return None

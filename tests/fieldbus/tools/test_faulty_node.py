@@ -64,7 +64,7 @@ def fault(kind, start_ms=2.5, duration_ms=3.0, node_id=5, **more):
 
 def test_without_faults_or_with_another_nodes_it_is_the_node():
     frames, node, _ = played(fault(BUS_FAULTS["mute"], node_id=6))
-    assert of(frames) == of(frames, 0x385) == CLEAN and node.hits == 0
+    assert of(frames) == of(frames, 0x385) == CLEAN and node.host.hits == 0
     assert frames[0] == (0.0, 0x705, b"\0")
 
 
@@ -72,7 +72,7 @@ def test_without_faults_or_with_another_nodes_it_is_the_node():
 def test_frames_are_lost(kind):
     frames, node, _ = played(fault(kind))
     assert of(frames) == [pair for pair in CLEAN if pair[1] not in (3, 4, 5)]
-    assert node.hits == 6
+    assert node.host.hits == 6
 
 
 def test_frames_come_later():

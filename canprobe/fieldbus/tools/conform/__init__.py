@@ -16,7 +16,7 @@ read before and after each point: where the power stage is on, the examination e
     point, registry     a point; the list of all; outcome: how one may end
     points/             the points, one module a service; hints.toml: what to look at where one fails
     examination         the order of things: hear, read, examine, put back
-    bench               what points use: entries, states, EMCY; below it sdo_client and frame_link
+    bench, pdo_bench    what points use: entries, states, EMCY; PDOs; below it sdo_client and frame_link
     permits, journal    what may be sent; what is put back
     surroundings        what else is on the bus
     device, accepted    what the device answered; which abort codes are accepted

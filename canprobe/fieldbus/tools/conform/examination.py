@@ -25,11 +25,11 @@ from canprobe.fieldbus.protocol.emcy import SYNC_LOST_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 from canprobe.fieldbus.protocol.pdo import RPDOS
 from canprobe.fieldbus.tools.conform import outcome
-from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
+from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 from canprobe.fieldbus.tools.conform.permits import Permits, WriteList, is_object
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
@@ -87,7 +87,7 @@ class Examination:
         journal: the snapshot; it is there once the device was read.
     """
 
-    bench: Bench
+    bench: PdoBench
     journal: Journal
 
     def __init__(
@@ -148,7 +148,7 @@ class Examination:
         written = settings.written.with_motion() if settings.motion else settings.written
         permits = Permits(self._node_id, surroundings, written)
         device = ExaminedDevice(self._node_id, self._description)
-        self.bench = bench = Bench(self._port, device, permits, settings.times)
+        self.bench = bench = PdoBench(self._port, device, permits, settings.times)
         bench.bitrate, bench.fd, bench.by_hand = settings.bitrate, settings.fd, self._by_hand
         try:
             bench.first_answer = bench.ask(READ_TYPE)
@@ -181,23 +181,19 @@ class Examination:
             self._check_power()
         except outcome.BenchFailure as error:
             self._ended = f"not examined: {error}"
-        else:
-            self._put_back()
-            self._look_for_standing_errors()
+            return
+        self._put_back()
+        if not self.bench.permits.surroundings.lacks("nmt"):
+            with contextlib.suppress(CanprobeError):  # a device that fails here fails the points that are about it
+                self._look_for_standing_errors()
+            with contextlib.suppress(CanprobeError):
+                self._put_back()
 
     def _look_for_standing_errors(self) -> None:
         """Find the errors that the device has already, and whether they keep it out of operational.
 
         An error that stays would otherwise fail every point that needs operational, and each for another reason.
         """
-        if self.bench.permits.surroundings.lacks("nmt"):
-            return
-        with contextlib.suppress(CanprobeError):  # a device that fails here fails the points that are about it
-            self._start_once()
-        with contextlib.suppress(CanprobeError):
-            self._put_back()
-
-    def _start_once(self) -> None:
         bench = self.bench
         state: int | None = None
         with contextlib.suppress(outcome.Deviation, outcome.PointNotApplicable):
@@ -230,9 +226,8 @@ class Examination:
             return _row(point, Verdict.NOT_APPLICABLE, why)
         bench, began_ns = self.bench, self.bench.now_ns
         verdict, detail = self._run(point)
-        sent, came = (
-            tuple(frame_text(*frame, self._node_id) for frame in frames) for frames in (bench.sent, bench.came)
-        )
+        sent = tuple(frame_text(*frame, self._node_id) for frame in bench.sent)
+        came = tuple(frame_text(*frame, self._node_id) for frame in bench.came)
         written: list[str] = []
         if not self._ended:
             try:
@@ -243,11 +238,9 @@ class Examination:
                 if unasked and verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE):
                     code = unasked[0].code
                     verdict, detail = Verdict.FAIL, f"EMCY {code:04X}h ({describe(code)}) that nobody asked for"
-            except outcome.PowerStageOn as error:
-                verdict, detail, self._ended = Verdict.ERROR, str(error), f"not examined: {error}"
             except CanprobeError as error:
-                detail = f"{detail}; then {error}" if verdict is Verdict.FAIL else str(error)
-                verdict = verdict if verdict is Verdict.FAIL else Verdict.ERROR
+                fails = verdict is Verdict.FAIL and not self._ended
+                verdict, detail = (verdict, f"{detail}; then {error}") if fails else (Verdict.ERROR, str(error))
         if verdict is Verdict.PASS:
             detail = "; ".join(bench.notes)
         seconds = (bench.now_ns - began_ns) * 1e-9
@@ -259,9 +252,6 @@ class Examination:
         try:
             self._prepare()
             point.run(self.bench)
-        except outcome.PowerStageOn as error:
-            self._ended = f"not examined: {error}"
-            return Verdict.ERROR, str(error)
         except outcome.PointNotApplicable as error:
             if isinstance(error, outcome.NotPermitted):
                 self.report.left_out.append((f"{point.group} {point.title}", str(error)))
@@ -317,14 +307,21 @@ class Examination:
             self._port.drain()
 
     def _check_power(self) -> None:
-        """Check that the power stage of each axis is off. Raises BenchFailure, or PowerStageOn where one is on."""
+        """Check that the power stage of each axis is off.
+
+        Raises:
+            BenchFailure: it cannot be read.
+            PowerStageOn: one is on; the examination has ended.
+        """
         for index in self.bench.device.statuswords:
             try:
                 word = self.bench.number(index)
             except outcome.Deviation as error:
                 raise outcome.BenchFailure(f"{index:04X}h cannot be read: {error}") from error
             if known_state(word) in POWERED_STATES:
-                raise outcome.PowerStageOn(f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)")
+                why = f"the power stage is on: the drive is {describe_state(word)} ({index:04X}h)"
+                self._ended = f"not examined: {why}"
+                raise outcome.PowerStageOn(why)
 
     def _put_back(self) -> list[str]:
         """Put back what the point wrote, and all of it where the device booted; it is pre-operational afterwards."""

@@ -22,7 +22,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import Enum
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol import frames
@@ -43,28 +43,19 @@ _ENTRY = re.compile(r"([0-9A-Fa-f]{4})h?(?:-([0-9A-Fa-f]{4})h?|:([0-9A-Fa-f]{1,2
 
 
 class WriteRule(Enum):
-    """What may be written to an object of the communication area."""
+    """What may be written to an object, with the objects of the communication area that have this rule."""
 
-    NEVER = auto()
-    REFUSED = auto()
-    HISTORY = auto()
-    IDENTIFIER = auto()
-    SAME = auto()
-    CHANGED = auto()
-    APPLICATION = auto()
+    NEVER = (*range(0x1021, 0x1027), *range(0x1280, 0x1400), *range(0x1F00, 0x2000), 0x1010, 0x1011, 0x1013)
+    REFUSED = (0x1000, 0x1001, 0x1002, 0x1008, 0x1009, 0x100A, 0x1018, 0x1027)
+    HISTORY = (0x1003,)
+    IDENTIFIER = (0x1005, 0x1012, 0x1014)
+    SAME = (0x1020, *range(0x1200, 0x1280))
+    CHANGED = (0x1006, 0x1007, 0x100C, 0x100D, *range(0x1015, 0x1018), 0x1019, 0x1028, 0x1029, *PDO_OBJECTS)
+    APPLICATION = ()
 
 
 _TIME_ID = 0x100
-_NEVER = (*range(0x1021, 0x1027), *range(0x1280, 0x1400), *range(0x1F00, 0x2000), 0x1010, 0x1011, 0x1013)
-_RULES: dict[int, WriteRule] = {
-    **dict.fromkeys(_NEVER, WriteRule.NEVER),
-    **dict.fromkeys((0x1000, 0x1001, 0x1002, 0x1008, 0x1009, 0x100A, 0x1018, 0x1027), WriteRule.REFUSED),
-    0x1003: WriteRule.HISTORY,
-    **dict.fromkeys((0x1005, 0x1012, 0x1014), WriteRule.IDENTIFIER),
-    **dict.fromkeys((0x1020, *range(0x1200, 0x1280)), WriteRule.SAME),
-    **dict.fromkeys((0x1006, 0x1007, 0x100C, 0x100D, 0x1015, 0x1016, 0x1017, 0x1019), WriteRule.CHANGED),
-    **dict.fromkeys((0x1028, 0x1029, *PDO_OBJECTS), WriteRule.CHANGED),
-}
+_RULES = {index: rule for rule in WriteRule for index in rule.value}
 
 
 def is_object(index: int, *wanted: int) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.bench import Bench
+from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 
 HINTS = tomllib.loads(Path(__file__).with_name("hints.toml").read_text(encoding="utf-8"))
 """What the author of a firmware can look at where a point fails, by its number."""
@@ -36,7 +36,7 @@ class Point:
     name: str
     clause: str
     expected: str
-    run: Callable[[Bench], None]
+    run: Callable[[PdoBench], None]
     needs: frozenset[str] = frozenset()
     hint: str = ""
 
@@ -62,13 +62,13 @@ class PointGroup:
 
     def __call__(
         self, number: int, name: str, clause: str, expected: str | accepted.AbortSet, *, needs: str = ""
-    ) -> Callable[[Callable[[Bench], None]], Point]:
+    ) -> Callable[[Callable[[PdoBench], None]], Point]:
         """Make a `Point` of the function below; `expected` are words or codes, `needs` are words with blanks."""
         text = expected if isinstance(expected, str) else accepted.text(expected)
         source = f"{self.standard}, {clause}" if self.standard else clause
         all_needs, hint = frozenset(f"{self.needs} {needs}".split()), HINTS[str(number)]
 
-        def make(run: Callable[[Bench], None]) -> Point:
+        def make(run: Callable[[PdoBench], None]) -> Point:
             return Point(number, self.name, name, source, text, run, all_needs, hint)
 
         return make

@@ -119,6 +119,11 @@ class SdoClient(FrameLink):
         """
         self.check_abort(self.ask(request), accepted, what)
 
+    def must_refuse_write(self, index: int, subindex: int, value: int | bytes, accepted: AbortSet, what: str) -> None:
+        """Write bytes, or a number of four bytes, which must be refused. Raises Deviation, as `must_refuse`."""
+        data = value.to_bytes(4, "little") if isinstance(value, int) else value
+        self.must_refuse(sdo.pack_write(index, subindex, data), accepted, what)
+
     def check_abort(self, answer: bytes, accepted: AbortSet, what: str) -> None:
         """Check that an answer is an abort with an accepted code. Raises Deviation."""
         if answer[0] != sdo.ABORT:

@@ -23,10 +23,10 @@ cycle; when it ends, what it changed in the node is undone; a node without fault
 Faults of the array are in `canprobe.cell.emulated.array_faults`. Start reading at `registry`, then `faulty_node`.
 """
 
-from canprobe.fieldbus.tools.faults.fault import Fault, FaultKind
+from canprobe.fieldbus.tools.faults.fault import Fault, FaultKind, FaultSpan
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
 from canprobe.fieldbus.tools.faults.injection import FaultyNodes, inject
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
 from canprobe.fieldbus.tools.faults.text import parse_fault
 
-__all__ = ["BUS_FAULTS", "Fault", "FaultKind", "FaultyNode", "FaultyNodes", "inject", "parse_fault"]
+__all__ = ["BUS_FAULTS", "Fault", "FaultKind", "FaultSpan", "FaultyNode", "FaultyNodes", "inject", "parse_fault"]

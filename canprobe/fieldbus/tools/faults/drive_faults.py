@@ -10,14 +10,13 @@ from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.sdo import Abort
-from canprobe.fieldbus.tools.faults.fault import Effect, Fault, Host, Parameter, error_code, numbers
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault, Host
 from canprobe.fieldbus.tools.faults.service_faults import ObjectAborted
 
 _MODE_INDEX = 0x6060
 _MAX_TORQUE_INDEX = 0x6072
 _FAULT_STATES = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _RESTING_STATES = (DriveState.NOT_READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED, *_FAULT_STATES)
-_LEAST, _MOST = -(2**31), 2**31 - 1
 
 
 class DriveEffect(Effect):
@@ -36,9 +35,6 @@ class DriveFault(DriveEffect):
     """The drive detects a fault. One that is not resettable comes back at once after a fault reset."""
 
     name = "drive-fault"
-    parameters = numbers(
-        code=error_code(0x4310, "error code"), resettable=Parameter(1, 0, 1, "0: it comes back after a reset")
-    )
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         return self.act(t_ns, lambda: self.drive.inject_fault(int(self.fault.value("code"))))
@@ -68,7 +64,7 @@ class ModeRefused(ObjectAborted):
     """Writes to 6060h are refused: value range exceeded."""
 
     name = "mode-refused"
-    incoming, needs = True, "drive"
+    needs = "drive"
     code = Abort.VALUE
 
     def index(self, data: bytes) -> int:
@@ -107,7 +103,6 @@ class EncoderJump(EncoderFault):
     """The encoder is wrong by so many counts from the beginning on."""
 
     name = "encoder-jump"
-    parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "error, counts"))
 
     def measured(self, counts: float) -> float:
         return counts + self.fault.value("counts")
@@ -138,7 +133,6 @@ class ZeroShift(DriveEffect):
     """The zero of the drive is elsewhere from the beginning on: every position is reported and taken beside it."""
 
     name = "zero-shift"
-    parameters = numbers(counts=Parameter(2000, _LEAST, _MOST, "way of the zero, units of position"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         units = self.drive.parts.parameters.units
@@ -150,7 +144,6 @@ class TorqueLimit(DriveEffect):
     """The torque is limited to a share of the rated one, as if 6072h had been written."""
 
     name = "torque-limit"
-    parameters = numbers(permille=Parameter(10, 0, 10_000, "limit, 1/1000 of the rated torque"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         self._before = self.node.dictionary.number(_MAX_TORQUE_INDEX)

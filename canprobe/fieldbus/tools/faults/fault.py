@@ -5,10 +5,11 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from heapq import heappush
 from pathlib import Path
 from random import Random
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar
 
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import Frame
@@ -16,8 +17,8 @@ from canprobe.fieldbus.protocol.frames import Frame
 FOREVER_NS = 1 << 62
 """Duration of a fault without an end."""
 ENDLESS_HITS = 1 << 62
-SHORT_NS = 100_000_000
-"""Duration of a power failure and of bus-off where none is given."""
+DIRECTIONS = {"in": True, "out": False}
+"""Whether a fault hits the frames that the node receives, by its direction."""
 _FACTS = tomllib.loads(Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
 
 
@@ -35,21 +36,6 @@ class Parameter:
     low: float
     high: float
     what: str
-
-
-def numbers(**parameters: Parameter) -> Mapping[str, Parameter]:
-    """The numbers that a kind takes, by name."""
-    return MappingProxyType(parameters)
-
-
-def in_ms(default: float, what: str) -> Parameter:
-    """A time in milliseconds, up to an hour."""
-    return Parameter(default, 0.001, 3_600_000, what)
-
-
-def error_code(default: int, what: str) -> Parameter:
-    """An emergency error code."""
-    return Parameter(default, 0, 0xFFFF, what)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,41 +93,63 @@ class Fault:
         return f"{self.kind.name}{way}{given} at node {self.node_id}, {begins}{lasts}, {100 * self.share:.0f} %"
 
 
+@dataclass(slots=True)
+class FaultSpan:
+    """When a fault held, on the clock of the bus.
+
+    Attributes:
+        fault: the fault.
+        begin_ns: its beginning.
+        end_ns: its end; `FOREVER_NS` while it holds.
+    """
+
+    fault: Fault
+    begin_ns: int
+    end_ns: int = FOREVER_NS
+
+    @property
+    def text(self) -> str:
+        """Node, kind and values of the fault."""
+        given = "".join(f" {name}={value:g}" for name, value in self.fault.values.items())
+        return f"node {self.fault.node_id}: {self.fault.kind.name}{given}"
+
+
 def number_text(name: str, value: float) -> str:
     """A number of a fault as it is typed: indices and codes of CANopen in hexadecimal."""
     return f"{name}=0x{int(value):X}" if name in ("index", "code") else f"{name}={value:g}"
 
 
-class Host(Protocol):
-    """A node with faults, as an effect sees it; `faulty_node` has the class.
+class Host:
+    """A node with faults, as their effects see it: beside its own frames it has those that they hold back or make up.
+
+    Args:
+        node: the node.
 
     Attributes:
-        node: the node.
-        hits: number of frames and events so far.
+        hits: number of frames that were changed, lost, moved or made up, and of reboots.
+        late: heap of the frames that go on later: time, number, whether the node receives it, frame.
+        swapped: frames to send behind those that the node sends next.
+        said: frames that the node did not make, to send with its next answers.
     """
 
-    node: SlaveNode
-    hits: int
+    def __init__(self, node: SlaveNode) -> None:
+        self.node, self.hits = node, 0
+        self.late: list[tuple[int, int, bool, Frame]] = []
+        self.swapped: list[Frame] = []
+        self.said: list[Frame] = []
+        self._count = 0
 
     def later(self, frame: Frame, t_ns: int, *, incoming: bool) -> None:
         """Let a frame go on at `t_ns`."""
-
-    def swap(self, frame: Frame) -> None:
-        """Send a frame behind those that the node sends next."""
-
-    def say(self, frame: Frame) -> None:
-        """Send a frame that the node did not make, with its next answers."""
-
-
-_DEFAULTS: Mapping[str, Any] = {"parameters": numbers(), "incoming": False, "lasts_ns": FOREVER_NS}
-"""What a kind has that states nothing else."""
+        self._count += 1
+        heappush(self.late, (t_ns, self._count, incoming, frame))
 
 
 class Effect:
     """A kind of fault: its facts, and what a fault of it does while it holds.
 
-    A subclass with a name is a row of the registry, whose facts `kinds.toml` has. It states parameters and direction,
-    of which it inherits none, and overrides what it needs of the methods; here they do nothing.
+    A subclass with a name is a row of the registry, whose facts `kinds.toml` has. It overrides what it needs of the
+    methods; here they do nothing.
 
     Args:
         fault: the fault.
@@ -155,39 +163,47 @@ class Effect:
         conditions: keys of the supervision's conditions that it trips in a cell in motion, at full share.
         points: numbers of the points of `conform` that a drive fails with it; or "unanswered", or "most".
         parameters: its numbers by name.
+        frames: service whose frames it changes, where it changes frames one by one; empty: all services.
         incoming: whether it hits frames that the node receives; None: either, as the fault says, else those it sends.
         needs: device that it needs: a node, a drive, or an array.
         lasts_ns: its duration where a text gives none.
         dark: whether the node neither sends nor hears nor computes.
         due_ns: time at which `advance` is called next; None: never.
         end_ns: time at which it ends.
+        span: when it held.
         left: number of frames that it may still hit.
     """
 
     name: ClassVar[str]
-    what: ClassVar[str]
-    clause: ClassVar[str]
-    reaction: ClassVar[str]
-    conditions: ClassVar[frozenset[str]]
-    points: ClassVar[frozenset[str]]
-    parameters: ClassVar[Mapping[str, Parameter]]
-    incoming: ClassVar[bool | None]
+    what: ClassVar[str] = ""
+    clause: ClassVar[str] = ""
+    reaction: ClassVar[str] = ""
+    conditions: ClassVar[frozenset[str]] = frozenset()
+    points: ClassVar[frozenset[str]] = frozenset()
+    parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})
+    frames: ClassVar[str] = ""
+    incoming: ClassVar[bool | None] = False
     needs: ClassVar[str] = "node"
-    lasts_ns: ClassVar[int]
+    lasts_ns: ClassVar[int] = FOREVER_NS
     dark = False
     due_ns: int | None = None
 
     def __init_subclass__(cls) -> None:
-        for fact, default in _DEFAULTS.items():
-            setattr(cls, fact, vars(cls).get(fact, default))
-        facts = _FACTS.get(vars(cls).get("name", ""), {})
-        cls.what, cls.clause, cls.reaction = (facts.get(key, "") for key in ("what", "clause", "reaction"))
+        facts = _FACTS.get(vars(cls).get("name", ""))
+        if facts is None:
+            return
+        cls.what, cls.clause, cls.reaction = facts["what"], facts["clause"], facts["reaction"]
         cls.conditions, cls.points = (frozenset(facts.get(key, "").split()) for key in ("trips", "fails"))
+        numbers = {name: Parameter(**number) for name, number in facts.get("parameters", {}).items()}
+        cls.parameters, cls.frames = MappingProxyType(numbers), facts.get("frames", "")
+        cls.incoming = DIRECTIONS.get(facts.get("direction", "out"))
+        cls.lasts_ns = facts["lasts_ms"] * 1_000_000 if "lasts_ms" in facts else FOREVER_NS
 
     def __init__(self, fault: Fault, host: Host) -> None:
         self.fault, self.host, self.node = fault, host, host.node
         self.rng = Random(fault.seed)
         self.end_ns = fault.end_ns
+        self.span = FaultSpan(fault, fault.start_ns)
         self.left = fault.hits
 
     def begin(self, t_ns: int) -> Sequence[Frame] | None:
@@ -219,11 +235,6 @@ class Effect:
         self.node.core.now_ns = t_ns
         act()
         return self.node.advance(t_ns)
-
-    def delayed(self, frame: Frame, t_ns: int, ms: float) -> Sequence[Frame]:
-        """Let a frame in the direction of the fault go on later; what goes on now."""
-        self.host.later(frame, t_ns + max(1, round(ms * 1e6)), incoming=self.fault.hears)
-        return ()
 
 
 FaultKind = type[Effect]

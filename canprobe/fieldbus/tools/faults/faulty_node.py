@@ -7,13 +7,13 @@ fault the node behaves as itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Sequence
-from heapq import heappop, heappush
+from heapq import heappop
 
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID, Frame, NmtState
-from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Effect, Fault
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Effect, Fault, FaultSpan, Host
 
 EVENTS = ("boot-up", "operational", "enabled", "sync")
 """Events of a node at which a fault may begin: its next boot-up, NMT start, operation enabled, or SYNC."""
@@ -27,22 +27,17 @@ class FaultyNode(Participant):
         faults: faults; those of other nodes are left out.
 
     Attributes:
-        hits: number of frames that were changed, lost, moved or made up, and of reboots.
+        host: the node as its faults see it, with what they hold back.
         now_ns: time of the last frame or deadline.
-        history: what happened: (time in ns, ``begins`` or ``ends``, fault).
+        spans: when its faults held, in the order of their beginnings.
     """
 
     def __init__(self, node: SlaveNode, faults: Iterable[Fault] = ()) -> None:
-        self.node = node
-        self.hits = 0
+        self.node, self.host = node, Host(node)
         self.now_ns = 0
-        self.history: list[tuple[int, str, Fault]] = []
+        self.spans: list[FaultSpan] = []
         self._pending: list[Fault] = []
         self._effects: list[Effect] = []
-        self._later: list[tuple[int, int, bool, Frame]] = []
-        self._count = 0
-        self._swapped: list[Frame] = []
-        self._said: list[Frame] = []
         self._acts: list[Callable[[SlaveNode], object]] = []
         self._busy = False
         self._before: frozenset[str] = frozenset()
@@ -109,7 +104,7 @@ class FaultyNode(Participant):
         own = self.node.next_deadline_ns
         if not self._busy:
             return own
-        due = [self._later[0][0]] if self._later else []
+        due = [self.host.late[0][0]] if self.host.late else []
         due += [fault.start_ns for fault in self._pending if not fault.event]
         due += [effect.end_ns for effect in self._effects]
         due += [self.now_ns] if self._acts else []
@@ -121,7 +116,7 @@ class FaultyNode(Participant):
 
     def start(self, t_ns: int) -> Sequence[Frame]:
         self.now_ns = t_ns
-        return self._finished(self.node.start(t_ns), (), t_ns)
+        return self._finished(self.node.start(t_ns), t_ns)
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
         self.now_ns = t_ns
@@ -129,12 +124,12 @@ class FaultyNode(Participant):
             return self.node.receive(can_id, data, t_ns)
         ready = self._turn(t_ns)
         if self._is_dark():
-            self.hits += 1
+            self.host.hits += 1
             return ready
         out: list[Frame] = []
         for frame in self._through([(can_id, data)], t_ns, incoming=True):
             out += self.node.receive(*frame, t_ns)
-        return [*ready, *self._finished(out, (), t_ns, synchronised=can_id == SYNC_ID)]
+        return [*ready, *self._finished(out, t_ns, synchronised=can_id == SYNC_ID)]
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
         self.now_ns = t_ns
@@ -142,8 +137,8 @@ class FaultyNode(Participant):
             return self.node.advance(t_ns)
         ready = self._turn(t_ns)
         answers: list[Frame] = []
-        while self._later and self._later[0][0] <= t_ns:
-            _, _, incoming, frame = heappop(self._later)
+        while self.host.late and self.host.late[0][0] <= t_ns:
+            _, _, incoming, frame = heappop(self.host.late)
             if not incoming:
                 ready.append(frame)
             elif not self._is_dark():
@@ -155,22 +150,10 @@ class FaultyNode(Participant):
         for act in acts:
             answers += self.node.act(t_ns, act)
         made = [f for e in self._effects if e.due_ns is not None and e.due_ns <= t_ns for f in e.advance(t_ns)]
-        out = [*ready, *self._finished(answers, made, t_ns)]
-        self._busy = bool(self._pending or self._effects or self._later or self._swapped or self._acts)
+        self.host.said = made + self.host.said
+        out = [*ready, *self._finished(answers, t_ns)]
+        self._busy = bool(self._pending or self._effects or self.host.late or self.host.swapped or self._acts)
         return out
-
-    def later(self, frame: Frame, t_ns: int, *, incoming: bool) -> None:
-        """Let a frame go on at `t_ns`."""
-        self._count += 1
-        heappush(self._later, (t_ns, self._count, incoming, frame))
-
-    def swap(self, frame: Frame) -> None:
-        """Send a frame behind those that the node sends next."""
-        self._swapped.append(frame)
-
-    def say(self, frame: Frame) -> None:
-        """Send a frame that the node did not make, with its next answers."""
-        self._said.append(frame)
 
     def _is_dark(self) -> bool:
         return any(effect.dark for effect in self._effects)
@@ -183,26 +166,24 @@ class FaultyNode(Participant):
             out += self._begin(fault, t_ns)
         for effect in [one for one in self._effects if one.end_ns <= t_ns or one.left <= 0]:
             self._effects.remove(effect)
-            self.history.append((t_ns, "ends", effect.fault))
+            effect.span.end_ns = t_ns
             out += effect.end(t_ns) or ()
         return [] if self._is_dark() else out
 
     def _begin(self, fault: Fault, t_ns: int) -> Sequence[Frame]:
-        self.history.append((t_ns, "begins", fault))
-        effect = fault.kind(fault, self)
-        effect.end_ns = t_ns + fault.duration_ns
+        effect = fault.kind(fault, self.host)
+        effect.span.begin_ns, effect.end_ns = t_ns, t_ns + fault.duration_ns
+        self.spans.append(effect.span)
         self._effects.append(effect)
         frames = effect.begin(t_ns)
-        self.hits += frames is not None
+        self.host.hits += frames is not None
         return frames or ()
 
-    def _finished(
-        self, frames: Sequence[Frame], made: Sequence[Frame], t_ns: int, *, synchronised: bool = False
-    ) -> list[Frame]:
-        """What the bus gets of the node's frames, of those that faults make, and of those said in its name."""
+    def _finished(self, frames: Sequence[Frame], t_ns: int, *, synchronised: bool = False) -> list[Frame]:
+        """What the bus gets of the node's frames, and of those said in its name."""
         sent = self._sent(frames, t_ns)
-        said, self._said = self._said, []
-        out = [*sent, *made, *said, *(frame for effect in self._effects for frame in effect.watch(t_ns))]
+        said, self.host.said = self.host.said, []
+        out = [*sent, *said, *(frame for effect in self._effects for frame in effect.watch(t_ns))]
         if any(fault.event for fault in self._pending):
             booted = any(can_id == HEARTBEAT_BASE + self.node_id and data == b"\0" for can_id, data in frames)
             now = self._events()
@@ -224,15 +205,15 @@ class FaultyNode(Participant):
         if not frames:
             return frames
         if self._is_dark():
-            self.hits += len(frames)
+            self.host.hits += len(frames)
             return ()
         batch = list(frames)
         for effect in self._effects:
             batch = effect.batch(batch, t_ns)
         sent = self._through(batch, t_ns, incoming=False)
         if sent:
-            sent += self._swapped
-            self._swapped = []
+            sent += self.host.swapped
+            self.host.swapped = []
         return sent
 
     def _through(self, frames: list[Frame], t_ns: int, *, incoming: bool) -> list[Frame]:
@@ -247,6 +228,6 @@ class FaultyNode(Participant):
         out = effect.frame(frame, t_ns)
         if out is None:
             return (frame,)
-        self.hits += 1
+        self.host.hits += 1
         effect.left -= 1
         return out

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
-from typing import ClassVar
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.node.slave_node import SlaveNode
@@ -13,90 +12,104 @@ from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.tactile import TactileHeader, crc16_ccitt
-from canprobe.fieldbus.tools.faults.fault import SHORT_NS, Effect, Parameter, in_ms, numbers
+from canprobe.fieldbus.tools.faults.fault import Effect
 
 BUS_OFF_RECOVERED_CODE = 0x8140
 HEADER_INDEX, POSITION_INDEX = 0x2120, 0x6064
 _GARBAGE_ID = 0x050
 _TPDO1 = 0x180
 _PDO_IDS = range(0x181, 0x580)
-_TO_ALL_ID = 0x100
+"""Identifiers that PDOs may have, and nothing else has by default."""
 
 
-def is_pdo(can_id: int) -> bool:
-    """Whether an identifier is one that PDOs may have, and nothing else has by default."""
-    return can_id in _PDO_IDS and can_id != _TO_ALL_ID
+def service_of(can_id: int, data: bytes, node_id: int) -> str:
+    """The service that a frame from or to a node belongs to, in the words of `kinds.toml`; empty for any other."""
+    whole = len(data) == frames.CLASSIC_BYTES
+    services = {
+        frames.SYNC_ID: "SYNC",
+        frames.HEARTBEAT_BASE + node_id: "boot-up" if data == b"\0" else "heartbeat",
+        frames.SDO_RX_BASE + node_id: "SDO request" if whole else "",
+        frames.SDO_TX_BASE + node_id: "SDO answer" if whole else "",
+    }
+    return services.get(can_id, "PDO" if can_id in _PDO_IDS else "")
 
 
-class Drop(Effect):
+class FrameFault(Effect):
+    """Base class of the faults that change the frames of a service one by one. Here they are lost."""
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        hit = self.frames in ("", service_of(*frame, self.node.node_id))
+        return self.changed(frame, t_ns) if hit else None
+
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        """What goes on in the place of a frame; None: the frame itself, which the fault does not hit."""
+        return ()
+
+
+class Drop(FrameFault):
     """Frames are lost."""
 
     name = "drop"
-    incoming: ClassVar[bool | None] = None
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        return ()
 
 
-class Delay(Effect):
+class Delay(FrameFault):
     """Frames come later."""
 
     name = "delay"
-    parameters, incoming = numbers(ms=in_ms(1, "delay, ms")), None
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        return self.delayed(frame, t_ns, self.fault.value("ms"))
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
+        self.host.later(frame, t_ns + max(1, round(self.delay_ms() * 1e6)), incoming=self.fault.hears)
+        return ()
+
+    def delay_ms(self) -> float:
+        """Delay of the next frame, ms."""
+        return self.fault.value("ms")
 
 
-class Duplicate(Effect):
+class Duplicate(FrameFault):
     """Frames come twice, or more often."""
 
     name = "duplicate"
-    parameters, incoming = numbers(n=Parameter(2, 2, 100, "number of frames for each")), None
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
         return [frame] * int(self.fault.value("n"))
 
 
-class Corrupt(Effect):
+class Corrupt(FrameFault):
     """A bit of each frame is another, or its end is missing, as the CRC of the wire lets it pass once in a lifetime."""
 
     name = "corrupt"
-    incoming = None
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
         return ((frame[0], _flip_bit(frame[1], self.rng)),)
 
 
-class Reorder(Effect):
+class Reorder(FrameFault):
     """A frame comes behind the next ones."""
 
     name = "reorder"
-    incoming = None
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        self.host.swap(frame)
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
+        self.host.swapped.append(frame)
         return ()
 
 
-class Mute(Drop):
+class Mute(FrameFault):
     """The node sends nothing."""
 
     name = "mute"
 
 
-class Deaf(Drop):
+class Deaf(FrameFault):
     """The node hears nothing."""
 
     name = "deaf"
-    incoming = True
 
 
 class Reboot(Effect):
     """The power fails for the duration; the node boots when it is back."""
 
     name = "reboot"
-    lasts_ns = SHORT_NS
     dark = True
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
@@ -119,7 +132,6 @@ class Babble(Effect):
     """The node sends frames that nobody asked for; each seed has its own sort."""
 
     name = "babble"
-    parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
 
     def begin(self, t_ns: int) -> None:
         self.due_ns = t_ns
@@ -186,48 +198,43 @@ class WrongData(Effect):
         return [(can_id, packed if can_id == ids[0] else data) for can_id, data in sent]
 
 
-class Short(Effect):
+class Short(FrameFault):
     """PDOs have a byte too few."""
 
     name = "short"
-    incoming = None
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return ((frame[0], frame[1][:-1]),) if is_pdo(frame[0]) and frame[1] else None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        return ((frame[0], frame[1][:-1]),) if frame[1] else None
 
 
-class Long(Effect):
+class Long(FrameFault):
     """PDOs have a byte too many, where a classical frame has room for it."""
 
     name = "long"
-    incoming = None
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return ((frame[0], frame[1] + b"\0"),) if is_pdo(frame[0]) and len(frame[1]) < frames.CLASSIC_BYTES else None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        return ((frame[0], frame[1] + b"\0"),) if len(frame[1]) < frames.CLASSIC_BYTES else None
 
 
 class Burst(Duplicate):
     """Frames come many times."""
 
     name = "burst"
-    parameters, incoming = numbers(n=Parameter(10, 2, 100, "number of frames for each")), None
 
 
-class WrongId(Effect):
+class WrongId(FrameFault):
     """PDOs come under another identifier."""
 
     name = "wrong-id"
-    parameters, incoming = numbers(offset=Parameter(16, -0x180, 0x180, "distance of the identifiers")), None
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return ((frame[0] + int(self.fault.value("offset")), frame[1]),) if is_pdo(frame[0]) else None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
+        return ((frame[0] + int(self.fault.value("offset")), frame[1]),)
 
 
 class OddFrames(Babble):
     """Remote requests for PDOs that allow none, and 29-bit frames with the bits of an RPDO."""
 
     name = "odd-frames"
-    parameters = numbers(gap_ms=in_ms(1, "time between two frames, ms"))
 
     def made(self) -> Frame:
         if self.rng.random() < 0.5:
@@ -235,43 +242,34 @@ class OddFrames(Babble):
         return frames.EFF_FLAG | _TPDO1 + 0x80 + self.node.node_id, self.rng.randbytes(8)
 
 
-class SyncJitter(Effect):
+class SyncJitter(Delay):
     """SYNC reaches the node later, each time by another time."""
 
     name = "sync-jitter"
-    parameters, incoming = numbers(us=Parameter(200, 1, 1e6, "longest delay, µs")), True
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        if frame[0] != frames.SYNC_ID:
-            return None
-        return self.delayed(frame, t_ns, 1e-3 * self.rng.uniform(0.0, self.fault.value("us")))
+    def delay_ms(self) -> float:
+        return 1e-3 * self.rng.uniform(0.0, self.fault.value("us"))
 
 
-class SyncLost(Effect):
+class SyncLost(FrameFault):
     """SYNC does not reach the node."""
 
     name = "sync-lost"
-    incoming = True
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame[0] == frames.SYNC_ID else None
 
 
-class SyncDouble(Effect):
+class SyncDouble(FrameFault):
     """SYNC reaches the node twice."""
 
     name = "sync-double"
-    incoming = True
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return (frame, frame) if frame[0] == frames.SYNC_ID else None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
+        return (frame, frame)
 
 
 class BusOff(Effect):
     """The controller is off the bus; the node itself goes on, and reports its return by EMCY 8140h."""
 
     name = "bus-off"
-    incoming, lasts_ns = True, SHORT_NS
 
     def batch(self, sent: list[Frame], t_ns: int) -> list[Frame]:
         self.host.hits += len(sent)

@@ -6,11 +6,11 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.drive.drive import DriveApplication
-from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Fault, FaultKind
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Fault, FaultKind, FaultSpan
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
 from canprobe.fieldbus.tools.faults.frame_faults import HEADER_INDEX
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
@@ -54,7 +54,8 @@ class FaultyNodes:
     def end(self, fault: Fault) -> None:
         """End a fault at the next frame or deadline of its node."""
         for node in self.nodes:
-            node.remove(fault)
+            if node.node_id == fault.node_id:
+                node.remove(fault)
 
     def clear(self) -> list[Fault]:
         """End all faults; return them."""
@@ -68,14 +69,15 @@ class FaultyNodes:
         """Faults that hold, and those that are to come."""
         return [fault for node in self.nodes for fault in node.faults]
 
-    def spans(self) -> list[tuple[Fault, int, int]]:
-        """Faults that have begun, in order, with begin and end on the clock of the bus; one that holds ends never."""
-        spans: dict[int, tuple[Fault, int, int]] = {}
-        for node in self.nodes:
-            for t_ns, word, fault in node.history:
-                begin_ns, end_ns = (t_ns, FOREVER_NS) if word == "begins" else (spans[id(fault)][1], t_ns)
-                spans[id(fault)] = fault, begin_ns, end_ns
-        return sorted(spans.values(), key=itemgetter(1))
+    def spans(self, start_ns: int = 0, now_ns: int = FOREVER_NS) -> list[FaultSpan]:
+        """When faults held, in order; one that holds still ends now.
+
+        Args:
+            start_ns: time on the clock of the bus that is 0 in what is returned.
+            now_ns: present time on that clock.
+        """
+        spans = sorted((span for node in self.nodes for span in node.spans), key=attrgetter("begin_ns"))
+        return [FaultSpan(one.fault, one.begin_ns - start_ns, min(one.end_ns, now_ns) - start_ns) for one in spans]
 
     def _node(self, node_id: int, text: str) -> FaultyNode:
         for node in self.nodes:
@@ -194,8 +196,10 @@ class PlannedFaults:
             start_ns: time on the clock of the bus that is 0 in the lines.
         """
         texts = {id(fault): text for fault, text in self._thrown}
-        events = [event for node in self._nodes for event in node.history]
+        spans = [span for node in self._nodes for span in node.spans]
+        events = [(span.begin_ns, "begins", span.fault) for span in spans]
+        events += [(span.end_ns, "ends", span.fault) for span in spans if span.end_ns < FOREVER_NS]
         lines = [f"thrown: {text}" for text in texts.values()] + [f"not yet thrown: {text}" for text in self.waiting]
-        for t_ns, word, fault in sorted(events, key=lambda event: event[0]):
+        for t_ns, word, fault in sorted(events, key=itemgetter(0, 1)):
             lines.append(f"{(t_ns - start_ns) * 1e-9:.6f} s {word}: {texts.get(id(fault), fault.kind.name)}")
         return lines or ["none"]

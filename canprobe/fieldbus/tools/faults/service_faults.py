@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.fieldbus.protocol.sdo import Abort, pack_abort, place_of
-from canprobe.fieldbus.tools.faults.fault import Effect, Parameter, error_code, in_ms, numbers
-from canprobe.fieldbus.tools.faults.frame_faults import Babble
+from canprobe.fieldbus.protocol.sdo import pack_abort, place_of
+from canprobe.fieldbus.tools.faults.fault import Effect
+from canprobe.fieldbus.tools.faults.frame_faults import Babble, Delay, FrameFault
 
-_BOOT_UP = b"\0"
 _TOGGLE_FLAG = 0x10
 _SEGMENT_ANSWERS = (0, 1)  # server command specifiers: upload segment, download segment
 _INITIATE_ANSWERS = (2, 3)  # initiate upload, initiate download
@@ -19,64 +18,47 @@ _INITIATE_REQUESTS = (1, 2, 5, 6)  # client command specifiers: download, upload
 _EXPEDITED_FLAGS = 0x43
 
 
-class HeartbeatOff(Effect):
+class HeartbeatOff(FrameFault):
     """The heartbeat is not sent; the boot-up message is."""
 
     name = "heartbeat-off"
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame[0] == frames.HEARTBEAT_BASE + self.node.node_id and frame[1] != _BOOT_UP else None
 
-
-class HeartbeatState(Effect):
+class HeartbeatState(FrameFault):
     """The heartbeat reports a state in which the node is not."""
 
     name = "heartbeat-state"
-    parameters = numbers(state=Parameter(4, 0, 127, "state: 4 stopped, 127 pre-operational"))
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        if frame[0] != frames.HEARTBEAT_BASE + self.node.node_id or frame[1] == _BOOT_UP:
-            return None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
         return ((frame[0], bytes((int(self.fault.value("state")),))),)
 
 
-class NoBootUp(Effect):
+class NoBootUp(FrameFault):
     """The boot-up message is not sent."""
 
     name = "no-boot-up"
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame == (frames.HEARTBEAT_BASE + self.node.node_id, _BOOT_UP) else None
 
 
 class Nmt(Effect):
     """The node changes its NMT state as if commanded, without a command on the bus."""
 
     name = "nmt"
-    parameters = numbers(command=Parameter(2, 1, 130, "command: 2 stop, 128 pre-operational, 129 reset"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         return self.node.receive(frames.NMT_ID, bytes((int(self.fault.value("command")), self.node.node_id)), t_ns)
 
 
-class ObjectAborted(Effect):
+class ObjectAborted(FrameFault):
     """Accesses to one object are aborted."""
 
     name = "sdo-abort"
-    incoming = True
-    parameters = numbers(
-        index=Parameter(0x1017, 0, 0xFFFF, "index of the object"),
-        code=Parameter(Abort.CANNOT_STORE, 0, 0xFFFFFFFF, "abort code"),
-    )
 
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        can_id, data = frame
-        if can_id != frames.SDO_RX_BASE + self.node.node_id or len(data) != frames.CLASSIC_BYTES:
-            return None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        data = frame[1]
         index, subindex = place_of(data)
         if data[0] >> 5 not in _INITIATE_REQUESTS or index != self.index(data):
             return None
-        self.host.say((frames.SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
+        self.host.said.append((frames.SDO_TX_BASE + self.node.node_id, pack_abort(index, subindex, self.code)))
         return ()
 
     def index(self, data: bytes) -> int:
@@ -89,79 +71,56 @@ class ObjectAborted(Effect):
         return int(self.fault.value("code"))
 
 
-class SdoSilent(Effect):
+class SdoSilent(FrameFault):
     """SDO requests are not answered."""
 
     name = "sdo-silent"
-    incoming = True
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        return () if frame[0] == frames.SDO_RX_BASE + self.node.node_id else None
 
 
-class SdoSlow(Effect):
+class SdoSlow(Delay):
     """SDO answers come late."""
 
     name = "sdo-slow"
-    parameters = numbers(ms=in_ms(100, "delay, ms"))
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        if frame[0] != frames.SDO_TX_BASE + self.node.node_id:
-            return None
-        return self.delayed(frame, t_ns, self.fault.value("ms"))
 
 
-class SdoAnswer(Effect):
-    """Base class of faults of the default SDO server's answers."""
-
-    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
-        can_id, data = frame
-        if can_id != frames.SDO_TX_BASE + self.node.node_id or len(data) != frames.CLASSIC_BYTES:
-            return None
-        changed = self.changed(data)
-        return None if changed is None else ((can_id, changed),)
-
-    def changed(self, data: bytes) -> bytes | None:
-        """The answer that is sent instead; None where it stays as it is."""
-        return None
-
-
-class SdoToggle(SdoAnswer):
+class SdoToggle(FrameFault):
     """Segments have the wrong toggle bit."""
 
     name = "sdo-toggle"
 
-    def changed(self, data: bytes) -> bytes | None:
-        return bytes((data[0] ^ _TOGGLE_FLAG,)) + data[1:] if data[0] >> 5 in _SEGMENT_ANSWERS else None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        can_id, data = frame
+        return ((can_id, bytes((data[0] ^ _TOGGLE_FLAG,)) + data[1:]),) if data[0] >> 5 in _SEGMENT_ANSWERS else None
 
 
-class SdoWrongObject(SdoAnswer):
+class SdoWrongObject(FrameFault):
     """Answers name the index behind the one that was asked for."""
 
     name = "sdo-wrong-object"
 
-    def changed(self, data: bytes) -> bytes | None:
-        index = (place_of(data)[0] + 1) & 0xFFFF
-        return data[:1] + index.to_bytes(2, "little") + data[3:] if data[0] >> 5 in _INITIATE_ANSWERS else None
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        can_id, data = frame
+        index = (place_of(data)[0] + 1 & 0xFFFF).to_bytes(2, "little")
+        return ((can_id, data[:1] + index + data[3:]),) if data[0] >> 5 in _INITIATE_ANSWERS else None
 
 
-class SdoSize(SdoAnswer):
+class SdoSize(FrameFault):
     """Expedited answers announce a byte too few; one byte becomes four."""
 
     name = "sdo-size"
 
-    def changed(self, data: bytes) -> bytes | None:
+    def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        can_id, data = frame
         if data[0] & 0xF3 != _EXPEDITED_FLAGS:
             return None
         unused = (data[0] >> 2 & 3) + 1 & 3
-        return bytes((_EXPEDITED_FLAGS | unused << 2,)) + data[1:]
+        return ((can_id, bytes((_EXPEDITED_FLAGS | unused << 2,)) + data[1:]),)
 
 
 class EmcyOnce(Effect):
     """The node reports an error in EMCY, 1001h and 1003h, and that it is gone at the end of the fault."""
 
     name = "emcy"
-    parameters = numbers(code=error_code(0x5000, "emergency error code"))
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         return self.act(t_ns, lambda: self.node.emcy.report(int(self.fault.value("code")), source=self))
@@ -174,9 +133,6 @@ class EmcyStorm(Babble):
     """An error comes and goes without an end, whatever the inhibit time."""
 
     name = "emcy-storm"
-    parameters = numbers(
-        gap_ms=in_ms(1, "time between two messages, ms"), code=error_code(0x8210, "emergency error code")
-    )
     _present = False
 
     def made(self) -> Frame:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 
 from canprobe.errors import UsageError, did_you_mean
-from canprobe.fieldbus.tools.faults.fault import ENDLESS_HITS, FOREVER_NS, Fault, FaultKind, Parameter
+from canprobe.fieldbus.tools.faults.fault import DIRECTIONS, ENDLESS_HITS, FOREVER_NS, Fault, FaultKind, Parameter
 from canprobe.fieldbus.tools.faults.faulty_node import EVENTS
 
 FORM = "node N: NAME [k=v …] [at T | on EVENT] [for D], such as: node 3: heartbeat-off at 5 s for 200 ms"
@@ -22,7 +22,6 @@ _FORM = re.compile(
     r"(?:\s+for\s+(?P<long>[\d.eE+-]+)\s*(?P<long_unit>[a-zµ]+))?\s*"
 )
 _UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000}
-_DIRECTIONS = {"in": True, "out": False}
 _COMMON = {
     "share": Parameter(1.0, 0.0, 1.0, "share of the frames that it hits"),
     "count": Parameter(ENDLESS_HITS, 1, ENDLESS_HITS, "number of frames, then it is over"),
@@ -67,29 +66,21 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind], now_ns: int = 0) -> F
     incoming = _direction(text, kind, given.pop("direction", None))
     known = {**kind.parameters, **_COMMON}
     values = {name: _number(text, name, value, known) for name, value in given.items()}
-    common = {name: values.pop(name, parameter.default) for name, parameter in _COMMON.items()}
-    return Fault(
-        kind,
-        int(match["node"]),
-        now_ns + (_time(text, match["at"], match["at_unit"]) if match["at"] else 0),
-        _time(text, match["long"], match["long_unit"]) if match["long"] else kind.lasts_ns,
-        values,
-        common["share"],
-        int(common["count"]),
-        incoming,
-        int(common["seed"]),
-        event,
-    )
+    share, count, seed = (values.pop(name, parameter.default) for name, parameter in _COMMON.items())
+    start_ns = now_ns + (_time(text, match["at"], match["at_unit"]) if match["at"] else 0)
+    lasts_ns = _time(text, match["long"], match["long_unit"]) if match["long"] else kind.lasts_ns
+    node_id = int(match["node"])
+    return Fault(kind, node_id, start_ns, lasts_ns, values, share, int(count), incoming, int(seed), event)
 
 
 def _direction(text: str, kind: FaultKind, given: str | None) -> bool | None:
     if given is None:
         return None
-    if given not in _DIRECTIONS:
+    if given not in DIRECTIONS:
         raise UsageError(f"fault {text!r}: expected direction=in or direction=out, got {given!r}")
-    if kind.incoming is not None and kind.incoming is not _DIRECTIONS[given]:
+    if kind.incoming is not None and kind.incoming is not DIRECTIONS[given]:
         raise UsageError(f"fault {text!r}: {kind.name} has its own direction; leave direction= out")
-    return _DIRECTIONS[given]
+    return DIRECTIONS[given]
 
 
 def _number(text: str, name: str, value: str, known: Mapping[str, Parameter]) -> float:

@@ -26,10 +26,4 @@ Start reading at `bus_state`, then `rule`, then `enable`.
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, nodes_of, read_record
 from canprobe.fieldbus.tools.judge.judging import RULES, Judge
 
-__all__ = [
-    "RULES",
-    "BusFrame",
-    "Judge",
-    "nodes_of",
-    "read_record",
-]
+__all__ = ["RULES", "BusFrame", "Judge", "nodes_of", "read_record"]

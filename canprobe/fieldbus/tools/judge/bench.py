@@ -20,11 +20,11 @@ from canprobe.fieldbus.bus.tapped import TappedPort
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, command_of
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.fieldbus.tools.faults import FaultyNodes
+from canprobe.fieldbus.tools.faults import FaultSpan, FaultyNodes
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import ControlSeen, NmtSeen, RequestSeen
-from canprobe.fieldbus.tools.judge.injections import Injections, Thrown
+from canprobe.fieldbus.tools.judge.injections import Injections
 from canprobe.fieldbus.tools.judge.judging import Judge
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
@@ -188,7 +188,7 @@ class MasterBench:
         ordered = sorted(self.frames, key=attrgetter("t_ns"))
         return [replace(frame, t_ns=frame.t_ns - self._begin_ns) for frame in ordered]
 
-    def thrown(self) -> list[Thrown]:
+    def thrown(self) -> list[FaultSpan]:
         """The faults that held, with times from the beginning."""
         return self.injections.thrown(self._begin_ns) if self.injections is not None else []
 
@@ -218,7 +218,7 @@ def write_log(frames: Sequence[BusFrame], path: Path, channel: str) -> None:
 
 
 def first_answers(
-    frames: Sequence[BusFrame], thrown: Sequence[Thrown], nodes: Mapping[int, Description]
+    frames: Sequence[BusFrame], thrown: Sequence[FaultSpan], nodes: Mapping[int, Description]
 ) -> list[BusFrame | None]:
     """The first frame after each fault by which the master does something else than before; None without one.
 

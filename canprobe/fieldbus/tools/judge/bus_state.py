@@ -64,15 +64,11 @@ class BusState:
         """
         self.now_ns = frame.t_ns
         can_id, data = frame.can_id, frame.data
-        if can_id & frames.RTR_FLAG and can_id & 0x3FFFFFFF <= 0x7FF:
-            yield events.RemoteSeen(frame)
-        elif can_id <= 0x7FF:
-            yield from self._events(frame, can_id, data)
-
-    def _events(self, frame: BusFrame, can_id: int, data: bytes) -> Iterator[BusEvent]:
-        node = self.nodes.get(can_id & 0x7F)
-        base = can_id - (can_id & 0x7F)
-        if can_id == frames.NMT_ID:
+        node, base = self.nodes.get(can_id & 0x7F), can_id & ~0x7F
+        if can_id > 0x7FF:
+            if can_id & frames.RTR_FLAG and can_id & 0x3FFFFFFF <= 0x7FF:
+                yield events.RemoteSeen(frame)
+        elif can_id == frames.NMT_ID:
             yield from self._nmt(frame)
         elif can_id == frames.SYNC_ID and len(data) <= 1:
             self.syncs_ns.append(frame.t_ns)
@@ -108,7 +104,12 @@ class BusState:
         for node in self.nodes.values():
             received, sent = node.rpdos.get(frame.can_id), node.tpdos.get(frame.can_id)
             if received is not None:
-                yield from self._rpdo(frame, node, received)
+                node.addressed = True
+                node.rpdo_counts[received.number] += 1
+                values = _unpacked(received, frame)
+                before = {place: node.sure_value(*place) for place in values}
+                yield events.RpdoSeen(frame, node, received, values, before)
+                yield from self._valued(node, values, frame, received, written=True)
             if sent is not None and frame.from_node is not False:
                 node.hear(frame.t_ns)
                 node.answers = True
@@ -174,14 +175,6 @@ class BusState:
             return
         shown = event.request if event.writes else event.frame
         yield from self._valued(node, {event.place: event.value}, shown, None, written=event.writes)
-
-    def _rpdo(self, frame: BusFrame, node: SeenNode, pdo: PdoView) -> Iterator[BusEvent]:
-        node.addressed = True
-        node.rpdo_counts[pdo.number] = node.rpdo_counts.get(pdo.number, 0) + 1
-        values = _unpacked(pdo, frame)
-        before = {place: node.sure_value(*place) for place in values}
-        yield events.RpdoSeen(frame, node, pdo, values, before)
-        yield from self._valued(node, values, frame, pdo, written=True)
 
     def _valued(
         self, node: SeenNode, values: Mapping[Place, int], frame: BusFrame, pdo: PdoView | None, *, written: bool

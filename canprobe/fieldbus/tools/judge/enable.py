@@ -40,11 +40,9 @@ _LONGEST_START_NS = 500_000_000
 
 def enables(event: events.ControlSeen) -> bool:
     """Whether a controlword is the first to enable a drive that is not enabled yet."""
-    was = command_of(event.before) if event.before is not None else None
-    is_first = was is not DriveCommand.ENABLE_OPERATION
-    return command_of(event.word, event.before or 0) is DriveCommand.ENABLE_OPERATION and (
-        is_first and not event.node.enabled
-    )
+    enable = DriveCommand.ENABLE_OPERATION
+    enabled_before = event.before is not None and command_of(event.before) is enable
+    return command_of(event.word, event.before or 0) is enable and not enabled_before and not event.node.enabled
 
 
 @rule(1)
@@ -63,10 +61,8 @@ def target_at_enable(case: Case, node: SeenNode) -> Watch[events.ControlSeen | e
         if target is None or position is None:
             continue
         command, armed, off = armed, None, abs(target.value - position.value)
-        allowed, where = (
-            node.tolerance(case.bus.period_ns),
-            f"target {target.value} while the axis is at {position.value}",
-        )
+        allowed = node.tolerance(case.bus.period_ns)
+        where = f"target {target.value} while the axis is at {position.value}"
         case.expect(node, off <= allowed, f"{where}: {off} off, {allowed:.0f} allowed", position, target, command)
 
 
@@ -240,11 +236,10 @@ def homing_start(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
         first, asked = first or event.frame, node.known(cia402.MODE)
         if asked is None or asked.value != OperationMode.HOMING:
             continue
+        waited_ns = event.frame.t_ns - asked.t_ns
         if first is event.frame:
             shown = node.known(cia402.MODE_DISPLAY)
             what = f"bit 4 rises while 6061h is {shown.value if shown is not None else 'not read'}"
             case.expect(node, node.mode_confirmed, what, asked, shown, event)
-        elif case.in_a_row(
-            node, first.t_ns < asked.t_ns and event.frame.t_ns - asked.t_ns > _LONGEST_START_NS and node.enabled
-        ):
+        elif case.in_a_row(node, first.t_ns < asked.t_ns and waited_ns > _LONGEST_START_NS and node.enabled):
             case.blame(node, "bit 4 was set before mode 6, and has no edge", first, asked, event)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
+from canprobe.fieldbus.tools.faults import FaultSpan, FaultyNode, FaultyNodes
 
 STANDARD_FAULTS = (
     "sdo-slow ms=200 for 2 s",
@@ -20,20 +20,6 @@ STANDARD_FAULTS = (
 """The standard sequence, from what a master may bear to what it must bring up anew."""
 _CALM_NS = 2_000_000_000
 """Time for which the nodes must have been at work before the next fault."""
-
-
-@dataclass(frozen=True, slots=True)
-class Thrown:
-    """A fault that was thrown.
-
-    Attributes:
-        text: node, kind and values of the fault.
-        begin_ns, end_ns: when it held.
-    """
-
-    text: str
-    begin_ns: int
-    end_ns: int
 
 
 class Injections:
@@ -58,41 +44,30 @@ class Injections:
         """Faults of the sequence that were not thrown."""
         return list(self._queue)
 
-    def thrown(self, start_ns: int = 0) -> list[Thrown]:
+    def thrown(self, start_ns: int = 0) -> list[FaultSpan]:
         """Faults that held, in order, with times from a beginning; one that holds ends at the last look."""
-        found = []
-        for fault, begin_ns, end_ns in self._nodes.spans():
-            given = "".join(f" {name}={value:g}" for name, value in fault.values.items())
-            text = f"node {fault.node_id}: {fault.kind.name}{given}"
-            found.append(Thrown(text, begin_ns - start_ns, min(end_ns, self._now_ns) - start_ns))
-        return found
+        return self._nodes.spans(start_ns, self._now_ns)
 
     def look(self, now_ns: int) -> None:
         """Throw the next fault of the sequence when no other holds and the nodes are at work."""
         self._now_ns = now_ns
-        if self._queue and not any(node.holding for node in self._nodes.nodes):
-            self._throw_next(now_ns)
-
-    def _throw_next(self, now_ns: int) -> None:
+        if not self._queue or any(node.holding for node in self._nodes.nodes):
+            return
         at_work = _at_work(self._nodes.nodes)
         if at_work is None:
             self._calm_ns = None
-            return
-        self._calm_ns = now_ns if self._calm_ns is None else self._calm_ns
-        if now_ns - self._calm_ns >= _CALM_NS:
-            text = f"node {at_work.node_id}: {self._queue.pop(0)}"
-            try:
-                self._nodes.inject(text, now_ns)
-            except UsageError:  # the node is no drive, which this kind needs
-                return
-            self._calm_ns = None
+        elif self._calm_ns is None:
+            self._calm_ns = now_ns
+        elif now_ns - self._calm_ns >= _CALM_NS:
+            with suppress(UsageError):  # the node is no drive, which this kind needs
+                self._nodes.inject(f"node {at_work.node_id}: {self._queue.pop(0)}", now_ns)
+                self._calm_ns = None
 
 
 def _at_work(nodes: Iterable[FaultyNode]) -> FaultyNode | None:
     """The first node that does what it is for: a drive that is enabled, or without drives a node in operational."""
     drives = [node for node in nodes if node.node.dictionary.has_index(0x6041)]
-    for node in drives:
-        if known_state(node.node.dictionary.number(0x6041)) is DriveState.OPERATION_ENABLED:
-            return node
-    others = [] if drives else [node for node in nodes if node.node.state is NmtState.OPERATIONAL]
-    return others[0] if others else None
+    if not drives:
+        return next((node for node in nodes if node.node.state is NmtState.OPERATIONAL), None)
+    words = {node: node.node.dictionary.number(0x6041) for node in drives}
+    return next((node for node in drives if known_state(words[node]) is DriveState.OPERATION_ENABLED), None)

@@ -75,7 +75,7 @@ def never_sent(case: Case, node: SeenNode) -> Watch[events.BusEvent]:
     for pdo in node.rpdos.values():
         if not pdo.used or not pdo.maps(cia402.CONTROLWORD, *TARGETS):
             continue
-        sent = bool(node.rpdo_counts.get(pdo.number)) or (by_sdo and not pdo.maps(*TARGETS))
+        sent = bool(node.rpdo_counts[pdo.number]) or (by_sdo and not pdo.maps(*TARGETS))
         seconds, kind = (case.bus.now_ns - started_ns) * 1e-9, f"type {pdo.layout.transmission_type}"
         what = f"RPDO {pdo.number} ({kind}) was not sent in {seconds:.1f} s of operational"
         case.expect(node, sent, what, node.known(RPDOS[pdo.number - 1], 1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -114,7 +114,7 @@ class SeenNode:
         self.heartbeats_ns: deque[int] = deque(maxlen=8)
         self._touched: set[int] = set()
         self._known: dict[Place, Known] = {}
-        self.rpdo_counts: dict[int, int] = {}
+        self.rpdo_counts: Counter[int] = Counter()
         self.rpdos: dict[int, PdoView] = {}
         self.tpdos: dict[int, PdoView] = {}
         self.positions: deque[tuple[int, int]] = deque(maxlen=6)

@@ -127,11 +127,11 @@ def judge_link(figures: LinkFigures, limits: LinkLimits) -> LinkVerdict:
     ]
     worst = max(findings, key=_ORDER.index)
     overruns = {rate: predict_overruns(figures, rate) for rate in sorted({*RATES_HZ, rate_hz}) if rate >= 100.0}
+    fit_rate = _fit_rate(figures, limits, rate_hz)
     if worst is Fitness.FIT:
-        return LinkVerdict(worst, rate_hz, fit_rate_hz=_fit_rate(figures, limits, rate_hz), overruns=overruns)
+        return LinkVerdict(worst, rate_hz, fit_rate_hz=fit_rate, overruns=overruns)
     late = _ORDER.index(lateness) >= _ORDER.index(answers) and lateness is not Fitness.FIT
     cause, why, way_out = _cause(figures, late=late)
-    fit_rate = _fit_rate(figures, limits, rate_hz)
     if fit_rate is not None and fit_rate < rate_hz:
         way_out += f"; or a lower rate: --set cycle.rate_hz={fit_rate:g}"
     return LinkVerdict(worst, rate_hz, cause, why, way_out, fit_rate, overruns)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, DriveState, OperationMode
-from canprobe.fieldbus.protocol.sdo import Abort, pack_write
+from canprobe.fieldbus.protocol.sdo import Abort
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.point import PointGroup
@@ -105,13 +105,10 @@ def mode_display(bench: Bench) -> None:
     modes = _supported(bench)
     _off(bench)
     for mode in range(1, 11):
-        request = pack_write(cia402.MODE, 0, bytes((mode,)))
         if not modes >> mode - 1 & 1:
-            bench.must_refuse(
-                request,
-                (*accepted.VALUE, Abort.PARAMETER_INCOMPATIBLE, Abort.UNSUPPORTED_ACCESS),
-                f"mode {mode}, which 6502h does not list",
-            )
+            codes = (*accepted.VALUE, Abort.PARAMETER_INCOMPATIBLE, Abort.UNSUPPORTED_ACCESS)
+            what = f"mode {mode}, which 6502h does not list"
+            bench.must_refuse_write(cia402.MODE, 0, bytes((mode,)), codes, what)
             continue
         bench.put(cia402.MODE, 0, mode, 1)
         bench.pass_time(0.05)

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, Emcy, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE
-from canprobe.fieldbus.protocol.sdo import pack_read, pack_write
+from canprobe.fieldbus.protocol.sdo import pack_read
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
-from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync
+from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 
 point = PointGroup("emcy", "CiA 301")
@@ -19,9 +18,9 @@ _INHIBIT_MS = 200
 _GENERIC, _COMMUNICATION = 0x01, 0x10
 
 
-def _provoke(bench: Bench) -> tuple[Emcy, int]:
+def _provoke(bench: PdoBench) -> tuple[Emcy, int]:
     """Provoke 8240h; return it and when it came."""
-    plain_sync(bench)
+    bench.plain_sync()
     bench.start()
     bench.sync_and_wait()
     bench.sync(1)
@@ -32,7 +31,7 @@ def _provoke(bench: Bench) -> tuple[Emcy, int]:
 
 
 @point(42, "history", "1003h", "the newest error first: its code in the low 16 bits", needs="nmt sync")
-def history(bench: Bench) -> None:
+def history(bench: PdoBench) -> None:
     """The count and the first entry after an error."""
     bench.need((0x1003, 0), written=False)
     before = bench.number(0x1003)
@@ -44,14 +43,14 @@ def history(bench: Bench) -> None:
 
 
 @point(42, "write to the history", "1003h", accepted.VALUE)
-def write_to_history(bench: Bench) -> None:
+def write_to_history(bench: PdoBench) -> None:
     """1003h:00 takes nothing but 0."""
     bench.need((0x1003, 0))
-    bench.must_refuse(pack_write(0x1003, 0, b"\1"), (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
+    bench.must_refuse_write(0x1003, 0, b"\1", (*accepted.VALUE, *accepted.READ_ONLY), "1 for 1003h:00")
 
 
 @point(42, "empty entry", "1003h", accepted.text(accepted.NO_DATA) + ", or 06090011h")
-def empty_entry(bench: Bench) -> None:
+def empty_entry(bench: PdoBench) -> None:
     """The entry behind the last error."""
     bench.need((0x1003, 0), written=False)
     beyond = bench.number(0x1003) + 1
@@ -60,7 +59,7 @@ def empty_entry(bench: Bench) -> None:
 
 
 @point(42, "clearing the history", "1003h", "0 to 1003h:00 empties it")
-def clear_history(bench: Bench) -> None:
+def clear_history(bench: PdoBench) -> None:
     """Where the user permits it."""
     bench.need((0x1003, 0))
     bench.put(0x1003, 0, 0)
@@ -69,7 +68,7 @@ def clear_history(bench: Bench) -> None:
 
 
 @point(43, "identifier", "1014h", "080h+id by default, and the one of the messages", needs="nmt sync")
-def identifier(bench: Bench) -> None:
+def identifier(bench: PdoBench) -> None:
     """1014h names the identifier on which an error comes."""
     bench.need((0x1014, 0), written=False)
     value = bench.number(0x1014)
@@ -90,7 +89,7 @@ def identifier(bench: Bench) -> None:
 
 
 @point(43, "inhibit time", "1015h", "no two messages within the inhibit time", needs="nmt sync")
-def inhibit_time(bench: Bench) -> None:
+def inhibit_time(bench: PdoBench) -> None:
     """An error and its end within 200 ms."""
     bench.need((0x1015, 0))
     bench.put(0x1015, 0, _INHIBIT_MS * 10)
@@ -110,7 +109,7 @@ def inhibit_time(bench: Bench) -> None:
     "bits 0 and 4 with 8240h, at least one of them; as the EMCY says; as before after its end",
     needs="nmt sync",
 )
-def error_register(bench: Bench) -> None:
+def error_register(bench: PdoBench) -> None:
     """1001h before, during and after an error."""
     before = bench.number(0x1001)
     emcy, _ = _provoke(bench)

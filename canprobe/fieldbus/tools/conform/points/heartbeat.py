@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
-from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
@@ -137,8 +136,7 @@ def duplicate_consumer(bench: Bench) -> None:
     """Two entries for one producer."""
     bench.need((0x1016, 2))
     producer = _consumer(bench)
-    request = pack_write(0x1016, 2, (producer << 16 | 500).to_bytes(4, "little"))
-    bench.must_refuse(request, accepted.DUPLICATE, "a second entry for one producer")
+    bench.must_refuse_write(0x1016, 2, producer << 16 | 500, accepted.DUPLICATE, "a second entry for one producer")
 
 
 @point(45, "error behaviour", "1029h:01", "after the loss 0: pre-operational, 1: no change, 2: stopped", needs="nmt")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from canprobe.fieldbus.protocol.frames import NMT_ID, RTR_FLAG, NmtCommand, NmtState
-from canprobe.fieldbus.protocol.pdo import NO_RTR_FLAG, TPDOS
-from canprobe.fieldbus.tools.conform.bench import QUEUED_NS, Bench
+from canprobe.fieldbus.protocol.frames import NMT_ID, NmtCommand, NmtState
+from canprobe.fieldbus.protocol.pdo import TPDOS
+from canprobe.fieldbus.tools.conform.bench import QUEUED_NS
 from canprobe.fieldbus.tools.conform.frame_link import CameFrame
-from canprobe.fieldbus.tools.conform.outcome import NotPermitted
+from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
@@ -18,7 +16,7 @@ _PACE_S = 0.02
 
 
 @point(1, "boot-up", "NMT boot-up", "700h+id with 00h, then pre-operational")
-def boot_up(bench: Bench) -> None:
+def boot_up(bench: PdoBench) -> None:
     """After a reset the device announces itself once, and is pre-operational."""
     before = bench.boots
     bench.reset()
@@ -32,7 +30,7 @@ def boot_up(bench: Bench) -> None:
 
 
 @point(1, "power on", "NMT boot-up", "700h+id with 00h after the power came back")
-def power_on(bench: Bench) -> None:
+def power_on(bench: PdoBench) -> None:
     """The device announces itself when it gets its power, which a person switches."""
     before = bench.boots
     if not bench.by_hand(f"switch node {bench.node_id} off and on, then confirm"):
@@ -42,7 +40,7 @@ def power_on(bench: Bench) -> None:
 
 
 @point(2, "reset communication", "NMT node control", "82h boots again from every state; 1017h has its power-on value")
-def reset_communication(bench: Bench) -> None:
+def reset_communication(bench: PdoBench) -> None:
     """82h from pre-operational, operational and stopped."""
     bench.reset()
     default = bench.number(0x1017) if bench.device.has(0x1017) else 0
@@ -55,7 +53,7 @@ def reset_communication(bench: Bench) -> None:
 
 
 @point(2, "reset node", "NMT node control", "81h boots again from every state")
-def reset_node(bench: Bench) -> None:
+def reset_node(bench: PdoBench) -> None:
     """81h, where the user permits that application objects are reset."""
     for state in _STATES:
         if state is not NmtState.PRE_OPERATIONAL:
@@ -65,7 +63,7 @@ def reset_node(bench: Bench) -> None:
 
 
 @point(3, "wrong commands", "NMT node control", "commands that do not exist, or of another length, change nothing")
-def wrong_commands(bench: Bench) -> None:
+def wrong_commands(bench: PdoBench) -> None:
     """In each state: unknown specifiers, and valid ones with a byte too many or too few."""
     wrong = [bytes((specifier, bench.node_id)) for specifier in (0x00, 0x03, 0x7F, 0x83, 0xFF)]
     wrong += [bytes((specifier, bench.node_id, 0)) for specifier in (0x01, 0x02, 0x80, 0x82)]
@@ -81,7 +79,7 @@ def wrong_commands(bench: Bench) -> None:
 
 
 @point(4, "initialisation", "NMT initialisation", "nothing is served before the boot-up")
-def initialisation(bench: Bench) -> None:
+def initialisation(bench: PdoBench) -> None:
     """SDO requests from the reset on: none is answered before the boot-up message."""
     beat_id, answer_id = bench.beat_id, bench.answer_id
     bench.taken(beat_id)
@@ -107,7 +105,7 @@ def initialisation(bench: Bench) -> None:
 
 
 @point(5, "stopped", "NMT stopped", "SDO requests are not answered in stopped")
-def stopped(bench: Bench) -> None:
+def stopped(bench: PdoBench) -> None:
     """SDO is silent in stopped, and served again in pre-operational."""
     bench.watch_state()
     bench.go(NmtState.STOPPED)
@@ -117,7 +115,7 @@ def stopped(bench: Bench) -> None:
 
 
 @point(6, "PDOs", "NMT states", "TPDOs come in operational only: neither SYNC nor remote request brings one elsewhere")
-def pdos_in_operational(bench: Bench) -> None:
+def pdos_in_operational(bench: PdoBench) -> None:
     """SYNC and remote requests in pre-operational and stopped; frames that were queued before may still come."""
     tpdos = bench.device.valid_pdos(TPDOS)
     bench.require(tpdos, "the device has no valid TPDO")
@@ -128,7 +126,7 @@ def pdos_in_operational(bench: Bench) -> None:
         for _ in range(2):
             if with_sync:
                 bench.sync()
-            request_pdos(bench, tpdos)
+            bench.request_pdos(tpdos)
         bench.pass_time(bench.times.silence_s)
         frames = [frame for can_id in tpdos for frame in bench.taken(can_id) if frame.t_ns > changed_ns + QUEUED_NS]
         if frames:
@@ -136,19 +134,8 @@ def pdos_in_operational(bench: Bench) -> None:
     bench.nmt(NmtCommand.PRE_OPERATIONAL)
 
 
-def request_pdos(bench: Bench, pdos: Mapping[int, int]) -> None:
-    """Send a remote request for each TPDO whose bit 30 allows it, where it may be sent."""
-    for cob_id, pdo in pdos.items():
-        if bench.device.number(pdo, 1) & NO_RTR_FLAG:
-            continue
-        try:
-            bench.send(cob_id | RTR_FLAG)
-        except NotPermitted:
-            bench.notes.append(f"no remote request for {cob_id:03X}h, which is not an identifier of this node alone")
-
-
 @point(7, "operational", "NMT state machine", "01h leads to operational, and the device stays there")
-def reaches_operational(bench: Bench) -> None:
+def reaches_operational(bench: PdoBench) -> None:
     """What was seen before the first point; points that need operational do not apply where it is not reached."""
     bench.expect(not bench.kept_out, f"{bench.kept_out}; end this error, and examine the device again")
 
@@ -159,7 +146,7 @@ def reaches_operational(bench: Bench) -> None:
     "NMT state machine",
     "01h, 02h and 80h lead to their states from every state, and error control reports them",
 )
-def transitions(bench: Bench) -> None:
+def transitions(bench: PdoBench) -> None:
     """Every transition between the three states."""
     bench.watch_state()
     for before in _STATES:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from canprobe.fieldbus.eds.description import DescribedEntry
-from canprobe.fieldbus.protocol.sdo import pack_read, pack_request, pack_write, place_text
+from canprobe.fieldbus.protocol.sdo import pack_read, pack_request, place_text
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.permits import MOTION_OBJECTS, WriteRule, is_object, rule_of
@@ -22,8 +22,7 @@ _ABSENT = (0x1FF0, 0x5FFE, 0x9FFE)
 def write_read_only(bench: Bench) -> None:
     """1000h gets its own value."""
     bench.need((0x1000, 0), written=False)
-    request = pack_write(0x1000, 0, bench.device.values[0x1000, 0])
-    bench.must_refuse(request, accepted.READ_ONLY, "write to 1000h")
+    bench.must_refuse_write(0x1000, 0, bench.device.values[0x1000, 0], accepted.READ_ONLY, "write to 1000h")
 
 
 @point(11, "read wo", CODES, accepted.WRITE_ONLY, needs="eds")
@@ -49,7 +48,7 @@ def absent_subindex(bench: Bench) -> None:
     bench.need((0x1018, 0), written=False)
     beyond = bench.device.number(0x1018) + 1
     bench.must_refuse(pack_read(0x1018, beyond), accepted.NO_SUBINDEX, f"read of 1018h:{beyond:02X}")
-    bench.must_refuse(pack_write(0x1018, beyond, bytes(4)), accepted.NO_SUBINDEX, f"write to 1018h:{beyond:02X}")
+    bench.must_refuse_write(0x1018, beyond, bytes(4), accepted.NO_SUBINDEX, f"write to 1018h:{beyond:02X}")
 
 
 @point(14, "unknown command", CODES, accepted.UNKNOWN_COMMAND)
@@ -63,7 +62,7 @@ def too_long(bench: Bench) -> None:
     """1017h in four bytes."""
     bench.need((0x1017, 0))
     value = bench.device.values[0x1017, 0].ljust(4, b"\0")
-    bench.must_refuse(pack_write(0x1017, 0, value), accepted.TOO_LONG, "4 bytes for 1017h")
+    bench.must_refuse_write(0x1017, 0, value, accepted.TOO_LONG, "4 bytes for 1017h")
 
 
 @point(16, "too short", CODES, accepted.TOO_SHORT)
@@ -71,7 +70,7 @@ def too_short(bench: Bench) -> None:
     """1017h in one byte."""
     bench.need((0x1017, 0))
     value = bench.device.values[0x1017, 0][:1]
-    bench.must_refuse(pack_write(0x1017, 0, value), accepted.TOO_SHORT, "1 byte for 1017h")
+    bench.must_refuse_write(0x1017, 0, value, accepted.TOO_SHORT, "1 byte for 1017h")
 
 
 def _limited(bench: Bench) -> Iterator[tuple[DescribedEntry, int, bool]]:
@@ -93,9 +92,8 @@ def limits(bench: Bench) -> None:
     found = False
     for entry, value, above in _limited(bench):
         found = True
-        request = pack_write(*entry.place, bench.packed(*entry.place, value))
-        what = f"{value} for {place_text(*entry.place)}"
-        bench.must_refuse(request, accepted.ABOVE if above else accepted.BELOW, what)
+        codes, what = accepted.ABOVE if above else accepted.BELOW, f"{value} for {place_text(*entry.place)}"
+        bench.must_refuse_write(*entry.place, bench.packed(*entry.place, value), codes, what)
     bench.require(found, "no entry that may be written has a limit; --write names more")
 
 

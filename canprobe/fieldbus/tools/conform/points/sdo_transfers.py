@@ -195,9 +195,8 @@ def acknowledgement_of_128(bench: Bench) -> None:
     """A block upload, of which more segments are acknowledged than a block can have."""
     index = _text_index(bench)
     _block_segments(bench, index)
-    _must_end_transfer(
-        bench, bytes((0xA2, 128, 127)) + bytes(5), accepted.SEQUENCE, "an acknowledgement of 128 segments"
-    )
+    acknowledgement = bytes((0xA2, 128, 127)) + bytes(5)
+    _must_end_transfer(bench, acknowledgement, accepted.SEQUENCE, "an acknowledgement of 128 segments")
 
 
 def _block_download(bench: Bench, value: bytes, *, number: int = 1, crc: int | None = None) -> bytes:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
-from canprobe.fieldbus.protocol.sdo import pack_write
 from canprobe.fieldbus.tools.conform import accepted
-from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.pdo_setup import plain_sync, synchronous_tpdo
+from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 from canprobe.fieldbus.tools.conform.point import PointGroup
-from canprobe.fieldbus.tools.conform.points.pdo import syncs
 
 point = PointGroup("sync", "CiA 301")
 _PERIOD_US = 100_000
@@ -16,42 +13,42 @@ _RESERVED = (1, 241, 248, 255)
 
 
 @point(39, "reserved overflow", "1019h", accepted.VALUE)
-def reserved_overflow(bench: Bench) -> None:
+def reserved_overflow(bench: PdoBench) -> None:
     """1019h with 1 and with 241 to 255."""
     bench.need((0x1019, 0))
     if bench.device.number(0x1006):
         bench.put(0x1006, 0, 0)
     for value in _RESERVED:
-        bench.must_refuse(pack_write(0x1019, 0, bytes((value,))), accepted.VALUE, f"{value} for 1019h")
+        bench.must_refuse_write(0x1019, 0, bytes((value,)), accepted.VALUE, f"{value} for 1019h")
 
 
 @point(39, "overflow while a period is set", "1019h", accepted.SYNC_LOCKED, needs="sync")
-def overflow_while_period(bench: Bench) -> None:
+def overflow_while_period(bench: PdoBench) -> None:
     """1019h while 1006h is not 0, and again while it is."""
     bench.need((0x1019, 0), (0x1006, 0))
     bench.put(0x1006, 0, _PERIOD_US)
     value = bytes((10 if bench.device.number(0x1019) != 10 else 20,))
-    bench.must_refuse(pack_write(0x1019, 0, value), accepted.SYNC_LOCKED, "1019h while 1006h is not 0")
+    bench.must_refuse_write(0x1019, 0, value, accepted.SYNC_LOCKED, "1019h while 1006h is not 0")
     bench.put(0x1006, 0, 0)
     bench.put(0x1019, 0, value[0])
 
 
 @point(40, "wrong length", "SYNC; 8240h", "EMCY 8240h, and no TPDO", needs="nmt sync")
-def wrong_length(bench: Bench) -> None:
+def wrong_length(bench: PdoBench) -> None:
     """A SYNC with a byte while 1019h is 0; a right one ends the error."""
-    cob_id = synchronous_tpdo(bench)
+    cob_id = bench.synchronous_tpdo()
     bench.start()
-    syncs(bench, cob_id, [None])
-    bench.expect(syncs(bench, cob_id, [1]) == [0], "a SYNC with a byte too many brings a TPDO")
+    bench.syncs(cob_id, [None])
+    bench.expect(bench.syncs(cob_id, [1]) == [0], "a SYNC with a byte too many brings a TPDO")
     bench.emcy(SYNC_LENGTH_CODE)
-    syncs(bench, cob_id, [None])
+    bench.syncs(cob_id, [None])
 
 
 @point(41, "lost SYNC", "1006h", "in time no EMCY; 8100h after the period, if at all", needs="nmt sync")
-def lost_sync(bench: Bench) -> None:
+def lost_sync(bench: PdoBench) -> None:
     """1006h is 100 ms: SYNCs in time, then none. A device may watch from a SYNC on that came long before."""
     bench.need((0x1006, 0))
-    plain_sync(bench)
+    bench.plain_sync()
     bench.put(0x1006, 0, _PERIOD_US)
     bench.start()
     for _ in range(2):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 from canprobe.fieldbus.protocol.frame_bits import NS_PER_S
-from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS, Bench
-from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
+from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS
+from canprobe.fieldbus.tools.conform.pdo_bench import PdoBench
 from canprobe.fieldbus.tools.conform.point import PointGroup
 from canprobe.fieldbus.tools.conform.sdo_client import READ_TYPE
 
@@ -23,7 +23,7 @@ _LOAD_GAP_BITS = 260
 _LOADED_COUNT = 50
 
 
-def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
+def _sdo_times(bench: PdoBench, count: int) -> tuple[float, ...]:
     """Times of reads of 1000h, ms. Raises Deviation where one is not answered or wrong."""
     times: list[float] = []
     for _ in range(count):
@@ -37,15 +37,15 @@ def _sdo_times(bench: Bench, count: int) -> tuple[float, ...]:
 
 
 @point(100, "SDO", "SDO time-out of the client", "each of 100 reads of 1000h is answered in time")
-def sdo_time(bench: Bench) -> None:
+def sdo_time(bench: PdoBench) -> None:
     """Times of 100 reads, one after another."""
     bench.distributions[SDO_TIME] = _sdo_times(bench, _SDO_COUNT)
 
 
 @point(101, "SYNC to TPDO", "synchronous TPDO", "one TPDO for each of 50 SYNCs, within 10 ms", needs="nmt sync stamps")
-def sync_time(bench: Bench) -> None:
+def sync_time(bench: PdoBench) -> None:
     """Times from SYNC to a TPDO of type 1, at 100 Hz."""
-    cob_id = synchronous_tpdo(bench)
+    cob_id = bench.synchronous_tpdo()
     bench.start()
     times = []
     for _ in range(_SYNC_COUNT):
@@ -59,7 +59,7 @@ def sync_time(bench: Bench) -> None:
 
 
 @point(102, "heartbeat", "1017h", "no period differs by more than 20 % from 1017h", needs="stamps")
-def heartbeat_time(bench: Bench) -> None:
+def heartbeat_time(bench: PdoBench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
     bench.put(0x1017, 0, HEARTBEAT_MS)
@@ -74,7 +74,7 @@ def heartbeat_time(bench: Bench) -> None:
 
 
 @point(103, "under load", "SDO, heartbeat", "reads are answered and heartbeats come under half load", needs="alone")
-def under_load(bench: Bench) -> None:
+def under_load(bench: PdoBench) -> None:
     """Frames of higher priority take half the bus, while 1000h is read and the heartbeat runs."""
     bench.need((0x1017, 0))
     bench.put(0x1017, 0, HEARTBEAT_MS)
