@@ -195,7 +195,7 @@ def predicted(path):
 
 def surfaces_of_methods(path):
     rng, rows = np.random.default_rng(0), []
-    for name, settings in (("map", (1,)), *((name, settings) for name, (_, settings, _) in METHODS.items())):
+    for name, (_, settings, _) in METHODS.items():
         for k, _ in enumerate(settings):
             scores = dict(
                 zip(("height_um", "normal_mrad", "curvature_per_m", "nll"), rng.uniform(1, 40, 4), strict=True)
