@@ -94,7 +94,7 @@ class Presses:
     def _new_array(self) -> TaxelArray:
         return TaxelArray(self.config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self.stiffness)
 
-    def dwell(  # noqa: PLR0917
+    def dwell(
         self,
         name: str,
         kappa: tuple[float, float],

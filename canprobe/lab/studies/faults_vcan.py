@@ -10,16 +10,13 @@ it is and in a patient one (`--patient`), and the true force of the plant.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import signal
 import subprocess
-import sys
-import tempfile
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from enum import Enum
 from functools import cache, partial
 from pathlib import Path
@@ -30,10 +27,10 @@ from canopen.sdo.exceptions import SdoCommunicationError
 
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.scene.load import dump_scene, load_scene
+from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.child_process import EmulatorChild, with_our_imports
+from canprobe.cell.session.child_process import ERRORS, ChildProcess, EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.task import Phase
@@ -43,18 +40,27 @@ from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.link import missing_ip
-from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.fieldbus.bus.sdo import hold_dialogues, upload
+from canprobe.fieldbus.bus.sdo import Dialogue, hold_dialogues, upload
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.fieldbus.tools.faults.control import request_faults
+from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
-from canprobe.lab.studies.realtime_cases import ON_VCAN, patient, vcan_facts, with_real_nodes
 from canprobe.lab.studies.recover_score import forces_of
-from canprobe.lab.studies.result import CHANNEL, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import (
+    ON_VCAN,
+    link,
+    open_vcan,
+    patient,
+    served,
+    sleep,
+    vcan_facts,
+    with_real_nodes,
+)
 from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
 
 RUNS, QUICK_THROWN = 40, 1
@@ -220,13 +226,13 @@ def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
 
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and score the end: the row of the case."""
-    with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        run = _ServedRun(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
+    nodes = EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,))
+    with served(nodes), running_master() as master:
+        run = _ServedRun(case, master, nodes)
         try:
             status, ended_s, drives = run.carry_out()
         finally:
             link("up")
-            run.close()
     return {
         "seed": case.seed,
         "fault": case.fault.value,
@@ -238,70 +244,53 @@ def row_of(case: ProcessCase) -> Row:
     }
 
 
+@contextmanager
+def running_master() -> Iterator[ChildProcess]:
+    """`canprobe run` of the served scene in its own process, which is killed where it outlives the block."""
+    plan = make_plan(resolve(load_scene(with_real_nodes(served_scene()), {"scene.figures": False})))
+    master = ChildProcess()
+    master.launch(plan, ["canprobe", "run", str(master.scene_file), "--out", str(master.folder / "run")])
+    try:
+        yield master
+    finally:
+        master.process.kill()
+        master.process.wait()
+        master.remove()
+
+
 class _ServedRun:
     """One case that is carried out."""
 
-    def __init__(self, case: ProcessCase, child: EmulatorChild, folder: Path) -> None:
-        self.case, self.child, self.folder = case, child, folder
+    def __init__(self, case: ProcessCase, master: ChildProcess, nodes: EmulatorChild) -> None:
+        self.case, self.master, self.nodes = case, master, nodes
         self.clock = MonotonicClock()
-        self.master: subprocess.Popen[bytes] | None = None
         self.failures: list[str] = []
 
     def carry_out(self) -> tuple[int | None, float, str]:
-        """Status of the master (None: killed after a hang), seconds from the fault to its end, states of the drives."""
-        port = self._open()
-        try:
-            self.child.start()
-            self.child.await_boot_ups(port)
-            self.master = self._start_master()
-            if not self._await_enabled(port, self.master):
+        """Status of the master (None: it hung), seconds from the fault to its end, states of the drives."""
+        with closing(open_vcan()) as port:
+            if not self._await_enabled(port):
                 self.failures.append("the drives were never enabled")
-                return self.master.poll(), 0.0, ""
+                return self.master.process.poll(), 0.0, ""
             sleep(self.case.after_s)
-        finally:
-            port.close()
         fault_ns = self.clock.now_ns()
-        self._let_happen(self.master)
+        self._let_happen(self.master.process)
         status = None
         try:
-            status = self.master.wait(PATIENCE_S)
+            status = self.master.process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
         ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
         sleep(REACTION_S - ended_s)
         link("up")
         drives = self._look()
-        self.failures += score_end(self.case.fault, status, self.folder)
+        self.failures += score_end(self.case.fault, status, self.master.folder)
         return status, ended_s, drives
 
-    def close(self) -> None:
-        """Leave no process behind."""
-        if self.master is not None and self.master.poll() is None:
-            self.master.kill()
-            self.master.wait()
-        self.child.end()
-
-    def _open(self) -> Port:
-        return open_port("socketcan", CHANNEL, 1_000_000, self.clock)
-
-    def _start_master(self) -> subprocess.Popen[bytes]:
-        scene = with_real_nodes(served_scene())
-        path = self.folder / "scene.toml"
-        path.write_text(dump_scene(replace(scene, scene=replace(scene.scene, figures=False))), encoding="utf-8")
-        command = [sys.executable, "-P", "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
-        with (self.folder / "stderr").open("wb") as errors:
-            return subprocess.Popen(
-                command,
-                env=with_our_imports(),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=errors,
-            )
-
-    def _await_enabled(self, port: Port, master: subprocess.Popen[bytes]) -> bool:
+    def _await_enabled(self, port: Port) -> bool:
         """Wait until the first drive reports operation enabled."""
         deadline_ns = self.clock.now_ns() + round(PATIENCE_S * 1e9)
-        while self.clock.now_ns() < deadline_ns and master.poll() is None:
+        while self.clock.now_ns() < deadline_ns and self.master.process.poll() is None:
             port.wait(self.clock.now_ns() + 50_000_000)
             for can_id, data, _ in port.drain():
                 word = int.from_bytes(data[:2], "little")
@@ -318,7 +307,7 @@ class _ServedRun:
                 sleep(STALL_S)
                 master.send_signal(signal.SIGCONT)
             case ProcessFault.NODES_KILLED:
-                os.kill(self.child.pid, signal.SIGKILL)
+                self.nodes.process.kill()
             case ProcessFault.LINK_DOWN:
                 link("down")
             case ProcessFault.LINK_DOWN_UP:
@@ -327,18 +316,15 @@ class _ServedRun:
 
     def _look(self) -> str:
         """The states of the drives, where their process still answers."""
-        first: dict[int, int] = {}
-        if Path(f"/proc/{self.child.pid}").exists():
-            with contextlib.suppress(CanprobeError):
-                first = self._ask(0x6041)
-        if not first:
+        words = self._ask(0x6041) if self.nodes.process.poll() is None else {}
+        if not words:
             if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
                 self.failures.append("the nodes ended with a master that is not their parent")
             return "gone"
         before = self._ask(0x6064)
         sleep(APART_S)
         after = self._ask(0x6064)
-        states = {node_id: state_of(word) for node_id, word in first.items()}
+        states = {node_id: state_of(word) for node_id, word in words.items()}
         for node_id, state in states.items():
             if state in POWERED_STATES:
                 self.failures.append(f"node {node_id} is {state.name} after the stop")
@@ -349,24 +335,25 @@ class _ServedRun:
 
     def _ask(self, index: int) -> dict[int, int]:
         """An object of each drive; empty where one does not answer."""
-        drives = served_scene().drives
-        port = self._open()
         answers: dict[int, int] = {}
-        try:
-            dialogues = {node_id: _read(index, node_id, answers.__setitem__) for node_id in drives}
-            hold_dialogues(PumpedNetwork(port), dialogues, timeout_s=1.0, retries=1)
-        finally:
-            port.close()
+
+        def ask(node_id: int) -> Dialogue:
+            answer = yield from upload(index, 0)
+            answers[node_id] = int.from_bytes(answer, "little", signed=index == 0x6064)
+
+        drives = served_scene().drives
+        with suppress(CanprobeError, SdoCommunicationError), closing(open_vcan()) as port:
+            hold_dialogues(PumpedNetwork(port), {i: ask(i) for i in drives}, timeout_s=1.0, retries=1)
         return answers if len(answers) == len(drives) else {}
 
 
 def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str]:
-    """Failures in what a master left: its status, `stderr`, and `run/bus.log` and `run/summary.json` in `folder`."""
+    """Failures in what a master left: its status, `ERRORS`, and `run/bus.log` and `run/summary.json` in `folder`."""
     failures = []
     killed = fault is ProcessFault.MASTER_KILLED
     if status is not None and not killed and status not in (1, 3):
         failures.append(f"the master ended with status {status}, expected 1 or 3")
-    errors = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+    errors = (folder / ERRORS).read_text(encoding="utf-8", errors="replace")
     if "Traceback" in errors:
         failures.append(f"crash: {errors.strip().splitlines()[-1]}")
     try:
@@ -380,31 +367,5 @@ def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str
     return failures
 
 
-def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
-    try:
-        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little", signed=index == 0x6064))
-    except SdoCommunicationError:
-        return
-
-
 def _text_of(state: DriveState, code: int | None) -> str:
     return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
-
-
-def sleep(seconds: float) -> None:
-    """Sleep for some time, s; not at all for a negative one."""
-    clock = MonotonicClock()
-    clock.sleep_until_ns(clock.now_ns() + max(0, round(seconds * 1e9)))
-
-
-def link(state: str) -> None:
-    """Take the interface down or up.
-
-    Raises:
-        InterfaceError: the right to do so is missing.
-    """
-    done = subprocess.run(["ip", "link", "set", CHANNEL, state], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise InterfaceError(
-            f"{CHANNEL}: the study takes it down and up, and `ip` says: {done.stderr.strip()}; run the study as root"
-        )

@@ -7,32 +7,53 @@ Needs a `vcan0`; `canprobe vcan --realtime -- canprobe study realtime` runs it w
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from time import process_time
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
+from numpy.typing import NDArray
 
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.options import RunOptions
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.traffic import LAST_LOOK
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
 from canprobe.cell.results.summary import percentiles
 from canprobe.cell.scene.hardware import TactileModeName
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.child_process import EmulatorChild
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.errors import CanprobeError
+from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
+from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
-from canprobe.lab.studies.realtime_cases import (
-    CycleTimes,
-    Measured,
-    Times,
-    measure_bare,
-    measure_hold,
-    measure_scan,
-    vcan_facts,
-)
-from canprobe.lab.studies.result import CHANNEL, Row, Say, StudyResult
+from canprobe.fieldbus.vcan.launch import CHANNEL
+from canprobe.lab.studies.result import Row, Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import (
+    ON_VCAN,
+    on_any_bitrate,
+    patient,
+    served,
+    vcan_facts,
+    with_real_nodes,
+)
 
+RATE_HZ = 400.0
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
 MODES: tuple[TactileModeName, ...] = ("features", "window", "image")
 HELD_PER_10000 = 1.0
@@ -70,6 +91,171 @@ def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say
         if climbed[-1].ended or climbed[-1].times.rate_hz < 0.9 * rate_hz:
             break
     return climbed
+
+
+Times = NDArray[np.int64]
+
+
+def _nothing() -> Times:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleTimes:
+    """Times of the cycles of one run; empty arrays where a time was not measured.
+
+    Attributes:
+        period_ns: requested period of SYNC.
+        lateness_ns: time of each SYNC behind its deadline (n,), ns.
+        seconds: time from the first SYNC to the last.
+        response_ns: time from the last TPDO to the RPDOs in every fifth cycle (m,), ns.
+        compute_ns: that time and the controller's work after the RPDOs (m,), ns.
+        latency_ns: time from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
+        missed: number of TPDOs that did not come in their cycle.
+        processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
+    """
+
+    period_ns: int
+    lateness_ns: Times
+    seconds: float
+    response_ns: Times = field(default_factory=_nothing)
+    compute_ns: Times = field(default_factory=_nothing)
+    latency_ns: Times = field(default_factory=_nothing)
+    missed: int = 0
+    processor_share: float | None = None
+
+    @property
+    def overruns(self) -> int:
+        """Number of cycles woken more than half a period late."""
+        return int(np.count_nonzero(self.lateness_ns > self.period_ns // 2))
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles."""
+        return len(self.lateness_ns)
+
+    @property
+    def rate_hz(self) -> float:
+        """Held rate, cycles per second."""
+        return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
+
+
+def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
+    """Wake at a number of deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
+
+    Yields:
+        The deadline, ns, or the last one that has passed by then.
+    """
+    deadline_ns = clock.now_ns() + period_ns
+    for _ in range(cycles):
+        clock.sleep_until_ns(deadline_ns)
+        lateness.append(clock.now_ns() - deadline_ns)
+        deadline_ns += lateness[-1] // period_ns * period_ns
+        yield deadline_ns
+        deadline_ns += period_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A case and its times; `ended` is the reason of an early end."""
+
+    case: str
+    sensor: str
+    rate_hz: float
+    times: CycleTimes
+    ended: str = ""
+
+
+def measure_scan(seconds: float) -> Measured:
+    """The scene `cylinder` with servo and estimator."""
+    return _measured("whole controller", _scene({"task.duration_s": seconds}), make_task)
+
+
+def measure_bare(seconds: float) -> Measured:
+    """A loop that wakes at every deadline and does nothing: the machine's own lateness."""
+    period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
+    with realtime(MASTER_PRIORITY, lambda _: None):  # the first case has reported missing permissions
+        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
+    times = CycleTimes(period_ns, np.array(lateness, np.int64), (deadlines[-1] - deadlines[0]) * 1e-9)
+    return Measured("bare clock", "none", RATE_HZ, times)
+
+
+def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:
+    """The joints hold their position, at any rate."""
+    with served(EmulatorChild(make_plan(resolve(_scene())), None, (CHANNEL,))):  # they take rates from the master
+        return _measured("hold", holding_scene(mode, rate_hz), lambda _: Hold(int(seconds * rate_hz)))
+
+
+def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
+    """Six drives and the sensor at half their rate; the session starts none of them."""
+    scene = on_any_bitrate(with_real_nodes(_scene()))
+    assert scene.sensor is not None
+    sensor = replace(scene.sensor, mode=mode, rate_hz=rate_hz / 2)
+    return replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz), sensor=sensor)
+
+
+def _scene(changes: Mapping[str, Any] = MappingProxyType({})) -> Scene:
+    """The scene `cylinder`, patient; with real-time priority and locked memory where they are permitted."""
+    return patient(load_scene("cylinder", {**ON_VCAN, "cycle.realtime": True, **changes}))
+
+
+class Hold(Controller):
+    """Hold the joints at their first position, for some cycles."""
+
+    def __init__(self, cycles: int) -> None:
+        self._cycles = cycles
+        self._q: Any = None
+
+    def step(self, measurement: Measurement) -> Command:
+        if self._q is None:
+            self._q = measurement.q
+        self._cycles -= 1
+        return Command(q_target=self._q, done=self._cycles <= 0)
+
+
+def _measured(case: str, scene: Scene, make: Callable[[Plan], Controller]) -> Measured:
+    """Run a controller to its end; the run writes its files, as those of users do."""
+    assert scene.sensor is not None
+    ended, used_s, latency_ns, missed = "", 0.0, list[int](), 0
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(scene, RunOptions(Path(folder)))
+
+        def note_latency(_: Measurement) -> None:
+            nonlocal missed
+            assert session.cell.drives is not None
+            if session.cell.drives.missed == missed:  # all have answered
+                latency_ns.append(session.cell.drives.answer_ns)
+            missed = session.cell.drives.missed
+
+        try:
+            with session:
+                used_s = process_time()
+                session.run(make(session.plan), note_latency)
+        except CanprobeError as error:
+            if not session.opened:
+                raise
+            ended = str(error)
+        cycle = session.cell.cycle
+        assert cycle is not None
+        seconds = cycle.t_ns * 1e-9
+        times = CycleTimes(
+            period_ns=session.plan.sync.period_ns,
+            lateness_ns=np.array(cycle.statistics.period_error_ns, np.int64),
+            seconds=seconds,
+            response_ns=np.array(cycle.statistics.response_ns, np.int64),
+            compute_ns=np.array(cycle.statistics.compute_ns, np.int64),
+            latency_ns=np.array(latency_ns, np.int64),
+            missed=missed,
+            processor_share=processor_share(used_s, seconds),
+        )
+    return Measured(case, scene.sensor.mode, scene.cycle.rate_hz, times, ended)
+
+
+def processor_share(used_before_s: float, passed_s: float) -> float | None:
+    """Processor share since `process_time` gave `used_before_s`; None in a guest, which counts whole ticks."""
+    if os.environ.get("CANPROBE_VCAN") == "guest" or passed_s <= 0:
+        return None
+    return (process_time() - used_before_s) / passed_s
 
 
 def _row(m: Measured) -> Row:

@@ -27,15 +27,14 @@ from canprobe.errors import CanprobeError
 from canprobe.fieldbus.tools.link.verdict import FIT_SHARE, UNFIT_SHARE, Fitness
 from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.link_setups import MACHINE_HZ, construct, draw_machine, draw_setup, scene_of
-from canprobe.lab.studies.realtime_cases import on_any_bitrate, patient
 from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import on_any_bitrate, patient
 
 CHECK_S, MINUTE_S, QUICK_MINUTE_S = 10.0, 60.0, 10.0
 SETUPS, QUICK_SETUPS, MACHINES, QUICK_MACHINES = 40, 8, 6, 3
 TEST_DRAW = 4
 RATES_HZ = (100, 200, 400, 800, 1000)
-BITRATE = 50_000_000
 ENOUGH = 25
 """Late SYNCs in the check from which a share is compared: fewer are scattered by chance by more than a fifth."""
 MODEL = (
@@ -163,7 +162,7 @@ def measure_machine(case: tuple[int, float]) -> list[Row]:
 
 def _patient_scene(rate_hz: float) -> Scene:
     changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "scene.figures": False}
-    return on_any_bitrate(patient(load_scene("free", changes)), BITRATE)
+    return on_any_bitrate(patient(load_scene("free", changes)))
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

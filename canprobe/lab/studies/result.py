@@ -26,8 +26,6 @@ from canprobe.mechanics.types import Floats
 Say = Callable[[str], None]
 Row = dict[str, Any]
 """A row of a table, by the keys of its columns."""
-CHANNEL = "vcan0"
-"""The interface of studies in real time."""
 CHI2_95_OF_3 = 7.815
 FROBENIUS = np.array([1.0, 2.0, 1.0])
 """Weights of (K11², K12², K22²) in ‖K‖²."""

@@ -9,6 +9,7 @@ import pytest
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.planning.motion import parked_posture
+from canprobe.cell.session.child_process import ERRORS
 from canprobe.cell.tasks import touch
 from canprobe.cli import main
 from canprobe.fieldbus.tools.faults import Fault
@@ -251,7 +252,7 @@ def test_every_process_fault_gets_its_turn_at_random_times():
 def test_the_score_sees_a_lost_log_and_a_wrong_end(tmp_path, fault, status, files, seen):
     log, summary, error = files
     (tmp_path / "run").mkdir()
-    (tmp_path / "stderr").write_text(error)
+    (tmp_path / ERRORS).write_text(error)
     (tmp_path / "run" / "bus.log").write_text(log)
     if summary is not None:
         (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))

@@ -25,8 +25,7 @@ from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name, draw_points
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
-from canprobe.lab.studies.realtime import draw_realtime
-from canprobe.lab.studies.realtime_cases import CycleTimes, Measured
+from canprobe.lab.studies.realtime import CycleTimes, Measured, draw_realtime
 from canprobe.lab.studies.realtime_soak import draw_soak
 from canprobe.lab.studies.region_scores import ScoredScan
 from canprobe.lab.studies.regions import draw_regions, rows_of

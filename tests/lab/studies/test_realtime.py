@@ -8,30 +8,9 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
-from canprobe.lab.studies.realtime import findings
-from canprobe.lab.studies.realtime_cases import CycleTimes, Measured, answer_latencies, holding_scene, woken
+from canprobe.lab.studies.realtime import CycleTimes, Measured, findings, holding_scene, woken
 from canprobe.lab.studies.realtime_soak import COLUMNS, resident_mib
 from canprobe.lab.studies.realtime_soak import findings as findings_of_soak
-
-
-def log_of(tmp_path, *lines):
-    path = tmp_path / "bus.log"
-    path.write_text("".join(f"(0000000000.{us:06d}) vcan0 {text}\n" for us, text in lines))
-    return path
-
-
-def test_latency_is_that_of_the_last_answer_and_only_where_all_answered(tmp_path):
-    path = log_of(
-        tmp_path,
-        (0, "080#01"), (300, "182#00"), (410, "181#00"),
-        (2500, "080#02"), (2600, "181#00"),  # 182h of this cycle never came
-        (5000, "080#03"), (5900, "182#00"), (5100, "181#00"), (5000, "201#00"),
-    )  # fmt: skip
-    assert answer_latencies(path, frozenset({0x181, 0x182}), 2_500_000).tolist() == [410_000, 900_000]
-
-
-def test_no_sync_no_latency(tmp_path):
-    assert len(answer_latencies(log_of(tmp_path, (0, "181#00")), frozenset({0x181}), 2_500_000)) == 0
 
 
 def times(cycles, overruns, seconds, response_us=(), compute_us=()):
