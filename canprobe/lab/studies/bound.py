@@ -95,7 +95,7 @@ def run_bound(*, quick: bool, sweep: Sweep) -> StudyResult:
     seeds = QUICK_SEEDS if quick else SEEDS
     rows = rows_of(list(quick_cases() if quick else all_cases()), seeds, sweep)
     facts = measuring_facts(quick, seeds, MODEL)
-    return StudyResult("bound", COLUMNS, rows, findings(rows), facts, partial(draw_bound, rows))
+    return StudyResult("bound", rows, findings(rows), facts, partial(draw_bound, rows), COLUMNS)
 
 
 def rows_of(cases: Sequence[BoundCase], seeds: int, sweep: Sweep) -> list[Row]:

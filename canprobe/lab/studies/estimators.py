@@ -92,7 +92,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
             rows += [_row(name, ground, noise, *one) for one in found]
     facts = measuring_facts(quick, seeds, MODEL) | {"turns": turns}
     said, more = findings(rows), (run_bound(quick=quick, sweep=sweep),)
-    return StudyResult("estimators", COLUMNS, rows, said, facts, partial(draw_estimators, rows), more)
+    return StudyResult("estimators", rows, said, facts, partial(draw_estimators, rows), COLUMNS, more)
 
 
 def on_the_move(surface: str, size: float) -> Ground:

@@ -84,10 +84,6 @@ APART_S = 0.3
 """Time between two looks at the positions, s."""
 MOST_COUNTS = 8
 _TPDO1 = 0x181
-COLUMNS = ("seed", "fault", "after_s", "status", "ended_s", "drives", "failures")
-
-
-THROWN_COLUMNS = ("fault", "task", "phase", "patient", "force_max_n", "above_ms", "left_n", "reason", "failures")
 THROWN = (
     ("node 16: stuck-image", "press", Phase.APPROACH),
     ("node 16: stuck-image", "weave", Phase.SCAN),
@@ -153,7 +149,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         "failed: it hung, or nodes moved or were enabled afterwards",
     )  # fmt: skip
     facts = vcan_facts(quick, total, MISSED_SYNCS)
-    return StudyResult("faults_vcan", COLUMNS, rows, findings(rows), facts, drawn, (thrown,))
+    return StudyResult("faults_vcan", rows, findings(rows), facts, drawn, more=(thrown,))
 
 
 def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
@@ -184,7 +180,7 @@ def _throw_all(quick: bool) -> StudyResult:
     told += [f"{row['fault']}, {row['task']}, patient {row['patient']}: {row['failures']}" for row in failed]
     title = f"Highest true force with a fault thrown on {CHANNEL}"
     drawn = partial(draw_by_name, rows, "fault", FORCE_AXIS, title=title, by="patient")
-    return StudyResult("faults_thrown", THROWN_COLUMNS, rows, told, measuring_facts(quick, len(rows)), drawn)
+    return StudyResult("faults_thrown", rows, told, measuring_facts(quick, len(rows)), drawn)
 
 
 def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:

@@ -79,7 +79,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         measured += _climb(mode, hold_s, (400,) if quick else RATES_HZ, say)
     facts = vcan_facts(quick, 1) | {"controller": "scan of cylinder; hold elsewhere"}
     draw = partial(draw_realtime, measured)
-    return StudyResult("realtime", COLUMNS, [_row(m) for m in measured], findings(measured), facts, draw)
+    return StudyResult("realtime", [_row(m) for m in measured], findings(measured), facts, draw, COLUMNS)
 
 
 def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say: Say) -> list[Measured]:

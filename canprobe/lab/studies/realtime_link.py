@@ -66,8 +66,8 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW) -> StudyResult:
         ("predicted_percent", "overruns predicted, %"), by="kind", log=True, lines=((1.0, "as predicted"),),
         title="Overruns at other rates: predicted by a check at 400 Hz, and seen in a minute",
     )  # fmt: skip
-    more = StudyResult("link_rates", RATE_COLUMNS, rates, rate_findings(rates), facts, drawn_rates)
-    return StudyResult("link", COLUMNS, rows, findings(rows), facts, drawn, (more,))
+    more = StudyResult("link_rates", rates, rate_findings(rates), facts, drawn_rates, RATE_COLUMNS)
+    return StudyResult("link", rows, findings(rows), facts, drawn, COLUMNS, (more,))
 
 
 class Held(NamedTuple):

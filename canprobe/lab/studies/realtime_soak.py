@@ -38,10 +38,6 @@ SOAK_S = 1800.0
 SAMPLES = 60
 SETTLED = 0.25
 """Share of the run after which memory should be constant."""
-COLUMNS = (
-    "t_s", "master_mib", "nodes_mib", "monitor_mib", "cycles", "overruns", "missed_pdos", "dropped_frames",
-    "latency_us", "frames_counted", "frames_on_bus",
-)  # fmt: skip
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
@@ -51,7 +47,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     sweep.say(f"hold the cell for {seconds:g} s")
     rows, ended = soak(seconds)
     facts = vcan_facts(quick, 1) | {"seconds": seconds}
-    return StudyResult("soak", COLUMNS, rows, findings(rows, ended), facts, partial(draw_soak, rows))
+    return StudyResult("soak", rows, findings(rows, ended), facts, partial(draw_soak, rows))
 
 
 def soak(seconds: float) -> tuple[list[Row], str]:

@@ -49,7 +49,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     runs = sweep.map(measure, range(total))
     rows = table_rows(runs)
     facts = measuring_facts(quick, total)
-    return StudyResult("recover", COLUMNS, rows, findings(runs), facts, partial(draw_runs, runs))
+    return StudyResult("recover", rows, findings(runs), facts, partial(draw_runs, runs), COLUMNS)
 
 
 def measure(seed: int) -> dict[str, Any]:

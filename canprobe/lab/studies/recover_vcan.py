@@ -44,7 +44,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
             runs.append({**one.outcome(), "shrunk": str(case)})
         sweep.say(f"{seed + 1} of {total}: {case}: {'; '.join(runs[-1]['failures']) or 'no failure'}")
     facts = vcan_facts(quick, total, MISSED_SYNCS)
-    return StudyResult("recover_vcan", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_runs, runs))
+    return StudyResult("recover_vcan", table_rows(runs), findings(runs), facts, partial(draw_runs, runs), COLUMNS)
 
 
 class ServedRun(RecoverRun):

@@ -61,11 +61,6 @@ MODEL = (
     "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/array_presses.py",
     "lab/studies/random_scenes.py", "lab/studies/region_scores.py",
 )  # fmt: skip
-COLUMNS = (
-    "group", "of", "seeds", "scenes", "refused", "stopped", "answers", "observed", "coverage", "coverage_low",
-    "coverage_high", "below_80", "below_40", "error_per_m", "stated_over_error", "stated_low", "stated_high",
-    "log_score", "worst",
-)  # fmt: skip
 COMPARED = ("refused", "stopped", "observed", "coverage", "stated_over_error", "log_score")
 """Figures that are shown beside those of an earlier run."""
 BY: Mapping[str, Callable[[ScoredScan], str]] = {
@@ -97,7 +92,7 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW, against: Path | Non
     if earlier is not None:
         said += compared(rows, earlier)
     facts = measuring_facts(quick, len(scans), MODEL) | {"draw": draw}
-    return StudyResult("regions", COLUMNS, rows, said, facts, partial(draw_regions, rows, scans))
+    return StudyResult("regions", rows, said, facts, partial(draw_regions, rows, scans))
 
 
 def scan_all(sweep: Sweep, draw: int, kinds: Sequence[str], wanted: int) -> list[ScoredScan]:

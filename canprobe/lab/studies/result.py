@@ -43,20 +43,20 @@ class StudyResult:
 
     Attributes:
         name: name of the study.
-        columns: keys of the rows that the printed table has, each with its unit at the end; the CSV has all.
-        rows: one row for each case; None where a value does not apply.
+        rows: one row for each case, by keys with their unit at the end; None where a value does not apply.
         findings: sentences with figures.
         facts: machine, versions and settings of the measurement.
         draw: function that writes the picture to a path; it needs matplotlib.
+        columns: keys of the rows that the printed table has, by default all; the CSV has all.
         more: further tables of the study, each with its findings, files and picture.
     """
 
     name: str
-    columns: Sequence[str]
     rows: Sequence[Row]
     findings: Sequence[str]
     facts: Mapping[str, Any]
     draw: Callable[[Path], None]
+    columns: Sequence[str] = ()
     more: Sequence[StudyResult] = ()
 
 
@@ -118,10 +118,11 @@ def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
 
 def table_lines(result: StudyResult) -> list[str]:
     """The table, a line for each row, numbers flush right."""
-    cells = [[heading(key) for key in result.columns]]
-    cells += [[shown(row.get(key)) for key in result.columns] for row in result.rows]
+    columns = result.columns or list(dict.fromkeys(key for row in result.rows for key in row))
+    cells = [[heading(key) for key in columns]]
+    cells += [[shown(row.get(key)) for key in columns] for row in result.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    words = [bool(result.rows) and isinstance(result.rows[0].get(key), str) for key in result.columns]
+    words = [bool(result.rows) and isinstance(result.rows[0].get(key), str) for key in columns]
     return [
         "  ".join(
             t.ljust(w) if is_word else t.rjust(w) for t, w, is_word in zip(line, widths, words, strict=True)

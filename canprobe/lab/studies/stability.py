@@ -69,7 +69,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     rows = [row_of(case, answer) for case, answer in zip(todo, sweep.map(carry_out, todo, model=MODEL), strict=True)]
     facts = measuring_facts(quick, 1, MODEL)
     more = (run_extremes(quick=quick, sweep=sweep),)
-    return StudyResult("stability", COLUMNS, rows, findings(rows), facts, partial(draw_stability, rows), more)
+    return StudyResult("stability", rows, findings(rows), facts, partial(draw_stability, rows), COLUMNS, more)
 
 
 def row_of(case: LoopCase, answer: Row) -> Row:

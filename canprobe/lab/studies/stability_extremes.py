@@ -84,7 +84,7 @@ def run_extremes(*, quick: bool, sweep: Sweep) -> StudyResult:
     sweep.say(f"{len(cases)} extreme cases")
     rows: list[Row] = sweep.map(measure, cases, model=MODEL)
     facts = measuring_facts(quick, 1, MODEL)
-    return StudyResult("stability_extremes", COLUMNS, rows, findings(rows), facts, partial(draw_extremes, rows))
+    return StudyResult("stability_extremes", rows, findings(rows), facts, partial(draw_extremes, rows), COLUMNS)
 
 
 def extreme_scene(case: ExtremeCase) -> Scene:

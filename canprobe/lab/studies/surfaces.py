@@ -86,8 +86,8 @@ def run(*, quick: bool, sweep: Sweep, draw: int = DRAW) -> StudyResult:
     facts = measuring_facts(quick, len(names), MODEL) | {"draw": draw}
     said = exploration.findings(paths, each, names)
     said += [f"Left out: {shape.name}, where a plan says: {why}" for shape, why in left_out.items()]
-    more = StudyResult("exploration", exploration.COLUMNS, paths, said, facts, partial(exploration.draw, each))
-    return StudyResult("surfaces", COLUMNS, rows, findings(rows), facts, partial(draw_surfaces, rows), (more,))
+    more = StudyResult("exploration", paths, said, facts, partial(exploration.draw, each))
+    return StudyResult("surfaces", rows, findings(rows), facts, partial(draw_surfaces, rows), COLUMNS, (more,))
 
 
 def measure(case: SurfaceCase) -> dict[str, Any]:

@@ -17,7 +17,7 @@ and the cells; the sweep does the rest:
         answers = sweep.map(measure, cases, model=("mechanics/touch", "cell/plant", "lab/studies/my_study.py"))
         costs = sweep.time(measure_cost, settings)             # one at a time, alone, on this machine
         ...
-        return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
+        return StudyResult("my_study", rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
 
 Answers come in the order of the cells and as JSON gives them, whether they were computed now or earlier: tuples
 and arrays are lists, keys of mappings are text. The cell holds all that decides an answer (parameters, seeds). `model`
@@ -36,7 +36,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
@@ -145,14 +145,15 @@ def open_sweep(
         store.close()
 
 
-def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> tuple[bool, str]:
-    """Measure a cell in the worker: success, and the answer, or the error as text: not all exceptions are pickled."""
+def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> str:
+    """Measure a cell in the worker; what it raises becomes text there: not all exceptions are pickled."""
+    if (here := model_digest(parts)) != model:
+        other = f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
+        raise StudyError(f"cell {as_json(cell)}: {other}")
     try:
-        if (here := model_digest(parts)) != model:
-            return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
-        return True, as_json(measure(cell))
-    except Exception as error:  # raised again in the main process
-        return False, error_text(error)
+        return as_json(measure(cell))
+    except Exception as error:  # of any kind
+        raise StudyError(f"cell {as_json(cell)}: {error_text(error)}") from None
 
 
 def error_text(error: Exception) -> str:
@@ -162,33 +163,22 @@ def error_text(error: Exception) -> str:
 
 
 def _collect(
-    executor: Executor,
-    task: Callable[[Any], tuple[bool, str]],
-    cells: Mapping[str, Any],
-    keep: Callable[[str, str], None],
+    executor: Executor, task: Callable[[Any], str], cells: Mapping[str, Any], keep: Callable[[str, str], None]
 ) -> None:
     """Compute cells and keep the answers as they come, also those that are ready when an exception ends it."""
     futures = {executor.submit(task, cell): key for key, cell in cells.items()}
     left = set(futures)
     try:
         for future in as_completed(futures):
-            keep(futures[future], _answer(future, cells[futures[future]]))
+            keep(futures[future], future.result())
             left.discard(future)
-    except BaseException:
+    except BaseException as error:
         for future in left:
-            if future.done() and not future.cancelled() and future.exception() is None and future.result()[0]:
-                keep(futures[future], future.result()[1])
+            if future.done() and not future.cancelled() and future.exception() is None:
+                keep(futures[future], future.result())
+        if isinstance(error, BrokenProcessPool):
+            raise StudyError("a worker was killed; start the study again to compute what is left") from error
         raise
-
-
-def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
-    try:
-        well, text = future.result()
-    except BrokenProcessPool as error:
-        raise StudyError("a worker was killed; start the study again to compute what is left") from error
-    if not well:
-        raise StudyError(f"cell {as_json(cell)}: {text}")
-    return text
 
 
 @contextmanager

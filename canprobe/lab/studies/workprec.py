@@ -126,7 +126,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         row |= dict.fromkeys(ENOUGH) if states is None else errors(truths[k], observed(k, np.array(states)))
         rows.append(row | {"verdict": verdict(row)})
     facts, draw = measuring_facts(quick, 0, MODEL), partial(draw_workprec, rows, floors)
-    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw)
+    return StudyResult("workprec", rows, findings(rows, floors), facts, draw, COLUMNS)
 
 
 @cache
