@@ -237,10 +237,9 @@ def draw_estimators(rows: Sequence[Row], path: Path) -> None:
             of_surface = [r for r in rows if r["surface"] == surface]
             for (point, normal), axes in zip(noises, line, strict=True):
                 _draw_panel(axes, [r for r in of_surface if r["sigma_point_um"] == point])
-                axes.set_title(f"{surface}, σ {point:.0f} µm, {normal:.1f} mrad")
-            line[0].set_ylabel("RMS error of K (%)")
-        for axes in grid[-1]:
-            axes.set_xlabel("time of a frame with an answer (ms)")
+                axes.set(title=f"{surface}, σ {point:.0f} µm, {normal:.1f} mrad", ylabel="RMS error of K (%)")
+                axes.set_xlabel("time of a frame with an answer (ms)")
+                axes.label_outer()
         legend(figure)
 
 

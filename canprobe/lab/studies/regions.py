@@ -296,10 +296,6 @@ def draw_regions(rows: Sequence[Row], scans: Sequence[ScoredScan], path: Path) -
             _draw_kind(axes, f"{row['of']}: {row['stated_over_error']:.2f}", mine, span)
         for axes in grid.flat[len(panels) :]:
             axes.set_visible(False)
-        for axes in grid[-1]:
-            axes.set_xlabel("RMS error (1/m)")
-        for line in grid:
-            line[0].set_ylabel("stated (1/m)")
         legend(upper)
         _draw_coverage(lower.subplots(), kinds)
 
@@ -313,7 +309,8 @@ def _draw_kind(axes: Axes, title: str, scans: Sequence[ScoredScan], span: tuple[
         x, y = [scan.error_per_m for scan in mine], [scan.stated_per_m for scan in mine]
         axes.scatter(x, y, s=14, color=colour, marker=marker, label=words, zorder=3, linewidths=0)
     log_scale(axes, "xy")
-    axes.set(title=title, xlim=span, ylim=span)
+    axes.set(title=title, xlabel="RMS error (1/m)", ylabel="stated (1/m)", xlim=span, ylim=span)
+    axes.label_outer()
 
 
 def _draw_coverage(axes: Axes, rows: Sequence[Row]) -> None:

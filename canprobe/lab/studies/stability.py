@@ -176,10 +176,8 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
                 mine = [r for r in rows if (r["servo"], r["rate_hz"], r["late_ms"]) == (servo, rate, late)]
                 _draw_map(axes, stiffness, ratios, loop_of(LoopCase(1e4, rate_hz=rate, late_ms=late)), mine)
                 axes.set_title(f"cycle of {rate:g} Hz" + (f", frames {late:g} ms late" if late else ""))
-            for axes in grid[-1]:
-                axes.set_xlabel("contact stiffness (N/m)")
-            for line in grid:
-                line[0].set_ylabel("force gain (Hz)")
+                axes.set(xlabel="contact stiffness (N/m)", ylabel="force gain (Hz)")
+                axes.label_outer()
         legend(part, end_marks(END_MARKS))
 
 
