@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
@@ -44,14 +43,7 @@ from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits,
 from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.result import Row, Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.vcan_cells import (
-    ON_VCAN,
-    on_any_bitrate,
-    patient,
-    served,
-    vcan_facts,
-    with_real_nodes,
-)
+from canprobe.lab.studies.vcan_cells import ON_VCAN, on_any_bitrate, patient, served, vcan_facts, with_real_nodes
 
 RATE_HZ = 400.0
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
@@ -88,46 +80,49 @@ def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say
     for rate_hz in rates_hz:
         say(f"hold with {mode} at {rate_hz:g} Hz, {seconds:g} s")
         climbed.append(measure_hold(mode, rate_hz, seconds))
-        if climbed[-1].ended or climbed[-1].times.rate_hz < 0.9 * rate_hz:
+        if climbed[-1].ended or climbed[-1].held_hz < 0.9 * rate_hz:
             break
     return climbed
 
 
-Times = NDArray[np.int64]
-
-
-def _nothing() -> Times:
-    return np.zeros(0, np.int64)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class CycleTimes:
-    """Times of the cycles of one run; empty arrays where a time was not measured.
+class Measured:
+    """A case, and the times of its cycles, ns; empty where a time was not measured.
 
     Attributes:
-        period_ns: requested period of SYNC.
-        lateness_ns: time of each SYNC behind its deadline (n,), ns.
+        case, sensor: name of the case, and mode of the sensor.
+        rate_hz: requested rate of SYNC.
+        lateness_ns: time of each SYNC behind its deadline.
         seconds: time from the first SYNC to the last.
-        response_ns: time from the last TPDO to the RPDOs in every fifth cycle (m,), ns.
-        compute_ns: that time and the controller's work after the RPDOs (m,), ns.
-        latency_ns: time from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
+        response_ns: time from the last TPDO to the RPDOs in every fifth cycle.
+        compute_ns: that time and the controller's work after the RPDOs.
+        latency_ns: time from a SYNC to the last of the drives' TPDOs, where all answered.
         missed: number of TPDOs that did not come in their cycle.
         processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
+        ended: reason of an early end.
     """
 
-    period_ns: int
-    lateness_ns: Times
+    case: str
+    sensor: str
+    rate_hz: float
+    lateness_ns: Sequence[int]
     seconds: float
-    response_ns: Times = field(default_factory=_nothing)
-    compute_ns: Times = field(default_factory=_nothing)
-    latency_ns: Times = field(default_factory=_nothing)
+    response_ns: Sequence[int] = ()
+    compute_ns: Sequence[int] = ()
+    latency_ns: Sequence[int] = ()
     missed: int = 0
     processor_share: float | None = None
+    ended: str = ""
+
+    @property
+    def period_ns(self) -> int:
+        """Requested period of SYNC, ns."""
+        return round(1e9 / self.rate_hz)
 
     @property
     def overruns(self) -> int:
         """Number of cycles woken more than half a period late."""
-        return int(np.count_nonzero(self.lateness_ns > self.period_ns // 2))
+        return sum(late_ns > self.period_ns // 2 for late_ns in self.lateness_ns)
 
     @property
     def cycles(self) -> int:
@@ -135,9 +130,14 @@ class CycleTimes:
         return len(self.lateness_ns)
 
     @property
-    def rate_hz(self) -> float:
+    def held_hz(self) -> float:
         """Held rate, cycles per second."""
         return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def per_10000(self) -> float:
+        """Overruns in 10 000 cycles."""
+        return 1e4 * self.overruns / max(1, self.cycles)
 
 
 def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
@@ -155,17 +155,6 @@ def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Ite
         deadline_ns += period_ns
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """A case and its times; `ended` is the reason of an early end."""
-
-    case: str
-    sensor: str
-    rate_hz: float
-    times: CycleTimes
-    ended: str = ""
-
-
 def measure_scan(seconds: float) -> Measured:
     """The scene `cylinder` with servo and estimator."""
     return _measured("whole controller", _scene({"task.duration_s": seconds}), make_task)
@@ -176,8 +165,7 @@ def measure_bare(seconds: float) -> Measured:
     period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
     with realtime(MASTER_PRIORITY, lambda _: None):  # the first case has reported missing permissions
         deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
-    times = CycleTimes(period_ns, np.array(lateness, np.int64), (deadlines[-1] - deadlines[0]) * 1e-9)
-    return Measured("bare clock", "none", RATE_HZ, times)
+    return Measured("bare clock", "none", RATE_HZ, lateness, (deadlines[-1] - deadlines[0]) * 1e-9)
 
 
 def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:
@@ -222,10 +210,11 @@ def _measured(case: str, scene: Scene, make: Callable[[Plan], Controller]) -> Me
 
         def note_latency(_: Measurement) -> None:
             nonlocal missed
-            assert session.cell.drives is not None
-            if session.cell.drives.missed == missed:  # all have answered
-                latency_ns.append(session.cell.drives.answer_ns)
-            missed = session.cell.drives.missed
+            drives = session.cell.drives
+            assert drives is not None
+            if drives.missed == missed:  # all have answered
+                latency_ns.append(drives.answer_ns)
+            missed = drives.missed
 
         try:
             with session:
@@ -235,20 +224,22 @@ def _measured(case: str, scene: Scene, make: Callable[[Plan], Controller]) -> Me
             if not session.opened:
                 raise
             ended = str(error)
-        cycle = session.cell.cycle
-        assert cycle is not None
-        seconds = cycle.t_ns * 1e-9
-        times = CycleTimes(
-            period_ns=session.plan.sync.period_ns,
-            lateness_ns=np.array(cycle.statistics.period_error_ns, np.int64),
-            seconds=seconds,
-            response_ns=np.array(cycle.statistics.response_ns, np.int64),
-            compute_ns=np.array(cycle.statistics.compute_ns, np.int64),
-            latency_ns=np.array(latency_ns, np.int64),
-            missed=missed,
-            processor_share=processor_share(used_s, seconds),
-        )
-    return Measured(case, scene.sensor.mode, scene.cycle.rate_hz, times, ended)
+    cycle, drives = session.cell.cycle, session.cell.drives
+    assert cycle is not None and drives is not None
+    seconds = cycle.t_ns * 1e-9
+    return Measured(
+        case,
+        scene.sensor.mode,
+        scene.cycle.rate_hz,
+        cycle.statistics.period_error_ns,
+        seconds,
+        cycle.statistics.response_ns,
+        cycle.statistics.compute_ns,
+        latency_ns,
+        drives.missed,
+        processor_share(used_s, seconds),
+        ended,
+    )
 
 
 def processor_share(used_before_s: float, passed_s: float) -> float | None:
@@ -259,21 +250,18 @@ def processor_share(used_before_s: float, passed_s: float) -> float | None:
 
 
 def _row(m: Measured) -> Row:
-    times = m.times
+    times_ns = {"lateness": m.lateness_ns, "response": m.response_ns, "compute": m.compute_ns, "latency": m.latency_ns}
     return {
         "case": m.case,
         "sensor": m.sensor,
         "rate_hz": m.rate_hz,
-        "held_hz": times.rate_hz,
-        "cycles": times.cycles,
-        "overruns": times.overruns,
-        "overruns_per_10000": per_10000(times),
-        "missed_pdos": times.missed,
-        **_percentiles("lateness", times.lateness_ns),
-        **_percentiles("response", times.response_ns),
-        **_percentiles("compute", times.compute_ns),
-        **_percentiles("latency", times.latency_ns),
-        "processor_percent": None if times.processor_share is None else 100 * times.processor_share,
+        "held_hz": m.held_hz,
+        "cycles": m.cycles,
+        "overruns": m.overruns,
+        "overruns_per_10000": m.per_10000,
+        "missed_pdos": m.missed,
+        **{f"{name}_{what}_us": us for name, ns in times_ns.items() for what, us in percentiles(ns).items()},
+        "processor_percent": None if m.processor_share is None else 100 * m.processor_share,
         "verdict": str(_verdict(m).fitness),
         "ended": m.ended,
     }
@@ -281,35 +269,23 @@ def _row(m: Measured) -> Row:
 
 def _verdict(m: Measured) -> LinkVerdict:
     """The verdict of `canprobe check` on the cycles of a case: SYNCs that are late, and answers that were missed."""
-    times = m.times
-    answered, rows = tuple(sorted(times.latency_ns.tolist())), (1,) * times.missed
-    answers = AnswerFigures(0, times.cycles, answered, 0, times.missed, rows)
-    wait_ns = round(LAST_LOOK * times.period_ns)
-    figures = LinkFigures(times.period_ns, sorted(times.lateness_ns.tolist()), wait_ns, (answers,))
+    answers = AnswerFigures(0, m.cycles, tuple(sorted(m.latency_ns)), 0, m.missed, (1,) * m.missed)
+    figures = LinkFigures(m.period_ns, sorted(m.lateness_ns), round(LAST_LOOK * m.period_ns), (answers,))
     return judge_link(figures, LinkLimits())
-
-
-def _percentiles(name: str, values_ns: Times) -> dict[str, float | None]:
-    return {f"{name}_{what}_us": value for what, value in percentiles(values_ns).items()}
-
-
-def per_10000(times: CycleTimes) -> float:
-    """Overruns in 10 000 cycles."""
-    return 1e4 * times.overruns / max(1, times.cycles)
 
 
 def findings(measured: list[Measured]) -> list[str]:
     """The figures beside the goals."""
     scan, bare = measured[:2]
     lines = [
-        f"whole controller at {scan.rate_hz:g} Hz for {scan.times.seconds:.0f} s: {per_10000(scan.times):.1f} overruns"
-        f" in 10 000 cycles (goal 1), {scan.times.rate_hz:.1f} cycles a second held",
-        f"a loop at {bare.rate_hz:g} Hz that does nothing: {per_10000(bare.times):.1f} overruns in 10 000 cycles, the"
+        f"whole controller at {scan.rate_hz:g} Hz for {scan.seconds:.0f} s: {scan.per_10000:.1f} overruns"
+        f" in 10 000 cycles (goal 1), {scan.held_hz:.1f} cycles a second held",
+        f"a loop at {bare.rate_hz:g} Hz that does nothing: {bare.per_10000:.1f} overruns in 10 000 cycles, the"
         " machine's own",
     ]
-    if len(scan.times.compute_ns):
-        of_period = 100.0 / scan.times.period_ns
-        response, whole = (of_period * np.percentile(t, 99) for t in (scan.times.response_ns, scan.times.compute_ns))
+    if len(scan.compute_ns):
+        of_period = 100.0 / scan.period_ns
+        response, whole = (of_period * np.percentile(t, 99) for t in (scan.response_ns, scan.compute_ns))
         lines.append(
             f"controller time p99 is {response:.0f} % of the period until the commands are out, {whole:.0f} % with the"
             " estimator's work behind them (goal 30 %)"
@@ -322,8 +298,8 @@ def findings(measured: list[Measured]) -> list[str]:
     )
     for mode in MODES:
         mine = [m for m in measured if m.case == "hold" and m.sensor == mode]
-        held = [m.rate_hz for m in mine if not m.ended and per_10000(m.times) <= HELD_PER_10000]
-        best = max((m.times.rate_hz for m in mine), default=0.0)
+        held = [m.rate_hz for m in mine if not m.ended and m.per_10000 <= HELD_PER_10000]
+        best = max((m.held_hz for m in mine), default=0.0)
         lines.append(
             f"{mode}: {f'{max(held):g} Hz held without overruns' if held else 'no rate held without overruns'}"
             f" of {', '.join(f'{m.rate_hz:g}' for m in mine)} Hz; {best:.0f} cycles a second at most"
@@ -338,7 +314,7 @@ LINES = ((BLUE, "-"), (ORANGE, "--"), (SKY, ":"))
 def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     """Lateness of SYNC, computing time, answer latency, and held over asked rate."""
     scan, bare = measured[:2]
-    rate, seconds = f"{scan.rate_hz:g} Hz", f"{scan.times.seconds:.0f} s"
+    rate, seconds = f"{scan.rate_hz:g} Hz", f"{scan.seconds:.0f} s"
     title = (
         f"How well the cycle keeps time: {rate} on a real SocketCAN interface for {seconds}, emulated nodes beside it\n"
         "histograms: all cycles, from a microsecond up; lower right: cycles a second that were reached"
@@ -346,17 +322,17 @@ def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     with picture(path, title, 6.6) as figure:
         panels = parts(figure, 2, 2)
         late = {"canprobe": scan, "a loop that does nothing": bare}
-        _histogram(panels[0], "lateness of SYNC (µs)", {name: m.times.lateness_ns for name, m in late.items()})
-        done = {"RPDOs out": scan.times.response_ns, "work behind them done": scan.times.compute_ns}
+        _histogram(panels[0], "lateness of SYNC (µs)", {name: m.lateness_ns for name, m in late.items()})
+        done = {"RPDOs out": scan.response_ns, "work behind them done": scan.compute_ns}
         axes = _histogram(panels[1], "from the last TPDO, whole controller (µs)", done)
-        axes.axvline(scan.times.period_ns * 0.3e-3, color=INK, linewidth=0.9, label="30 % of the period")
-        _histogram(panels[2], "SYNC → last TPDO (µs)", {"canprobe": scan.times.latency_ns})
+        axes.axvline(scan.period_ns * 0.3e-3, color=INK, linewidth=0.9, label="30 % of the period")
+        _histogram(panels[2], "SYNC → last TPDO (µs)", {"canprobe": scan.latency_ns})
         _rates(panels[3].subplots(), measured)
         for part in panels:
             legend(part)
 
 
-def _histogram(part: SubFigure, what: str, series: dict[str, Times]) -> Axes:
+def _histogram(part: SubFigure, what: str, series: Mapping[str, Sequence[int]]) -> Axes:
     axes: Axes = part.subplots()
     values = {name: np.maximum(v, 1000) / 1e3 for name, v in series.items() if len(v)}
     if values:
@@ -375,9 +351,7 @@ def _rates(axes: Axes, measured: Sequence[Measured]) -> None:
     holds = [m for m in measured if m.case == "hold"]
     for mode, (colour, line) in zip(dict.fromkeys(m.sensor for m in holds), LINES, strict=False):
         mine = [m for m in holds if m.sensor == mode]
-        axes.plot(
-            [m.rate_hz for m in mine], [m.times.rate_hz for m in mine], "o", linestyle=line, color=colour, label=mode
-        )
+        axes.plot([m.rate_hz for m in mine], [m.held_hz for m in mine], "o", linestyle=line, color=colour, label=mode)
     top = max((m.rate_hz for m in holds), default=1.0)
     axes.plot([0, top], [0, top], color=GREY, linewidth=0.8, zorder=0, label="as asked")
     axes.axvline(639, color=GREY, linestyle="-.", zorder=0, label="end of 1 Mbit/s, six drives")

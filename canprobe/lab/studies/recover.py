@@ -18,13 +18,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import canprobe
 from canprobe.cell.master.options import quiet
 from canprobe.cell.results.picture import BLUE, picture
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.lab.studies.recover_score import (
-    END_S,
     REPLUG,
     SCENES,
     STALL,
@@ -32,6 +30,7 @@ from canprobe.lab.studies.recover_score import (
     RecoverRun,
     draw_case,
     shrink,
+    work_scene,
 )
 from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
@@ -117,8 +116,7 @@ class LockstepRun(RecoverRun):
     """One run in lockstep; for its arguments see `RecoverRun`."""
 
     def __init__(self, case: RecoverCase, out: Path, say: Say) -> None:
-        changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
-        super().__init__(case, canprobe.plan(SCENES[case.work], changes), out, say)
+        super().__init__(case, work_scene(case.work, {"bus.timed": False}), out, say)
         self._faulty = self.session.buses.world.make_faulty()
         self.session.around = self._disturbed
         self._away: list[tuple[int, int, bool]] = []

@@ -20,6 +20,8 @@ from typing import Any
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.free_and_listen import HoldTask
 from canprobe.cell.tasks.from_plan import make_task
@@ -117,6 +119,11 @@ class RecoverCase:
         return f"{self.work}: " + "; ".join(map(str, self.outages))
 
 
+def work_scene(work: str, changes: Mapping[str, Any]) -> Scene:
+    """The scene of a kind of work, which goes on for longer than anything is lost."""
+    return load_scene(SCENES[work], {"scene.figures": False, "task.duration_s": END_S + 2.0, **changes})
+
+
 def draw_case(seed: int) -> RecoverCase:
     """The run of a seed: every other one has a pair, whose second outage begins 1 ms to 3 s after the first."""
     rng = Random(seed)
@@ -163,20 +170,21 @@ class RecoverRun(ABC):
 
     Args:
         case: what happens.
-        plan: plan of its cell.
+        scene: scene of its work.
         out: folder of the run's files.
         say: called with each step.
 
     Attributes:
-        case, plan: as given.
+        case, plan: what happens, and the plan of the cell.
         session: the session, which whoever carries the run out opens and closes.
         errors: errors that ended a controller.
         first_s: time of the first cycle of the work, from which the outages count, s; 0 before.
     """
 
-    def __init__(self, case: RecoverCase, plan: Plan, out: Path, say: Say) -> None:
-        self.case, self.plan, self._out, self._say = case, plan, out, say
-        self.session = Session(plan, RunOptions(out, self._note, recover=True))
+    def __init__(self, case: RecoverCase, scene: Scene, out: Path, say: Say) -> None:
+        self.case, self._out, self._say = case, out, say
+        self.session = Session(scene, RunOptions(out, self._note, recover=True))
+        self.plan = self.session.plan
         self.errors: list[CanprobeError] = []
         self.first_s = 0.0
         self._said: list[tuple[float, str]] = []

@@ -14,14 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cell.master.controller import Measurement
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
-from canprobe.lab.studies.recover_score import END_S, REPLUG, SCENES, STALL, RecoverCase, RecoverRun, draw_case
+from canprobe.lab.studies.recover_score import REPLUG, STALL, RecoverCase, RecoverRun, draw_case, work_scene
 from canprobe.lab.studies.result import Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.vcan_cells import ON_VCAN, link, patient, sleep, vcan_facts
@@ -51,9 +48,7 @@ class ServedRun(RecoverRun):
     """One run on vcan0; for its arguments see `RecoverRun`."""
 
     def __init__(self, case: RecoverCase, out: Path, say: Say) -> None:
-        changes = {**ON_VCAN, "scene.figures": False, "task.duration_s": END_S + 2.0}
-        scene = patient(load_scene(SCENES[case.work], changes), MISSED_SYNCS)
-        super().__init__(case, make_plan(resolve(scene)), out, say)
+        super().__init__(case, patient(work_scene(case.work, ON_VCAN), MISSED_SYNCS), out, say)
         self._stalls: list[tuple[float, float]] = []
 
     def carry_out(self) -> None:

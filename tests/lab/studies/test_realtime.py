@@ -8,26 +8,26 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
-from canprobe.lab.studies.realtime import CycleTimes, Measured, findings, holding_scene, woken
+from canprobe.lab.studies.realtime import Measured, findings, holding_scene, woken
 from canprobe.lab.studies.realtime_soak import findings as findings_of_soak
 from canprobe.lab.studies.realtime_soak import resident_mib
 
 
-def times(cycles, overruns, seconds, response_us=(), compute_us=()):
+def measured(case, sensor, rate_hz, cycles, overruns, *, seconds=10.0, response_us=(), compute_us=(), ended=""):
     late = np.where(np.arange(cycles) < overruns, 2_000_000, 0)
     response, compute = (1000 * np.array(us, np.int64) for us in (response_us, compute_us))
-    return CycleTimes(2_500_000, late, seconds, response, compute)
+    return Measured(case, sensor, rate_hz, late, seconds, response, compute, ended=ended)
 
 
 def test_findings_tell_rates_and_shares():
-    measured = [
-        Measured("whole controller", "window", 400.0, times(4001, 2, 10.0, [500], [750])),
-        Measured("bare clock", "none", 400.0, times(4000, 1, 10.0)),
-        Measured("hold", "features", 400.0, times(4001, 0, 10.0)),
-        Measured("hold", "features", 500.0, times(4001, 40, 10.0)),
-        Measured("hold", "image", 400.0, times(401, 0, 1.0), ended="node 1: lost"),
+    cases = [
+        measured("whole controller", "window", 400.0, 4001, 2, response_us=[500], compute_us=[750]),
+        measured("bare clock", "none", 400.0, 4000, 1),
+        measured("hold", "features", 400.0, 4001, 0),
+        measured("hold", "features", 500.0, 4001, 40),
+        measured("hold", "image", 400.0, 401, 0, seconds=1.0, ended="node 1: lost"),
     ]
-    text = "\n".join(findings(measured))
+    text = "\n".join(findings(cases))
     assert "whole controller at 400 Hz for 10 s: 5.0 overruns in 10 000 cycles (goal 1), 400.0 cycles" in text
     assert "does nothing: 2.5 overruns in 10 000 cycles" in text
     assert "p99 is 20 % of the period until the commands are out, 30 % with" in text
@@ -62,8 +62,8 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
     lateness: list[int] = []
     assert list(woken(Clock(), 1000, 4, lateness)) == [1000, 2000, 5000, 6000]
     assert lateness == [0, 100, 2600, 0]
-    times = CycleTimes(1000, np.array(lateness), 5e-6)
-    assert (times.overruns, times.cycles, times.missed) == (1, 4, 0)
+    loop = Measured("", "", 1e6, lateness, 5e-6)
+    assert (loop.overruns, loop.cycles, loop.missed) == (1, 4, 0)
 
 
 # The arithmetic of `realtime --soak`; it runs on vcan0 only.
