@@ -122,21 +122,15 @@ class LockstepRun(RecoverRun):
         self._away: list[tuple[int, int, bool]] = []
         """Times in which the master's interface is down, or the master stands still: begin and end, ns."""
 
-    @property
-    def _now_ns(self) -> int:
-        lockstep = self.session.buses.lockstep
-        return 0 if lockstep is None else lockstep.clock.now_ns()
-
-    def now_s(self) -> float:
-        return self._now_ns * 1e-9
-
     def lose(self) -> None:
+        assert self.session.buses.lockstep is not None
+        now_ns = self.session.buses.lockstep.clock.now_ns()
         for loss in self.case.outages:
             if loss.name in (REPLUG, STALL):
-                begin_ns = self._now_ns + round(loss.after_s * 1e9)
+                begin_ns = now_ns + round(loss.after_s * 1e9)
                 self._away.append((begin_ns, begin_ns + loss.lasts_ms * 1_000_000, loss.name == STALL))
             for node_id in loss.nodes(self.plan.node_ids):
-                self._faulty.inject(loss.fault(node_id, loss.after_s), self._now_ns)
+                self._faulty.inject(loss.fault(node_id, loss.after_s), now_ns)
 
     def _disturbed(self, port: Port) -> Port:
         """The port of the master: it fails while its interface is down, and its calls do not return in a stall."""
@@ -144,7 +138,7 @@ class LockstepRun(RecoverRun):
         def around(method: Callable[..., Any]) -> Callable[..., Any]:
             def call(*arguments: Any) -> Any:
                 for begin_ns, end_ns, stalls in self._away:
-                    if begin_ns <= self._now_ns < end_ns:
+                    if begin_ns <= port.clock.now_ns() < end_ns:
                         if not stalls:
                             down = f"{port.channel}: interface is down; type: sudo ip link set {port.channel} up"
                             raise InterfaceError(down)

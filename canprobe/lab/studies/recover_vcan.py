@@ -58,10 +58,6 @@ class ServedRun(RecoverRun):
         finally:
             link("up")
 
-    def now_s(self) -> float:
-        time_s = self.session.steps.time_s
-        return time_s() if time_s is not None else 0.0
-
     def is_over(self, measurement: Measurement) -> bool:
         """See `RecoverRun.is_over`; a stall that is due is slept through, in the controller."""
         for begin_s, end_s in [one for one in self._stalls if one[0] <= self.now_s()]:
