@@ -45,28 +45,19 @@ from canprobe.fieldbus.bus.sdo import Dialogue, hold_dialogues, upload
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.fieldbus.vcan.launch import CHANNEL
+from canprobe.lab.studies import vcan_cells
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
 from canprobe.lab.studies.recover_score import forces_of
 from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.vcan_cells import (
-    ON_VCAN,
-    link,
-    open_vcan,
-    patient,
-    served,
-    sleep,
-    vcan_facts,
-    with_real_nodes,
-)
 from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
 
 RUNS, QUICK_THROWN = 40, 1
 HOLD_S = 3.0
 SERVED: Mapping[str, Any] = {
-    **ON_VCAN,
+    **vcan_cells.ON_VCAN,
     "cycle.rate_hz": 100.0,
     "sensor.rate_hz": 100.0,
     "sensor.mode": "features",
@@ -135,7 +126,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     check_interface(CHANNEL)
     if (missing := missing_ip()) is not None:
         raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
-    link("up")  # a user who may not do that learns it before anything moves
+    vcan_cells.link("up")  # a user who may not do that learns it before anything moves
     rows = []
     total = len(ProcessFault) if quick else RUNS
     for seed in range(total):
@@ -148,7 +139,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         title="How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"
         "failed: it hung, or nodes moved or were enabled afterwards",
     )  # fmt: skip
-    facts = vcan_facts(quick, total, MISSED_SYNCS)
+    facts = vcan_cells.vcan_facts(quick, total, MISSED_SYNCS)
     return StudyResult("faults_vcan", rows, findings(rows), facts, drawn, more=(thrown,))
 
 
@@ -164,7 +155,7 @@ def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
 @cache
 def served_scene() -> Scene:
     """A press whose nodes are a separate process, which outlives the master."""
-    return patient(load_scene("press", SERVED), MISSED_SYNCS)
+    return vcan_cells.patient(load_scene("press", SERVED), MISSED_SYNCS)
 
 
 def _throw_all(quick: bool) -> StudyResult:
@@ -185,8 +176,8 @@ def _throw_all(quick: bool) -> StudyResult:
 
 def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
     """Run a task, throw a fault in a phase of it, and score the true force."""
-    scene = load_scene(task_scene(task, "ideal"), ON_VCAN)
-    session = Session(patient(scene, MISSED_SYNCS) if is_patient else scene)
+    scene = load_scene(task_scene(task, "ideal"), vcan_cells.ON_VCAN)
+    session = Session(vcan_cells.patient(scene, MISSED_SYNCS) if is_patient else scene)
     work = make_task(session.plan)
     with ThreadPoolExecutor(1) as others:
         thrown: list[Future[Any]] = []
@@ -223,27 +214,20 @@ def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and score the end: the row of the case."""
     nodes = EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,))
-    with served(nodes), running_master() as master:
+    with vcan_cells.served(nodes), running_master() as master:
         run = _ServedRun(case, master, nodes)
         try:
             status, ended_s, drives = run.carry_out()
         finally:
-            link("up")
-    return {
-        "seed": case.seed,
-        "fault": case.fault.value,
-        "after_s": case.after_s,
-        "status": status,
-        "ended_s": ended_s,
-        "drives": drives,
-        "failures": "; ".join(run.failures),
-    }
+            vcan_cells.link("up")
+    row = {"seed": case.seed, "fault": case.fault.value, "after_s": case.after_s}
+    return row | {"status": status, "ended_s": ended_s, "drives": drives, "failures": "; ".join(run.failures)}
 
 
 @contextmanager
 def running_master() -> Iterator[ChildProcess]:
     """`canprobe run` of the served scene in its own process, which is killed where it outlives the block."""
-    plan = make_plan(resolve(load_scene(with_real_nodes(served_scene()), {"scene.figures": False})))
+    plan = make_plan(resolve(load_scene(vcan_cells.with_real_nodes(served_scene()), {"scene.figures": False})))
     master = ChildProcess()
     master.launch(plan, ["canprobe", "run", str(master.scene_file), "--out", str(master.folder / "run")])
     try:
@@ -264,11 +248,11 @@ class _ServedRun:
 
     def carry_out(self) -> tuple[int | None, float, str]:
         """Status of the master (None: it hung), seconds from the fault to its end, states of the drives."""
-        with closing(open_vcan()) as port:
+        with closing(vcan_cells.open_vcan()) as port:
             if not self._await_enabled(port):
                 self.failures.append("the drives were never enabled")
                 return self.master.process.poll(), 0.0, ""
-            sleep(self.case.after_s)
+            vcan_cells.sleep(self.case.after_s)
         fault_ns = self.clock.now_ns()
         self._let_happen(self.master.process)
         status = None
@@ -277,8 +261,8 @@ class _ServedRun:
         except subprocess.TimeoutExpired:
             self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
         ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
-        sleep(REACTION_S - ended_s)
-        link("up")
+        vcan_cells.sleep(REACTION_S - ended_s)
+        vcan_cells.link("up")
         drives = self._look()
         self.failures += score_end(self.case.fault, status, self.master.folder)
         return status, ended_s, drives
@@ -300,15 +284,15 @@ class _ServedRun:
                 master.kill()
             case ProcessFault.MASTER_STALLED:
                 master.send_signal(signal.SIGSTOP)
-                sleep(STALL_S)
+                vcan_cells.sleep(STALL_S)
                 master.send_signal(signal.SIGCONT)
             case ProcessFault.NODES_KILLED:
                 self.nodes.process.kill()
             case ProcessFault.LINK_DOWN:
-                link("down")
+                vcan_cells.link("down")
             case ProcessFault.LINK_DOWN_UP:
-                link("down")
-                link("up")
+                vcan_cells.link("down")
+                vcan_cells.link("up")
 
     def _look(self) -> str:
         """The states of the drives, where their process still answers."""
@@ -318,7 +302,7 @@ class _ServedRun:
                 self.failures.append("the nodes ended with a master that is not their parent")
             return "gone"
         before = self._ask(0x6064)
-        sleep(APART_S)
+        vcan_cells.sleep(APART_S)
         after = self._ask(0x6064)
         states = {node_id: state_of(word) for node_id, word in words.items()}
         for node_id, state in states.items():
@@ -338,7 +322,7 @@ class _ServedRun:
             answers[node_id] = int.from_bytes(answer, "little", signed=index == 0x6064)
 
         drives = served_scene().drives
-        with suppress(CanprobeError, SdoCommunicationError), closing(open_vcan()) as port:
+        with suppress(CanprobeError, SdoCommunicationError), closing(vcan_cells.open_vcan()) as port:
             hold_dialogues(PumpedNetwork(port), {i: ask(i) for i in drives}, timeout_s=1.0, retries=1)
         return answers if len(answers) == len(drives) else {}
 

@@ -153,10 +153,9 @@ def measure_machine(case: tuple[int, float]) -> list[Row]:
         predicted, held = report.verdict.overruns[float(rate_hz)], hold(session, minute_s)
         if held.ended:
             raise CanprobeError(held.ended)
-        head = {"seed": seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
-        percents = {"predicted_percent": 100.0 * predicted, "seen_percent": 100.0 * held.overruns}
-        ratio = predicted / held.overruns if predicted and held.overruns else None
-        rows.append({**head, **percents, "ratio": ratio})
+        row = {"seed": seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
+        row |= {"predicted_percent": 100.0 * predicted, "seen_percent": 100.0 * held.overruns}
+        rows.append(row | {"ratio": predicted / held.overruns if predicted and held.overruns else None})
     return rows
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import importlib.util
 import json
 import math
 import platform
@@ -158,23 +157,21 @@ def as_document(result: StudyResult) -> dict[str, Any]:
 
 
 def write_study(result: StudyResult, out: Path) -> list[Path]:
-    """Write `<name>.csv`, `.txt`, `.json` and, where matplotlib is installed, `.png`.
+    """Write `<name>.csv`, `.txt`, `.json` and `.png`.
 
     Returns:
-        The files of each table, its picture last where there is one.
+        The files of each table, its picture last.
 
     Raises:
         ResultsError: one cannot be written.
     """
     make_folder(out)
-    paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
+    paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json", "png")]
     write_csv(paths[0], result.rows)
     write_text(paths[1], text_of(result))
     document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
     write_text(paths[2], document + "\n")
-    if importlib.util.find_spec("matplotlib") is not None:
-        paths.append(out / f"{result.name}.png")
-        result.draw(paths[-1])
+    result.draw(paths[3])
     return [*paths, *(path for more in result.more for path in write_study(more, out))]
 
 

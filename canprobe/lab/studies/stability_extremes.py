@@ -136,18 +136,16 @@ def _with_wrist(scene: Scene, wrist_deg: float) -> Scene:
     return replace(scene, joints=joints)
 
 
-def _touched_at(scene: Scene, place: tuple[float, float, float]) -> Scene:
+def _touched_at(scene: Scene, place: tuple[float, ...]) -> Scene:
     scene = changed(changed(scene, "task", start_mm=place), "object", position_mm=place)
     return changed(scene, "limits", joint_margin_deg=0.5)
 
 
-def touch_in_posture(
-    posture_deg: tuple[float, ...],
-) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
+def touch_in_posture(posture_deg: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """A touch with the pole of the default probe and these joint angles, deg.
 
     Returns:
-        Its place, mm; the outward normal there; joint angles (n,) 10 mm above it, deg.
+        Its place (3,), mm; the outward normal (3,) there; joint angles (n,) 10 mm above it, deg.
     """
     arm, probe = resolve(load_scene("press")).arm, ProbeSettings()
     assert arm is not None
@@ -160,12 +158,10 @@ def touch_in_posture(
     above[:3, 3] -= 10e-3 * pole
     away = np.degrees(inverse_near(model, above, T_flange_centre, q))
     at = 1e3 * T[:3, 3] + probe.radius_mm * pole
-    x, y, z = (float(value) for value in at)
-    nx, ny, nz = (-float(value) for value in pole)
-    return (x, y, z), (nx, ny, nz), tuple(float(angle) for angle in away)
+    return tuple(at.tolist()), tuple((-pole).tolist()), tuple(away.tolist())
 
 
-def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[float, float, float]:
+def upright(normal: tuple[float, ...], yaw_deg: float = 20.0) -> tuple[float, float, float]:
     """Roll, pitch and yaw, deg, of an object whose z is a unit normal."""
     yaw = math.radians(yaw_deg)
     x = math.cos(yaw) * normal[0] + math.sin(yaw) * normal[1]
