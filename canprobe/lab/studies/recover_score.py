@@ -43,11 +43,7 @@ SLACK_S = 1.0
 SCENES: Mapping[str, str] = {"hold": "free", "free": "free", "press": "press", "scan": "plane"}
 """Scene of each kind of work."""
 LOST: Mapping[str, str] = {
-    "reboot": "reboot",
-    "bus-off": "bus-off",
-    "freeze": "freeze",
-    "sync-lost": "sync-lost",
-    "heartbeat-off": "heartbeat-off",
+    **{name: name for name in ("reboot", "bus-off", "freeze", "sync-lost", "heartbeat-off")},
     "nmt-reset": "nmt command=129",
     "nmt-preop": "nmt command=128",
 }
@@ -256,7 +252,10 @@ class RecoverRun(ABC):
         forces = forces_of(self.session)
         limit = self.plan.setup.limits.force_max
         lost, back = self._times_of("lost: "), self._times_of(BACK)
-        calm = [force for time, force in forces if not self._reacts(time, lost)]
+        begun = [self.first_s + loss.after_s for loss in self.case.outages]
+        # between an outage and the stop of the cell the force may rise: how far, study `faults` judges
+        reacting = [(begin, min((stop for stop in lost if stop >= begin), default=begin)) for begin in begun]
+        calm = [force for time, force in forces if not any(begin <= time < stop for begin, stop in reacting)]
         force, calm_n = max((force for _, force in forces), default=0.0), max(calm, default=0.0)
         refused = bool(self.errors) and self.errors[-1].exit_status == 1
         failures = []
@@ -297,11 +296,6 @@ class RecoverRun(ABC):
         """Whether the cell takes the probe off at a time, s: that is no jump."""
         said = [text for time, text in self._said if time <= time_s and text.startswith(("lift off", "enable the"))]
         return bool(said) and said[-1].startswith("lift off")
-
-    def _reacts(self, time_s: float, lost_s: Sequence[float]) -> bool:
-        """Whether an outage has begun, and the cell has not stopped: how far the force rises then, `faults` judges."""
-        begun = [self.first_s + loss.after_s for loss in self.case.outages]
-        return any(begin <= time_s < min((t for t in lost_s if t >= begin), default=begin) for begin in begun)
 
     def _late_s(
         self, since_s: float, lost_s: float, back_s: float, boot_ups: Mapping[int, Sequence[float]]

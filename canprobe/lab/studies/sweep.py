@@ -79,31 +79,23 @@ class Sweep:
         if store.damaged:
             say(f"{store.path}: {store.damaged} damaged lines left out; their cells are computed again")
 
-    def map(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+    def map(
+        self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = (), machine: str = ""
+    ) -> list[Any]:
         """Answers of `measure` to cells, in their order.
 
         Args:
             measure: a function of a module, of one cell; its answer has a JSON form.
             cells: dataclasses, or other values with a JSON form.
             model: files and folders of the package behind the answers; by default all.
+            machine: this machine, for answers that hold on it only: see `time`.
 
         Raises:
             StudyError: a cell or a worker failed; the cells that are finished by then are kept.
         """
-        return self._all(measure, cells, tuple(model), None)
-
-    def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
-        """Answers of cells that measure run time: one after another, alone, in one process of this machine.
-
-        A kept answer counts on the machine that measured it only.
-        """
-        return self._all(measure, cells, tuple(model), f"{platform.node()} {platform.processor()}")
-
-    def _all(
-        self, measure: Callable[[Any], object], cells: Sequence[Any], parts: tuple[str, ...], machine: str | None
-    ) -> list[Any]:
-        name, model = f"{measure.__module__}:{measure.__qualname__}", model_digest(parts)
-        keys = [cell_key(name, [cell, machine] if machine else cell, model) for cell in cells]
+        parts = tuple(model)
+        name, digest = f"{measure.__module__}:{measure.__qualname__}", model_digest(parts)
+        keys = [cell_key(name, [cell, machine] if machine else cell, digest) for cell in cells]
         todo = {key: cell for key, cell in zip(keys, cells, strict=True) if key not in self._store.answers}
         total = len(set(keys))
         done = total - len(todo)
@@ -111,15 +103,23 @@ class Sweep:
             self.say(f"{done} of {total} cells are kept in {self._store.path}")
 
         def keep(key: str, answer: str) -> None:
-            self._store.put(key, {"measure": name, "cell": todo[key], "model": model, "machine": machine}, answer)
+            what = {"measure": name, "cell": todo[key], "model": digest, "machine": machine or None}
+            self._store.put(key, what, answer)
             if self._progress is not None:
                 self._progress(total - len(todo.keys() - self._store.answers.keys()), total)
 
         if todo:
-            with self._executor() if machine is None else process_pool(1) as executor:
-                for batch in [todo] if machine is None else [{key: cell} for key, cell in todo.items()]:
-                    _collect(executor, partial(_compute, measure, parts, model), batch, keep)
+            with process_pool(1) if machine else self._executor() as executor:
+                for batch in [{key: cell} for key, cell in todo.items()] if machine else [todo]:
+                    _collect(executor, partial(_compute, measure, parts, digest), batch, keep)
         return [json.loads(self._store.answers[key]) for key in keys]
+
+    def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+        """Answers of cells that measure run time: one after another, alone, in one process of this machine.
+
+        A kept answer counts on the machine that measured it only.
+        """
+        return self.map(measure, cells, model=model, machine=f"{platform.node()} {platform.processor()}")
 
 
 @contextmanager
