@@ -206,31 +206,28 @@ def value_in_words(case: ExtremeCase) -> str:
 
 def measure(case: ExtremeCase) -> Row:
     """Carry out a case: its row of the table."""
-    row: Row = {"extreme": case.extreme, "value": value_in_words(case), "task": "scan" if case.scan else "press"}
-    none: Row = dict.fromkeys(("curvature_per_m", "stated_per_m", "held"))
+    row: Row = dict.fromkeys(("curvature_per_m", "stated_per_m", "held"))
+    row |= {"extreme": case.extreme, "value": value_in_words(case), "task": "scan" if case.scan else "press"}
     scene = extreme_scene(case)
     try:
         session = Session(scene)
         world = session.buses.world
     except PlanError as refusal:
-        return row | refused_row(refusal) | none
+        return row | refused_row(refusal)
     task = make_task(session.plan)
     assert isinstance(task, TouchTask) and world.nodes
     if case.extreme == "jitter of the period":
         jitter_ns = 1e-2 * case.value * 1e9 / scene.cycle.rate_hz
         delay(world, {SYNC_ID}, partial(sync_delay_ns, jitter_ns))
-    found = row | run_touch(session, task, scene.task.force_n) | none
-    scores = np.zeros((0, 5))
-    if task.shape is not None:
-        late, behind = scores_of(session, task.shape.records)
-        scores = np.array([one for one in (*late, *behind) if one]).reshape(-1, 5)
-    if len(scores):
-        found["curvature_per_m"], found["stated_per_m"] = (float(np.sqrt(scores[:, i].mean())) for i in (1, 2))
-        found["held"] = float(np.mean(scores[:, 3] < CHI2_95_OF_3))
+    row |= run_touch(session, task, scene.task.force_n)
+    late, behind = scores_of(session, task.shape.records if task.shape is not None else [])
+    if scores := [one for one in (*late, *behind) if one]:
+        _, errors, variances, squares, _ = np.array(scores).T
+        row |= {"curvature_per_m": math.sqrt(errors.mean()), "stated_per_m": math.sqrt(variances.mean())}
+        row["held"] = float(np.mean(squares < CHI2_95_OF_3))
     assert scene.probe is not None
-    return found | judged(
-        found, 1e3 / scene.probe.radius_mm + float(np.abs(session.buses.truth["kappa_per_m"][-1]).max())
-    )
+    curved_per_m = 1e3 / scene.probe.radius_mm + float(np.abs(session.buses.truth["kappa_per_m"][-1]).max())
+    return row | judged(row, curved_per_m)
 
 
 def sync_delay_ns(jitter_ns: float, t_ns: int) -> int:

@@ -191,14 +191,14 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
         workers: number of processes; one for each core that this process may use by default.
     """
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
+    pool = _DeafPool(
         workers or system.processors(),
         multiprocessing.get_context("spawn"),
         initializer=_begin,
         initargs=(os.getpid(),),
     )
     try:
-        yield _Deaf(pool)
+        yield pool
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         _end(set(multiprocessing.active_children()) - before)
@@ -233,22 +233,18 @@ def dask_executor(address: str) -> Iterator[Executor]:
         client.close()  # cancels what is under way
 
 
-class _Deaf(Executor):
+class _DeafPool(ProcessPoolExecutor):
     """Submits with SIGINT blocked: workers inherit that from their first instruction on.
 
     A worker that is started then does not import the script that starts it, which would start its sweep again; cells
     are measured by functions of modules.
     """
 
-    def __init__(self, pool: ProcessPoolExecutor) -> None:
-        self._pool = pool
-
     def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]  # as its base has it
-        """See `Executor.submit`."""
         script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             with system.interrupts_blocked():
-                return self._pool.submit(fn, *args, **kwargs)
+                return super().submit(fn, *args, **kwargs)
         finally:
             sys.modules["__main__"] = script
 
