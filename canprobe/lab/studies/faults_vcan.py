@@ -13,11 +13,10 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from enum import Enum
 from functools import cache, partial
 from pathlib import Path
 from random import Random
@@ -90,14 +89,28 @@ THROWN = (
 """Faults that press hardest in lockstep, the task, and its phase."""
 
 
-class ProcessFault(Enum):
-    """Kind of a fault on vcan0."""
+def stall(process: subprocess.Popen[bytes]) -> None:
+    """Let a process stand still for a time."""
+    process.send_signal(signal.SIGSTOP)
+    vcan_cells.sleep(STALL_S)
+    process.send_signal(signal.SIGCONT)
 
-    MASTER_KILLED = "master killed"
-    MASTER_STALLED = "master stalled"
-    NODES_KILLED = "nodes killed"
-    LINK_DOWN = "link down"
-    LINK_DOWN_UP = "link down and up"
+
+def replug() -> None:
+    """Take the interface down, and up at once."""
+    vcan_cells.link("down")
+    vcan_cells.link("up")
+
+
+MASTER_KILLED, MASTER_STALLED = "master killed", "master stalled"
+PROCESS_FAULTS: Mapping[str, Callable[[ChildProcess, ChildProcess], None]] = {
+    MASTER_KILLED: lambda master, nodes: master.process.kill(),
+    MASTER_STALLED: lambda master, nodes: stall(master.process),
+    "nodes killed": lambda master, nodes: nodes.process.kill(),
+    "link down": lambda master, nodes: vcan_cells.link("down"),
+    "link down and up": lambda master, nodes: replug(),
+}
+"""Kind of a fault → what it does to the process of the master and that of the nodes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,18 +119,18 @@ class ProcessCase:
 
     Attributes:
         seed: number of the run.
-        fault: kind of the fault.
+        fault: key of `PROCESS_FAULTS`.
         after_s: time from the enabling of the drives to the fault.
     """
 
     seed: int
-    fault: ProcessFault
+    fault: str
     after_s: float
 
 
 def draw_process_case(seed: int) -> ProcessCase:
     """The case of a seed: the kinds take turns, the time is random, from the enabling to beyond the retreat."""
-    kinds = tuple(ProcessFault)
+    kinds = tuple(PROCESS_FAULTS)
     return ProcessCase(seed, kinds[seed % len(kinds)], Random(f"vcan {seed}").uniform(0.0, HOLD_S + 1.0))
 
 
@@ -128,7 +141,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
     vcan_cells.link("up")  # a user who may not do that learns it before anything moves
     rows = []
-    total = len(ProcessFault) if quick else RUNS
+    total = len(PROCESS_FAULTS) if quick else RUNS
     for seed in range(total):
         rows.append(row_of(draw_process_case(seed)))
         sweep.say(f"{seed + 1} of {total}: {rows[-1]['fault']}: {rows[-1]['failures'] or 'no failure'}")
@@ -220,7 +233,7 @@ def row_of(case: ProcessCase) -> Row:
             status, ended_s, drives = run.carry_out()
         finally:
             vcan_cells.link("up")
-    row = {"seed": case.seed, "fault": case.fault.value, "after_s": case.after_s}
+    row = {"seed": case.seed, "fault": case.fault, "after_s": case.after_s}
     return row | {"status": status, "ended_s": ended_s, "drives": drives, "failures": "; ".join(run.failures)}
 
 
@@ -254,7 +267,7 @@ class _ServedRun:
                 return self.master.process.poll(), 0.0, ""
             vcan_cells.sleep(self.case.after_s)
         fault_ns = self.clock.now_ns()
-        self._let_happen(self.master.process)
+        PROCESS_FAULTS[self.case.fault](self.master, self.nodes)
         status = None
         try:
             status = self.master.process.wait(PATIENCE_S)
@@ -278,27 +291,11 @@ class _ServedRun:
                     return True
         return False
 
-    def _let_happen(self, master: subprocess.Popen[bytes]) -> None:
-        match self.case.fault:
-            case ProcessFault.MASTER_KILLED:
-                master.kill()
-            case ProcessFault.MASTER_STALLED:
-                master.send_signal(signal.SIGSTOP)
-                vcan_cells.sleep(STALL_S)
-                master.send_signal(signal.SIGCONT)
-            case ProcessFault.NODES_KILLED:
-                self.nodes.process.kill()
-            case ProcessFault.LINK_DOWN:
-                vcan_cells.link("down")
-            case ProcessFault.LINK_DOWN_UP:
-                vcan_cells.link("down")
-                vcan_cells.link("up")
-
     def _look(self) -> str:
         """The states of the drives, where their process still answers."""
         words = self._ask(0x6041) if self.nodes.process.poll() is None else {}
         if not words:
-            if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
+            if self.case.fault in (MASTER_KILLED, MASTER_STALLED):
                 self.failures.append("the nodes ended with a master that is not their parent")
             return "gone"
         before = self._ask(0x6064)
@@ -327,10 +324,10 @@ class _ServedRun:
         return answers if len(answers) == len(drives) else {}
 
 
-def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str]:
+def score_end(fault: str, status: int | None, folder: Path) -> list[str]:
     """Failures in what a master left: its status, `ERRORS`, and `run/bus.log` and `run/summary.json` in `folder`."""
     failures = []
-    killed = fault is ProcessFault.MASTER_KILLED
+    killed = fault == MASTER_KILLED
     if status is not None and not killed and status not in (1, 3):
         failures.append(f"the master ended with status {status}, expected 1 or 3")
     errors = (folder / ERRORS).read_text(encoding="utf-8", errors="replace")
