@@ -48,10 +48,9 @@ from canprobe.lab.studies import vcan_cells
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
-from canprobe.lab.studies.recover_score import forces_of
 from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
+from canprobe.lab.studies.witnessed_run import forces_of, longest_above, run_to_end
 
 RUNS, QUICK_THROWN = 40, 1
 HOLD_S = 3.0

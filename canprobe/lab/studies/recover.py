@@ -1,7 +1,7 @@
 """Study `faults --recover`: cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
 
 What is lost, when, for how long, alone or in pairs, follows from a seed, while the arm holds, moves, presses or scans
-(`recover_score`). A run fails where a drive is enabled with a target more than one count beside its position, where the
+(`recover_runs`). A run fails where a drive is enabled with a target more than one count beside its position, where the
 force exceeds the limit at another time than between loss and stop (study `faults` judges that time), where the cell
 does not come back or takes more than a second from the boot-up of the last node to the hold, or where its log lacks a
 cycle. Behind a loss without a boot-up the cell may take as long again as its nodes may take to stop. A stop that
@@ -22,7 +22,7 @@ from canprobe.cell.master.options import quiet
 from canprobe.cell.results.picture import BLUE, picture
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.lab.studies.recover_score import (
+from canprobe.lab.studies.recover_runs import (
     REPLUG,
     SCENES,
     STALL,

@@ -1,4 +1,4 @@
-"""Study `faults --recover` on a real vcan0: the cases of `recover_score`, with nodes in their own process.
+"""Study `faults --recover` on a real vcan0: the cases of `recover_runs`, with nodes in their own process.
 
 `canprobe vcan -- canprobe study faults --recover --vcan`. Faults are thrown as `canprobe inject` throws them, the
 interface is taken down and up by `ip`, and the master stands still in its controller. The score is that of the study in
@@ -18,7 +18,7 @@ from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
-from canprobe.lab.studies.recover_score import REPLUG, STALL, RecoverCase, RecoverRun, draw_case, work_scene
+from canprobe.lab.studies.recover_runs import REPLUG, STALL, RecoverCase, RecoverRun, draw_case, work_scene
 from canprobe.lab.studies.result import Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.vcan_cells import ON_VCAN, link, patient, sleep, vcan_facts

@@ -31,6 +31,7 @@ from canprobe.fieldbus.protocol.cia402 import POSITION, STATUSWORD, TARGET_POSIT
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.lab.studies.result import Say
+from canprobe.lab.studies.witnessed_run import forces_of
 
 FIRST_SYNCS = 8
 """SYNCs after each enabling of a drive in which its target is compared with its position."""
@@ -358,9 +359,3 @@ class FirstTargets:
         elif TARGET_POSITION in got and times > 1 and 0 <= age < FIRST_SYNCS and POSITION in values:
             return abs(got[TARGET_POSITION] - values[POSITION])
         return 0
-
-
-def forces_of(session: Session) -> list[tuple[float, float]]:
-    """Force of the plant of a finished session: (time, s; force, N)."""
-    truth = session.buses.truth
-    return list(zip(truth["t_s"].tolist(), truth["force_n"].tolist(), strict=True)) if "force_n" in truth else []
