@@ -78,7 +78,7 @@ def test_a_table_leaves_no_part_of_a_file(scan, tmp_path):
 
 def test_a_study_leaves_no_part_of_a_file(tmp_path):
     rows = [{"value": float(value)} for value in np.arange(1000)]
-    result = StudyResult("some", ("value",), rows, (), {}, lambda path: path.write_text("x"))
+    result = StudyResult("some", rows, (), {}, lambda path: path.write_text("x"))
     with room_for(ROOM), pytest.raises(ResultsError, match=r"some\.csv: cannot be written"):
         write_study(result, tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -123,7 +123,7 @@ def run(*, quick: bool, sweep: object) -> StudyResult:
         f"dropped in all: {dropped} of {samples} samples",
     ]
     facts = measuring_facts(quick, 1) | {"cycles": len(observations), "processors": os.cpu_count()}
-    return StudyResult("bridges", COLUMNS, rows, findings, facts, lambda path: _draw(rows, path))
+    return StudyResult("bridges", rows, findings, facts, lambda path: _draw(rows, path), COLUMNS)
 
 
 def _record(seconds: float) -> list[Observation]:

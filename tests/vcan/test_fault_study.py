@@ -9,7 +9,7 @@ from rights import type_as_root
 
 from canprobe.cli import main
 from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE, REFERENCE_LIMIT_CODE
-from canprobe.lab.studies.faults_vcan import ProcessFault
+from canprobe.lab.studies.faults_vcan import PROCESS_FAULTS
 
 pytestmark = pytest.mark.vcan
 
@@ -20,7 +20,7 @@ def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
     type_as_root("ip", "link", "set", "vcan0", "up")  # the study takes it down, too
     assert main(["study", "faults", "--vcan", "--quick", "--json", "--out", str(tmp_path)]) == 0
     rows = {row["fault"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
-    assert set(rows) == {fault.value for fault in ProcessFault}
+    assert set(rows) == set(PROCESS_FAULTS)
     assert {row["failures"] for row in rows.values()} == {""}
     assert rows["master killed"]["status"] == -9
     assert all(row["status"] in (1, 3) for name, row in rows.items() if name != "master killed")

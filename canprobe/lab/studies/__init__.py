@@ -17,6 +17,6 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
     workprec    error of the dynamic plant against its run time
     stability   `stability_runs`, `stability_extremes`, `linear_loop`
     faults      `fault_cases`, `fault_runs`, `witnessed_run`; `faults_vcan`
-    faults --recover  `recover`, `recover_score`; `recover_vcan`
-    realtime    `realtime_cases`; `realtime_soak`; `realtime_link` on `link_setups`
+    faults --recover  `recover`, `recover_runs`; `recover_vcan`
+    realtime    `realtime_soak`; `realtime_link` on `link_setups`; `vcan_cells`: what studies in real time share
 """

@@ -1,15 +1,14 @@
 """Emulated arrays that are drawn at random, and the touches that calibrate one, directly and without a bus.
 
-An array is touched as `canprobe calibrate array` touches it: a plane at 4 places with 3 forces, a ball at 9 places with
-2 forces, three reference loads, short rolls to and fro, a rod to verify. The images come from `cell.plant.taxels`,
-whose pressure is that of the exact sphere, sampled nine times a taxel, with hysteresis, creep and noise; a calibration
-knows none of its formulas.
+An array is touched as `canprobe calibrate array` touches it, but for the touches with the probe turned. The images come
+from `cell.plant.taxels`, whose pressure is that of the exact sphere, sampled nine times a taxel, with hysteresis, creep
+and noise; a calibration knows none of its formulas.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +16,8 @@ import numpy as np
 from canprobe.cell.emulated.array import follow
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
+from canprobe.cell.session.array_calibration import visits
+from canprobe.cell.tasks.calibrate import Press
 from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit, calibrate_array
 from canprobe.mechanics.touch.array_calibration.touches import Dwell
 from canprobe.mechanics.touch.pad import Pad
@@ -25,16 +26,13 @@ from canprobe.mechanics.types import Floats
 RADIUS_M = 0.040
 BALL_PER_M = 40.0
 WINDOW = 8
-FRAME_S, LOADING_S, DWELL_S, APART_S = 0.02, 0.5, 3.0, 2.5
+FRAME_S, LOADING_S, APART_S = 0.02, 0.5, 2.5
 HOLD_S = (8.0, 20.0, 60.0)
 """Durations of a hold, s."""
-REFERENCE_S = 9.0
-"""Time of a reference load, s: creep has ended by then."""
 REFERENCE_SIGMA = 0.005
 FORCE_RELATIVE_SIGMA, FORCE_CORRELATION_S = 0.03, 0.1
 """The force wanders under a servo: relative standard deviation, and correlation time."""
 ENCODER_M = 3e-6
-EIGHT_M, STROKE_M, STROKE_HZ = (1.5e-3, 0.6e-3), (0.5e-3, 0.0), (0.5, 1.5)
 
 
 def pad_of(config: TaxelConfig) -> Pad:
@@ -96,50 +94,41 @@ class Presses:
     def _new_array(self) -> TaxelArray:
         return TaxelArray(self.config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self.stiffness)
 
-    def dwell(  # noqa: PLR0917
+    def dwell(
         self,
         name: str,
-        force: float,
         kappa: tuple[float, float],
-        number: int = 0,
-        at: tuple[float, float] = (0.0, 0.0),
+        press: Press,
+        place: int = 0,
         angle: float = 0.0,
         *,
-        seconds: float = DWELL_S,
-        heading: float = 0.0,
-        roll: tuple[float, float] = EIGHT_M,
-        hz: Sequence[float] = (0.35,),
         measured: bool = False,
     ) -> Dwell:
         """One touch, pressed for half a second and rolled over the pad.
 
         Args:
             name: name of the object.
-            force: normal force, N.
             kappa: principal curvatures, larger first, 1/m.
-            number: number of the place.
-            at: place on the pad, m.
+            press: force, place on the pad, and roll.
+            place: number of the place.
             angle: angle of the first principal direction on the pad, rad.
-            seconds: duration of the roll.
-            heading: heading of the roll on the pad, rad.
-            roll: half-widths along and across the heading, m.
-            hz: rates of the roll, one after the other.
             measured: whether the true force is given, with the error of a scale.
         """
         array, began = self._array, self._t
-        rng, depth = self._rng, depth_for_force(force, kappa, RADIUS_M, self.stiffness)
+        rng, force, hz = self._rng, press.force, press.hz
+        depth = depth_for_force(force, kappa, RADIUS_M, self.stiffness)
         c, s = math.cos(angle), math.sin(angle)
         axes, origin = np.array([[c, s], [-s, c]]), (4, 4)
-        c, s = math.cos(heading), math.sin(heading)
+        c, s = math.cos(press.heading), math.sin(press.heading)
         unrest = phase = 0.0
         kept = math.exp(-FRAME_S / FORCE_CORRELATION_S)
         rows = []
-        for t in np.arange(0.0, LOADING_S + seconds, FRAME_S).tolist():
+        for t in np.arange(0.0, LOADING_S + press.seconds, FRAME_S).tolist():
             unrest = kept * unrest + FORCE_RELATIVE_SIGMA * math.sqrt(1.0 - kept**2) * float(rng.standard_normal())
-            share = max(0.0, t - LOADING_S) / seconds
+            share = max(0.0, t - LOADING_S) / press.seconds
             phase += 2.0 * math.pi * FRAME_S * hz[min(int(share * len(hz)), len(hz) - 1)] * (share > 0.0)
-            x, y = roll[0] * math.sin(phase), roll[1] * math.sin(2.0 * phase)
-            uv = (at[0] + c * x - s * y, at[1] + s * x + c * y)
+            x, y = press.roll[0] * math.sin(phase), press.roll[1] * math.sin(2.0 * phase)
+            uv = (press.at[0] + c * x - s * y, press.at[1] + s * x + c * y)
             now = force * min(1.0, t / LOADING_S) * max(1.0 + unrest, 0.0)
             sunk = depth * math.sqrt(now / force)
             image = array.image(uv, sunk, kappa, axes, began + t)
@@ -158,7 +147,7 @@ class Presses:
             name=name,
             kappa=kappa,
             angle=angle,
-            place=number,
+            place=place,
             t_s=np.array(t_s),
             images=images,
             windows=windows,
@@ -176,28 +165,20 @@ class Presses:
 
     def protocol(self) -> Iterator[Dwell]:
         """The touches of `canprobe calibrate array`, with a rest where it changes the object."""
-        flat, ball = (0.0, 0.0), (BALL_PER_M, BALL_PER_M)
-        corners = [(x, y) for x in (-2e-3, 2e-3) for y in (-2e-3, 2e-3)]
-        for force in (0.7, 1.5, 3.0):
-            if force == 3.0:
-                for number, heading in enumerate((0.0, 0.5 * math.pi), start=20):
-                    yield self.dwell(
-                        "plane", 2.0, flat, number, seconds=8.0, heading=heading, roll=STROKE_M, hz=STROKE_HZ
-                    )
-            for number, at in enumerate(corners):
-                yield self.dwell("plane", force, flat, number, at, heading=0.8 * number)
-        self.rest()
-        for force in (1.0, 2.0, 3.0):
-            yield self.dwell("plane", force, flat, 10, seconds=REFERENCE_S, measured=True)
-        self.rest()
-        grid = [(x, y) for x in (-2e-3, 0.0, 2e-3) for y in (-2e-3, 0.0, 2e-3)]
-        for force in (0.8, 2.0):
-            for number, at in enumerate(grid):
-                yield self.dwell("ball", force, ball, number, at, heading=0.7 * number)
-        for number, angle in enumerate((0.0, 0.25 * math.pi)):
-            self.rest()
-            heading = angle + 0.5 * math.pi
-            yield self.dwell("rod", 2.0, (BALL_PER_M, 0.0), number, angle=angle, heading=heading, roll=(1.5e-3, 0.0))
+        places: dict[object, int] = {}
+        for visit in visits(1.0 / BALL_PER_M, 1.0 / BALL_PER_M, loads=True, one_by_one=False):
+            if visit.turned:
+                continue
+            if places:
+                self.rest()
+            known = visit.known
+            kappa = (1.0 / known.radius, 0.0 if known.name == "rod" else 1.0 / known.radius)
+            for press in visit.presses:
+                heading = known.angle + 0.5 * math.pi if math.isnan(press.heading) else press.heading
+                place = (known.name, visit.first, press.at, heading if press.hz[1:] else None)
+                number = places.setdefault(place, len(places))
+                rolled = replace(press, heading=heading)
+                yield self.dwell(known.name, kappa, rolled, number, known.angle, measured=visit.load)
 
     def by_chance(self) -> Dwell:
         """A random quadric, force, place and time; the true force is given exactly."""
@@ -207,9 +188,8 @@ class Presses:
         x, y = rng.uniform(-2e-3, 2e-3, 2).tolist()
         angle, heading = rng.uniform(0.0, math.pi), rng.uniform(0.0, 2.0 * math.pi)
         hz, seconds = (float(rng.choice((0.35, 1.0))),), float(rng.uniform(3.0, 8.0))
-        force = float(rng.uniform(0.7, 3.0))
-        dwell = self.dwell("quadric", force, (k1, k2), 0, (x, y), angle, seconds=seconds, heading=heading, hz=hz)
-        return replace(dwell, force=force)
+        press = Press(float(rng.uniform(0.7, 3.0)), (x, y), heading=heading, hz=hz, seconds=seconds)
+        return replace(self.dwell("quadric", (k1, k2), press, angle=angle), force=press.force)
 
     def held(self) -> tuple[Dwell, Floats]:
         """A random quadric, held for some time, and its true forces (n,), N."""
@@ -221,8 +201,5 @@ class Presses:
             float(rng.uniform(low, high)) for low, high in ((0.0, 1.5e-3), (0.5, 3.0), (0.0, math.pi))
         )
         seconds, heading = float(rng.choice(HOLD_S)), float(rng.uniform(0.0, 2.0 * math.pi))
-        roll, hz = (half, 0.4 * half), (float(rng.uniform(0.05, 0.5)),)
-        dwell = self.dwell(
-            "quadric", force, (k1, k2), 0, (x, y), angle, seconds=seconds, heading=heading, roll=roll, hz=hz
-        )
-        return dwell, self.forces
+        press = Press(force, (x, y), (half, 0.4 * half), heading, (float(rng.uniform(0.05, 0.5)),), seconds)
+        return self.dwell("quadric", (k1, k2), press, angle=angle), self.forces

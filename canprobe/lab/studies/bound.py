@@ -28,7 +28,7 @@ from canprobe.lab.studies.cell_store import as_json
 from canprobe.lab.studies.ground import PATHS, SURFACES, Ground, make_ground
 from canprobe.lab.studies.result import CHI2_95_OF_3, FROBENIUS, Row, StudyResult, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch import Prior, cramer_rao, fit_surface
+from canprobe.mechanics.touch import Prior, SurfaceEstimate, cramer_rao, fit_surface
 from canprobe.mechanics.types import Floats
 
 METHODS = ("ml", "recursive")
@@ -95,34 +95,35 @@ def run_bound(*, quick: bool, sweep: Sweep) -> StudyResult:
     seeds = QUICK_SEEDS if quick else SEEDS
     rows = rows_of(list(quick_cases() if quick else all_cases()), seeds, sweep)
     facts = measuring_facts(quick, seeds, MODEL)
-    return StudyResult("bound", COLUMNS, rows, findings(rows), facts, partial(draw_bound, rows))
+    return StudyResult("bound", rows, findings(rows), facts, partial(draw_bound, rows), COLUMNS)
 
 
 def rows_of(cases: Sequence[BoundCase], seeds: int, sweep: Sweep) -> list[Row]:
     """The rows of some cases with a number of seeds each."""
     sweep.say(f"bound: {len(cases)} cases, {seeds} seeds each")
-    blocks = [(first, min(BLOCK, seeds - first)) for first in range(0, seeds, BLOCK)]
-    cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
-    answers: dict[tuple[BoundCase, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
-    for (case, method, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
-        answers[case, method] += found
-    return [row for case in cases for row in _rows(case, {method: answers[case, method] for method in METHODS})]
+    cells = [(case, first, min(first + BLOCK, seeds)) for first in range(0, seeds, BLOCK) for case in cases]
+    answers: dict[BoundCase, list[list[Answer]]] = {case: [] for case in cases}
+    for (case, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
+        answers[case] += found
+    return [row for case, found in answers.items() for row in _rows(case, found)]
 
 
-def measure(cell: tuple[BoundCase, str, int, int]) -> list[Answer]:
-    """Answers of a method to a case, with a number of seeds from the first one on."""
-    case, method, first, count = cell
+def measure(cell: tuple[BoundCase, int, int]) -> list[list[Answer]]:
+    """Answers to a case for each seed from a first to before a last one: those of all methods to the same noise."""
+    case, first, last = cell
     ground, fit, own = case.ground, _fitter(case), zlib.crc32(as_json(case).encode())
-    answers: list[Answer] = []
-    for seed in range(first, first + count):
-        points, normals = ground.measured(case.sigma_point, case.sigma_normal, np.random.default_rng([own, seed]))
-        estimate = fit(points, normals, method=method)
-        if estimate.rank < 3:
-            answers.append(None)
-            continue
-        e, C = ground.error(estimate.T_frame_contact, estimate.K), estimate.covariance
-        answers.append([*e.tolist(), float(e @ np.linalg.solve(C, e)), float(FROBENIUS @ np.diag(C))])
+    answers = []
+    for seed in range(first, last):
+        measured = ground.measured(case.sigma_point, case.sigma_normal, np.random.default_rng([own, seed]))
+        answers.append([_scored(ground, fit(*measured, method=method)) for method in METHODS])
     return answers
+
+
+def _scored(ground: Ground, estimate: SurfaceEstimate) -> Answer:
+    if estimate.rank < 3:
+        return None
+    e, C = ground.error(estimate.T_frame_contact, estimate.K), estimate.covariance
+    return [*e.tolist(), float(e @ np.linalg.solve(C, e)), float(FROBENIUS @ np.diag(C))]
 
 
 def _fitter(case: BoundCase) -> partial[Any]:
@@ -131,7 +132,7 @@ def _fitter(case: BoundCase) -> partial[Any]:
     return partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
 
 
-def _rows(case: BoundCase, answers: dict[str, list[Answer]]) -> Iterator[Row]:
+def _rows(case: BoundCase, answers: Sequence[Sequence[Answer]]) -> Iterator[Row]:
     """One row for each method."""
     ground, fit = case.ground, _fitter(case)
     C = cramer_rao(ground.points, ground.normals, ground.surface, **fit.keywords)
@@ -152,7 +153,7 @@ def _rows(case: BoundCase, answers: dict[str, list[Answer]]) -> Iterator[Row]:
         **{f"at_{name}": value for name, value in criteria.items()},
         "inside": not why, "outside_for": ", ".join(why) or "–",
     }  # fmt: skip
-    for method, mine in answers.items():
+    for method, mine in zip(METHODS, zip(*answers, strict=True), strict=True):
         row = shared | {"method": method} | score(mine, bound)
         yield row | {"verdict": verdict(row, len(mine))}
 

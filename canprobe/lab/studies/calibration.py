@@ -71,7 +71,6 @@ FORCE_COLUMNS = (
     "array", "calibration", "creep_percent", "creep_found_percent", "seconds", "uncorrected_percent", "error_percent",
     "stated_percent", "within_percent", "bound_percent",
 )  # fmt: skip
-SCAN_COLUMNS = ("calibration", "scans", "noticed", "coverage", "coverage_noticed")
 
 
 def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
@@ -88,10 +87,10 @@ def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
         lines=((1.0, "stated = error"), (2.0, "goal: twice the error")),
     )  # fmt: skip
     more = (
-        StudyResult("calibration_forces", FORCE_COLUMNS, forces, force_findings(forces), facts, drawn),
+        StudyResult("calibration_forces", forces, force_findings(forces), facts, drawn, FORCE_COLUMNS),
         run_scans(quick=quick, sweep=sweep, draw=DRAWS["scenes"] if draw is None else draw),
     )
-    return StudyResult("calibration", COLUMNS, rows, findings(rows), facts, partial(draw_arrays, rows), more)
+    return StudyResult("calibration", rows, findings(rows), facts, partial(draw_arrays, rows), COLUMNS, more)
 
 
 def measure(seed: int) -> Row:
@@ -251,7 +250,7 @@ def run_scans(*, quick: bool, sweep: Sweep, draw: int) -> StudyResult:
         draw_points, marks, ("blur", "blur over the calibration's"), ("stiffness", "stiffness over the calibration's"),
         by="noticed", title="Arrays with the packaged calibration, which another one made: which of them are noticed",
     )  # fmt: skip
-    return StudyResult("calibrations", SCAN_COLUMNS, rows, scan_findings(rows), facts, drawn)
+    return StudyResult("calibrations", rows, scan_findings(rows), facts, drawn)
 
 
 def differences(seed: int) -> tuple[float, float]:

@@ -92,7 +92,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
             rows += [_row(name, ground, noise, *one) for one in found]
     facts = measuring_facts(quick, seeds, MODEL) | {"turns": turns}
     said, more = findings(rows), (run_bound(quick=quick, sweep=sweep),)
-    return StudyResult("estimators", COLUMNS, rows, said, facts, partial(draw_estimators, rows), more)
+    return StudyResult("estimators", rows, said, facts, partial(draw_estimators, rows), COLUMNS, more)
 
 
 def on_the_move(surface: str, size: float) -> Ground:
@@ -237,10 +237,9 @@ def draw_estimators(rows: Sequence[Row], path: Path) -> None:
             of_surface = [r for r in rows if r["surface"] == surface]
             for (point, normal), axes in zip(noises, line, strict=True):
                 _draw_panel(axes, [r for r in of_surface if r["sigma_point_um"] == point])
-                axes.set_title(f"{surface}, σ {point:.0f} µm, {normal:.1f} mrad")
-            line[0].set_ylabel("RMS error of K (%)")
-        for axes in grid[-1]:
-            axes.set_xlabel("time of a frame with an answer (ms)")
+                axes.set(title=f"{surface}, σ {point:.0f} µm, {normal:.1f} mrad", ylabel="RMS error of K (%)")
+                axes.set_xlabel("time of a frame with an answer (ms)")
+                axes.label_outer()
         legend(figure)
 
 

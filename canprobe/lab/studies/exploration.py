@@ -28,9 +28,6 @@ LIMITS = {"height": 20e-6, "normal": 3e-3, "curvature": 2.0}
 """Mean errors that are to be reached: height, m; normal, rad; curvature, 1/m."""
 STRATEGIES = ("explore", "weave 12 mm", "weave 9 mm", "raster 10 mm", "raster 8 mm", "raster 6 mm", "circle")
 COLOURS = dict(zip(STRATEGIES, (ORANGE, BLUE, SKY, INK, GREEN, PINK, GREY), strict=True))
-COLUMNS = (
-    "strategy", "height_mm", "normal_mm", "curvature_mm", "reached", "height_s", "force_percent", "contact", "stopped",
-)  # fmt: skip
 
 
 class Lines:

@@ -24,8 +24,6 @@ from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
 from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
-NUMBERS_A_CELL = 17
-"""Runs in a row, of one task and plant, so that a process does not plan for a single one."""
 JOINTS = 6
 QUICK_KINDS = ("stuck-image", "replayed-image", "gain-lost", "brake-stuck", "encoder-jump")
 _QUICK_PLACES = (("press", "approach"), ("weave", "contact"))
@@ -37,17 +35,13 @@ COLOURS = {
     "bring-up refused": (GREY, "xx"),
 }
 """Colour and hatch of each outcome; the others, `hang` and `crash`, are failures."""
-COLUMNS = (
-    "fault", "runs", "force_max_n", "worst", *(f"{task}_n" for task in TASKS), "above_ms", "noticed_ms",
-    "noticed_max_ms", "unnoticed", *COLOURS, "pressing", "left_n", "named", "failures",
-)  # fmt: skip
 FILE_COLUMNS = ("file", "joint", "plant", "force_max_n", "above_ms", "left_n", "outcome", "reason")
 MOST_FAILURES = 20
 
 
-def measure(numbers: Sequence[int]) -> list[dict[str, Any]]:
-    """The runs of some numbers: one cell of the sweep."""
-    return [run_case(FaultCase.of(number)) for number in numbers]
+def measure(number: int) -> dict[str, Any]:
+    """The run of a number."""
+    return run_case(FaultCase.of(number))
 
 
 def quick_numbers() -> list[int]:
@@ -62,14 +56,13 @@ def quick_numbers() -> list[int]:
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Carry out the campaign."""
     numbers = quick_numbers() if quick else range(REPEATS * CASES)
-    cells = [list(numbers[i : i + NUMBERS_A_CELL]) for i in range(0, len(numbers), NUMBERS_A_CELL)]
-    runs = [one for answer in sweep.map(measure, cells) for one in answer]
+    runs = sweep.map(measure, numbers)
     touches = sweep.map(run_wrong_file, QUICK_FILES if quick else wrong_files(JOINTS))
     facts = measuring_facts(quick, len(numbers))
     title = "Highest true force of a first touch with a wrong file"
     drawn = partial(draw_by_name, touches, "file", FORCE_AXIS, title=title, by="plant")
-    files = StudyResult("faults_files", FILE_COLUMNS, touches, file_findings(touches), facts, drawn)
-    return StudyResult("faults", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw, runs), (files,))
+    files = StudyResult("faults_files", touches, file_findings(touches), facts, drawn, FILE_COLUMNS)
+    return StudyResult("faults", table_rows(runs), findings(runs), facts, partial(draw, runs), more=(files,))
 
 
 def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:

@@ -10,17 +10,13 @@ it is and in a patient one (`--patient`), and the true force of the plant.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import signal
 import subprocess
-import sys
-import tempfile
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from enum import Enum
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from random import Random
@@ -30,10 +26,10 @@ from canopen.sdo.exceptions import SdoCommunicationError
 
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.scene.load import dump_scene, load_scene
+from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.child_process import EmulatorChild, with_our_imports
+from canprobe.cell.session.child_process import ERRORS, ChildProcess, EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.task import Phase
@@ -43,24 +39,23 @@ from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.link import missing_ip
-from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.fieldbus.bus.sdo import hold_dialogues, upload
+from canprobe.fieldbus.bus.sdo import Dialogue, hold_dialogues, upload
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.fieldbus.tools.faults.control import request_faults
+from canprobe.fieldbus.vcan.launch import CHANNEL
+from canprobe.lab.studies import vcan_cells
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
-from canprobe.lab.studies.realtime_cases import ON_VCAN, patient, vcan_facts, with_real_nodes
-from canprobe.lab.studies.recover_score import forces_of
-from canprobe.lab.studies.result import CHANNEL, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.witnessed_run import longest_above, run_to_end
+from canprobe.lab.studies.witnessed_run import forces_of, longest_above, run_to_end
 
 RUNS, QUICK_THROWN = 40, 1
 HOLD_S = 3.0
 SERVED: Mapping[str, Any] = {
-    **ON_VCAN,
+    **vcan_cells.ON_VCAN,
     "cycle.rate_hz": 100.0,
     "sensor.rate_hz": 100.0,
     "sensor.mode": "features",
@@ -78,10 +73,6 @@ APART_S = 0.3
 """Time between two looks at the positions, s."""
 MOST_COUNTS = 8
 _TPDO1 = 0x181
-COLUMNS = ("seed", "fault", "after_s", "status", "ended_s", "drives", "failures")
-
-
-THROWN_COLUMNS = ("fault", "task", "phase", "patient", "force_max_n", "above_ms", "left_n", "reason", "failures")
 THROWN = (
     ("node 16: stuck-image", "press", Phase.APPROACH),
     ("node 16: stuck-image", "weave", Phase.SCAN),
@@ -97,14 +88,28 @@ THROWN = (
 """Faults that press hardest in lockstep, the task, and its phase."""
 
 
-class ProcessFault(Enum):
-    """Kind of a fault on vcan0."""
+def stall(process: subprocess.Popen[bytes]) -> None:
+    """Let a process stand still for a time."""
+    process.send_signal(signal.SIGSTOP)
+    vcan_cells.sleep(STALL_S)
+    process.send_signal(signal.SIGCONT)
 
-    MASTER_KILLED = "master killed"
-    MASTER_STALLED = "master stalled"
-    NODES_KILLED = "nodes killed"
-    LINK_DOWN = "link down"
-    LINK_DOWN_UP = "link down and up"
+
+def replug() -> None:
+    """Take the interface down, and up at once."""
+    vcan_cells.link("down")
+    vcan_cells.link("up")
+
+
+MASTER_KILLED, MASTER_STALLED = "master killed", "master stalled"
+PROCESS_FAULTS: Mapping[str, Callable[[ChildProcess, ChildProcess], None]] = {
+    MASTER_KILLED: lambda master, nodes: master.process.kill(),
+    MASTER_STALLED: lambda master, nodes: stall(master.process),
+    "nodes killed": lambda master, nodes: nodes.process.kill(),
+    "link down": lambda master, nodes: vcan_cells.link("down"),
+    "link down and up": lambda master, nodes: replug(),
+}
+"""Kind of a fault → what it does to the process of the master and that of the nodes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,18 +118,18 @@ class ProcessCase:
 
     Attributes:
         seed: number of the run.
-        fault: kind of the fault.
+        fault: key of `PROCESS_FAULTS`.
         after_s: time from the enabling of the drives to the fault.
     """
 
     seed: int
-    fault: ProcessFault
+    fault: str
     after_s: float
 
 
 def draw_process_case(seed: int) -> ProcessCase:
     """The case of a seed: the kinds take turns, the time is random, from the enabling to beyond the retreat."""
-    kinds = tuple(ProcessFault)
+    kinds = tuple(PROCESS_FAULTS)
     return ProcessCase(seed, kinds[seed % len(kinds)], Random(f"vcan {seed}").uniform(0.0, HOLD_S + 1.0))
 
 
@@ -133,9 +138,9 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     check_interface(CHANNEL)
     if (missing := missing_ip()) is not None:
         raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
-    link("up")  # a user who may not do that learns it before anything moves
+    vcan_cells.link("up")  # a user who may not do that learns it before anything moves
     rows = []
-    total = len(ProcessFault) if quick else RUNS
+    total = len(PROCESS_FAULTS) if quick else RUNS
     for seed in range(total):
         rows.append(row_of(draw_process_case(seed)))
         sweep.say(f"{seed + 1} of {total}: {rows[-1]['fault']}: {rows[-1]['failures'] or 'no failure'}")
@@ -146,8 +151,8 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         title="How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"
         "failed: it hung, or nodes moved or were enabled afterwards",
     )  # fmt: skip
-    facts = vcan_facts(quick, total, MISSED_SYNCS)
-    return StudyResult("faults_vcan", COLUMNS, rows, findings(rows), facts, drawn, (thrown,))
+    facts = vcan_cells.vcan_facts(quick, total, MISSED_SYNCS)
+    return StudyResult("faults_vcan", rows, findings(rows), facts, drawn, more=(thrown,))
 
 
 def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
@@ -162,7 +167,7 @@ def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
 @cache
 def served_scene() -> Scene:
     """A press whose nodes are a separate process, which outlives the master."""
-    return patient(load_scene("press", SERVED), MISSED_SYNCS)
+    return vcan_cells.patient(load_scene("press", SERVED), MISSED_SYNCS)
 
 
 def _throw_all(quick: bool) -> StudyResult:
@@ -178,13 +183,13 @@ def _throw_all(quick: bool) -> StudyResult:
     told += [f"{row['fault']}, {row['task']}, patient {row['patient']}: {row['failures']}" for row in failed]
     title = f"Highest true force with a fault thrown on {CHANNEL}"
     drawn = partial(draw_by_name, rows, "fault", FORCE_AXIS, title=title, by="patient")
-    return StudyResult("faults_thrown", THROWN_COLUMNS, rows, told, measuring_facts(quick, len(rows)), drawn)
+    return StudyResult("faults_thrown", rows, told, measuring_facts(quick, len(rows)), drawn)
 
 
 def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
     """Run a task, throw a fault in a phase of it, and score the true force."""
-    scene = load_scene(task_scene(task, "ideal"), ON_VCAN)
-    session = Session(patient(scene, MISSED_SYNCS) if is_patient else scene)
+    scene = load_scene(task_scene(task, "ideal"), vcan_cells.ON_VCAN)
+    session = Session(vcan_cells.patient(scene, MISSED_SYNCS) if is_patient else scene)
     work = make_task(session.plan)
     with ThreadPoolExecutor(1) as others:
         thrown: list[Future[Any]] = []
@@ -220,88 +225,64 @@ def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
 
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and score the end: the row of the case."""
-    with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        run = _ServedRun(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
+    nodes = EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,))
+    with vcan_cells.served(nodes), running_master() as master:
+        run = _ServedRun(case, master, nodes)
         try:
             status, ended_s, drives = run.carry_out()
         finally:
-            link("up")
-            run.close()
-    return {
-        "seed": case.seed,
-        "fault": case.fault.value,
-        "after_s": case.after_s,
-        "status": status,
-        "ended_s": ended_s,
-        "drives": drives,
-        "failures": "; ".join(run.failures),
-    }
+            vcan_cells.link("up")
+    row = {"seed": case.seed, "fault": case.fault, "after_s": case.after_s}
+    return row | {"status": status, "ended_s": ended_s, "drives": drives, "failures": "; ".join(run.failures)}
+
+
+@contextmanager
+def running_master() -> Iterator[ChildProcess]:
+    """`canprobe run` of the served scene in its own process, which is killed where it outlives the block."""
+    plan = make_plan(resolve(load_scene(vcan_cells.with_real_nodes(served_scene()), {"scene.figures": False})))
+    master = ChildProcess()
+    master.launch(plan, ["canprobe", "run", str(master.scene_file), "--out", str(master.folder / "run")])
+    try:
+        yield master
+    finally:
+        master.process.kill()
+        master.process.wait()
+        master.remove()
 
 
 class _ServedRun:
     """One case that is carried out."""
 
-    def __init__(self, case: ProcessCase, child: EmulatorChild, folder: Path) -> None:
-        self.case, self.child, self.folder = case, child, folder
+    def __init__(self, case: ProcessCase, master: ChildProcess, nodes: EmulatorChild) -> None:
+        self.case, self.master, self.nodes = case, master, nodes
         self.clock = MonotonicClock()
-        self.master: subprocess.Popen[bytes] | None = None
         self.failures: list[str] = []
 
     def carry_out(self) -> tuple[int | None, float, str]:
-        """Status of the master (None: killed after a hang), seconds from the fault to its end, states of the drives."""
-        port = self._open()
-        try:
-            self.child.start()
-            self.child.await_boot_ups(port)
-            self.master = self._start_master()
-            if not self._await_enabled(port, self.master):
+        """Status of the master (None: it hung), seconds from the fault to its end, states of the drives."""
+        with closing(vcan_cells.open_vcan()) as port:
+            if not self._await_enabled(port):
                 self.failures.append("the drives were never enabled")
-                return self.master.poll(), 0.0, ""
-            sleep(self.case.after_s)
-        finally:
-            port.close()
+                return self.master.process.poll(), 0.0, ""
+            vcan_cells.sleep(self.case.after_s)
         fault_ns = self.clock.now_ns()
-        self._let_happen(self.master)
+        PROCESS_FAULTS[self.case.fault](self.master, self.nodes)
         status = None
         try:
-            status = self.master.wait(PATIENCE_S)
+            status = self.master.process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
         ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
-        sleep(REACTION_S - ended_s)
-        link("up")
+        vcan_cells.sleep(REACTION_S - ended_s)
+        vcan_cells.link("up")
         drives = self._look()
-        self.failures += score_end(self.case.fault, status, self.folder)
+        self.failures += score_end(self.case.fault, status, self.master.folder)
         return status, ended_s, drives
 
-    def close(self) -> None:
-        """Leave no process behind."""
-        if self.master is not None and self.master.poll() is None:
-            self.master.kill()
-            self.master.wait()
-        self.child.end()
-
-    def _open(self) -> Port:
-        return open_port("socketcan", CHANNEL, 1_000_000, self.clock)
-
-    def _start_master(self) -> subprocess.Popen[bytes]:
-        scene = with_real_nodes(served_scene())
-        path = self.folder / "scene.toml"
-        path.write_text(dump_scene(replace(scene, scene=replace(scene.scene, figures=False))), encoding="utf-8")
-        command = [sys.executable, "-P", "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
-        with (self.folder / "stderr").open("wb") as errors:
-            return subprocess.Popen(
-                command,
-                env=with_our_imports(),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=errors,
-            )
-
-    def _await_enabled(self, port: Port, master: subprocess.Popen[bytes]) -> bool:
+    def _await_enabled(self, port: Port) -> bool:
         """Wait until the first drive reports operation enabled."""
         deadline_ns = self.clock.now_ns() + round(PATIENCE_S * 1e9)
-        while self.clock.now_ns() < deadline_ns and master.poll() is None:
+        while self.clock.now_ns() < deadline_ns and self.master.process.poll() is None:
             port.wait(self.clock.now_ns() + 50_000_000)
             for can_id, data, _ in port.drain():
                 word = int.from_bytes(data[:2], "little")
@@ -309,36 +290,17 @@ class _ServedRun:
                     return True
         return False
 
-    def _let_happen(self, master: subprocess.Popen[bytes]) -> None:
-        match self.case.fault:
-            case ProcessFault.MASTER_KILLED:
-                master.kill()
-            case ProcessFault.MASTER_STALLED:
-                master.send_signal(signal.SIGSTOP)
-                sleep(STALL_S)
-                master.send_signal(signal.SIGCONT)
-            case ProcessFault.NODES_KILLED:
-                os.kill(self.child.pid, signal.SIGKILL)
-            case ProcessFault.LINK_DOWN:
-                link("down")
-            case ProcessFault.LINK_DOWN_UP:
-                link("down")
-                link("up")
-
     def _look(self) -> str:
         """The states of the drives, where their process still answers."""
-        first: dict[int, int] = {}
-        if Path(f"/proc/{self.child.pid}").exists():
-            with contextlib.suppress(CanprobeError):
-                first = self._ask(0x6041)
-        if not first:
-            if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
+        words = self._ask(0x6041) if self.nodes.process.poll() is None else {}
+        if not words:
+            if self.case.fault in (MASTER_KILLED, MASTER_STALLED):
                 self.failures.append("the nodes ended with a master that is not their parent")
             return "gone"
         before = self._ask(0x6064)
-        sleep(APART_S)
+        vcan_cells.sleep(APART_S)
         after = self._ask(0x6064)
-        states = {node_id: state_of(word) for node_id, word in first.items()}
+        states = {node_id: state_of(word) for node_id, word in words.items()}
         for node_id, state in states.items():
             if state in POWERED_STATES:
                 self.failures.append(f"node {node_id} is {state.name} after the stop")
@@ -349,24 +311,25 @@ class _ServedRun:
 
     def _ask(self, index: int) -> dict[int, int]:
         """An object of each drive; empty where one does not answer."""
-        drives = served_scene().drives
-        port = self._open()
         answers: dict[int, int] = {}
-        try:
-            dialogues = {node_id: _read(index, node_id, answers.__setitem__) for node_id in drives}
-            hold_dialogues(PumpedNetwork(port), dialogues, timeout_s=1.0, retries=1)
-        finally:
-            port.close()
+
+        def ask(node_id: int) -> Dialogue:
+            answer = yield from upload(index, 0)
+            answers[node_id] = int.from_bytes(answer, "little", signed=index == 0x6064)
+
+        drives = served_scene().drives
+        with suppress(CanprobeError, SdoCommunicationError), closing(vcan_cells.open_vcan()) as port:
+            hold_dialogues(PumpedNetwork(port), {i: ask(i) for i in drives}, timeout_s=1.0, retries=1)
         return answers if len(answers) == len(drives) else {}
 
 
-def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str]:
-    """Failures in what a master left: its status, `stderr`, and `run/bus.log` and `run/summary.json` in `folder`."""
+def score_end(fault: str, status: int | None, folder: Path) -> list[str]:
+    """Failures in what a master left: its status, `ERRORS`, and `run/bus.log` and `run/summary.json` in `folder`."""
     failures = []
-    killed = fault is ProcessFault.MASTER_KILLED
+    killed = fault == MASTER_KILLED
     if status is not None and not killed and status not in (1, 3):
         failures.append(f"the master ended with status {status}, expected 1 or 3")
-    errors = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+    errors = (folder / ERRORS).read_text(encoding="utf-8", errors="replace")
     if "Traceback" in errors:
         failures.append(f"crash: {errors.strip().splitlines()[-1]}")
     try:
@@ -380,31 +343,5 @@ def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str
     return failures
 
 
-def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
-    try:
-        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little", signed=index == 0x6064))
-    except SdoCommunicationError:
-        return
-
-
 def _text_of(state: DriveState, code: int | None) -> str:
     return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
-
-
-def sleep(seconds: float) -> None:
-    """Sleep for some time, s; not at all for a negative one."""
-    clock = MonotonicClock()
-    clock.sleep_until_ns(clock.now_ns() + max(0, round(seconds * 1e9)))
-
-
-def link(state: str) -> None:
-    """Take the interface down or up.
-
-    Raises:
-        InterfaceError: the right to do so is missing.
-    """
-    done = subprocess.run(["ip", "link", "set", CHANNEL, state], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise InterfaceError(
-            f"{CHANNEL}: the study takes it down and up, and `ip` says: {done.stderr.strip()}; run the study as root"
-        )

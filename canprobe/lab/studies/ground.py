@@ -35,14 +35,12 @@ class Ground:
     Attributes:
         points, normals: points (n, 3), m, and outward unit normals (n, 3) in the contact frame of the last point.
         surface: the quadric of the surface's second order there (the surface itself but for a torus).
-        length: along the path, m.
         tensor: the true curvature tensor (3, 3) at the foot of a point (3,) near the contact, 1/m.
     """
 
     points: Floats
     normals: Floats
     surface: SurfaceMatrix
-    length: float
     tensor: Callable[[Floats], Floats]
 
     @property
@@ -85,12 +83,12 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
         raise UsageError(f"path: expected one of {', '.join(PATHS)}, got {path!r}")
     x, y = _weave(length, samples, waves) if path == "weave" else _circle(length, samples)
     if surface == "torus":
-        return _on_torus(size, x, y, length)
+        return _on_torus(size, x, y)
     if surface not in SURFACES:
         raise UsageError(f"surface: expected one of {', '.join(SURFACES)}, got {surface!r}")
     matrix = _turned(_quadric(surface, size))
     points = np.stack([x, y, matrix.height(x, y)], axis=1)
-    return Ground(points, matrix.normal(points), matrix, length, partial(_tensor_of_quadric, matrix))
+    return Ground(points, matrix.normal(points), matrix, partial(_tensor_of_quadric, matrix))
 
 
 def _tensor_of_quadric(surface: SurfaceMatrix, near: Floats) -> Floats:
@@ -138,7 +136,7 @@ def _turned(surface: SurfaceMatrix) -> SurfaceMatrix:
     return surface.transformed(T)
 
 
-def _on_torus(tube: float, x: Floats, y: Floats, length: float) -> Ground:
+def _on_torus(tube: float, x: Floats, y: Floats) -> Ground:
     """Outside of a torus; the path is laid on its two angles, which keeps points and normals exact."""
     ring, a = _TORUS_RING * tube, _TORUS_ANGLE
     c, s = np.cos(_OFF_AXIS), np.sin(_OFF_AXIS)
@@ -164,4 +162,4 @@ def _on_torus(tube: float, x: Floats, y: Floats, length: float) -> Ground:
         return np.asarray(axes.T @ (k * np.outer(along, along) + np.outer(up, up) / tube) @ axes, dtype=np.float64)
 
     K = tensor(np.zeros(3))[:2, :2]
-    return Ground(points @ axes, normals @ axes, SurfaceMatrix.from_curvature(K), length, tensor)
+    return Ground(points @ axes, normals @ axes, SurfaceMatrix.from_curvature(K), tensor)

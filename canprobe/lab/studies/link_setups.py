@@ -7,9 +7,9 @@ Each is drawn from a seed: kind, rate of the cycle, and how bad, from not felt t
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from heapq import heappop, heappush
 from random import Random
 
 from canprobe.cell.scene.load import load_scene
@@ -20,6 +20,7 @@ from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.tapped import OuterPort
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS
 
 FRAME_NS = 130_000
 """Time of a frame of eight bytes at 1 Mbit/s."""
@@ -190,8 +191,8 @@ class DisturbedPort(OuterPort):
         clocks = {"machine": DisturbedClock, "still": StandingClock}
         if setup.kind in clocks:
             self.clock = clocks[setup.kind](port.clock, rng, setup.share, setup.size * self._period_ns)
-        self._arriving: list[tuple[int, int, Frame]] = []  # a heap: time of arrival, number, frame
-        self._number = self._last_ns = self._sent_ns = self._lost_until_ns = 0
+        self._arriving = deque[TimedFrame]()
+        self._last_ns = self._sent_ns = self._lost_until_ns = 0
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send frames, as far as they are not lost; a full queue is waited for."""
@@ -211,21 +212,21 @@ class DisturbedPort(OuterPort):
     def drain(self) -> list[TimedFrame]:
         """Return the frames that have arrived."""
         self._take()
-        heap, arrived = self._arriving, list[TimedFrame]()
-        now_ns = self.clock.now_ns()
-        while heap and heap[0][0] <= now_ns:
-            ready_ns, _, (can_id, data) = heappop(heap)
-            arrived.append((can_id, data, ready_ns))
+        arrived, now_ns = list[TimedFrame](), self.clock.now_ns()
+        while self._next_ns() <= now_ns:
+            arrived.append(self._arriving.popleft())
         return arrived
 
     def wait(self, until_ns: int) -> None:
         """Wait for a frame, until `until_ns` at the latest."""
-        while True:
+        self._take()
+        while self.clock.now_ns() < min(until_ns, self._next_ns()):
+            self._port.wait(min(until_ns, self._next_ns()))
             self._take()
-            heap, now_ns = self._arriving, self.clock.now_ns()
-            if now_ns >= until_ns or (heap and heap[0][0] <= now_ns):
-                return
-            self._port.wait(min(until_ns, heap[0][0]) if heap else until_ns)
+
+    def _next_ns(self) -> int:
+        """Time of the next arrival, ns; of none that is known far away."""
+        return self._arriving[0][2] if self._arriving else FOREVER_NS
 
     def _is_lost(self) -> bool:
         """Whether a frame falls into a loss: each begins with a frame, and lasts for some periods or for that frame."""
@@ -247,5 +248,4 @@ class DisturbedPort(OuterPort):
             if kind == "jitter":
                 delay_ns = self._rng.expovariate(1.0 / delay_ns)
             self._last_ns = max(self._last_ns, t_ns + round(delay_ns))  # an adapter keeps the order
-            self._number += 1
-            heappush(self._arriving, (self._last_ns, self._number, (can_id, data)))
+            self._arriving.append((can_id, data, self._last_ns))

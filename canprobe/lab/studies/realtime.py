@@ -7,32 +7,45 @@ Needs a `vcan0`; `canprobe vcan --realtime -- canprobe study realtime` runs it w
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from time import process_time
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.options import RunOptions
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.traffic import LAST_LOOK
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
 from canprobe.cell.results.summary import percentiles
 from canprobe.cell.scene.hardware import TactileModeName
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.child_process import EmulatorChild
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.errors import CanprobeError
+from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
+from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
-from canprobe.lab.studies.realtime_cases import (
-    CycleTimes,
-    Measured,
-    Times,
-    measure_bare,
-    measure_hold,
-    measure_scan,
-    vcan_facts,
-)
-from canprobe.lab.studies.result import CHANNEL, Row, Say, StudyResult
+from canprobe.fieldbus.vcan.launch import CHANNEL
+from canprobe.lab.studies.result import Row, Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import ON_VCAN, on_any_bitrate, patient, served, vcan_facts, with_real_nodes
 
+RATE_HZ = 400.0
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
 MODES: tuple[TactileModeName, ...] = ("features", "window", "image")
 HELD_PER_10000 = 1.0
@@ -58,7 +71,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         measured += _climb(mode, hold_s, (400,) if quick else RATES_HZ, say)
     facts = vcan_facts(quick, 1) | {"controller": "scan of cylinder; hold elsewhere"}
     draw = partial(draw_realtime, measured)
-    return StudyResult("realtime", COLUMNS, [_row(m) for m in measured], findings(measured), facts, draw)
+    return StudyResult("realtime", [_row(m) for m in measured], findings(measured), facts, draw, COLUMNS)
 
 
 def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say: Say) -> list[Measured]:
@@ -67,27 +80,188 @@ def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say
     for rate_hz in rates_hz:
         say(f"hold with {mode} at {rate_hz:g} Hz, {seconds:g} s")
         climbed.append(measure_hold(mode, rate_hz, seconds))
-        if climbed[-1].ended or climbed[-1].times.rate_hz < 0.9 * rate_hz:
+        if climbed[-1].ended or climbed[-1].held_hz < 0.9 * rate_hz:
             break
     return climbed
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A case, and the times of its cycles, ns; empty where a time was not measured.
+
+    Attributes:
+        case, sensor: name of the case, and mode of the sensor.
+        rate_hz: requested rate of SYNC.
+        lateness_ns: time of each SYNC behind its deadline.
+        seconds: time from the first SYNC to the last.
+        response_ns: time from the last TPDO to the RPDOs in every fifth cycle.
+        compute_ns: that time and the controller's work after the RPDOs.
+        latency_ns: time from a SYNC to the last of the drives' TPDOs, where all answered.
+        missed: number of TPDOs that did not come in their cycle.
+        processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
+        ended: reason of an early end.
+    """
+
+    case: str
+    sensor: str
+    rate_hz: float
+    lateness_ns: Sequence[int]
+    seconds: float
+    response_ns: Sequence[int] = ()
+    compute_ns: Sequence[int] = ()
+    latency_ns: Sequence[int] = ()
+    missed: int = 0
+    processor_share: float | None = None
+    ended: str = ""
+
+    @property
+    def period_ns(self) -> int:
+        """Requested period of SYNC, ns."""
+        return round(1e9 / self.rate_hz)
+
+    @property
+    def overruns(self) -> int:
+        """Number of cycles woken more than half a period late."""
+        return sum(late_ns > self.period_ns // 2 for late_ns in self.lateness_ns)
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles."""
+        return len(self.lateness_ns)
+
+    @property
+    def held_hz(self) -> float:
+        """Held rate, cycles per second."""
+        return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def per_10000(self) -> float:
+        """Overruns in 10 000 cycles."""
+        return 1e4 * self.overruns / max(1, self.cycles)
+
+
+def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
+    """Wake at a number of deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
+
+    Yields:
+        The deadline, ns, or the last one that has passed by then.
+    """
+    deadline_ns = clock.now_ns() + period_ns
+    for _ in range(cycles):
+        clock.sleep_until_ns(deadline_ns)
+        lateness.append(clock.now_ns() - deadline_ns)
+        deadline_ns += lateness[-1] // period_ns * period_ns
+        yield deadline_ns
+        deadline_ns += period_ns
+
+
+def measure_scan(seconds: float) -> Measured:
+    """The scene `cylinder` with servo and estimator."""
+    return _measured("whole controller", _scene({"task.duration_s": seconds}), make_task)
+
+
+def measure_bare(seconds: float) -> Measured:
+    """A loop that wakes at every deadline and does nothing: the machine's own lateness."""
+    period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
+    with realtime(MASTER_PRIORITY, lambda _: None):  # the first case has reported missing permissions
+        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
+    return Measured("bare clock", "none", RATE_HZ, lateness, (deadlines[-1] - deadlines[0]) * 1e-9)
+
+
+def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:
+    """The joints hold their position, at any rate."""
+    with served(EmulatorChild(make_plan(resolve(_scene())), None, (CHANNEL,))):  # they take rates from the master
+        return _measured("hold", holding_scene(mode, rate_hz), lambda _: Hold(int(seconds * rate_hz)))
+
+
+def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
+    """Six drives and the sensor at half their rate; the session starts none of them."""
+    scene = on_any_bitrate(with_real_nodes(_scene()))
+    assert scene.sensor is not None
+    sensor = replace(scene.sensor, mode=mode, rate_hz=rate_hz / 2)
+    return replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz), sensor=sensor)
+
+
+def _scene(changes: Mapping[str, Any] = MappingProxyType({})) -> Scene:
+    """The scene `cylinder`, patient; with real-time priority and locked memory where they are permitted."""
+    return patient(load_scene("cylinder", {**ON_VCAN, "cycle.realtime": True, **changes}))
+
+
+class Hold(Controller):
+    """Hold the joints at their first position, for some cycles."""
+
+    def __init__(self, cycles: int) -> None:
+        self._cycles = cycles
+        self._q: Any = None
+
+    def step(self, measurement: Measurement) -> Command:
+        if self._q is None:
+            self._q = measurement.q
+        self._cycles -= 1
+        return Command(q_target=self._q, done=self._cycles <= 0)
+
+
+def _measured(case: str, scene: Scene, make: Callable[[Plan], Controller]) -> Measured:
+    """Run a controller to its end; the run writes its files, as those of users do."""
+    assert scene.sensor is not None
+    ended, used_s, latency_ns, missed = "", 0.0, list[int](), 0
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(scene, RunOptions(Path(folder)))
+
+        def note_latency(_: Measurement) -> None:
+            nonlocal missed
+            drives = session.cell.drives
+            assert drives is not None
+            if drives.missed == missed:  # all have answered
+                latency_ns.append(drives.answer_ns)
+            missed = drives.missed
+
+        try:
+            with session:
+                used_s = process_time()
+                session.run(make(session.plan), note_latency)
+        except CanprobeError as error:
+            if not session.opened:
+                raise
+            ended = str(error)
+    cycle, drives = session.cell.cycle, session.cell.drives
+    assert cycle is not None and drives is not None
+    seconds = cycle.t_ns * 1e-9
+    return Measured(
+        case,
+        scene.sensor.mode,
+        scene.cycle.rate_hz,
+        cycle.statistics.period_error_ns,
+        seconds,
+        cycle.statistics.response_ns,
+        cycle.statistics.compute_ns,
+        latency_ns,
+        drives.missed,
+        processor_share(used_s, seconds),
+        ended,
+    )
+
+
+def processor_share(used_before_s: float, passed_s: float) -> float | None:
+    """Processor share since `process_time` gave `used_before_s`; None in a guest, which counts whole ticks."""
+    if os.environ.get("CANPROBE_VCAN") == "guest" or passed_s <= 0:
+        return None
+    return (process_time() - used_before_s) / passed_s
+
+
 def _row(m: Measured) -> Row:
-    times = m.times
+    times_ns = {"lateness": m.lateness_ns, "response": m.response_ns, "compute": m.compute_ns, "latency": m.latency_ns}
     return {
         "case": m.case,
         "sensor": m.sensor,
         "rate_hz": m.rate_hz,
-        "held_hz": times.rate_hz,
-        "cycles": times.cycles,
-        "overruns": times.overruns,
-        "overruns_per_10000": per_10000(times),
-        "missed_pdos": times.missed,
-        **_percentiles("lateness", times.lateness_ns),
-        **_percentiles("response", times.response_ns),
-        **_percentiles("compute", times.compute_ns),
-        **_percentiles("latency", times.latency_ns),
-        "processor_percent": None if times.processor_share is None else 100 * times.processor_share,
+        "held_hz": m.held_hz,
+        "cycles": m.cycles,
+        "overruns": m.overruns,
+        "overruns_per_10000": m.per_10000,
+        "missed_pdos": m.missed,
+        **{f"{name}_{what}_us": us for name, ns in times_ns.items() for what, us in percentiles(ns).items()},
+        "processor_percent": None if m.processor_share is None else 100 * m.processor_share,
         "verdict": str(_verdict(m).fitness),
         "ended": m.ended,
     }
@@ -95,35 +269,23 @@ def _row(m: Measured) -> Row:
 
 def _verdict(m: Measured) -> LinkVerdict:
     """The verdict of `canprobe check` on the cycles of a case: SYNCs that are late, and answers that were missed."""
-    times = m.times
-    answered, rows = tuple(sorted(times.latency_ns.tolist())), (1,) * times.missed
-    answers = AnswerFigures(0, times.cycles, answered, 0, times.missed, rows)
-    wait_ns = round(LAST_LOOK * times.period_ns)
-    figures = LinkFigures(times.period_ns, sorted(times.lateness_ns.tolist()), wait_ns, (answers,))
+    answers = AnswerFigures(0, m.cycles, tuple(sorted(m.latency_ns)), 0, m.missed, (1,) * m.missed)
+    figures = LinkFigures(m.period_ns, sorted(m.lateness_ns), round(LAST_LOOK * m.period_ns), (answers,))
     return judge_link(figures, LinkLimits())
-
-
-def _percentiles(name: str, values_ns: Times) -> dict[str, float | None]:
-    return {f"{name}_{what}_us": value for what, value in percentiles(values_ns).items()}
-
-
-def per_10000(times: CycleTimes) -> float:
-    """Overruns in 10 000 cycles."""
-    return 1e4 * times.overruns / max(1, times.cycles)
 
 
 def findings(measured: list[Measured]) -> list[str]:
     """The figures beside the goals."""
     scan, bare = measured[:2]
     lines = [
-        f"whole controller at {scan.rate_hz:g} Hz for {scan.times.seconds:.0f} s: {per_10000(scan.times):.1f} overruns"
-        f" in 10 000 cycles (goal 1), {scan.times.rate_hz:.1f} cycles a second held",
-        f"a loop at {bare.rate_hz:g} Hz that does nothing: {per_10000(bare.times):.1f} overruns in 10 000 cycles, the"
+        f"whole controller at {scan.rate_hz:g} Hz for {scan.seconds:.0f} s: {scan.per_10000:.1f} overruns"
+        f" in 10 000 cycles (goal 1), {scan.held_hz:.1f} cycles a second held",
+        f"a loop at {bare.rate_hz:g} Hz that does nothing: {bare.per_10000:.1f} overruns in 10 000 cycles, the"
         " machine's own",
     ]
-    if len(scan.times.compute_ns):
-        of_period = 100.0 / scan.times.period_ns
-        response, whole = (of_period * np.percentile(t, 99) for t in (scan.times.response_ns, scan.times.compute_ns))
+    if len(scan.compute_ns):
+        of_period = 100.0 / scan.period_ns
+        response, whole = (of_period * np.percentile(t, 99) for t in (scan.response_ns, scan.compute_ns))
         lines.append(
             f"controller time p99 is {response:.0f} % of the period until the commands are out, {whole:.0f} % with the"
             " estimator's work behind them (goal 30 %)"
@@ -136,8 +298,8 @@ def findings(measured: list[Measured]) -> list[str]:
     )
     for mode in MODES:
         mine = [m for m in measured if m.case == "hold" and m.sensor == mode]
-        held = [m.rate_hz for m in mine if not m.ended and per_10000(m.times) <= HELD_PER_10000]
-        best = max((m.times.rate_hz for m in mine), default=0.0)
+        held = [m.rate_hz for m in mine if not m.ended and m.per_10000 <= HELD_PER_10000]
+        best = max((m.held_hz for m in mine), default=0.0)
         lines.append(
             f"{mode}: {f'{max(held):g} Hz held without overruns' if held else 'no rate held without overruns'}"
             f" of {', '.join(f'{m.rate_hz:g}' for m in mine)} Hz; {best:.0f} cycles a second at most"
@@ -152,7 +314,7 @@ LINES = ((BLUE, "-"), (ORANGE, "--"), (SKY, ":"))
 def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     """Lateness of SYNC, computing time, answer latency, and held over asked rate."""
     scan, bare = measured[:2]
-    rate, seconds = f"{scan.rate_hz:g} Hz", f"{scan.times.seconds:.0f} s"
+    rate, seconds = f"{scan.rate_hz:g} Hz", f"{scan.seconds:.0f} s"
     title = (
         f"How well the cycle keeps time: {rate} on a real SocketCAN interface for {seconds}, emulated nodes beside it\n"
         "histograms: all cycles, from a microsecond up; lower right: cycles a second that were reached"
@@ -160,17 +322,17 @@ def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     with picture(path, title, 6.6) as figure:
         panels = parts(figure, 2, 2)
         late = {"canprobe": scan, "a loop that does nothing": bare}
-        _histogram(panels[0], "lateness of SYNC (µs)", {name: m.times.lateness_ns for name, m in late.items()})
-        done = {"RPDOs out": scan.times.response_ns, "work behind them done": scan.times.compute_ns}
+        _histogram(panels[0], "lateness of SYNC (µs)", {name: m.lateness_ns for name, m in late.items()})
+        done = {"RPDOs out": scan.response_ns, "work behind them done": scan.compute_ns}
         axes = _histogram(panels[1], "from the last TPDO, whole controller (µs)", done)
-        axes.axvline(scan.times.period_ns * 0.3e-3, color=INK, linewidth=0.9, label="30 % of the period")
-        _histogram(panels[2], "SYNC → last TPDO (µs)", {"canprobe": scan.times.latency_ns})
+        axes.axvline(scan.period_ns * 0.3e-3, color=INK, linewidth=0.9, label="30 % of the period")
+        _histogram(panels[2], "SYNC → last TPDO (µs)", {"canprobe": scan.latency_ns})
         _rates(panels[3].subplots(), measured)
         for part in panels:
             legend(part)
 
 
-def _histogram(part: SubFigure, what: str, series: dict[str, Times]) -> Axes:
+def _histogram(part: SubFigure, what: str, series: Mapping[str, Sequence[int]]) -> Axes:
     axes: Axes = part.subplots()
     values = {name: np.maximum(v, 1000) / 1e3 for name, v in series.items() if len(v)}
     if values:
@@ -189,9 +351,7 @@ def _rates(axes: Axes, measured: Sequence[Measured]) -> None:
     holds = [m for m in measured if m.case == "hold"]
     for mode, (colour, line) in zip(dict.fromkeys(m.sensor for m in holds), LINES, strict=False):
         mine = [m for m in holds if m.sensor == mode]
-        axes.plot(
-            [m.rate_hz for m in mine], [m.times.rate_hz for m in mine], "o", linestyle=line, color=colour, label=mode
-        )
+        axes.plot([m.rate_hz for m in mine], [m.held_hz for m in mine], "o", linestyle=line, color=colour, label=mode)
     top = max((m.rate_hz for m in holds), default=1.0)
     axes.plot([0, top], [0, top], color=GREY, linewidth=0.8, zorder=0, label="as asked")
     axes.axvline(639, color=GREY, linestyle="-.", zorder=0, label="end of 1 Mbit/s, six drives")

@@ -27,15 +27,14 @@ from canprobe.errors import CanprobeError
 from canprobe.fieldbus.tools.link.verdict import FIT_SHARE, UNFIT_SHARE, Fitness
 from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.link_setups import MACHINE_HZ, construct, draw_machine, draw_setup, scene_of
-from canprobe.lab.studies.realtime_cases import on_any_bitrate, patient
 from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import on_any_bitrate, patient
 
 CHECK_S, MINUTE_S, QUICK_MINUTE_S = 10.0, 60.0, 10.0
 SETUPS, QUICK_SETUPS, MACHINES, QUICK_MACHINES = 40, 8, 6, 3
 TEST_DRAW = 4
 RATES_HZ = (100, 200, 400, 800, 1000)
-BITRATE = 50_000_000
 ENOUGH = 25
 """Late SYNCs in the check from which a share is compared: fewer are scattered by chance by more than a fifth."""
 MODEL = (
@@ -67,8 +66,8 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW) -> StudyResult:
         ("predicted_percent", "overruns predicted, %"), by="kind", log=True, lines=((1.0, "as predicted"),),
         title="Overruns at other rates: predicted by a check at 400 Hz, and seen in a minute",
     )  # fmt: skip
-    more = StudyResult("link_rates", RATE_COLUMNS, rates, rate_findings(rates), facts, drawn_rates)
-    return StudyResult("link", COLUMNS, rows, findings(rows), facts, drawn, (more,))
+    more = StudyResult("link_rates", rates, rate_findings(rates), facts, drawn_rates, RATE_COLUMNS)
+    return StudyResult("link", rows, findings(rows), facts, drawn, COLUMNS, (more,))
 
 
 class Held(NamedTuple):
@@ -154,16 +153,15 @@ def measure_machine(case: tuple[int, float]) -> list[Row]:
         predicted, held = report.verdict.overruns[float(rate_hz)], hold(session, minute_s)
         if held.ended:
             raise CanprobeError(held.ended)
-        head = {"seed": seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
-        percents = {"predicted_percent": 100.0 * predicted, "seen_percent": 100.0 * held.overruns}
-        ratio = predicted / held.overruns if predicted and held.overruns else None
-        rows.append({**head, **percents, "ratio": ratio})
+        row = {"seed": seed, "kind": machine.kind, "rate_hz": rate_hz, "late": late}
+        row |= {"predicted_percent": 100.0 * predicted, "seen_percent": 100.0 * held.overruns}
+        rows.append(row | {"ratio": predicted / held.overruns if predicted and held.overruns else None})
     return rows
 
 
 def _patient_scene(rate_hz: float) -> Scene:
     changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "scene.figures": False}
-    return on_any_bitrate(patient(load_scene("free", changes)), BITRATE)
+    return on_any_bitrate(patient(load_scene("free", changes)))
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

@@ -10,9 +10,8 @@ import os
 import pty
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -30,58 +29,15 @@ from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.lab.studies.realtime_cases import Hold, patient, served, vcan_facts, with_real_nodes
-from canprobe.lab.studies.result import CHANNEL, Row, StudyResult
+from canprobe.fieldbus.vcan.launch import CHANNEL
+from canprobe.lab.studies.result import Row, StudyResult
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import patient, served, vcan_facts, with_real_nodes
 
 SOAK_S = 1800.0
 SAMPLES = 60
 SETTLED = 0.25
 """Share of the run after which memory should be constant."""
-COLUMNS = (
-    "t_s", "master_mib", "nodes_mib", "monitor_mib", "cycles", "overruns", "missed_pdos", "dropped_frames",
-    "latency_us", "frames_counted", "frames_on_bus",
-)  # fmt: skip
-
-
-class Soaker(Hold):
-    """Holds the joints, and takes a sample periodically, with the memory of the processes beside it."""
-
-    def __init__(self, session: Session, nodes_pid: int, monitor_pid: int, seconds: float) -> None:
-        super().__init__()
-        self.samples: list[Row] = []
-        self._session, self._nodes_pid, self._monitor_pid, self._seconds = session, nodes_pid, monitor_pid, seconds
-        self._next_s = 0.0
-        self._first_packets = self._first_counted = 0
-
-    def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
-        t_s = measurement.t_ns * 1e-9
-        if t_s >= self._next_s:
-            self._next_s += self._seconds / SAMPLES
-            self._look(t_s)
-        return replace(super().step(measurement), done=t_s >= self._seconds)
-
-    def _look(self, t_s: float) -> None:
-        cell = self._session.cell
-        cycle, drives, counters = cell.cycle, cell.drives, cell.port.counters
-        assert cycle is not None and drives is not None
-        counted, packets = counters.sent + counters.received, packets_on(CHANNEL)
-        if not self.samples:
-            self._first_counted, self._first_packets = counted, packets
-        self.samples.append({
-            "t_s": t_s,
-            "master_mib": resident_mib(os.getpid()),
-            "nodes_mib": resident_mib(self._nodes_pid),
-            "monitor_mib": resident_mib(self._monitor_pid),
-            "cycles": cycle.number,
-            "overruns": cycle.statistics.overruns,
-            "missed_pdos": drives.missed,
-            "dropped_frames": counters.overruns,
-            "latency_us": drives.answer_ns * 1e-3,
-            "frames_counted": counted - self._first_counted,
-            "frames_on_bus": packets - self._first_packets,
-        })  # fmt: skip
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
@@ -91,7 +47,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     sweep.say(f"hold the cell for {seconds:g} s")
     rows, ended = soak(seconds)
     facts = vcan_facts(quick, 1) | {"seconds": seconds}
-    return StudyResult("soak", COLUMNS, rows, findings(rows, ended), facts, partial(draw_soak, rows))
+    return StudyResult("soak", rows, findings(rows, ended), facts, partial(draw_soak, rows))
 
 
 def soak(seconds: float) -> tuple[list[Row], str]:
@@ -102,18 +58,46 @@ def soak(seconds: float) -> tuple[list[Row], str]:
     """
     scene = load_scene("cylinder", {"cycle.realtime": True})
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
-    child = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
-    with watched() as monitor_pid, served(child):
+    nodes = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
+    samples: list[Row] = []
+    with watched() as monitor_pid, served(nodes):
         session = Session(with_real_nodes(patient(scene)), RunOptions(rows_kept=ROWS_OF_UP))
-        soaker = Soaker(session, child.pid, monitor_pid, seconds)
+        pids = {"master_mib": os.getpid(), "nodes_mib": nodes.pid, "monitor_mib": monitor_pid}
+
+        def hold(measurement: Measurement) -> Command:
+            t_s = measurement.t_ns * 1e-9
+            if t_s >= len(samples) * seconds / SAMPLES:
+                samples.append(sample(session, t_s, pids))
+            return Command(done=t_s >= seconds)
+
+        ended = ""
         try:
             with session:
-                session.run(soaker)
+                session.run(hold)
         except CanprobeError as error:
-            if not soaker.samples:
+            if not samples:
                 raise
-            return soaker.samples, str(error)
-    return soaker.samples, ""
+            ended = str(error)
+    counted = {key: samples[0][key] for key in ("frames_counted", "frames_on_bus")}
+    return [s | {key: s[key] - first for key, first in counted.items()} for s in samples], ended
+
+
+def sample(session: Session, t_s: float, pids: Mapping[str, int]) -> Row:
+    """Memory of some processes, counters of the cell and of the interface."""
+    cell = session.cell
+    cycle, drives, counters = cell.cycle, cell.drives, cell.port.counters
+    assert cycle is not None and drives is not None
+    return {
+        "t_s": t_s,
+        **{name: resident_mib(pid) for name, pid in pids.items()},
+        "cycles": cycle.number,
+        "overruns": cycle.statistics.overruns,
+        "missed_pdos": drives.missed,
+        "dropped_frames": counters.overruns,
+        "latency_us": drives.answer_ns * 1e-3,
+        "frames_counted": counters.sent + counters.received,
+        "frames_on_bus": packets_on(CHANNEL),
+    }
 
 
 @contextmanager

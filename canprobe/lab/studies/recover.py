@@ -1,7 +1,7 @@
 """Study `faults --recover`: cells in lockstep that lose nodes or their bus by chance, and whether each comes back.
 
 What is lost, when, for how long, alone or in pairs, follows from a seed, while the arm holds, moves, presses or scans
-(`recover_score`). A run fails where a drive is enabled with a target more than one count beside its position, where the
+(`recover_runs`). A run fails where a drive is enabled with a target more than one count beside its position, where the
 force exceeds the limit at another time than between loss and stop (study `faults` judges that time), where the cell
 does not come back or takes more than a second from the boot-up of the last node to the hold, or where its log lacks a
 cycle. Behind a loss without a boot-up the cell may take as long again as its nodes may take to stop. A stop that
@@ -18,26 +18,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import canprobe
-from canprobe.cell.master.options import RunOptions
+from canprobe.cell.master.options import quiet
 from canprobe.cell.results.picture import BLUE, picture
-from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.lab.studies.recover_score import (
-    END_S,
+from canprobe.lab.studies.recover_runs import (
     REPLUG,
     SCENES,
     STALL,
     RecoverCase,
-    RecoverScore,
+    RecoverRun,
     draw_case,
     shrink,
+    work_scene,
 )
 from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
-RUNS, QUICK_RUNS, SEEDS_A_CELL = 1000, 8, 20
+RUNS, QUICK_RUNS = 1000, 8
 COLUMNS = (
     "work", "runs", "lost", "back", "refused", "jump_counts", "force_max_n", "force_calm_n", "late_s", "rows_lost",
     "failures",
@@ -47,20 +45,17 @@ COLUMNS = (
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Carry out the runs."""
     total = QUICK_RUNS if quick else RUNS
-    cells = [list(range(first, min(total, first + SEEDS_A_CELL))) for first in range(0, total, SEEDS_A_CELL)]
-    runs = [one for answer in sweep.map(measure, cells) for one in answer]
+    runs = sweep.map(measure, range(total))
     rows = table_rows(runs)
     facts = measuring_facts(quick, total)
-    return StudyResult("recover", COLUMNS, rows, findings(runs), facts, partial(draw_runs, runs))
+    return StudyResult("recover", rows, findings(runs), facts, partial(draw_runs, runs), COLUMNS)
 
 
-def measure(seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """The runs of some seeds; a case that fails is shrunk."""
-    runs = []
-    for case in map(draw_case, seeds):
-        outcome = run_case(case)
-        runs.append({**outcome, "shrunk": str(shrink(case, run_case)) if outcome["failures"] else ""})
-    return runs
+def measure(seed: int) -> dict[str, Any]:
+    """The run of a seed; a case that fails is shrunk."""
+    case = draw_case(seed)
+    outcome = run_case(case)
+    return {**outcome, "shrunk": str(shrink(case, run_case)) if outcome["failures"] else ""}
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
@@ -117,58 +112,33 @@ def draw_runs(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
         axes.set_ylabel("runs")
 
 
-class RecoverRun:
-    """One run of the study.
+class LockstepRun(RecoverRun):
+    """One run in lockstep; for its arguments see `RecoverRun`."""
 
-    Args:
-        case: what happens.
-        say: called with each step.
-        out: folder of the run's files.
-
-    Attributes:
-        outcome: what came of it, and what failed; with the hash of the bus log.
-    """
-
-    def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path) -> None:
-        self._case = case
-        changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
-        plan = canprobe.plan(SCENES[case.work], changes)
-        self._score = RecoverScore(case, plan, say)
-        self._session = session = Session(plan, RunOptions(out, self._say, recover=True))
-        self._faulty = session.buses.world.make_faulty()
-        session.around = self._disturbed
+    def __init__(self, case: RecoverCase, out: Path, say: Say) -> None:
+        super().__init__(case, work_scene(case.work, {"bus.timed": False}), out, say)
+        self._faulty = self.session.buses.world.make_faulty()
+        self.session.around = self._disturbed
         self._away: list[tuple[int, int, bool]] = []
-        with session:
-            self._score.carry_out(session, self._begin, lambda: self._now_ns * 1e-9)
-        log = hashlib.sha256((out / "bus.log").read_bytes()).hexdigest()
-        self.outcome = {**self._score.outcome(session), "bus_log_sha256": log}
+        """Times in which the master's interface is down, or the master stands still: begin and end, ns."""
 
-    @property
-    def _now_ns(self) -> int:
-        assert self._session.buses.lockstep is not None
-        return self._session.buses.lockstep.clock.now_ns()
-
-    def _say(self, text: str) -> None:
-        self._score.say(self._now_ns * 1e-9 if self._session.buses.lockstep is not None else 0.0, text)
-
-    def _begin(self) -> None:
-        """Throw the outages."""
-        for loss in self._case.outages:
+    def lose(self) -> None:
+        assert self.session.buses.lockstep is not None
+        now_ns = self.session.buses.lockstep.clock.now_ns()
+        for loss in self.case.outages:
             if loss.name in (REPLUG, STALL):
-                begin_ns = self._now_ns + round(loss.after_s * 1e9)
+                begin_ns = now_ns + round(loss.after_s * 1e9)
                 self._away.append((begin_ns, begin_ns + loss.lasts_ms * 1_000_000, loss.name == STALL))
-            for node_id in loss.nodes(self._score.plan.node_ids):
-                self._faulty.inject(loss.fault(node_id, loss.after_s), self._now_ns)
+            for node_id in loss.nodes(self.plan.node_ids):
+                self._faulty.inject(loss.fault(node_id, loss.after_s), now_ns)
 
     def _disturbed(self, port: Port) -> Port:
         """The port of the master: it fails while its interface is down, and its calls do not return in a stall."""
 
-        def around(name: str) -> Callable[..., Any]:
-            method = getattr(port, name)
-
+        def around(method: Callable[..., Any]) -> Callable[..., Any]:
             def call(*arguments: Any) -> Any:
                 for begin_ns, end_ns, stalls in self._away:
-                    if begin_ns <= self._now_ns < end_ns:
+                    if begin_ns <= port.clock.now_ns() < end_ns:
                         if not stalls:
                             down = f"{port.channel}: interface is down; type: sudo ip link set {port.channel} up"
                             raise InterfaceError(down)
@@ -178,11 +148,15 @@ class RecoverRun:
             return call
 
         for name in ("send_batch", "drain", "wait"):
-            setattr(port, name, around(name))
+            setattr(port, name, around(getattr(port, name)))
         return port
 
 
-def run_case(case: RecoverCase, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Carry out a run, and score it."""
+def run_case(case: RecoverCase, say: Say = quiet) -> dict[str, Any]:
+    """Carry out a run: what came of it, and what failed; with the hash of the bus log."""
     with tempfile.TemporaryDirectory(prefix="canprobe-recover-") as folder:
-        return RecoverRun(case, say, Path(folder)).outcome
+        run = LockstepRun(case, Path(folder), say)
+        with run.session:
+            run.carry_out()
+        log = hashlib.sha256((Path(folder) / "bus.log").read_bytes()).hexdigest()
+        return {**run.outcome(), "bus_log_sha256": log}

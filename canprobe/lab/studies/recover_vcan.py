@@ -1,4 +1,4 @@
-"""Study `faults --recover` on a real vcan0: the cases of `recover_score`, with nodes in their own process.
+"""Study `faults --recover` on a real vcan0: the cases of `recover_runs`, with nodes in their own process.
 
 `canprobe vcan -- canprobe study faults --recover --vcan`. Faults are thrown as `canprobe inject` throws them, the
 interface is taken down and up by `ip`, and the master stands still in its controller. The score is that of the study in
@@ -8,25 +8,20 @@ lockstep. Real time is not repeated by a seed.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.session import Session
+from canprobe.cell.master.controller import Measurement
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.faults.control import request_faults
-from canprobe.lab.studies.faults_vcan import link, sleep
-from canprobe.lab.studies.realtime_cases import ON_VCAN, patient, vcan_facts
+from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
-from canprobe.lab.studies.recover_score import END_S, REPLUG, SCENES, STALL, RecoverCase, RecoverScore, draw_case
-from canprobe.lab.studies.result import CHANNEL, StudyResult
+from canprobe.lab.studies.recover_runs import REPLUG, STALL, RecoverCase, RecoverRun, draw_case, work_scene
+from canprobe.lab.studies.result import Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import ON_VCAN, link, patient, sleep, vcan_facts
 
 RUNS, QUICK_RUNS = 50, 2
 MISSED_SYNCS = 40
@@ -41,58 +36,43 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     for seed in range(total):
         case = draw_case(seed)
         with tempfile.TemporaryDirectory(prefix="canprobe-recover-") as folder:
-            runs.append({**ServedRun(case, sweep.say, Path(folder)).outcome, "shrunk": str(case)})
+            one = ServedRun(case, Path(folder), sweep.say)
+            one.carry_out()
+            runs.append({**one.outcome(), "shrunk": str(case)})
         sweep.say(f"{seed + 1} of {total}: {case}: {'; '.join(runs[-1]['failures']) or 'no failure'}")
     facts = vcan_facts(quick, total, MISSED_SYNCS)
-    return StudyResult("recover_vcan", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_runs, runs))
+    return StudyResult("recover_vcan", table_rows(runs), findings(runs), facts, partial(draw_runs, runs), COLUMNS)
 
 
-class ServedRun:
-    """One run on vcan0.
+class ServedRun(RecoverRun):
+    """One run on vcan0; for its arguments see `RecoverRun`."""
 
-    Args:
-        case: what happens.
-        say: called with each step.
-        out: folder of the run's files.
-
-    Attributes:
-        outcome: what came of it, and what failed.
-    """
-
-    def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path) -> None:
-        changes = {**ON_VCAN, "scene.figures": False, "task.duration_s": END_S + 2.0}
-        plan = make_plan(resolve(patient(load_scene(SCENES[case.work], changes), MISSED_SYNCS)))
-        self._case, self._score = case, RecoverScore(case, plan, say)
-        self._session = Session(plan, RunOptions(out, lambda text: self._score.say(self._now_s(), text), recover=True))
+    def __init__(self, case: RecoverCase, out: Path, say: Say) -> None:
+        super().__init__(case, patient(work_scene(case.work, ON_VCAN), MISSED_SYNCS), out, say)
         self._stalls: list[tuple[float, float]] = []
+
+    def carry_out(self) -> None:
         try:
-            with ThreadPoolExecutor() as self._others, self._session as session:
-                self._score.carry_out(session, self._begin, self._now_or_stall)
+            with ThreadPoolExecutor() as self._others, self.session:
+                super().carry_out()
         finally:
             link("up")
-        self.outcome = self._score.outcome(self._session)
 
-    def _now_s(self) -> float:
-        """Time since the beginning of the log, s."""
-        time_s = self._session.steps.time_s
-        return time_s() if time_s is not None else 0.0
-
-    def _now_or_stall(self) -> float:
-        """The time; a stall that is due is slept through, in the controller."""
-        now_s = self._now_s()
-        for begin_s, end_s in [one for one in self._stalls if one[0] <= now_s]:
+    def is_over(self, measurement: Measurement) -> bool:
+        """See `RecoverRun.is_over`; a stall that is due is slept through, in the controller."""
+        for begin_s, end_s in [one for one in self._stalls if one[0] <= self.now_s()]:
             self._stalls.remove((begin_s, end_s))
-            sleep(end_s - now_s)
-        return now_s
+            sleep(end_s - self.now_s())
+        return super().is_over(measurement)
 
-    def _begin(self) -> None:
-        """Throw the faults of the nodes, and let the others happen at their time."""
-        first_s, node_ids = self._score.first_s or 0.0, self._score.plan.node_ids
-        self._stalls += [(first_s + o.after_s, first_s + o.ends_s) for o in self._case.outages if o.name == STALL]
-        faults = [o.fault(node_id, o.after_s) for o in self._case.outages for node_id in o.nodes(node_ids)]
+    def lose(self) -> None:
+        self._stalls += [
+            (self.first_s + o.after_s, self.first_s + o.ends_s) for o in self.case.outages if o.name == STALL
+        ]
+        faults = [o.fault(node_id, o.after_s) for o in self.case.outages for node_id in o.nodes(self.plan.node_ids)]
         if faults:
             self._others.submit(request_faults, CHANNEL, faults)
-        for outage in self._case.outages:
+        for outage in self.case.outages:
             if outage.name == REPLUG:
                 self._others.submit(_replug, outage.after_s, outage.lasts_ms * 1e-3)
 

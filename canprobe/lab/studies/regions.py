@@ -61,11 +61,6 @@ MODEL = (
     "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/array_presses.py",
     "lab/studies/random_scenes.py", "lab/studies/region_scores.py",
 )  # fmt: skip
-COLUMNS = (
-    "group", "of", "seeds", "scenes", "refused", "stopped", "answers", "observed", "coverage", "coverage_low",
-    "coverage_high", "below_80", "below_40", "error_per_m", "stated_over_error", "stated_low", "stated_high",
-    "log_score", "worst",
-)  # fmt: skip
 COMPARED = ("refused", "stopped", "observed", "coverage", "stated_over_error", "log_score")
 """Figures that are shown beside those of an earlier run."""
 BY: Mapping[str, Callable[[ScoredScan], str]] = {
@@ -97,7 +92,7 @@ def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW, against: Path | Non
     if earlier is not None:
         said += compared(rows, earlier)
     facts = measuring_facts(quick, len(scans), MODEL) | {"draw": draw}
-    return StudyResult("regions", COLUMNS, rows, said, facts, partial(draw_regions, rows, scans))
+    return StudyResult("regions", rows, said, facts, partial(draw_regions, rows, scans))
 
 
 def scan_all(sweep: Sweep, draw: int, kinds: Sequence[str], wanted: int) -> list[ScoredScan]:
@@ -301,10 +296,6 @@ def draw_regions(rows: Sequence[Row], scans: Sequence[ScoredScan], path: Path) -
             _draw_kind(axes, f"{row['of']}: {row['stated_over_error']:.2f}", mine, span)
         for axes in grid.flat[len(panels) :]:
             axes.set_visible(False)
-        for axes in grid[-1]:
-            axes.set_xlabel("RMS error (1/m)")
-        for line in grid:
-            line[0].set_ylabel("stated (1/m)")
         legend(upper)
         _draw_coverage(lower.subplots(), kinds)
 
@@ -318,7 +309,8 @@ def _draw_kind(axes: Axes, title: str, scans: Sequence[ScoredScan], span: tuple[
         x, y = [scan.error_per_m for scan in mine], [scan.stated_per_m for scan in mine]
         axes.scatter(x, y, s=14, color=colour, marker=marker, label=words, zorder=3, linewidths=0)
     log_scale(axes, "xy")
-    axes.set(title=title, xlim=span, ylim=span)
+    axes.set(title=title, xlabel="RMS error (1/m)", ylabel="stated (1/m)", xlim=span, ylim=span)
+    axes.label_outer()
 
 
 def _draw_coverage(axes: Axes, rows: Sequence[Row]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import importlib.util
 import json
 import math
 import platform
@@ -26,8 +25,6 @@ from canprobe.mechanics.types import Floats
 Say = Callable[[str], None]
 Row = dict[str, Any]
 """A row of a table, by the keys of its columns."""
-CHANNEL = "vcan0"
-"""The interface of studies in real time."""
 CHI2_95_OF_3 = 7.815
 FROBENIUS = np.array([1.0, 2.0, 1.0])
 """Weights of (K11², K12², K22²) in ‖K‖²."""
@@ -45,20 +42,20 @@ class StudyResult:
 
     Attributes:
         name: name of the study.
-        columns: keys of the rows that the printed table has, each with its unit at the end; the CSV has all.
-        rows: one row for each case; None where a value does not apply.
+        rows: one row for each case, by keys with their unit at the end; None where a value does not apply.
         findings: sentences with figures.
         facts: machine, versions and settings of the measurement.
         draw: function that writes the picture to a path; it needs matplotlib.
+        columns: keys of the rows that the printed table has, by default all; the CSV has all.
         more: further tables of the study, each with its findings, files and picture.
     """
 
     name: str
-    columns: Sequence[str]
     rows: Sequence[Row]
     findings: Sequence[str]
     facts: Mapping[str, Any]
     draw: Callable[[Path], None]
+    columns: Sequence[str] = ()
     more: Sequence[StudyResult] = ()
 
 
@@ -120,10 +117,11 @@ def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
 
 def table_lines(result: StudyResult) -> list[str]:
     """The table, a line for each row, numbers flush right."""
-    cells = [[heading(key) for key in result.columns]]
-    cells += [[shown(row.get(key)) for key in result.columns] for row in result.rows]
+    columns = result.columns or list(dict.fromkeys(key for row in result.rows for key in row))
+    cells = [[heading(key) for key in columns]]
+    cells += [[shown(row.get(key)) for key in columns] for row in result.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    words = [bool(result.rows) and isinstance(result.rows[0].get(key), str) for key in result.columns]
+    words = [bool(result.rows) and isinstance(result.rows[0].get(key), str) for key in columns]
     return [
         "  ".join(
             t.ljust(w) if is_word else t.rjust(w) for t, w, is_word in zip(line, widths, words, strict=True)
@@ -159,23 +157,21 @@ def as_document(result: StudyResult) -> dict[str, Any]:
 
 
 def write_study(result: StudyResult, out: Path) -> list[Path]:
-    """Write `<name>.csv`, `.txt`, `.json` and, where matplotlib is installed, `.png`.
+    """Write `<name>.csv`, `.txt`, `.json` and `.png`.
 
     Returns:
-        The files of each table, its picture last where there is one.
+        The files of each table, its picture last.
 
     Raises:
         ResultsError: one cannot be written.
     """
     make_folder(out)
-    paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
+    paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json", "png")]
     write_csv(paths[0], result.rows)
     write_text(paths[1], text_of(result))
     document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
     write_text(paths[2], document + "\n")
-    if importlib.util.find_spec("matplotlib") is not None:
-        paths.append(out / f"{result.name}.png")
-        result.draw(paths[-1])
+    result.draw(paths[3])
     return [*paths, *(path for more in result.more for path in write_study(more, out))]
 
 

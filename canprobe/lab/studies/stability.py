@@ -69,7 +69,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     rows = [row_of(case, answer) for case, answer in zip(todo, sweep.map(carry_out, todo, model=MODEL), strict=True)]
     facts = measuring_facts(quick, 1, MODEL)
     more = (run_extremes(quick=quick, sweep=sweep),)
-    return StudyResult("stability", COLUMNS, rows, findings(rows), facts, partial(draw_stability, rows), more)
+    return StudyResult("stability", rows, findings(rows), facts, partial(draw_stability, rows), COLUMNS, more)
 
 
 def row_of(case: LoopCase, answer: Row) -> Row:
@@ -176,10 +176,8 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
                 mine = [r for r in rows if (r["servo"], r["rate_hz"], r["late_ms"]) == (servo, rate, late)]
                 _draw_map(axes, stiffness, ratios, loop_of(LoopCase(1e4, rate_hz=rate, late_ms=late)), mine)
                 axes.set_title(f"cycle of {rate:g} Hz" + (f", frames {late:g} ms late" if late else ""))
-            for axes in grid[-1]:
-                axes.set_xlabel("contact stiffness (N/m)")
-            for line in grid:
-                line[0].set_ylabel("force gain (Hz)")
+                axes.set(xlabel="contact stiffness (N/m)", ylabel="force gain (Hz)")
+                axes.label_outer()
         legend(part, end_marks(END_MARKS))
 
 

@@ -84,7 +84,7 @@ def run_extremes(*, quick: bool, sweep: Sweep) -> StudyResult:
     sweep.say(f"{len(cases)} extreme cases")
     rows: list[Row] = sweep.map(measure, cases, model=MODEL)
     facts = measuring_facts(quick, 1, MODEL)
-    return StudyResult("stability_extremes", COLUMNS, rows, findings(rows), facts, partial(draw_extremes, rows))
+    return StudyResult("stability_extremes", rows, findings(rows), facts, partial(draw_extremes, rows), COLUMNS)
 
 
 def extreme_scene(case: ExtremeCase) -> Scene:
@@ -136,18 +136,16 @@ def _with_wrist(scene: Scene, wrist_deg: float) -> Scene:
     return replace(scene, joints=joints)
 
 
-def _touched_at(scene: Scene, place: tuple[float, float, float]) -> Scene:
+def _touched_at(scene: Scene, place: tuple[float, ...]) -> Scene:
     scene = changed(changed(scene, "task", start_mm=place), "object", position_mm=place)
     return changed(scene, "limits", joint_margin_deg=0.5)
 
 
-def touch_in_posture(
-    posture_deg: tuple[float, ...],
-) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
+def touch_in_posture(posture_deg: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """A touch with the pole of the default probe and these joint angles, deg.
 
     Returns:
-        Its place, mm; the outward normal there; joint angles (n,) 10 mm above it, deg.
+        Its place (3,), mm; the outward normal (3,) there; joint angles (n,) 10 mm above it, deg.
     """
     arm, probe = resolve(load_scene("press")).arm, ProbeSettings()
     assert arm is not None
@@ -160,12 +158,10 @@ def touch_in_posture(
     above[:3, 3] -= 10e-3 * pole
     away = np.degrees(inverse_near(model, above, T_flange_centre, q))
     at = 1e3 * T[:3, 3] + probe.radius_mm * pole
-    x, y, z = (float(value) for value in at)
-    nx, ny, nz = (-float(value) for value in pole)
-    return (x, y, z), (nx, ny, nz), tuple(float(angle) for angle in away)
+    return tuple(at.tolist()), tuple((-pole).tolist()), tuple(away.tolist())
 
 
-def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[float, float, float]:
+def upright(normal: tuple[float, ...], yaw_deg: float = 20.0) -> tuple[float, float, float]:
     """Roll, pitch and yaw, deg, of an object whose z is a unit normal."""
     yaw = math.radians(yaw_deg)
     x = math.cos(yaw) * normal[0] + math.sin(yaw) * normal[1]
@@ -210,31 +206,28 @@ def value_in_words(case: ExtremeCase) -> str:
 
 def measure(case: ExtremeCase) -> Row:
     """Carry out a case: its row of the table."""
-    row: Row = {"extreme": case.extreme, "value": value_in_words(case), "task": "scan" if case.scan else "press"}
-    none: Row = dict.fromkeys(("curvature_per_m", "stated_per_m", "held"))
+    row: Row = dict.fromkeys(("curvature_per_m", "stated_per_m", "held"))
+    row |= {"extreme": case.extreme, "value": value_in_words(case), "task": "scan" if case.scan else "press"}
     scene = extreme_scene(case)
     try:
         session = Session(scene)
         world = session.buses.world
     except PlanError as refusal:
-        return row | refused_row(refusal) | none
+        return row | refused_row(refusal)
     task = make_task(session.plan)
     assert isinstance(task, TouchTask) and world.nodes
     if case.extreme == "jitter of the period":
         jitter_ns = 1e-2 * case.value * 1e9 / scene.cycle.rate_hz
         delay(world, {SYNC_ID}, partial(sync_delay_ns, jitter_ns))
-    found = row | run_touch(session, task, scene.task.force_n) | none
-    scores = np.zeros((0, 5))
-    if task.shape is not None:
-        late, behind = scores_of(session, task.shape.records)
-        scores = np.array([one for one in (*late, *behind) if one]).reshape(-1, 5)
-    if len(scores):
-        found["curvature_per_m"], found["stated_per_m"] = (float(np.sqrt(scores[:, i].mean())) for i in (1, 2))
-        found["held"] = float(np.mean(scores[:, 3] < CHI2_95_OF_3))
+    row |= run_touch(session, task, scene.task.force_n)
+    late, behind = scores_of(session, task.shape.records if task.shape is not None else [])
+    if scores := [one for one in (*late, *behind) if one]:
+        _, errors, variances, squares, _ = np.array(scores).T
+        row |= {"curvature_per_m": math.sqrt(errors.mean()), "stated_per_m": math.sqrt(variances.mean())}
+        row["held"] = float(np.mean(squares < CHI2_95_OF_3))
     assert scene.probe is not None
-    return found | judged(
-        found, 1e3 / scene.probe.radius_mm + float(np.abs(session.buses.truth["kappa_per_m"][-1]).max())
-    )
+    curved_per_m = 1e3 / scene.probe.radius_mm + float(np.abs(session.buses.truth["kappa_per_m"][-1]).max())
+    return row | judged(row, curved_per_m)
 
 
 def sync_delay_ns(jitter_ns: float, t_ns: int) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -68,17 +69,17 @@ class PlaneContacts(NamedTuple):
     sigma_slope: Floats
 
 
-Heights = Callable[[Floats], HeightAnswer]
-"""Places (n, 2), mm, to heights."""
-Fit = Callable[[PlaneContacts, float], Heights]
-"""Contacts and a setting of the method to heights."""
+Fit = Callable[[PlaneContacts, float, Floats], HeightAnswer]
+"""Contacts, a setting of the method, and places (n, 2), mm, to heights there."""
+Method = Callable[[Sequence[ContactSample], Touch, float, Floats], FoundSurface]
+"""Contacts, their task, a setting of the method, and points (n, 3), m, near the surface to the surface there."""
 
 
-def map_of(samples: Sequence[ContactSample], task: Touch) -> SurfaceMap:
-    """The package's map of all contacts."""
+def map_of_share(samples: Sequence[ContactSample], task: Touch, percent: float, points: Floats) -> FoundSurface:
+    """The package's map of the first contacts, as many as a share of all, at points (n, 3), m, near it."""
     found = make_surface_map(task)
-    found.add_samples(samples)
-    return found
+    found.add_samples(samples[: round(0.01 * percent * len(samples))])
+    return evaluate_map(found, points)
 
 
 def evaluate_map(found: SurfaceMap, points: Floats) -> FoundSurface:
@@ -88,7 +89,7 @@ def evaluate_map(found: SurfaceMap, points: Floats) -> FoundSurface:
 
 
 def evaluate_heights(
-    fit: Fit, setting: float, samples: Sequence[ContactSample], task: Touch, points: Floats
+    fit: Fit, samples: Sequence[ContactSample], task: Touch, setting: float, points: Floats
 ) -> FoundSurface:
     """Heights over the mean plane of contacts, as a surface at points (n, 3), m, near it."""
     p, n = (np.array([getattr(sample, name) for sample in samples]) for name in ("p_base", "n_base"))
@@ -99,7 +100,7 @@ def evaluate_heights(
     turned = np.hypot(SIGMA_NORMAL_RAD, along * centroid_coupling(task.probe))
     at = 1e3 * (points - middle) @ R
     contacts = PlaneContacts(local[:, :2], local[:, 2], -up[:, :2] / up[:, 2:], 1e3 * height, turned)
-    answer = fit(contacts, setting)(at[:, :2])
+    answer = fit(contacts, setting, at[:, :2])
     size = np.sqrt(1.0 + np.sum(answer.slope**2, axis=1))
     normal = np.column_stack([-answer.slope, np.ones(len(at))]) / size[:, None]
     P = np.eye(3) - normal[:, :, None] * normal[:, None, :]
@@ -116,69 +117,60 @@ def evaluate_heights(
     )
 
 
-def quadrics(contacts: PlaneContacts, setting: float) -> Heights:
+def quadrics(contacts: PlaneContacts, radius: float, xy: Floats) -> HeightAnswer:
     """Least-squares quadrics of heights and slopes of all contacts within a radius of each place, mm."""
     tree = cKDTree(contacts.xy)
-
-    def answer(xy: Floats) -> HeightAnswer:
-        found = np.full((len(xy), 7), math.nan)
-        for i, place in enumerate(xy):
-            near = np.array(tree.query_ball_point(place, setting), np.intp)
-            if len(near) < ENOUGH_CONTACTS:
-                continue
-            x, y = (contacts.xy[near] - place).T
-            one, zero = np.ones_like(x), np.zeros_like(x)
-            rows = np.concatenate([
-                np.stack([one, x, y, 0.5 * x * x, x * y, 0.5 * y * y], axis=1),
-                np.stack([zero, one, zero, x, y, zero], axis=1),
-                np.stack([zero, zero, one, zero, x, y], axis=1),
-            ])  # fmt: skip
-            values = np.concatenate([contacts.z[near], *contacts.slope[near].T])
-            weights = 1.0 / np.concatenate([contacts.sigma_z[near], *2 * [contacts.sigma_slope[near]]])
-            c, _, rank, _ = np.linalg.lstsq(rows * weights[:, None], values * weights, rcond=1e-9)
-            if rank == 6:
-                information = (rows * weights[:, None]).T @ (rows * weights[:, None])
-                found[i] = *c, math.sqrt(np.linalg.inv(information)[0, 0])
-        hessian = found[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
-        return HeightAnswer(found[:, 0], found[:, 1:3], hessian, found[:, 6])
-
-    return answer
+    found = np.full((len(xy), 7), math.nan)
+    for i, place in enumerate(xy):
+        near = np.array(tree.query_ball_point(place, radius), np.intp)
+        if len(near) < ENOUGH_CONTACTS:
+            continue
+        x, y = (contacts.xy[near] - place).T
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        rows = np.concatenate([
+            np.stack([one, x, y, 0.5 * x * x, x * y, 0.5 * y * y], axis=1),
+            np.stack([zero, one, zero, x, y, zero], axis=1),
+            np.stack([zero, zero, one, zero, x, y], axis=1),
+        ])  # fmt: skip
+        values = np.concatenate([contacts.z[near], *contacts.slope[near].T])
+        weights = 1.0 / np.concatenate([contacts.sigma_z[near], *2 * [contacts.sigma_slope[near]]])
+        c, _, rank, _ = np.linalg.lstsq(rows * weights[:, None], values * weights, rcond=1e-9)
+        if rank == 6:
+            information = (rows * weights[:, None]).T @ (rows * weights[:, None])
+            found[i] = *c, math.sqrt(np.linalg.inv(information)[0, 0])
+    return HeightAnswer(found[:, 0], found[:, 1:3], found[:, [3, 4, 4, 5]].reshape(-1, 2, 2), found[:, 6])
 
 
-def spline(contacts: PlaneContacts, setting: float) -> Heights:
+def spline(contacts: PlaneContacts, smoothing: float, xy: Floats) -> HeightAnswer:
     """A thin-plate spline of the heights; its smoothing is in mm²."""
-    found = RBFInterpolator(contacts.xy, contacts.z, kernel="thin_plate_spline", smoothing=setting)
-    return lambda xy: _by_differences(found, xy, np.full(len(xy), math.nan))
+    found = RBFInterpolator(contacts.xy, contacts.z, kernel="thin_plate_spline", smoothing=smoothing)
+    return _by_differences(found, xy, np.full(len(xy), math.nan))
 
 
-def process(contacts: PlaneContacts, setting: float) -> Heights:
+def process(contacts: PlaneContacts, number: float, xy: Floats) -> HeightAnswer:
     """A Gaussian process of the heights of some contacts at equal steps, with a squared exponential of the distance."""
-    i = np.unique(np.linspace(0, len(contacts.z) - 1, int(setting)).round().astype(int))
-    xy, z, noise = contacts.xy[i], contacts.z[i], np.diag(contacts.sigma_z[i] ** 2)
-    squares = cdist(xy, xy, "sqeuclidean")
+    i = np.unique(np.linspace(0, len(contacts.z) - 1, int(number)).round().astype(int))
+    known, z, noise = contacts.xy[i], contacts.z[i], np.diag(contacts.sigma_z[i] ** 2)
+    squares = cdist(known, known, "sqeuclidean")
+
+    def covariance(squares: Floats, x: Floats) -> Floats:
+        scale, length = np.exp(x)
+        return np.asarray(scale**2 * np.exp(-0.5 * squares / length**2), np.float64)
 
     def cost(x: Floats) -> float:
-        scale, length = np.exp(x)
         try:
-            root = cho_factor(scale**2 * np.exp(-0.5 * squares / length**2) + noise, lower=True)
+            root = cho_factor(covariance(squares, x) + noise, lower=True)
         except np.linalg.LinAlgError:
             return math.inf
         return float(0.5 * z @ cho_solve(root, z) + np.log(np.diag(root[0])).sum())
 
-    scale, length = np.exp(minimize(cost, np.log([3.0, 30.0]), method="Nelder-Mead", options={"maxfev": 60}).x)
-    root = cho_factor(scale**2 * np.exp(-0.5 * squares / length**2) + noise, lower=True)
-    weights = cho_solve(root, z)
-
-    def covariance(at: Floats) -> Floats:
-        found: Floats = scale**2 * np.exp(-0.5 * cdist(at, xy, "sqeuclidean") / length**2)
-        return found
-
-    def answer(at: Floats) -> HeightAnswer:
-        c = covariance(at)
-        variance = scale**2 - np.einsum("ij,ji->i", c, cho_solve(root, c.T))
-        return _by_differences(lambda where: covariance(where) @ weights, at, np.sqrt(np.maximum(variance, 0.0)))
-
-    return answer
+    x = minimize(cost, np.log([3.0, 30.0]), method="Nelder-Mead", options={"maxfev": 60}).x
+    root = cho_factor(covariance(squares, x) + noise, lower=True)
+    weights, c = cho_solve(root, z), covariance(cdist(xy, known, "sqeuclidean"), x)
+    variance = np.exp(x[0]) ** 2 - np.einsum("ij,ji->i", c, cho_solve(root, c.T))
+    return _by_differences(
+        lambda at: covariance(cdist(at, known, "sqeuclidean"), x) @ weights, xy, np.sqrt(np.maximum(variance, 0.0))
+    )
 
 
 def _by_differences(f: Callable[[Floats], Floats], xy: Floats, sigma: Floats) -> HeightAnswer:
@@ -191,9 +183,10 @@ def _by_differences(f: Callable[[Floats], Floats], xy: Floats, sigma: Floats) ->
     return HeightAnswer(z, slope, np.stack([xx, xy_, xy_, yy], axis=1).reshape(-1, 2, 2) / STEP_MM**2, sigma)
 
 
-METHODS: Mapping[str, tuple[Fit, tuple[float, ...], str]] = {
-    "quadrics": (quadrics, (3.0, 4.0, 6.0, 9.0), "mm radius"),
-    "spline": (spline, (10.0, 100.0, 1000.0), "mm² smoothing"),
-    "process": (process, (100, 200, 400), "contacts"),
+METHODS: Mapping[str, tuple[Method, tuple[float, ...], str]] = {
+    "map": (map_of_share, (100.0,), "% of contacts"),
+    "quadrics": (partial(evaluate_heights, quadrics), (3.0, 4.0, 6.0, 9.0), "mm radius"),
+    "spline": (partial(evaluate_heights, spline), (10.0, 100.0, 1000.0), "mm² smoothing"),
+    "process": (partial(evaluate_heights, process), (100, 200, 400), "contacts"),
 }
-"""Method → how it fits, its settings, and their unit. A new method is a function and a line here."""
+"""Method → how it finds a surface, its settings, and their unit. A new method is a function and a line here."""

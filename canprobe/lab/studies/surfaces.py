@@ -18,7 +18,7 @@ Source: Gneiting and Raftery, "Strictly proper scoring rules, prediction, and es
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,7 +40,7 @@ from canprobe.errors import PlanError, SafetyStop, StudyError
 from canprobe.lab.studies import exploration
 from canprobe.lab.studies.drawn_shapes import DrawnShape, TrueGround, drawn, scene_of
 from canprobe.lab.studies.result import Row, StudyResult, heading, mean_and_interval, measuring_facts
-from canprobe.lab.studies.surface_methods import METHODS, FoundSurface, evaluate_heights, evaluate_map, map_of
+from canprobe.lab.studies.surface_methods import METHODS, FoundSurface
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.contact import ContactSample
 
@@ -72,23 +72,22 @@ def run(*, quick: bool, sweep: Sweep, draw: int = DRAW) -> StudyResult:
     seconds = QUICK_SECONDS if quick else SECONDS
     cases = [SurfaceCase(shape, name, seconds) for shape in shapes for name in strategies]
     sweep.say(f"{len(cases)} scans, draw {draw}")
-    found = sweep.map(measure, cases, model=MODEL)
-    by_shape = {shape: found[k * len(strategies) :][: len(strategies)] for k, shape in enumerate(shapes)}
-    left_out = {shape: why for shape, scans in by_shape.items() for scan in scans if (why := scan.get("refused"))}
+    scans = dict(zip(cases, sweep.map(measure, cases, model=MODEL), strict=True))
+    left_out = {case.shape: why for case, scan in scans.items() if (why := scan.get("refused"))}
     names = [shape.name for shape in shapes if shape not in left_out]
     if not names:
         raise StudyError(f"every shape has a strategy whose plan refuses it, such as: {next(iter(left_out.values()))}")
     each = {
-        name: [scans[k] for shape, scans in by_shape.items() if shape not in left_out]
-        for k, name in enumerate(strategies)
+        name: [scan for case, scan in scans.items() if case.strategy == name and case.shape not in left_out]
+        for name in strategies
     }
     rows = rows_of([scan["methods"] for scan in each[COMPARED]])
     paths = [exploration.row_of(name, scans) for name, scans in each.items()]
     facts = measuring_facts(quick, len(names), MODEL) | {"draw": draw}
     said = exploration.findings(paths, each, names)
     said += [f"Left out: {shape.name}, where a plan says: {why}" for shape, why in left_out.items()]
-    more = StudyResult("exploration", exploration.COLUMNS, paths, said, facts, partial(exploration.draw, each))
-    return StudyResult("surfaces", COLUMNS, rows, findings(rows), facts, partial(draw_surfaces, rows), (more,))
+    more = StudyResult("exploration", paths, said, facts, partial(exploration.draw, each))
+    return StudyResult("surfaces", rows, findings(rows), facts, partial(draw_surfaces, rows), COLUMNS, (more,))
 
 
 def measure(case: SurfaceCase) -> dict[str, Any]:
@@ -132,20 +131,13 @@ def measure(case: SurfaceCase) -> dict[str, Any]:
 
 def compare_methods(samples: Sequence[ContactSample], task: Touch, truth: TrueGround) -> list[dict[str, Any]]:
     """Scores of every method and setting on the same contacts, the map's first."""
-    ways: list[tuple[str, float, str, Callable[[], FoundSurface]]] = [
-        ("map", 100.0, "% of contacts", lambda: evaluate_map(map_of(samples, task), truth.points))
-    ]
-    ways += [
-        (name, setting, unit, partial(evaluate_heights, fit, setting, samples, task, truth.points))
-        for name, (fit, settings, unit) in METHODS.items()
-        for setting in settings
-    ]
     found = []
-    for name, setting, unit, way in ways:
-        begun = process_time()
-        surface = way()
-        spent = process_time() - begun
-        found.append({"method": name, "setting": setting, "unit": unit, **score(surface, truth), "cpu_s": spent})
+    for name, (find, settings, unit) in METHODS.items():
+        for setting in settings:
+            begun = process_time()
+            surface = find(samples, task, setting, truth.points)
+            spent = process_time() - begun
+            found.append({"method": name, "setting": setting, "unit": unit, **score(surface, truth), "cpu_s": spent})
     return found
 
 
@@ -205,7 +197,7 @@ def draw_surfaces(rows: Sequence[Row], path: Path) -> None:
     with picture(path, title, 3.6) as figure:
         panels = figure.subplots(1, 4, sharex=True)
         for axes, score_key in zip(panels, COLUMNS[4:8], strict=True):
-            for name, colour, marker in zip(("map", *METHODS), (INK, BLUE, GREEN, ORANGE), "*Dv^", strict=True):
+            for name, colour, marker in zip(METHODS, (INK, BLUE, GREEN, ORANGE), "*Dv^", strict=True):
                 mine = [row for row in rows if row["method"] == name]
                 times, values = ([row[key] for row in mine] for key in ("cpu_s", score_key))
                 axes.plot(times, values, marker=marker, color=colour, label=name)

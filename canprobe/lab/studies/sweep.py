@@ -17,7 +17,7 @@ and the cells; the sweep does the rest:
         answers = sweep.map(measure, cases, model=("mechanics/touch", "cell/plant", "lab/studies/my_study.py"))
         costs = sweep.time(measure_cost, settings)             # one at a time, alone, on this machine
         ...
-        return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
+        return StudyResult("my_study", rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
 
 Answers come in the order of the cells and as JSON gives them, whether they were computed now or earlier: tuples
 and arrays are lists, keys of mappings are text. The cell holds all that decides an answer (parameters, seeds). `model`
@@ -36,7 +36,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
@@ -79,31 +79,23 @@ class Sweep:
         if store.damaged:
             say(f"{store.path}: {store.damaged} damaged lines left out; their cells are computed again")
 
-    def map(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+    def map(
+        self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = (), machine: str = ""
+    ) -> list[Any]:
         """Answers of `measure` to cells, in their order.
 
         Args:
             measure: a function of a module, of one cell; its answer has a JSON form.
             cells: dataclasses, or other values with a JSON form.
             model: files and folders of the package behind the answers; by default all.
+            machine: this machine, for answers that hold on it only: see `time`.
 
         Raises:
             StudyError: a cell or a worker failed; the cells that are finished by then are kept.
         """
-        return self._all(measure, cells, tuple(model), None)
-
-    def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
-        """Answers of cells that measure run time: one after another, alone, in one process of this machine.
-
-        A kept answer counts on the machine that measured it only.
-        """
-        return self._all(measure, cells, tuple(model), f"{platform.node()} {platform.processor()}")
-
-    def _all(
-        self, measure: Callable[[Any], object], cells: Sequence[Any], parts: tuple[str, ...], machine: str | None
-    ) -> list[Any]:
-        name, model = f"{measure.__module__}:{measure.__qualname__}", model_digest(parts)
-        keys = [cell_key(name, [cell, machine] if machine else cell, model) for cell in cells]
+        parts = tuple(model)
+        name, digest = f"{measure.__module__}:{measure.__qualname__}", model_digest(parts)
+        keys = [cell_key(name, [cell, machine] if machine else cell, digest) for cell in cells]
         todo = {key: cell for key, cell in zip(keys, cells, strict=True) if key not in self._store.answers}
         total = len(set(keys))
         done = total - len(todo)
@@ -111,15 +103,23 @@ class Sweep:
             self.say(f"{done} of {total} cells are kept in {self._store.path}")
 
         def keep(key: str, answer: str) -> None:
-            self._store.put(key, {"measure": name, "cell": todo[key], "model": model, "machine": machine}, answer)
+            what = {"measure": name, "cell": todo[key], "model": digest, "machine": machine or None}
+            self._store.put(key, what, answer)
             if self._progress is not None:
                 self._progress(total - len(todo.keys() - self._store.answers.keys()), total)
 
         if todo:
-            with self._executor() if machine is None else process_pool(1) as executor:
-                for batch in [todo] if machine is None else [{key: cell} for key, cell in todo.items()]:
-                    _collect(executor, partial(_compute, measure, parts, model), batch, keep)
+            with process_pool(1) if machine else self._executor() as executor:
+                for batch in [{key: cell} for key, cell in todo.items()] if machine else [todo]:
+                    _collect(executor, partial(_compute, measure, parts, digest), batch, keep)
         return [json.loads(self._store.answers[key]) for key in keys]
+
+    def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+        """Answers of cells that measure run time: one after another, alone, in one process of this machine.
+
+        A kept answer counts on the machine that measured it only.
+        """
+        return self.map(measure, cells, model=model, machine=f"{platform.node()} {platform.processor()}")
 
 
 @contextmanager
@@ -145,14 +145,15 @@ def open_sweep(
         store.close()
 
 
-def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> tuple[bool, str]:
-    """Measure a cell in the worker: success, and the answer, or the error as text: not all exceptions are pickled."""
+def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> str:
+    """Measure a cell in the worker; what it raises becomes text there: not all exceptions are pickled."""
+    if (here := model_digest(parts)) != model:
+        other = f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
+        raise StudyError(f"cell {as_json(cell)}: {other}")
     try:
-        if (here := model_digest(parts)) != model:
-            return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
-        return True, as_json(measure(cell))
-    except Exception as error:  # raised again in the main process
-        return False, error_text(error)
+        return as_json(measure(cell))
+    except Exception as error:  # of any kind
+        raise StudyError(f"cell {as_json(cell)}: {error_text(error)}") from None
 
 
 def error_text(error: Exception) -> str:
@@ -162,33 +163,22 @@ def error_text(error: Exception) -> str:
 
 
 def _collect(
-    executor: Executor,
-    task: Callable[[Any], tuple[bool, str]],
-    cells: Mapping[str, Any],
-    keep: Callable[[str, str], None],
+    executor: Executor, task: Callable[[Any], str], cells: Mapping[str, Any], keep: Callable[[str, str], None]
 ) -> None:
     """Compute cells and keep the answers as they come, also those that are ready when an exception ends it."""
     futures = {executor.submit(task, cell): key for key, cell in cells.items()}
     left = set(futures)
     try:
         for future in as_completed(futures):
-            keep(futures[future], _answer(future, cells[futures[future]]))
+            keep(futures[future], future.result())
             left.discard(future)
-    except BaseException:
+    except BaseException as error:
         for future in left:
-            if future.done() and not future.cancelled() and future.exception() is None and future.result()[0]:
-                keep(futures[future], future.result()[1])
+            if future.done() and not future.cancelled() and future.exception() is None:
+                keep(futures[future], future.result())
+        if isinstance(error, BrokenProcessPool):
+            raise StudyError("a worker was killed; start the study again to compute what is left") from error
         raise
-
-
-def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
-    try:
-        well, text = future.result()
-    except BrokenProcessPool as error:
-        raise StudyError("a worker was killed; start the study again to compute what is left") from error
-    if not well:
-        raise StudyError(f"cell {as_json(cell)}: {text}")
-    return text
 
 
 @contextmanager
@@ -201,14 +191,14 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
         workers: number of processes; one for each core that this process may use by default.
     """
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
+    pool = _DeafPool(
         workers or system.processors(),
         multiprocessing.get_context("spawn"),
         initializer=_begin,
         initargs=(os.getpid(),),
     )
     try:
-        yield _Deaf(pool)
+        yield pool
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         _end(set(multiprocessing.active_children()) - before)
@@ -243,22 +233,18 @@ def dask_executor(address: str) -> Iterator[Executor]:
         client.close()  # cancels what is under way
 
 
-class _Deaf(Executor):
+class _DeafPool(ProcessPoolExecutor):
     """Submits with SIGINT blocked: workers inherit that from their first instruction on.
 
     A worker that is started then does not import the script that starts it, which would start its sweep again; cells
     are measured by functions of modules.
     """
 
-    def __init__(self, pool: ProcessPoolExecutor) -> None:
-        self._pool = pool
-
     def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]  # as its base has it
-        """See `Executor.submit`."""
         script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             with system.interrupts_blocked():
-                return self._pool.submit(fn, *args, **kwargs)
+                return super().submit(fn, *args, **kwargs)
         finally:
             sys.modules["__main__"] = script
 

@@ -84,3 +84,9 @@ def longest_above(rows: Sequence[tuple[int, float]], limit: float) -> int:
     """Longest time without a break for which the force of (t_ns, force) rows is above the limit, ns."""
     stretches = [list(some) for within, some in groupby(rows, lambda row: row[1] <= limit) if not within]
     return max((some[-1][0] - some[0][0] for some in stretches), default=0)
+
+
+def forces_of(session: Session) -> list[tuple[float, float]]:
+    """Force of the plant of a finished session: (time, s; force, N)."""
+    truth = session.buses.truth
+    return list(zip(truth["t_s"].tolist(), truth["force_n"].tolist(), strict=True)) if "force_n" in truth else []

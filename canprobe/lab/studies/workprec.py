@@ -126,7 +126,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         row |= dict.fromkeys(ENOUGH) if states is None else errors(truths[k], observed(k, np.array(states)))
         rows.append(row | {"verdict": verdict(row)})
     facts, draw = measuring_facts(quick, 0, MODEL), partial(draw_workprec, rows, floors)
-    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw)
+    return StudyResult("workprec", rows, findings(rows, floors), facts, draw, COLUMNS)
 
 
 @cache
@@ -318,13 +318,12 @@ def draw_workprec(rows: Sequence[Row], floors: Mapping[float, Mapping[str, float
                 _draw(axes, [r for r in known if r["stiffness_n_m3"] == stiffness], key, floor[key])
                 axes.axhspan(1e-12, enough, color=SHADE, linewidth=0, zorder=0)
                 log_scale(axes, "xy")
-            line[0].set_ylabel(label)
+                axes.set(xlabel="processor time a cycle (µs)", ylabel=label)
+                axes.label_outer()
             seen = [enough, *(max(r[key], floors[r["stiffness_n_m3"]][key]) for r in known)]
             line[0].set_ylim(max(0.3 * min(seen), 1e-7), min(3.0 * max(seen), 1e3))
         for axes, stiffness in zip(grid[0], floors, strict=True):
             axes.set_title(f"K/h {stiffness:.3g} N/m³")
-        for axes in grid[-1]:
-            axes.set_xlabel("processor time a cycle (µs)")
         legend(figure)
 
 

@@ -13,6 +13,7 @@ from canprobe.cell.results.array_report import as_document, calibration_text
 from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.tasks.calibrate import Press
 from canprobe.errors import SceneError, UsageError
 from canprobe.lab.studies.array_presses import RADIUS_M, Presses, random_array
 from canprobe.lab.studies.calibration import measure, score_holds
@@ -181,7 +182,7 @@ def test_the_shipped_calibration_holds_for_the_make_at_both_full_scales():
         errors = []
         for seed, (kappa, force) in enumerate([((0.0, 0.0), 1.0), ((30.0, 0.0), 2.0), ((20.0, 20.0), 3.0)]):
             presses = Presses(TaxelConfig(full_scale_pa=full_scale), 1.27e8, np.random.default_rng(seed + 77))
-            dwell = presses.dwell("x", force, kappa, seconds=6.0, measured=True)
+            dwell = presses.dwell("x", kappa, Press(force, seconds=6.0), measured=True)
             pairs = zip(dwell.images[100:], dwell.windows[100:], strict=True)
             mean = np.mean([compute_patch(image, patch, window).force for image, window in pairs])
             errors.append(mean / dwell.force - 1.0)

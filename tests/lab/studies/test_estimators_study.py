@@ -75,10 +75,7 @@ def test_ratios_are_to_the_paper_in_the_same_run():
 
 
 def result(draw=lambda path: path.write_bytes(b"")):
-    columns = ("name", "x_mm")
-    return StudyResult(
-        "demo", columns, [{"name": "a", "x_mm": 1.25}, {"name": "b", "x_mm": float("nan")}], ["so"], {}, draw
-    )
+    return StudyResult("demo", [{"name": "a", "x_mm": 1.25}, {"name": "b", "x_mm": float("nan")}], ["so"], {}, draw)
 
 
 def test_what_does_not_apply_is_null_and_a_dash(tmp_path):
@@ -91,7 +88,7 @@ def test_what_does_not_apply_is_null_and_a_dash(tmp_path):
 
 def test_a_table_spells_units_and_shows_four_digits_or_all_before_the_point():
     row = {"stiffness_n_m3": 1.27e8, "force_max_n": 12345.67, "error_per_m": 0.123456, "cycles": 72000, "held": True}
-    table = StudyResult("demo", tuple(row), [row], [], {}, lambda path: None)
+    table = StudyResult("demo", [row], [], {}, lambda path: None)
     heads, cells = (line.split("  ") for line in table_lines(table))
     assert [head.strip() for head in heads if head] == [
         "stiffness N/m³", "force max N", "error 1/m", "cycles", "held",

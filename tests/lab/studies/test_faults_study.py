@@ -9,6 +9,7 @@ import pytest
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.planning.motion import parked_posture
+from canprobe.cell.session.child_process import ERRORS
 from canprobe.cell.tasks import touch
 from canprobe.cli import main
 from canprobe.fieldbus.tools.faults import Fault
@@ -26,7 +27,7 @@ from canprobe.lab.studies.fault_cases import (
 )
 from canprobe.lab.studies.fault_runs import FaultRun, phase_windows, run_case, run_wrong_file
 from canprobe.lab.studies.faults import QUICK_KINDS, findings, quick_numbers, table_rows
-from canprobe.lab.studies.faults_vcan import HOLD_S, ProcessFault, draw_process_case, score_end
+from canprobe.lab.studies.faults_vcan import HOLD_S, PROCESS_FAULTS, draw_process_case, score_end
 from canprobe.lab.studies.faults_vcan import findings as findings_on_vcan
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
@@ -232,7 +233,7 @@ LINE = "(0000000000.002500) vcan0 080#01\n"
 
 def test_every_process_fault_gets_its_turn_at_random_times():
     cases = [draw_process_case(seed) for seed in range(20)]
-    assert [case.fault for case in cases[: len(ProcessFault)]] == list(ProcessFault)
+    assert [case.fault for case in cases[: len(PROCESS_FAULTS)]] == list(PROCESS_FAULTS)
     assert len({case.after_s for case in cases}) == 20 and all(0 <= case.after_s < HOLD_S + 1 for case in cases)
     assert cases == [draw_process_case(seed) for seed in range(20)]
 
@@ -240,18 +241,18 @@ def test_every_process_fault_gets_its_turn_at_random_times():
 @pytest.mark.parametrize(
     ("fault", "status", "files", "seen"),
     [
-        (ProcessFault.NODES_KILLED, 3, (LINE, {"completed": False}, "node 1 lost"), []),
-        (ProcessFault.MASTER_KILLED, -9, (LINE, None, ""), []),
-        (ProcessFault.MASTER_KILLED, -9, ("", None, ""), ["bus.log is empty"]),
-        (ProcessFault.MASTER_KILLED, -9, (LINE + LINE[:20], None, ""), ["log: "]),
-        (ProcessFault.LINK_DOWN, 0, (LINE, {"completed": True}, ""), ["status 0", "completed"]),
-        (ProcessFault.LINK_DOWN, 3, (LINE, None, "Traceback\nKeyError: 1"), ["crash: KeyError: 1", "summary.json"]),
+        ("nodes killed", 3, (LINE, {"completed": False}, "node 1 lost"), []),
+        ("master killed", -9, (LINE, None, ""), []),
+        ("master killed", -9, ("", None, ""), ["bus.log is empty"]),
+        ("master killed", -9, (LINE + LINE[:20], None, ""), ["log: "]),
+        ("link down", 0, (LINE, {"completed": True}, ""), ["status 0", "completed"]),
+        ("link down", 3, (LINE, None, "Traceback\nKeyError: 1"), ["crash: KeyError: 1", "summary.json"]),
     ],
 )
 def test_the_score_sees_a_lost_log_and_a_wrong_end(tmp_path, fault, status, files, seen):
     log, summary, error = files
     (tmp_path / "run").mkdir()
-    (tmp_path / "stderr").write_text(error)
+    (tmp_path / ERRORS).write_text(error)
     (tmp_path / "run" / "bus.log").write_text(log)
     if summary is not None:
         (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))

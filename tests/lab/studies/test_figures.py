@@ -25,8 +25,7 @@ from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name, draw_points
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
-from canprobe.lab.studies.realtime import draw_realtime
-from canprobe.lab.studies.realtime_cases import CycleTimes, Measured
+from canprobe.lab.studies.realtime import Measured, draw_realtime
 from canprobe.lab.studies.realtime_soak import draw_soak
 from canprobe.lab.studies.region_scores import ScoredScan
 from canprobe.lab.studies.regions import draw_regions, rows_of
@@ -161,13 +160,13 @@ def extremes(path):
 def realtime(path):
     rng = np.random.default_rng(0)
 
-    def times(rate):
+    def measured(case, mode, rate, held):
         late, some = (1e3 * rng.lognormal(mean, 0.6, 4000) for mean in (4, 6))
         some = some.astype(int)
-        return CycleTimes(2_500_000, late.astype(int), 4000 / rate, some, 2 * some, 3 * some)
+        return Measured(case, mode, rate, late.astype(int), 4000 / held, some, 2 * some, 3 * some)
 
-    cases = [Measured(case, "window", 400.0, times(400.0)) for case in ("whole controller", "bare clock")]
-    held = [Measured("hold", mode, rate, times(rate - 30 * i)) for i, mode in enumerate(("features", "window", "image"))
+    cases = [measured(case, "window", 400.0, 400.0) for case in ("whole controller", "bare clock")]
+    held = [measured("hold", mode, rate, rate - 30 * i) for i, mode in enumerate(("features", "window", "image"))
             for rate in (200.0, 400.0, 1000.0)]  # fmt: skip
     draw_realtime([*cases, *held], path)
 
@@ -195,7 +194,7 @@ def predicted(path):
 
 def surfaces_of_methods(path):
     rng, rows = np.random.default_rng(0), []
-    for name, settings in (("map", (1,)), *((name, settings) for name, (_, settings, _) in METHODS.items())):
+    for name, (_, settings, _) in METHODS.items():
         for k, _ in enumerate(settings):
             scores = dict(
                 zip(("height_um", "normal_mrad", "curvature_per_m", "nll"), rng.uniform(1, 40, 4), strict=True)

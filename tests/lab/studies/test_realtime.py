@@ -8,47 +8,26 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
-from canprobe.lab.studies.realtime import findings
-from canprobe.lab.studies.realtime_cases import CycleTimes, Measured, answer_latencies, holding_scene, woken
-from canprobe.lab.studies.realtime_soak import COLUMNS, resident_mib
+from canprobe.lab.studies.realtime import Measured, findings, holding_scene, woken
 from canprobe.lab.studies.realtime_soak import findings as findings_of_soak
+from canprobe.lab.studies.realtime_soak import resident_mib
 
 
-def log_of(tmp_path, *lines):
-    path = tmp_path / "bus.log"
-    path.write_text("".join(f"(0000000000.{us:06d}) vcan0 {text}\n" for us, text in lines))
-    return path
-
-
-def test_latency_is_that_of_the_last_answer_and_only_where_all_answered(tmp_path):
-    path = log_of(
-        tmp_path,
-        (0, "080#01"), (300, "182#00"), (410, "181#00"),
-        (2500, "080#02"), (2600, "181#00"),  # 182h of this cycle never came
-        (5000, "080#03"), (5900, "182#00"), (5100, "181#00"), (5000, "201#00"),
-    )  # fmt: skip
-    assert answer_latencies(path, frozenset({0x181, 0x182}), 2_500_000).tolist() == [410_000, 900_000]
-
-
-def test_no_sync_no_latency(tmp_path):
-    assert len(answer_latencies(log_of(tmp_path, (0, "181#00")), frozenset({0x181}), 2_500_000)) == 0
-
-
-def times(cycles, overruns, seconds, response_us=(), compute_us=()):
+def measured(case, sensor, rate_hz, cycles, overruns, *, seconds=10.0, response_us=(), compute_us=(), ended=""):
     late = np.where(np.arange(cycles) < overruns, 2_000_000, 0)
     response, compute = (1000 * np.array(us, np.int64) for us in (response_us, compute_us))
-    return CycleTimes(2_500_000, late, seconds, response, compute)
+    return Measured(case, sensor, rate_hz, late, seconds, response, compute, ended=ended)
 
 
 def test_findings_tell_rates_and_shares():
-    measured = [
-        Measured("whole controller", "window", 400.0, times(4001, 2, 10.0, [500], [750])),
-        Measured("bare clock", "none", 400.0, times(4000, 1, 10.0)),
-        Measured("hold", "features", 400.0, times(4001, 0, 10.0)),
-        Measured("hold", "features", 500.0, times(4001, 40, 10.0)),
-        Measured("hold", "image", 400.0, times(401, 0, 1.0), ended="node 1: lost"),
+    cases = [
+        measured("whole controller", "window", 400.0, 4001, 2, response_us=[500], compute_us=[750]),
+        measured("bare clock", "none", 400.0, 4000, 1),
+        measured("hold", "features", 400.0, 4001, 0),
+        measured("hold", "features", 500.0, 4001, 40),
+        measured("hold", "image", 400.0, 401, 0, seconds=1.0, ended="node 1: lost"),
     ]
-    text = "\n".join(findings(measured))
+    text = "\n".join(findings(cases))
     assert "whole controller at 400 Hz for 10 s: 5.0 overruns in 10 000 cycles (goal 1), 400.0 cycles" in text
     assert "does nothing: 2.5 overruns in 10 000 cycles" in text
     assert "p99 is 20 % of the period until the commands are out, 30 % with" in text
@@ -83,13 +62,14 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
     lateness: list[int] = []
     assert list(woken(Clock(), 1000, 4, lateness)) == [1000, 2000, 5000, 6000]
     assert lateness == [0, 100, 2600, 0]
-    times = CycleTimes(1000, np.array(lateness), 5e-6)
-    assert (times.overruns, times.cycles, times.missed) == (1, 4, 0)
+    loop = Measured("", "", 1e6, lateness, 5e-6)
+    assert (loop.overruns, loop.cycles, loop.missed) == (1, 4, 0)
 
 
 # The arithmetic of `realtime --soak`; it runs on vcan0 only.
 
-ZERO = dict.fromkeys(COLUMNS, 0) | {"master_mib": 90.0, "nodes_mib": 80.0, "monitor_mib": 85.0, "latency_us": 400.0}
+ZERO = dict.fromkeys(("overruns", "missed_pdos", "dropped_frames"), 0)
+ZERO |= {"master_mib": 90.0, "nodes_mib": 80.0, "monitor_mib": 85.0}
 
 
 def hour(leak_mib_h=0.0, drift_us=0.0, lost=0):

@@ -8,7 +8,7 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.lab.studies.recover import findings, run_case, table_rows
-from canprobe.lab.studies.recover_score import Outage, RecoverCase, draw_case, shrink
+from canprobe.lab.studies.recover_runs import Outage, RecoverCase, draw_case, shrink
 
 MORE = pytest.mark.slow(reason="more seeds of a study")
 

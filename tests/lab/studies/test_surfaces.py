@@ -12,7 +12,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
 from canprobe.lab.studies import exploration, surfaces
 from canprobe.lab.studies.drawn_shapes import KINDS, DrawnShape, TrueGround, drawn, form_heights_mm, object_of, scene_of
-from canprobe.lab.studies.surface_methods import METHODS, FoundSurface, evaluate_heights
+from canprobe.lab.studies.surface_methods import METHODS, FoundSurface
 from canprobe.lab.studies.surfaces import COLUMNS, SurfaceCase, findings, measure, rows_of, score
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.objects import Sphere
@@ -47,8 +47,8 @@ def on_ball(noise=0.0, seed=0):
 
 
 def seen(name, setting, samples, points):
-    fit, *_ = METHODS[name]
-    return evaluate_heights(fit, setting, samples, resolve(load_scene("cylinder")).task, points)
+    find, *_ = METHODS[name]
+    return find(samples, resolve(load_scene("cylinder")).task, setting, points)
 
 
 @pytest.mark.parametrize(("name", "setting"), [("quadrics", 3.0), ("spline", 0.0), ("process", 400)])
@@ -150,7 +150,7 @@ def test_a_strategy_that_a_plan_refuses_says_why():
 def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert main(["study", "surfaces", "--quick", "--out", str(tmp_path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert {row["method"] for row in document["rows"]} == {"map", *METHODS}
+    assert {row["method"] for row in document["rows"]} == set(METHODS)
     assert all(row["height_um"] < 100 and row["cpu_s"] > 0 for row in document["rows"])
     (paths,) = document["more"]
     assert [row["strategy"] for row in paths["rows"]] == list(surfaces.QUICK_STRATEGIES)

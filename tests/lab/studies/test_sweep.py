@@ -58,7 +58,7 @@ def deaf():
 
 def run(*, quick, sweep):
     rows = sweep.map(measure, [Case(x) for x in range(6)], model=("lab/studies/sweep.py",))
-    return StudyResult("demo", ("square",), rows, ["done"], {}, lambda path: path.write_bytes(b""))
+    return StudyResult("demo", rows, ["done"], {}, lambda path: path.write_bytes(b""), ("square",))
 
 if __name__ == "__main__":
     from types import MappingProxyType

@@ -8,14 +8,20 @@ master believes.
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from random import Random
 from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.free_and_listen import HoldTask
 from canprobe.cell.tasks.from_plan import make_task
@@ -24,6 +30,8 @@ from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.protocol.cia402 import POSITION, STATUSWORD, TARGET_POSITION, DriveState, known_state
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.pdo import PdoLayout
+from canprobe.lab.studies.result import Say
+from canprobe.lab.studies.witnessed_run import forces_of
 
 FIRST_SYNCS = 8
 """SYNCs after each enabling of a drive in which its target is compared with its position."""
@@ -36,11 +44,7 @@ SLACK_S = 1.0
 SCENES: Mapping[str, str] = {"hold": "free", "free": "free", "press": "press", "scan": "plane"}
 """Scene of each kind of work."""
 LOST: Mapping[str, str] = {
-    "reboot": "reboot",
-    "bus-off": "bus-off",
-    "freeze": "freeze",
-    "sync-lost": "sync-lost",
-    "heartbeat-off": "heartbeat-off",
+    **{name: name for name in ("reboot", "bus-off", "freeze", "sync-lost", "heartbeat-off")},
     "nmt-reset": "nmt command=129",
     "nmt-preop": "nmt command=128",
 }
@@ -51,6 +55,8 @@ BOOTING = frozenset(("reboot", "nmt-reset", POWER))
 """Outages after which a node boots."""
 AT_ONCE = frozenset(("nmt-reset", "nmt-preop"))
 """Outages that have no length: the node is back at once."""
+BACK = "the cell is back"
+"""Beginning of the step in which a cell has come back."""
 BEGIN_S, END_S = 0.3, 3.0
 """Time of the first loss after the first cycle of the task."""
 
@@ -110,6 +116,11 @@ class RecoverCase:
         return f"{self.work}: " + "; ".join(map(str, self.outages))
 
 
+def work_scene(work: str, changes: Mapping[str, Any]) -> Scene:
+    """The scene of a kind of work, which goes on for longer than anything is lost."""
+    return load_scene(SCENES[work], {"scene.figures": False, "task.duration_s": END_S + 2.0, **changes})
+
+
 def draw_case(seed: int) -> RecoverCase:
     """The run of a seed: every other one has a pair, whose second outage begins 1 ms to 3 s after the first."""
     rng = Random(seed)
@@ -151,87 +162,101 @@ def ending(task: Controller, is_over: Callable[[Measurement], bool]) -> Controll
     return task
 
 
-class RecoverScore:
-    """What is said and done in a run, and its score.
+class RecoverRun(ABC):
+    """One run: its session, what is said and done in it, and its score.
 
     Args:
         case: what happens.
-        plan: plan of its cell.
+        scene: scene of its work.
+        out: folder of the run's files.
         say: called with each step.
 
     Attributes:
+        case, plan: what happens, and the plan of the cell.
+        session: the session, which whoever carries the run out opens and closes.
         errors: errors that ended a controller.
-        first_s: time of the first cycle of the work, from which the outages count, s; None before.
-        resumes_in: cycles until motion is asked for; None where nothing is held.
+        first_s: time of the first cycle of the work, from which the outages count, s; 0 before.
     """
 
-    def __init__(self, case: RecoverCase, plan: Plan, say: Callable[[str], None]) -> None:
-        self.case, self.plan, self._say_too = case, plan, say
-        self._said: list[tuple[float, str]] = []
+    def __init__(self, case: RecoverCase, scene: Scene, out: Path, say: Say) -> None:
+        self.case, self._out, self._say = case, out, say
+        self.session = Session(scene, RunOptions(out, self._note, recover=True))
+        self.plan = self.session.plan
         self.errors: list[CanprobeError] = []
-        self.first_s: float | None = None
-        self.resumes_in: int | None = None
+        self.first_s = 0.0
+        self._said: list[tuple[float, str]] = []
+        self._resumes_in = math.inf
+        """Cycles until motion is asked for; infinite where nothing is held."""
 
-    def say(self, time_s: float, text: str) -> None:
+    def now_s(self) -> float:
+        """Time since the beginning of the log, s; 0 before."""
+        time_s = self.session.steps.time_s
+        return 0.0 if time_s is None else time_s()
+
+    @abstractmethod
+    def lose(self) -> None:
+        """Let the outages happen at their times; called in the first cycle of the work."""
+
+    def _note(self, text: str) -> None:
         """Note a step of the cell."""
+        time_s = self.now_s()
         self._said.append((time_s, text))
-        self._say_too(f"{time_s:8.3f} s  {text}")
-        if text.startswith("the cell is back"):
-            self.resumes_in = round(HELD_S * 1e9 / self.plan.sync.period_ns)
+        self._say(f"{time_s:8.3f} s  {text}")
+        if text.startswith(BACK):
+            self._resumes_in = round(HELD_S * 1e9 / self.plan.sync.period_ns)
 
-    def carry_out(self, session: Session, begin: Callable[[], None], now_s: Callable[[], float]) -> None:
-        """Run the work in an open session, then hold, until nothing more is to be lost or the cell has ended.
+    def _times_of(self, step: str) -> list[float]:
+        """Times at which steps were noted that begin with some words, s."""
+        return [time_s for time_s, text in self._said if text.startswith(step)]
 
-        Args:
-            session: the session.
-            begin: called in the first cycle of the work: the outages count from then.
-            now_s: present time, s.
-        """
-
-        def is_over(_: Measurement) -> bool:
-            if self.first_s is None:
-                self.first_s = now_s()
-                begin()
-            last_s = max(loss.ends_s for loss in self.case.outages) + self.first_s
-            back_s = max((time for time, text in self._said if text.startswith("the cell is back")), default=0.0)
-            return now_s() >= max(last_s, back_s + HELD_S) + SETTLED_S
-
-        def after_cycle(_: Measurement) -> None:
-            if self.resumes_in is not None:
-                self.resumes_in -= 1
-                if self.resumes_in <= 0:
-                    self.resumes_in = None
-                    session.resume()
-
+    def carry_out(self) -> None:
+        """Run the work in the open session, then hold, until nothing more is to be lost or the cell has ended."""
         task = HoldTask() if self.case.work == "hold" else make_task(self.plan)
         for controller in (task, *(HoldTask() for _ in range(len(self.case.outages) + 1))):
             try:
-                session.run(ending(controller, is_over), after_cycle)
-                if is_over(Measurement(0, 0)):
+                self.session.run(ending(controller, self.is_over), self._ask_for_motion)
+                if self.is_over(Measurement(0, 0)):
                     break
             except CanprobeError as error:
                 self.errors.append(error)
                 if self._said[-1][1].startswith("not back") or error.exit_status == 1:
                     break  # it ended for good, or somebody has to look
 
-    def outcome(self, session: Session) -> dict[str, Any]:
-        """What came of a finished session, and what failed: by its bus log, its log and the force of its plant."""
-        assert session.options.out is not None
+    def is_over(self, _: Measurement) -> bool:
+        """Whether all outages and returns are `SETTLED_S` ago; asked in each cycle."""
+        if not self.first_s:
+            self.first_s = self.now_s()
+            self.lose()
+        last_s = self.first_s + max(loss.ends_s for loss in self.case.outages)
+        back_s = max(self._times_of(BACK), default=0.0)
+        return self.now_s() >= max(last_s, back_s + HELD_S) + SETTLED_S
+
+    def _ask_for_motion(self, _: Measurement) -> None:
+        """Resume the work some time after the cell is back; called after each cycle."""
+        self._resumes_in -= 1
+        if self._resumes_in <= 0:
+            self._resumes_in = math.inf
+            self.session.resume()
+
+    def outcome(self) -> dict[str, Any]:
+        """What came of the finished session, and what failed: by its bus log, its log and the force of its plant."""
         boot_ups: dict[int, list[float]] = {node_id: [] for node_id in self.plan.node_ids}
         targets, jump_counts, syncs = FirstTargets(self.plan), 0, 0
-        for t_ns, _, can_id, data in read_candump(session.options.out / "bus.log"):
+        for t_ns, _, can_id, data in read_candump(self._out / "bus.log"):
             syncs += can_id == SYNC_ID
             if (jump := targets.push(can_id, data)) > jump_counts and not self._lifts(t_ns * 1e-9):
                 jump_counts = jump
             if HEARTBEAT_BASE < can_id < HEARTBEAT_BASE + MASTER_NODE_ID and data == b"\0":
                 boot_ups[can_id - HEARTBEAT_BASE].append(t_ns * 1e-9)
-        log = session.cell.log
+        log = self.session.cell.log
         times_s = log.arrays()["t_s"].tolist() if len(log) else list[float]()
-        forces = forces_of(session)
+        forces = forces_of(self.session)
         limit = self.plan.setup.limits.force_max
-        lost = [time for time, text in self._said if text.startswith("lost: ")]
-        back = [time for time, text in self._said if text.startswith("the cell is back")]
-        calm = [force for time, force in forces if not self._reacts(time, lost)]
+        lost, back = self._times_of("lost: "), self._times_of(BACK)
+        begun = [self.first_s + loss.after_s for loss in self.case.outages]
+        # between an outage and the stop of the cell the force may rise: how far, study `faults` judges
+        reacting = [(begin, min((stop for stop in lost if stop >= begin), default=begin)) for begin in begun]
+        calm = [force for time, force in forces if not any(begin <= time < stop for begin, stop in reacting)]
         force, calm_n = max((force for _, force in forces), default=0.0), max(calm, default=0.0)
         refused = bool(self.errors) and self.errors[-1].exit_status == 1
         failures = []
@@ -273,11 +298,6 @@ class RecoverScore:
         said = [text for time, text in self._said if time <= time_s and text.startswith(("lift off", "enable the"))]
         return bool(said) and said[-1].startswith("lift off")
 
-    def _reacts(self, time_s: float, lost_s: Sequence[float]) -> bool:
-        """Whether an outage has begun, and the cell has not stopped: how far the force rises then, `faults` judges."""
-        begun = [(self.first_s or 0.0) + loss.after_s for loss in self.case.outages]
-        return any(begin <= time_s < min((t for t in lost_s if t >= begin), default=begin) for begin in begun)
-
     def _late_s(
         self, since_s: float, lost_s: float, back_s: float, boot_ups: Mapping[int, Sequence[float]]
     ) -> tuple[float, float]:
@@ -286,7 +306,7 @@ class RecoverScore:
         That is a second and the SDO times of the nodes. The cell begins to come back when it has stopped, which may
         take as long again as its nodes may take to stop; a node that has booted is not waited for.
         """
-        first_s = self.first_s or 0.0
+        first_s = self.first_s
         begun = [o for o in self.case.outages if first_s + o.after_s < back_s and first_s + o.ends_s > since_s]
         ready_s = [lost_s, *(self._ready_s(loss, boot_ups) for loss in begun)]
         booted = bool(begun) and all(loss.name in BOOTING for loss in begun)
@@ -295,14 +315,13 @@ class RecoverScore:
 
     def _sdo_s(self, lost_s: float, back_s: float) -> float:
         """Time of the SDO transfers of the last bring-up between a loss and the return, s."""
-        said = [(time, text) for time, text in self._said if lost_s <= time <= back_s]
-        begin = [time for time, text in said if text.startswith("identify and configure")]
-        end = [time for time, text in said if text.startswith("start all nodes")]
+        steps = ("identify and configure", "start all nodes")
+        begin, end = ([t for t in self._times_of(step) if lost_s <= t <= back_s] for step in steps)
         return end[-1] - begin[-1] if begin and end else 0.0
 
     def _ready_s(self, loss: Outage, boot_ups: Mapping[int, Sequence[float]]) -> float:
         """Time at which what was lost is there again: the end of the outage, or the boot-up behind it."""
-        end_s = (self.first_s or 0.0) + loss.ends_s
+        end_s = self.first_s + loss.ends_s
         if loss.name not in BOOTING:
             return end_s
         behind = [[time for time in boot_ups[i] if time >= end_s - 1e-6] for i in loss.nodes(self.plan.node_ids)]
@@ -340,9 +359,3 @@ class FirstTargets:
         elif TARGET_POSITION in got and times > 1 and 0 <= age < FIRST_SYNCS and POSITION in values:
             return abs(got[TARGET_POSITION] - values[POSITION])
         return 0
-
-
-def forces_of(session: Session) -> list[tuple[float, float]]:
-    """Force of the plant of a finished session: (time, s; force, N)."""
-    truth = session.buses.truth
-    return list(zip(truth["t_s"].tolist(), truth["force_n"].tolist(), strict=True)) if "force_n" in truth else []
