@@ -14,7 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
-from canprobe.cell.planning.model import SYNC_OVERFLOW, Interpolation, SyncPlan
+from canprobe.cell.planning.model import SYNC_OVERFLOW, SyncPlan
+from canprobe.cell.planning.node_configuration import Interpolation
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, sync_patience
