@@ -46,14 +46,12 @@ from canprobe.cell.planning.units import (
     POSITION_LIMITS,
     PROFILE_DECELERATION,
     PROFILE_SPEED_LIMIT,
-    following_window,
-    motor_speed_limit,
+    ROUNDING_COUNTS,
+    DriveAxis,
     profile_values,
     software_limits,
-    speed_unit,
-    turn_units,
 )
-from canprobe.cell.scene.setup import Arm, Array, Drive, HomingParameters, Node, Setup
+from canprobe.cell.scene.setup import Array, HomingParameters, Node, Setup
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, LONG_PDOS, MISSED_SYNCS, WINDOW_SIZE, has_known
 from canprobe.fieldbus.eds.values import name_of
@@ -89,7 +87,10 @@ def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfig
     planned = {(pdo.direction, pdo.number): pdo for pdo in bus.pdos if pdo.node_id == node.node_id}
     switched_off = tuple(one for one in device.switchable_pdos if one not in planned)
     used = [pdo for _, pdo in sorted(planned.items()) if pdo.used]
-    own = _array_writes(bus.setup, node, device) if isinstance(node, Array) else _drive_writes(bus, node, device)
+    if isinstance(node, Array):
+        own, given = _array_writes(bus.setup, node, device), _array_given(node, device)
+    else:
+        own, given = _drive_writes(bus.sync, bus.axis_of(node.node_id)), _drive_given(device)
     wanted = [*_pdo_writes(device, used, switched_off), *_common_writes(bus.sync, device), *own]
     writes, left_out = _possible(bus, device, wanted)
     found = NodeConfiguration(
@@ -103,19 +104,19 @@ def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfig
         channel=node.channel,
         switched_off=switched_off,
         writes=writes,
-        given=_array_given(node, device) if isinstance(node, Array) else _drive_given(device),
+        given=given,
         left_out=left_out,
     )
-    return _with_drive(found, bus, node, device) if isinstance(node, Drive) else found
+    return found if isinstance(node, Array) else _with_drive(found, bus, bus.axis_of(node.node_id))
 
 
-def _with_drive(found: NodeConfiguration, bus: BusPlan, drive: Drive, device: DeviceCapabilities) -> NodeConfiguration:
+def _with_drive(found: NodeConfiguration, bus: BusPlan, axis: DriveAxis) -> NodeConfiguration:
     """The configuration with mode, homing and units of a drive."""
-    times = _times(bus, device)
+    device, times = axis.device, _times(bus.sync, axis.device)
     others = [_interpolation_writes(device, time) for time in times[1:]]
-    homing, not_homing = _possible(bus, device, _homing_writes(bus.setup, drive, device))
+    homing, not_homing = _possible(bus, device, _homing_writes(axis))
     if homing:
-        bus.problems += _unhomed(bus.setup, drive, device)
+        bus.problems += _unhomed(axis)
     return replace(
         found,
         left_out=(*found.left_out, *not_homing),
@@ -123,14 +124,14 @@ def _with_drive(found: NodeConfiguration, bus: BusPlan, drive: Drive, device: De
         interpolation=times,
         otherwise=tuple(tuple(write for write in one if _excluded(device, write) is None) for one in others),
         homing=homing,
-        turn=turn_units(device, drive.turn_units, drive.gear),
-        speed_unit=speed_unit(device, drive, VELOCITY_UNIT_INDEX) or 1.0,
+        turn=axis.turn,
+        speed_unit=axis.unit(VELOCITY_UNIT_INDEX) or 1.0,
     )
 
 
-def _times(bus: BusPlan, device: DeviceCapabilities) -> tuple[Interpolation, ...]:
+def _times(sync: SyncPlan, device: DeviceCapabilities) -> tuple[Interpolation, ...]:
     """The values of 60C2h that express the period; none for profile position."""
-    return () if is_profiled(device) else interpolations(device, bus.sync.period_us)
+    return () if is_profiled(device) else interpolations(device, sync.period_us)
 
 
 Writes = tuple[Write, ...]
@@ -239,11 +240,10 @@ _MISSED_SYNCS = "SYNCs after which the drive stops by itself"
 _FAST = "the drive itself limits its speed as the device has it, or not at all"
 
 
-def _drive_writes(bus: BusPlan, drive: Node, device: DeviceCapabilities) -> Iterator[Write]:
-    arm, mode, times = bus.setup.needed_arm(), choose_mode(device), _times(bus, device)
+def _drive_writes(sync: SyncPlan, axis: DriveAxis) -> Iterator[Write]:
+    device, arm, mode = axis.device, axis.setup.needed_arm(), choose_mode(axis.device)
     assert mode is not None  # else the plan has said no
-    axis = arm.node_ids.index(drive.node_id)
-    low, high = software_limits(arm.model)
+    low, high = (int(ends[axis.number]) for ends in software_limits(arm.model))
     following = "a drive that does not follow is noticed as the device has it"
     lag = "a drive that lags is given as long as the device has it"
     stops = "the drive guards the ends of the joint as the device has it, or not at all"
@@ -253,79 +253,69 @@ def _drive_writes(bus: BusPlan, drive: Node, device: DeviceCapabilities) -> Iter
     yield Write(MODE, 0, mode, "mode of operation")
     if mode is OperationMode.INTERPOLATED_POSITION:
         yield Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")
-    if times:
-        yield from _interpolation_writes(device, times[0])
+    for time in _times(sync, device)[:1]:
+        yield from _interpolation_writes(device, time)
     if mode is OperationMode.PROFILE_POSITION:
-        yield from _profile_writes(bus.setup, drive, device)
-    yield Write(FOLLOWING_WINDOW, 0, following_window(arm.model, axis), "following error window", following)
+        for (index, subindex), value in profile_values(axis).items():
+            # a drive without 6084h decelerates as it accelerates (CiA 402-2)
+            if index != PROFILE_DECELERATION or device.has(index):
+                yield Write(index, subindex, value, "profile position within the limits of [joints]")
+        yield Write(PROFILE_TYPE, 0, 0, "trapezoidal speed", "it accelerates as the device has it")
+    yield Write(FOLLOWING_WINDOW, 0, axis.following_window, "following error window", following)
     yield Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag)
-    if unit := speed_unit(device, arm.drives[axis], VELOCITY_UNIT_INDEX):
-        limit = motor_speed_limit(arm.model, axis, bus.setup.limits.speed_share, bus.sync.period_ns)
+    if unit := axis.unit(VELOCITY_UNIT_INDEX):
+        limit = math.ceil(axis.fastest + ROUNDING_COUNTS * 1e9 / sync.period_ns)  # a target is a whole number of units
         yield Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), "highest speed of the motor", _FAST)
-    yield Write(POSITION_LIMITS, 1, int(low[axis]), "lowest position", stops)
-    yield Write(POSITION_LIMITS, 2, int(high[axis]), "highest position", stops)
+    yield Write(POSITION_LIMITS, 1, low, "lowest position", stops)
+    yield Write(POSITION_LIMITS, 2, high, "highest position", stops)
     yield Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick)
     yield Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost)
 
 
-def _profile_writes(setup: Setup, drive: Node, device: DeviceCapabilities) -> Iterator[Write]:
-    """Writes of profile position: it may not be faster than its joints, and stops as late as it decelerates.
-
-    A drive without 6084h decelerates as it accelerates. Source: CiA 402-2, object 6084h.
-    """
-    for (index, subindex), value in profile_values(setup, drive.node_id, device).items():
-        if index != PROFILE_DECELERATION or device.has(index):
-            yield Write(index, subindex, value, "profile position within the limits of [joints]")
-    yield Write(PROFILE_TYPE, 0, 0, "trapezoidal speed", "it accelerates as the device has it")
-
-
-def _homing_writes(setup: Setup, drive: Drive, device: DeviceCapabilities) -> Iterator[Write]:
+def _homing_writes(axis: DriveAxis) -> Iterator[Write]:
     """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
-    if (zero := drive.zero) is None:
+    if (zero := axis.drive.zero) is None:
         return
-    arm = setup.needed_arm()
-    axis = arm.node_ids.index(drive.node_id)
-    units = abs(float(arm.model.units_per_q[axis, axis]))
-    speed = units / (speed_unit(device, drive, VELOCITY_UNIT_INDEX) or 1.0)
-    acceleration = units / (speed_unit(device, drive, ACCELERATION_UNIT_INDEX) or 1.0)
+    units = abs(float(axis.model.units_per_q[axis.number, axis.number]))
+    speed = units / (axis.unit(VELOCITY_UNIT_INDEX) or 1.0)
+    acceleration = units / (axis.unit(ACCELERATION_UNIT_INDEX) or 1.0)
     ramp = "homing accelerates as the device has it"
     still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
     yield Write(0x6098, 0, zero.method, "homing method")
     yield Write(0x6099, 1, max(1, round(zero.speed * speed)), "speed of the search for the switch", still)
     yield Write(0x6099, 2, max(1, round(zero.zero_speed * speed)), "speed of the search for the zero", still)
     yield Write(0x609A, 0, max(1, round(zero.acceleration * acceleration)), "acceleration in homing", ramp)
-    if device.has(HOME_OFFSET):
-        yield Write(HOME_OFFSET, 0, -round(_home_units(arm, axis, zero)), "home offset")
+    if axis.device.has(HOME_OFFSET):
+        yield Write(HOME_OFFSET, 0, -round(_home_units(axis, zero)), "home offset")
 
 
-def _home_units(arm: Arm, axis: int, zero: HomingParameters) -> float:
+def _home_units(axis: DriveAxis, zero: HomingParameters) -> float:
     """Position of a drive at home, units, with the other joints in the start posture."""
-    return float(drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start)))
+    others = joints_to_units(axis.model, axis.setup.needed_arm().q_start)
+    return float(drive_position_at(axis.model, axis.number, zero.home, others))
 
 
-def _unhomed(setup: Setup, drive: Drive, device: DeviceCapabilities) -> Iterator[str]:
+def _unhomed(axis: DriveAxis) -> Iterator[str]:
     """Why a drive cannot be homed: its modes, joints on which its zero depends, or no 607Ch where home is not 0."""
-    if (zero := drive.zero) is None:
+    if (zero := axis.drive.zero) is None:
         return
-    yield from homing_problems(device)
-    arm = setup.needed_arm()
-    axis = arm.node_ids.index(drive.node_id)
-    joints, coupled = arm.model.joints, coupled_joints(arm.model, axis)
+    yield from homing_problems(axis.device)
+    number, joints, coupled = axis.number, axis.model.joints, coupled_joints(axis.model, axis.number)
     for other in sorted(coupled):
-        its, name = arm.drives[other].zero, joints[other].name
-        if its is None or (its.order, other) < (zero.order, axis):
+        its, name = axis.setup.drives[other].zero, joints[other].name
+        if its is None or (its.order, other) < (zero.order, number):
             continue
         way = f"joints.{name}.homing_order must be lower than {zero.order}"
-        if axis in coupled_joints(arm.model, other):
+        if number in coupled_joints(axis.model, other):
             way = "each depends on the other: one of them needs an absolute encoder"
-        yield f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}"
-    if device.has(HOME_OFFSET):
+        yield f"the zero of {joints[number].name} depends on {name}, which is homed later: {way}"
+    if axis.device.has(HOME_OFFSET):
         return
-    name, lack = joints[axis].name, f"{device.eds}: no such object: 607Ch (home offset)"
+    name, lack = joints[number].name, f"{axis.device.eds}: no such object: 607Ch (home offset)"
     if coupled:
         yield f"{lack}, and what the motor of {name} counts at home depends on other joints: it cannot be homed"
-    elif round(home := _home_units(arm, axis, zero)):
-        counts = round(arm.model.zero_units[axis] - home)
+    elif round(home := _home_units(axis, zero)):
+        counts = round(axis.model.zero_units[number] - home)
         yield f"{lack}: the drive counts 0 at home, and the cell {home:.0f}: set joints.{name}.zero_counts = {counts}"
 
 

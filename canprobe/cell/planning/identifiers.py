@@ -24,7 +24,6 @@ from canprobe.fieldbus.protocol.frames import (
     Frame,
     is_restricted,
 )
-from canprobe.fieldbus.protocol.pdo import PdoLayout
 
 _POOL = range(0x181, 0x580)
 """Identifiers below SYNC, emergencies and TIME and above SDO and heartbeats; restricted ones are left out."""
@@ -49,10 +48,7 @@ def order_by_deadline(pdos: Sequence[PlannedPdo], devices: Iterable[DeviceCapabi
     ordered = sorted(first.values(), key=lambda pdo: (pdo.deadline_ns, pdo.direction == "rpdo", pdo.cob_id))
     chosen = {pdo.cob_id: cob_id for pdo, cob_id in zip(ordered, free, strict=False)}
     return [
-        pdo
-        if pdo.fixed_id
-        else replace(pdo, layout=PdoLayout(chosen[pdo.cob_id], pdo.entries, pdo.transmission_type, fd=pdo.layout.fd))
-        for pdo in pdos
+        pdo if pdo.fixed_id else replace(pdo, layout=replace(pdo.layout, cob_id=chosen[pdo.cob_id])) for pdo in pdos
     ]
 
 

@@ -30,7 +30,7 @@ from canprobe.cell.planning.sync import (
     plan_sync,
 )
 from canprobe.cell.planning.traffic import plan_traffic
-from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
+from canprobe.cell.planning.units import range_problems, within_drives
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
 
@@ -56,7 +56,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     narrowed: tuple[str, ...] = ()
     bus: BusPlan | None = None
     if not problems:
-        setup, beyond, narrowed = _within_drives(setup, devices)
+        setup, beyond, narrowed = within_drives(setup, devices)
         bus = _choose(setup, devices)
         setup = bus.setup
         problems += [*bus.problems, *bus.overload]
@@ -90,14 +90,6 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     )
 
 
-def _within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, list[str], tuple[str, ...]]:
-    """The setup within the limits of its drives, the problems where it cannot be, and warnings where that is less."""
-    if beyond := [*range_problems(setup), *speed_problems(setup, devices)]:
-        return setup, beyond, ()
-    setup, narrowed = within_drives(setup, devices)
-    return setup, [], narrowed
-
-
 def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpeeds | None, list[str]]:
     """Joint speeds that the task needs, and why array, arm and plant cannot carry it out, whatever the bus carries.
 
@@ -106,7 +98,12 @@ def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpee
         narrowed: what the drives allow less than the joints; where the arm cannot move, it may be the reason.
     """
     unsuited = [*array_problems(setup)]
-    speeds, unreachable = _check_motion(setup) if not unsuited else (None, [])
+    speeds: JointSpeeds | None = None
+    unreachable: list[str] = []
+    if setup.arm is not None and not unsuited:
+        from canprobe.cell.planning.motion import check_motion
+
+        speeds, unreachable = check_motion(setup, setup.arm)
     problems = [*unsuited, *speed_over_array_problems(setup)]
     if (cut := cut_patch(setup)) is not None and not cut.safe:
         problems.append(f"{cut.text}; take {' or '.join(cut.ways)}")
@@ -143,17 +140,8 @@ def _images(setup: Setup) -> tuple[object, ...]:
 
 def _problems_beside_bus(setup: Setup) -> list[str]:
     """Problems of a setup with known devices, apart from those of its bus."""
-    setup, beyond, _ = _within_drives(setup, _devices(setup)[0])
+    setup, beyond, _ = within_drives(setup, _devices(setup)[0])
     return [*beyond, *_check_task(setup)[1]]
-
-
-def _check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
-    """As `check_motion`; of a cell without an arm nothing moves."""
-    if setup.arm is None:
-        return None, []
-    from canprobe.cell.planning.motion import check_motion
-
-    return check_motion(setup, setup.arm)
 
 
 def _shared(problems: Sequence[str]) -> list[str]:

@@ -23,7 +23,7 @@ from canprobe.cell.planning.model import (
 )
 from canprobe.cell.planning.node_configuration import Direction, NodeKind
 from canprobe.cell.planning.sync import TARGETS, Place, choose_mode, is_profiled
-from canprobe.cell.planning.units import profile_values
+from canprobe.cell.planning.units import DriveAxis, profile_values
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, WINDOW_SIZE, has_known
@@ -93,6 +93,10 @@ class BusPlan:
     not_available: list[tuple[str, str]] = field(default_factory=list)
     untaken: dict[str, list[tuple[str, Setup]]] = field(default_factory=dict)
 
+    def axis_of(self, node_id: int) -> DriveAxis:
+        """A drive with its device."""
+        return DriveAxis(self.setup, self.setup.needed_arm().node_ids.index(node_id), self.devices[node_id])
+
     def channel_of(self, node_id: int) -> str:
         """Channel of a node's bus."""
         return next(channel for channel, node_ids in self.channels.items() if node_id in node_ids)
@@ -128,7 +132,7 @@ class BusPlan:
         on_event = layout.transmission_type == ON_EVENT
         fixed = device.fixed_cob_id(direction, number)
         if fixed is not None:
-            layout = PdoLayout(fixed, layout.entries, layout.transmission_type, fd=layout.fd)
+            layout = replace(layout, cob_id=fixed)
         self.pdos.append(
             PlannedPdo(
                 node_id=node_id,
@@ -255,7 +259,7 @@ def _plan_commands(bus: BusPlan, node_id: int) -> None:
     mode = choose_mode(device)
     assert mode is not None  # else the plan has said no
     targets = set(TARGETS.values())
-    held = {MODE: int(mode), **(profile_values(bus.setup, node_id, device) if is_profiled(device) else {})}
+    held = {MODE: int(mode), **(profile_values(bus.axis_of(node_id)) if is_profiled(device) else {})}
     chosen = bus.choose(node_id, "rpdo", (CONTROLWORD, TARGETS[mode]))
     for base, (number, mapped) in zip(DRIVE_RPDOS, chosen.items(), strict=False):
         constants: list[tuple[Place, int]] = []

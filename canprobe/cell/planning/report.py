@@ -6,7 +6,7 @@ import itertools
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 from canprobe.cell.planning.array import array_text, support_of
@@ -346,12 +346,12 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         },
         "nodes": [_node(node) for node in plan.nodes],
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
-        "raw_frames": [_in_us(asdict(frames)) for frames in plan.raw],
+        "raw_frames": [_picked(frames) for frames in plan.raw],
         "array": _array(setup),
         "object": _mesh(setup),
         "bus_load": {one.channel: _bus(one, plan.budget) for one in plan.buses},
         "choices": [{"key": one.key, "value": one.written, "why": one.why} for one in plan.choices],
-        "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
+        "timeline": [_picked(slot) | {"channel": slot.channel or None} for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
         "witnesses": dict(witness_rows(plan)),
         "estimator": shape.method if shape is not None else None,
@@ -382,9 +382,9 @@ def _bus(bus: PlannedBus, budget: CycleBudget) -> dict[str, Any]:
         "node_ids": list(bus.node_ids),
         "planned_worst": bus.load,
         "parts": dict(bus.parts),
-        "demands": [_in_us(asdict(demand)) for demand in bus.demands],
-        "sync_response_us": _microseconds(bus.sync_response_ns),
-        "budget": _in_us(asdict(budget) | {"bus_ns": budget.bus_ns}),
+        "demands": [_picked(demand) for demand in bus.demands],
+        **_picked(bus, "sync_response_ns"),
+        "budget": _picked(budget) | _picked(budget, "bus_ns"),
     }
 
 
@@ -433,33 +433,23 @@ def _node(node: NodeConfiguration) -> dict[str, Any]:
 
 
 def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
-    return _picked(pdo, "node_id", "channel", "direction", "number", "cob_id") | {
+    return {
+        **_picked(pdo, "node_id", "channel", "direction", "number", "cob_id"),
         "entries": [_picked(entry, "index", "subindex", "bits", "name") for entry in pdo.entries],
-        "transmission_type": pdo.transmission_type,
-        "rate_hz": pdo.rate_hz,
+        **_picked(pdo, "transmission_type", "rate_hz"),
         "bytes": pdo.layout.length,
-        "bits_worst": pdo.bits_worst,
-        "deadline_us": _microseconds(pdo.deadline_ns),
-        "response_us": _microseconds(pdo.response_ns),
-        "slack_us": _microseconds(pdo.slack_ns),
+        **_picked(pdo, "bits_worst", "deadline_ns", "response_ns", "slack_ns"),
         "event_timer_ms": pdo.event_timer_ms or None,
         "used": pdo.used,
     }
 
 
-def _picked(part: object, *names: str) -> dict[str, Any]:
-    return {name: getattr(part, name) for name in names}
-
-
-def _in_us(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with times in µs: `start_ns` becomes `start_us`."""
-    return {
-        f"{name.removesuffix('_ns')}_us" if name.endswith("_ns") else name: (
-            _microseconds(value) if name.endswith("_ns") else value
-        )
-        for name, value in values.items()
-    }
-
-
-def _microseconds(t_ns: Any) -> Any:
-    return None if t_ns is None else [t / 1000 for t in t_ns] if isinstance(t_ns, tuple) else t_ns / 1000
+def _picked(part: Any, *names: str) -> dict[str, Any]:
+    """Some values of a part of the plan, or all its fields; times in µs: `start_ns` becomes `start_us`."""
+    found: dict[str, Any] = {}
+    for name in names or [item.name for item in fields(part)]:
+        value = getattr(part, name)
+        if name.endswith("_ns") and value is not None:
+            value = [t_ns / 1000 for t_ns in value] if isinstance(value, tuple) else value / 1000
+        found[re.sub("_ns$", "_us", name)] = value
+    return found
