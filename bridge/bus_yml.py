@@ -24,12 +24,10 @@ from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
-    Direction,
     Plan,
-    PlannedNode,
     PlannedPdo,
 )
-from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
+from canprobe.cell.planning.node_configuration import Direction, NodeConfiguration, Write
 from canprobe.cell.scene.toml_files import MAX_BYTES
 from canprobe.errors import UsageError, needed_module, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
@@ -100,13 +98,12 @@ def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
         if not path.exists() or not path.samefile(eds_file(eds)):
             with whole_file(path) as part:
                 part.write_bytes(eds_file(eds).read_bytes())
-    setups = {setup.node_id: setup for setup in plan.configurations}
     paths = []
     for bus in plan.buses:
         document: dict[str, Any] = {"options": {"dcf_path": "."}, "master": _master(plan)}
         for node in plan.nodes:
             if node.channel == bus.channel:
-                document[node.role.replace(" ", "_")] = _slave(plan, node, setups[node.node_id], files[node.eds].name)
+                document[node.name.replace(" ", "_")] = _slave(plan, node, files[node.eds].name)
         name = "" if len(plan.buses) == 1 else f"-{re.sub(r'[^A-Za-z0-9_.-]', '_', bus.channel)}"
         paths.append(folder / f"bus{name}.yml")
         write_text(paths[-1], _dump(yaml, document))
@@ -142,7 +139,7 @@ def _master(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _slave(plan: Plan, node: PlannedNode, setup: NodeConfiguration, eds: str) -> dict[str, Any]:
+def _slave(plan: Plan, node: NodeConfiguration, eds: str) -> dict[str, Any]:
     driver, package = _DRIVERS[node.kind]
     revision = node.identity.revision_number
     return {
@@ -153,17 +150,17 @@ def _slave(plan: Plan, node: PlannedNode, setup: NodeConfiguration, eds: str) ->
         **({"revision_number": revision} if revision is not None else {}),
         "heartbeat_producer": HEARTBEAT_PRODUCED_MS,
         "heartbeat_consumer": True,
-        "rpdo": _pdos(plan, node, setup, "rpdo"),
-        "tpdo": _pdos(plan, node, setup, "tpdo"),
+        "rpdo": _pdos(plan, node, "rpdo"),
+        "tpdo": _pdos(plan, node, "tpdo"),
         "sdo": [
             {"index": _Hex(write.index), "sub_index": write.subindex, "value": int(write.value)}
-            for write in setup.writes
+            for write in node.writes
             if _by_sdo(plan, node, write)
         ],
     }
 
 
-def _by_sdo(plan: Plan, node: PlannedNode, write: Write) -> bool:
+def _by_sdo(plan: Plan, node: NodeConfiguration, write: Write) -> bool:
     """Whether dcfgen has no key that makes this write."""
     if write.index not in PDO_OBJECTS:
         return write.index not in _OWN_KEYS
@@ -178,9 +175,9 @@ def _by_hand(pdo: PlannedPdo) -> bool:
     return pdo.layout.length > CLASSIC_BYTES or any(entry.is_dummy for entry in pdo.entries)
 
 
-def _pdos(plan: Plan, node: PlannedNode, setup: NodeConfiguration, direction: Direction) -> dict[int, Any]:
+def _pdos(plan: Plan, node: NodeConfiguration, direction: Direction) -> dict[int, Any]:
     off = {n: {"enabled": False, "cob_id": _Hex(INVALID)} for way, n in node.switched_off if way == direction}
-    written = {write.index for write in setup.writes}
+    written = {write.index for write in node.writes}
     on = {pdo.number: _pdo(pdo, written) for pdo in plan.pdos_of(node.node_id, direction) if not _by_hand(pdo)}
     return dict(sorted((off | on).items()))
 

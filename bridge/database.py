@@ -101,7 +101,7 @@ class _Describer:
         cantools = needed_module("cantools.database", "can", "a DBC or KCD file needs cantools; type:")
         self._can, self._conversion = cantools.can, cantools.conversion.BaseConversion
         self._load = cantools.load_string
-        self._names = {MASTER_NODE_ID: _MASTER} | {node.node_id: identifier(node.role) for node in plan.nodes}
+        self._names = {MASTER_NODE_ID: _MASTER} | {node.node_id: identifier(node.name) for node in plan.nodes}
         self._channels = {node.node_id: node.channel for node in plan.nodes} | {MASTER_NODE_ID: plan.buses[0].channel}
 
     def database(self) -> Any:

@@ -31,7 +31,7 @@ def write_dcfs(plan: Plan, folder: Path) -> list[Path]:
         The files.
     """
     paths = []
-    for setup in plan.configurations:
+    for setup in plan.nodes:
         path = folder / f"node{setup.node_id:03}.dcf"
         write_text(path, _dcf_of(plan, setup, path.name), newline="")
         paths.append(path)

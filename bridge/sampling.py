@@ -9,7 +9,8 @@ import numpy as np
 from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.watch import NodeWatch
-from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
+from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan
+from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.task import Phase
@@ -115,7 +116,7 @@ class Health:
         nodes = tuple(self._node(node, received.measurement, t_ns) for node in self._plan.nodes)
         return (*nodes, _cell(received))
 
-    def _node(self, node: PlannedNode, measurement: Measurement, t_ns: int) -> Diagnostic:
+    def _node(self, node: NodeConfiguration, measurement: Measurement, t_ns: int) -> Diagnostic:
         node_id, watch = node.node_id, self._watch
         state = watch.states.get(node_id)
         drive = self._drive(node, measurement)
@@ -134,9 +135,9 @@ class Health:
         values = [("nmt_state", state.name.lower() if state is not None else "unknown")]
         if drive is not None:
             values.append(("drive_state", drive.name.lower()))
-        return Diagnostic(f"node {node_id} ({node.role})", level, message, tuple(values))
+        return Diagnostic(f"node {node_id} ({node.name})", level, message, tuple(values))
 
-    def _drive(self, node: PlannedNode, measurement: Measurement) -> DriveState | None:
+    def _drive(self, node: NodeConfiguration, measurement: Measurement) -> DriveState | None:
         arm = self._plan.setup.arm
         if arm is None or node.kind != "drive" or not measurement.statuswords:
             return None

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import RawArray, TactileApplication
-from canprobe.cell.planning.model import Plan, PlannedNode
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.cell.plant.config import PlantConfig, PressMotion
 from canprobe.cell.plant.contact import PlantState, TruthRow
@@ -215,7 +216,7 @@ def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
     return RawArray(array, plant, sync_ratio=max(1, round(setup.rate_hz / array.rate_hz)), seed=setup.seed)
 
 
-def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
+def _node(setup: Setup, planned: NodeConfiguration, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
     dictionary = planned.dictionary
     speaks_lss = node_id == UNCONFIGURED_ID or dictionary.device_information.LSS_supported
     od_of = partial(load_eds, planned.eds) if speaks_lss else None

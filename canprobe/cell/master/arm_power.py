@@ -29,7 +29,7 @@ class ArmPower:
     def __init__(self, plan: Plan, drives: DriveGroup, cycles: SupervisedCycle, bring_up: BringUp) -> None:
         self._drives, self._cycles, self._bring_up = drives, cycles, bring_up
         self._watch, self._times = cycles.supervisor.seen.watch, plan.setup.bring_up
-        self._period_ns, self._last_look_ns = plan.sync.period_ns, plan.traffic.budget.looks_ns[-1]
+        self._period_ns, self._last_look_ns = plan.sync.period_ns, plan.budget.looks_ns[-1]
 
     def enable(self, check: Callable[[], None]) -> None:
         """Enable the drives, each with its position as its target.

@@ -194,7 +194,7 @@ class BringUp:
             name = f"node {node_id}: ({node.setup.name})"
             for remark in node.remarks:
                 self._say(f"{name} {remark}")
-            if left := ", ".join(dict.fromkeys(f"{one.write.index:04X}h" for one in node.setup.left_out)):
+            if left := ", ".join(dict.fromkeys(f"{write.index:04X}h" for write in node.setup.left_out)):
                 self._say(f"{name} cannot take {left} by its EDS: left as the device has it")
 
     # 4. start

@@ -107,7 +107,7 @@ class Cell:
         self._network = PumpedNetwork(port, other=self._other)
         self.readings = Readings(self._network, plan)
         self._make_cycle = direct or Cycle
-        setups = plan.configurations if direct is None else ()  # without setups, bring-up only takes its time
+        setups = plan.nodes if direct is None else ()  # without setups, bring-up only takes its time
         settings, check = setup.bring_up, options.to_check
         if check:  # nothing is commanded or stored, such as a tare
             setups = tuple(replace(one, writes=tuple(w for w in one.writes if w.read_back)) for one in setups)

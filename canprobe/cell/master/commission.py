@@ -379,7 +379,7 @@ def commission(
 
 def wanted_by(plan: Plan) -> list[Wanted]:
     """The nodes of a scene: ids, and identities from their EDS files and the scene's serial numbers."""
-    return [Wanted(node.node_id, node.role, node.identity.numbers) for node in plan.nodes]
+    return [Wanted(node.node_id, node.name, node.identity.numbers) for node in plan.nodes]
 
 
 def _check_all_placed(

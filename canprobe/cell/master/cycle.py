@@ -174,7 +174,7 @@ class Cycle:
         self._heartbeat_ns = 0
         self._port = port
         self._period_ns = period_ns
-        self._looks_ns = plan.traffic.budget.looks_ns
+        self._looks_ns = plan.budget.looks_ns
         self._on_arrival = on_arrival
         self._drives, self._tactile = drives, tactile
         self._intake = Intake(drives, tactile, plan.sync.overflow or SYNCS_REMEMBERED)

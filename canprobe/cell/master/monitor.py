@@ -136,7 +136,7 @@ class Monitor:
         self._plan = plan
         channels = [bus.channel for bus in plan.buses]
         self._view = CellView("+".join(channels))
-        roles = {node.node_id: node.role for node in plan.nodes} | {MASTER_NODE_ID: "master"}
+        roles = {node.node_id: node.name for node in plan.nodes} | {MASTER_NODE_ID: "master"}
         self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
         arm = plan.setup.arm
         self._model = arm.model if arm is not None else None

@@ -168,7 +168,7 @@ class NodeBringUp:
 
     def _identify(self) -> Dialogue:
         setup = self.setup
-        for subindex, expected in setup.identity.items():
+        for subindex, expected in setup.identity.stated.items():
             got = yield from read_entry(setup, IDENTITY, subindex)
             newer = got > expected and got >> 16 == expected >> 16  # CiA 301, 1018h:03: of the same major revision
             if subindex == REVISION_SUBINDEX and newer:

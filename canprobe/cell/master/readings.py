@@ -44,7 +44,7 @@ class Readings:
         self.values: dict[int, dict[str, float]] = {}
         self.remarks: list[str] = []
         temperature = None if plan.setup.arm is None else plan.setup.arm.temperature
-        for setup in plan.configurations:
+        for setup in plan.nodes:
             if setup.mode is None:
                 continue
             link = setup.dictionary.get(DC_LINK)

@@ -209,8 +209,14 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
 
         if isinstance(setup.truth.object, MeshHeights):
             yield from mesh_warnings(setup.truth.object.fit)
-    if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
-        yield from _long_waits(setup.arm.missed_syncs, setup.rate_hz)
+    real = any(not drive.emulated for drive in setup.drives)
+    if real and setup.arm is not None and (missed := setup.arm.missed_syncs) > MISSED_SYNCS_REAL:
+        yield (
+            f"arm.missed_syncs = {missed}: real drives stay enabled for {1e3 * missed / setup.rate_hz:g} ms after the"
+            " last SYNC of a master that stalls or dies, and a drive that falls silent is waited for as long: an object"
+            f" that moves is pressed without supervision until then; leave it at {MISSED_SYNCS_REAL} or below, more is"
+            " for emulated nodes"
+        )
     if setup.array is not None:
         yield from _calibration_warnings(setup.array)
     if setup.touch is not None:
@@ -239,18 +245,6 @@ def _beyond_the_calibration(task: Touch | Calibrate) -> Iterator[str]:
             f"task.force_n = {task.force:g}: the calibration of the array has forces up to {errors.highest:g} N; beyond"
             f" them the force errs by {100 * BEYOND_SIGMA * more:.1f} % more (1σ), and regions are wider"
         )
-
-
-def _long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
-    """Warning for real drives that wait long for a SYNC."""
-    if missed_syncs <= MISSED_SYNCS_REAL:
-        return
-    waited_ms = 1e3 * missed_syncs / rate_hz
-    yield (
-        f"arm.missed_syncs = {missed_syncs}: real drives stay enabled for {waited_ms:g} ms after the last SYNC of"
-        " a master that stalls or dies, and a drive that falls silent is waited for as long: an object that moves is"
-        f" pressed without supervision until then; leave it at {MISSED_SYNCS_REAL} or below, more is for emulated nodes"
-    )
 
 
 def _held_rows(arm: Arm) -> Iterator[str]:

@@ -1,54 +1,59 @@
-"""Plan → the configuration of each node: what it must be, and the writes that make it so.
+"""The configuration of each node: what it must be, and the writes that make it so.
 
 The configuration of a node is an explicit list: one `Write` is an object, its value and the purpose. The order matters:
 PDOs first, then the objects of every node, then those of a drive or the array.
 
 A write is *required*, or it is *wished* and says what its absence means. What the EDS excludes (no such object,
 read-only with another value, limits) is left out where it is wished, `NodeConfiguration.left_out`, and makes the plan
-impossible where it is required, `NodeConfiguration.problems`. What the EDS allows and the device refuses is for
-bring-up.
+impossible where it is required. What the EDS allows and the device refuses is for bring-up.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, DeviceCapabilities
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
-    Interpolation,
-    Plan,
-    PlannedNode,
     PlannedPdo,
+    SyncPlan,
 )
-from canprobe.cell.planning.node_configuration import FixedEntry, LeftOut, NodeConfiguration, Write
-from canprobe.cell.planning.sync import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
+from canprobe.cell.planning.node_configuration import (
+    Direction,
+    FixedEntry,
+    Interpolation,
+    NodeConfiguration,
+    NodeKind,
+    Write,
+)
+from canprobe.cell.planning.pdos import BusPlan
+from canprobe.cell.planning.sync import (
+    INTERPOLATION_TIME,
+    SYNC_PERIOD,
+    choose_mode,
+    follows_sync_period,
+    homing_problems,
+    interpolations,
+    is_profiled,
+)
 from canprobe.cell.planning.units import (
     FOLLOWING_WINDOW,
     POLARITY,
     POSITION_LIMITS,
     PROFILE_DECELERATION,
     PROFILE_SPEED_LIMIT,
-    following_window,
-    motor_speed_limit,
+    ROUNDING_COUNTS,
+    DriveAxis,
     profile_values,
     software_limits,
-    speed_unit,
-    turn_units,
 )
-from canprobe.cell.scene.setup import Arm, HomingParameters
-from canprobe.fieldbus.eds.description import DescribedEntry, Description
-from canprobe.fieldbus.eds.packaged import (
-    FULL_SCALE,
-    LONG_PDOS,
-    MISSED_SYNCS,
-    WINDOW_SIZE,
-    has_known,
-)
+from canprobe.cell.scene.setup import Array, HomingParameters, Node, Setup
+from canprobe.fieldbus.eds.description import DescribedEntry
+from canprobe.fieldbus.eds.packaged import FULL_SCALE, LONG_PDOS, MISSED_SYNCS, WINDOW_SIZE, has_known
 from canprobe.fieldbus.eds.values import name_of
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
@@ -73,56 +78,83 @@ STARTUP, NOT_BY_ITSELF = 0x1F80, 1 << 2  # CiA 302-2: the device does not become
 ABORT_QUICK_STOP = 3  # 6007h: quick stop when the connection is lost
 
 
-def make_configurations(plan: Plan) -> tuple[NodeConfiguration, ...]:
-    """Make the configuration of every planned node, drives first."""
-    return tuple(_setup(plan, node) for node in plan.nodes)
+def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfiguration:
+    """Make the configuration of a node.
 
-
-def _setup(plan: Plan, node: PlannedNode) -> NodeConfiguration:
-    device = DeviceCapabilities(node.eds, Description(node.dictionary))
-    arm = plan.setup.arm if node.kind == "drive" else None
-    axis = arm.node_ids.index(node.node_id) if arm is not None else 0
-    drive = arm.drives[axis] if arm is not None else None
-    own = _array_writes(plan, device) if arm is None else _drive_writes(plan, node, arm, axis, device)
-    wanted = [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *own]
-    writes, left_out, problems = _possible(device, wanted)
-    times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
-    homing, not_homing, no_homing = _possible(device, _homing_writes(arm, axis, device) if arm is not None else ())
-    if homing and arm is not None and drive is not None and drive.zero is not None:
-        no_homing += _unhomed(arm, axis, drive.zero, device)
-    return NodeConfiguration(
+    A required write that its device cannot take is a problem of the plan; a wished one is not available.
+    """
+    device = bus.devices[node.node_id]
+    planned = {(pdo.direction, pdo.number): pdo for pdo in bus.pdos if pdo.node_id == node.node_id}
+    switched_off = tuple(one for one in device.switchable_pdos if one not in planned)
+    used = [pdo for _, pdo in sorted(planned.items()) if pdo.used]
+    if isinstance(node, Array):
+        own, given = _array_writes(bus.setup, node, device), _array_given(node, device)
+    else:
+        own, given = _drive_writes(bus.sync, bus.axis_of(node.node_id)), _drive_given(device)
+    wanted = [*_pdo_writes(device, used, switched_off), *_common_writes(bus.sync, device), *own]
+    writes, left_out = _possible(bus, device, wanted)
+    found = NodeConfiguration(
         node_id=node.node_id,
-        name=node.role,
-        channel=node.channel,
+        kind=kind,
+        name=name,
         eds=node.eds,
         dictionary=device.od,
-        identity={sub: value for sub, value in enumerate(node.identity.numbers, start=1) if value is not None},
-        writes=tuple(writes),
-        given=_array_given(plan, device.od) if node.kind == "tactile" else _drive_given(device),
-        otherwise=tuple(tuple(_possible(device, other)[0]) for other in times),
-        left_out=(*left_out, *not_homing),
-        problems=(*problems, *no_homing),
-        mode=node.mode,
-        homing=tuple(homing),
-        turn=None if drive is None else turn_units(device, drive.turn_units, drive.gear),
-        speed_unit=1.0 if drive is None else speed_unit(device, drive, VELOCITY_UNIT_INDEX) or 1.0,
+        identity=replace(device.identity, serial_number=node.serial),
+        emulated=node.emulated,
+        channel=node.channel,
+        switched_off=switched_off,
+        writes=writes,
+        given=given,
+        left_out=left_out,
+    )
+    return found if isinstance(node, Array) else _with_drive(found, bus, bus.axis_of(node.node_id))
+
+
+def _with_drive(found: NodeConfiguration, bus: BusPlan, axis: DriveAxis) -> NodeConfiguration:
+    """The configuration with mode, homing and units of a drive."""
+    device, times = axis.device, _times(bus.sync, axis.device)
+    others = [_interpolation_writes(device, time) for time in times[1:]]
+    homing, not_homing = _possible(bus, device, _homing_writes(axis))
+    if homing:
+        bus.problems += _unhomed(axis)
+    return replace(
+        found,
+        left_out=(*found.left_out, *not_homing),
+        mode=choose_mode(device),
+        interpolation=times,
+        otherwise=tuple(tuple(write for write in one if _excluded(device, write) is None) for one in others),
+        homing=homing,
+        turn=axis.turn,
+        speed_unit=axis.unit(VELOCITY_UNIT_INDEX) or 1.0,
     )
 
 
-def _possible(device: DeviceCapabilities, writes: Iterable[Write]) -> tuple[list[Write], list[LeftOut], list[str]]:
-    """The writes that a device can take by its EDS, the wished ones that it cannot, and why not a required one."""
+def _times(sync: SyncPlan, device: DeviceCapabilities) -> tuple[Interpolation, ...]:
+    """The values of 60C2h that express the period; none for profile position."""
+    return () if is_profiled(device) else interpolations(device, sync.period_us)
+
+
+Writes = tuple[Write, ...]
+
+
+def _possible(bus: BusPlan, device: DeviceCapabilities, writes: Iterable[Write]) -> tuple[Writes, Writes]:
+    """The writes that a device can take by its EDS, and the wished ones that it cannot, the first of each entry."""
     possible: list[Write] = []
-    left_out: dict[tuple[int, int], LeftOut] = {}
-    problems: list[str] = []
+    left_out: dict[tuple[int, int], tuple[Write, str]] = {}
     for write in writes:
         why = _excluded(device, write)
         if why is None:
             possible.append(write)
         elif write.absence is not None:
-            left_out.setdefault((write.index, write.subindex), LeftOut(write, why))
+            left_out.setdefault((write.index, write.subindex), (write, why))
         elif why:
-            problems.append(f"{device.eds}: {write.place} = {write.value} ({write.purpose}) is needed: {why}")
-    return possible, [one for one in left_out.values() if one.why], problems
+            problem = f"{device.eds}: {write.place} = {write.value} ({write.purpose}) is needed: {why}"
+            bus.problems.append(problem)
+    lost = [(write, why) for write, why in left_out.values() if why]
+    for write, why in lost:
+        what = f"{write.purpose} ({write.place})"
+        bus.not_available.append((what, f"{device.eds}: {why}: {write.absence}"))
+    return tuple(possible), tuple(write for write, _ in lost)
 
 
 def _excluded(device: DeviceCapabilities, write: Write) -> str | None:
@@ -146,65 +178,58 @@ def _ends(entry: DescribedEntry) -> str:
     return f"at least {entry.low}" if entry.high is None else f"{entry.low} to {entry.high}"
 
 
-def _pdo_writes(plan: Plan, node: PlannedNode, device: DeviceCapabilities) -> list[Write]:
-    writes = []
+def _pdo_writes(
+    device: DeviceCapabilities, used: Sequence[PlannedPdo], switched_off: Sequence[tuple[Direction, int]]
+) -> Iterator[Write]:
     if has_known(device.od, LONG_PDOS):
-        long = any(pdo.layout.length > CLASSIC_BYTES for pdo in plan.pdos_of(node.node_id, "tpdo"))
-        writes.append(Write(LONG_PDOS, 0, int(long), "PDOs of up to 64 bytes"))
-    for direction, number in node.switched_off:
+        long = any(pdo.layout.length > CLASSIC_BYTES for pdo in used if pdo.direction == "tpdo")
+        yield Write(LONG_PDOS, 0, int(long), "PDOs of up to 64 bytes")
+    for direction, number in switched_off:
         index, name = COMMUNICATION[direction] + number - 1, f"{direction.upper()} {number}"
         cob_id = (device.number(index, 1) or 0) | INVALID
         absence = "it is sent besides" if direction == "tpdo" else "it listens besides"
-        writes.append(Write(index, 1, cob_id, f"{name} is not used", absence, own_bits=OWN_BITS))
-    for direction in COMMUNICATION:
-        for pdo in plan.pdos_of(node.node_id, direction):
-            writes += _one_pdo(pdo, device)
-    return writes
+        yield Write(index, 1, cob_id, f"{name} is not used", absence, own_bits=OWN_BITS)
+    for pdo in used:
+        yield from _one_pdo(pdo, device)
 
 
-def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> list[Write]:
+def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> Iterator[Write]:
     communication = COMMUNICATION[pdo.direction] + pdo.number - 1
     mapping = MAPPING[pdo.direction] + pdo.number - 1
     name, cob_id = f"{pdo.direction.upper()} {pdo.number}", pdo.cob_id | pdo.own_bits
-    writes = []
     if not pdo.fixed_id:
         off = f"{name} off while it is changed"
-        writes.append(Write(communication, 1, cob_id | INVALID, off, "it stays on", own_bits=OWN_BITS))
-    writes.append(Write(communication, 2, pdo.transmission_type, f"transmission type of {name}"))
+        yield Write(communication, 1, cob_id | INVALID, off, "it stays on", own_bits=OWN_BITS)
+    yield Write(communication, 2, pdo.transmission_type, f"transmission type of {name}")
     if pdo.event_timer_ms:
         absence = "the device does not notice that its controlword stays away"
-        writes.append(Write(communication, 5, pdo.event_timer_ms, f"event timer of {name}", absence))
+        yield Write(communication, 5, pdo.event_timer_ms, f"event timer of {name}", absence)
     if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= MAX_SYNC_TYPE and device.has(communication, 6):
-        writes.append(Write(communication, 6, SYNC_START_VALUE, f"first SYNC of {name}"))
+        yield Write(communication, 6, SYNC_START_VALUE, f"first SYNC of {name}")
     if device.capacity(pdo.direction, pdo.number):
-        entries = enumerate(pdo.entries, start=1)
-        writes.append(Write(mapping, 0, 0, f"mapping of {name} off while it is changed", "it stays on"))
-        writes += [Write(mapping, sub, entry.word, f"mapping of {name}") for sub, entry in entries]
-        writes.append(Write(mapping, 0, len(pdo.entries), f"mapping of {name} on"))
-    return (
-        writes if pdo.fixed_id else [*writes, Write(communication, 1, cob_id, f"COB-ID of {name}", own_bits=OWN_BITS)]
-    )
+        yield Write(mapping, 0, 0, f"mapping of {name} off while it is changed", "it stays on")
+        for sub, entry in enumerate(pdo.entries, start=1):
+            yield Write(mapping, sub, entry.word, f"mapping of {name}")
+        yield Write(mapping, 0, len(pdo.entries), f"mapping of {name} on")
+    if not pdo.fixed_id:
+        yield Write(communication, 1, cob_id, f"COB-ID of {name}", own_bits=OWN_BITS)
 
 
 _UNTIMED = "the device does not know how long a cycle is"
 
 
-def _common_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
-    counter = [
-        Write(SYNC_PERIOD, 0, 0, "1019h may only change while this is 0", _UNTIMED),
-        Write(0x1019, 0, plan.sync.overflow, "overflow of the SYNC counter"),
-    ]
-    value, others = (device.number(STARTUP) or 0) | NOT_BY_ITSELF, 0xFFFFFFFF & ~NOT_BY_ITSELF
-    waits = Write(STARTUP, 0, value, "the node waits for its start", _SELF_STARTING, own_bits=others)
-    return [
-        *(counter if plan.sync.overflow else []),
-        Write(SYNC_PERIOD, 0, plan.sync.period_us, "period of SYNC", None if follows_sync_period(device) else _UNTIMED),
-        Write(0x1015, 0, EMCY_INHIBIT_100US, "shortest time between two emergencies", _EMERGENCIES),
-        Write(0x1017, 0, HEARTBEAT_PRODUCED_MS, "period of the node's heartbeat"),
-        Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS, "the node notices a dead master", _DEAF),
-        Write(0x1029, 1, GO_PRE_OPERATIONAL, "NMT state of a node that has lost its master", _BY_DEFAULT),
-        *([waits] if device.has(STARTUP) else []),  # a device without it is not asked
-    ]
+def _common_writes(sync: SyncPlan, device: DeviceCapabilities) -> Iterator[Write]:
+    if sync.overflow:
+        yield Write(SYNC_PERIOD, 0, 0, "1019h may only change while this is 0", _UNTIMED)
+        yield Write(0x1019, 0, sync.overflow, "overflow of the SYNC counter")
+    yield Write(SYNC_PERIOD, 0, sync.period_us, "period of SYNC", None if follows_sync_period(device) else _UNTIMED)
+    yield Write(0x1015, 0, EMCY_INHIBIT_100US, "shortest time between two emergencies", _EMERGENCIES)
+    yield Write(0x1017, 0, HEARTBEAT_PRODUCED_MS, "period of the node's heartbeat")
+    yield Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS, "the node notices a dead master", _DEAF)
+    yield Write(0x1029, 1, GO_PRE_OPERATIONAL, "NMT state of a node that has lost its master", _BY_DEFAULT)
+    if device.has(STARTUP):  # a device without it is not asked
+        value, others = (device.number(STARTUP) or 0) | NOT_BY_ITSELF, 0xFFFFFFFF & ~NOT_BY_ITSELF
+        yield Write(STARTUP, 0, value, "the node waits for its start", _SELF_STARTING, own_bits=others)
 
 
 _EMERGENCIES = "a faulty device may fill the bus with emergencies"
@@ -215,90 +240,82 @@ _MISSED_SYNCS = "SYNCs after which the drive stops by itself"
 _FAST = "the drive itself limits its speed as the device has it, or not at all"
 
 
-def _drive_writes(plan: Plan, node: PlannedNode, arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
-    assert node.mode is not None
-    model = arm.model
-    low, high = software_limits(model)
-    limit = motor_speed_limit(model, axis, plan.setup.limits.speed_share, plan.sync.period_ns)
-    unit = speed_unit(device, arm.drives[axis], VELOCITY_UNIT_INDEX)
-    fastest = "highest speed of the motor"
-    speed = [Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), fastest, _FAST)] if unit else []
-    interpolated = node.mode is OperationMode.INTERPOLATED_POSITION
+def _drive_writes(sync: SyncPlan, axis: DriveAxis) -> Iterator[Write]:
+    device, arm, mode = axis.device, axis.setup.needed_arm(), choose_mode(axis.device)
+    assert mode is not None  # else the plan has said no
+    low, high = (int(ends[axis.number]) for ends in software_limits(arm.model))
     following = "a drive that does not follow is noticed as the device has it"
     lag = "a drive that lags is given as long as the device has it"
     stops = "the drive guards the ends of the joint as the device has it, or not at all"
     quick = "a quick stop goes and ends as the device has it"
     lost = "a drive that loses its master does what the device has"
-    return [
-        Write(MISSED_SYNCS, 0, arm.missed_syncs, _MISSED_SYNCS, "a drive may go on without SYNC"),
-        Write(MODE, 0, node.mode, "mode of operation"),
-        *([Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")] if interpolated else []),
-        *(_interpolation_writes(device, node.interpolation[0]) if node.interpolation else []),
-        *(_profile_writes(plan, node, device) if node.mode is OperationMode.PROFILE_POSITION else []),
-        Write(FOLLOWING_WINDOW, 0, following_window(model, axis), "following error window", following),
-        Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag),
-        *speed,
-        Write(POSITION_LIMITS, 1, int(low[axis]), "lowest position", stops),
-        Write(POSITION_LIMITS, 2, int(high[axis]), "highest position", stops),
-        Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick),
-        Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost),
-    ]
+    yield Write(MISSED_SYNCS, 0, arm.missed_syncs, _MISSED_SYNCS, "a drive may go on without SYNC")
+    yield Write(MODE, 0, mode, "mode of operation")
+    if mode is OperationMode.INTERPOLATED_POSITION:
+        yield Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")
+    for time in _times(sync, device)[:1]:
+        yield from _interpolation_writes(device, time)
+    if mode is OperationMode.PROFILE_POSITION:
+        for (index, subindex), value in profile_values(axis).items():
+            # a drive without 6084h decelerates as it accelerates (CiA 402-2)
+            if index != PROFILE_DECELERATION or device.has(index):
+                yield Write(index, subindex, value, "profile position within the limits of [joints]")
+        yield Write(PROFILE_TYPE, 0, 0, "trapezoidal speed", "it accelerates as the device has it")
+    yield Write(FOLLOWING_WINDOW, 0, axis.following_window, "following error window", following)
+    yield Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag)
+    if unit := axis.unit(VELOCITY_UNIT_INDEX):
+        limit = math.ceil(axis.fastest + ROUNDING_COUNTS * 1e9 / sync.period_ns)  # a target is a whole number of units
+        yield Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), "highest speed of the motor", _FAST)
+    yield Write(POSITION_LIMITS, 1, low, "lowest position", stops)
+    yield Write(POSITION_LIMITS, 2, high, "highest position", stops)
+    yield Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick)
+    yield Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost)
 
 
-def _profile_writes(plan: Plan, node: PlannedNode, device: DeviceCapabilities) -> Iterator[Write]:
-    """Writes of profile position: it may not be faster than its joints, and stops as late as it decelerates.
-
-    A drive without 6084h decelerates as it accelerates. Source: CiA 402-2, object 6084h.
-    """
-    for (index, subindex), value in profile_values(plan.setup, node.node_id, device).items():
-        if index != PROFILE_DECELERATION or device.has(index):
-            yield Write(index, subindex, value, "profile position within the limits of [joints]")
-    yield Write(PROFILE_TYPE, 0, 0, "trapezoidal speed", "it accelerates as the device has it")
-
-
-def _homing_writes(arm: Arm, axis: int, device: DeviceCapabilities) -> list[Write]:
+def _homing_writes(axis: DriveAxis) -> Iterator[Write]:
     """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
-    drive, units = arm.drives[axis], abs(float(arm.model.units_per_q[axis, axis]))
-    if (zero := drive.zero) is None:
-        return []
-    speed = units / (speed_unit(device, drive, VELOCITY_UNIT_INDEX) or 1.0)
-    acceleration = units / (speed_unit(device, drive, ACCELERATION_UNIT_INDEX) or 1.0)
+    if (zero := axis.drive.zero) is None:
+        return
+    units = abs(float(axis.model.units_per_q[axis.number, axis.number]))
+    speed = units / (axis.unit(VELOCITY_UNIT_INDEX) or 1.0)
+    acceleration = units / (axis.unit(ACCELERATION_UNIT_INDEX) or 1.0)
     ramp = "homing accelerates as the device has it"
     still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
-    offset = -round(_home_units(arm, axis, zero))
-    return [
-        Write(0x6098, 0, zero.method, "homing method"),
-        Write(0x6099, 1, max(1, round(zero.speed * speed)), "speed of the search for the switch", still),
-        Write(0x6099, 2, max(1, round(zero.zero_speed * speed)), "speed of the search for the zero", still),
-        Write(0x609A, 0, max(1, round(zero.acceleration * acceleration)), "acceleration in homing", ramp),
-        *([Write(HOME_OFFSET, 0, offset, "home offset")] if device.has(HOME_OFFSET) else []),
-    ]
+    yield Write(0x6098, 0, zero.method, "homing method")
+    yield Write(0x6099, 1, max(1, round(zero.speed * speed)), "speed of the search for the switch", still)
+    yield Write(0x6099, 2, max(1, round(zero.zero_speed * speed)), "speed of the search for the zero", still)
+    yield Write(0x609A, 0, max(1, round(zero.acceleration * acceleration)), "acceleration in homing", ramp)
+    if axis.device.has(HOME_OFFSET):
+        yield Write(HOME_OFFSET, 0, -round(_home_units(axis, zero)), "home offset")
 
 
-def _home_units(arm: Arm, axis: int, zero: HomingParameters) -> float:
+def _home_units(axis: DriveAxis, zero: HomingParameters) -> float:
     """Position of a drive at home, units, with the other joints in the start posture."""
-    return float(drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start)))
+    others = joints_to_units(axis.model, axis.setup.needed_arm().q_start)
+    return float(drive_position_at(axis.model, axis.number, zero.home, others))
 
 
-def _unhomed(arm: Arm, axis: int, zero: HomingParameters, device: DeviceCapabilities) -> Iterator[str]:
+def _unhomed(axis: DriveAxis) -> Iterator[str]:
     """Why a drive cannot be homed: its modes, joints on which its zero depends, or no 607Ch where home is not 0."""
-    yield from homing_problems(device)
-    joints, coupled = arm.model.joints, coupled_joints(arm.model, axis)
+    if (zero := axis.drive.zero) is None:
+        return
+    yield from homing_problems(axis.device)
+    number, joints, coupled = axis.number, axis.model.joints, coupled_joints(axis.model, axis.number)
     for other in sorted(coupled):
-        its, name = arm.drives[other].zero, joints[other].name
-        if its is None or (its.order, other) < (zero.order, axis):
+        its, name = axis.setup.drives[other].zero, joints[other].name
+        if its is None or (its.order, other) < (zero.order, number):
             continue
         way = f"joints.{name}.homing_order must be lower than {zero.order}"
-        if axis in coupled_joints(arm.model, other):
+        if number in coupled_joints(axis.model, other):
             way = "each depends on the other: one of them needs an absolute encoder"
-        yield f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}"
-    if device.has(HOME_OFFSET):
+        yield f"the zero of {joints[number].name} depends on {name}, which is homed later: {way}"
+    if axis.device.has(HOME_OFFSET):
         return
-    name, lack = joints[axis].name, f"{device.eds}: no such object: 607Ch (home offset)"
+    name, lack = joints[number].name, f"{axis.device.eds}: no such object: 607Ch (home offset)"
     if coupled:
         yield f"{lack}, and what the motor of {name} counts at home depends on other joints: it cannot be homed"
-    elif round(home := _home_units(arm, axis, zero)):
-        counts = round(arm.model.zero_units[axis] - home)
+    elif round(home := _home_units(axis, zero)):
+        counts = round(axis.model.zero_units[number] - home)
         yield f"{lack}: the drive counts 0 at home, and the cell {home:.0f}: set joints.{name}.zero_counts = {counts}"
 
 
@@ -309,15 +326,12 @@ def _interpolation_writes(device: DeviceCapabilities, time: Interpolation) -> li
     return [value, *(unit if device.has(INTERPOLATION_TIME, 2) else [])]
 
 
-def _array_writes(plan: Plan, device: DeviceCapabilities) -> list[Write]:
-    array = plan.setup.array
-    assert array is not None
-    writes = [Write(0x2000, 0, TactileMode[array.mode.upper()], "what the array sends")]
+def _array_writes(setup: Setup, array: Array, device: DeviceCapabilities) -> Iterator[Write]:
+    yield Write(0x2000, 0, TactileMode[array.mode.upper()], "what the array sends")
     if array.mode == "window" and has_known(device.od, WINDOW_SIZE):
-        writes.append(Write(WINDOW_SIZE, 0, int(array.window), "taxels along the window"))
-    if plan.setup.tares:
-        writes.append(Write(TARE_COMMAND, 0, TARE, "tare", read_back=False))
-    return writes
+        yield Write(WINDOW_SIZE, 0, int(array.window), "taxels along the window")
+    if setup.tares:
+        yield Write(TARE_COMMAND, 0, TARE, "tare", read_back=False)
 
 
 def _drive_given(device: DeviceCapabilities) -> tuple[FixedEntry, ...]:
@@ -334,13 +348,10 @@ def _drive_given(device: DeviceCapabilities) -> tuple[FixedEntry, ...]:
     )
 
 
-def _array_given(plan: Plan, dictionary: Any) -> tuple[FixedEntry, ...]:
+def _array_given(array: Array, device: DeviceCapabilities) -> tuple[FixedEntry, ...]:
     """The full scale that the array must hold: with another one the force would be wrong by their ratio."""
-    array = plan.setup.array
-    assert array is not None
-    if not has_known(dictionary, FULL_SCALE):
+    if not has_known(device.od, FULL_SCALE):
         return ()
-    pascals = round(array.pad.full_scale_pa)
-    key = "sensor.full_scale_kpa"
+    pascals, key = round(array.pad.full_scale_pa), "sensor.full_scale_kpa"
     otherwise = f"force would be read wrong by their ratio; put right {key}"
     return (FixedEntry(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from canprobe.cell.planning.model import EVERY_SYNC, Direction, Identity, NodeKind
+from canprobe.cell.planning.model import EVERY_SYNC
+from canprobe.cell.planning.node_configuration import Direction, Identity, NodeKind
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds

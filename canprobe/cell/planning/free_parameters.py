@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from canprobe.cell.planning.array import window_choices, windows_of
-from canprobe.cell.planning.model import Choice, Traffic
+from canprobe.cell.planning.model import Choice
+from canprobe.cell.planning.pdos import BusPlan
 from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
@@ -133,8 +134,8 @@ def wants_torque(setup: Setup) -> bool:
 
 
 FD_ARRAY = "tactile_array_fd.eds"
-Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
-"""Completes a modified setup. Returns it with the traffic of its busiest bus, or None if it does not fit."""
+Fit = Callable[[Setup], BusPlan | None]
+"""Plans the bus of a modified setup; None where it does not fit."""
 
 
 def suggested_changes(setup: Setup, fit: Fit, sound: Callable[[Setup], bool]) -> list[str]:
@@ -148,12 +149,12 @@ def suggested_changes(setup: Setup, fit: Fit, sound: Callable[[Setup], bool]) ->
     found = []
     for text, changed in (*_changes(setup), *_together(setup, fit), *_quicker(setup, fit), *_slower(setup, fit)):
         fitting = fit(changed)
-        if fitting is not None and sound(fitting[0]):
-            closed, traffic = fitting
-            peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
+        if fitting is not None and sound(fitting.setup):
+            busiest = max(fitting.buses, key=lambda bus: bus.load)
+            peak = max(busiest.demands, key=lambda demand: demand.share)
             share = f"{peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
-            less = ", without 6077h" if wants_torque(setup) and not wants_torque(closed) else ""
-            found.append(f"{text}: load {100 * traffic.load:.0f} %, peak {share}{less}")
+            less = ", without 6077h" if wants_torque(setup) and not wants_torque(fitting.setup) else ""
+            found.append(f"{text}: load {100 * busiest.load:.0f} %, peak {share}{less}")
     return found or ["fewer nodes or a faster bus"]
 
 
@@ -220,9 +221,9 @@ def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
 def _quicker(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     """A computing time that the bus leaves to the controller, in whole microseconds."""
     idle = fit(replace(setup, compute_ns=0))
-    if idle is None or (slack_ns := idle[1].budget.slack_ns) is None:
+    if idle is None or idle.budget is None or idle.budget.slack_ns is None:
         return
-    left_us = slack_ns // 1000
+    left_us = idle.budget.slack_ns // 1000
     if 0 < left_us * 1000 < setup.compute_ns:
         yield f"cycle.compute_us = {left_us}", replace(setup, compute_ns=left_us * 1000)
 

@@ -6,13 +6,14 @@ stands before one that cannot. Source: Davis et al. 2007 (priority assignment); 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.model import MASTER_NODE_ID, PlannedFrames, PlannedPdo, RawKind
+from canprobe.cell.planning.pdos import BusPlan
 from canprobe.cell.planning.wire_time import frame_bits
-from canprobe.cell.scene.setup import Setup
+from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.protocol.frames import (
     EMCY_BASE,
     HEARTBEAT_BASE,
@@ -23,7 +24,6 @@ from canprobe.fieldbus.protocol.frames import (
     Frame,
     is_restricted,
 )
-from canprobe.fieldbus.protocol.pdo import PdoLayout
 
 _POOL = range(0x181, 0x580)
 """Identifiers below SYNC, emergencies and TIME and above SDO and heartbeats; restricted ones are left out."""
@@ -48,10 +48,7 @@ def order_by_deadline(pdos: Sequence[PlannedPdo], devices: Iterable[DeviceCapabi
     ordered = sorted(first.values(), key=lambda pdo: (pdo.deadline_ns, pdo.direction == "rpdo", pdo.cob_id))
     chosen = {pdo.cob_id: cob_id for pdo, cob_id in zip(ordered, free, strict=False)}
     return [
-        pdo
-        if pdo.fixed_id
-        else replace(pdo, layout=PdoLayout(chosen[pdo.cob_id], pdo.entries, pdo.transmission_type, fd=pdo.layout.fd))
-        for pdo in pdos
+        pdo if pdo.fixed_id else replace(pdo, layout=replace(pdo.layout, cob_id=chosen[pdo.cob_id])) for pdo in pdos
     ]
 
 
@@ -74,47 +71,42 @@ def identifier_problems(pdos: Iterable[PlannedPdo]) -> list[str]:
     return problems
 
 
-def plan_raw_frames(setup: Setup) -> tuple[PlannedFrames, ...]:
+def plan_raw_frames(setup: Setup) -> Iterator[PlannedFrames]:
     """The frames of an array that is no CANopen node, an entry for each identifier and sender."""
     array = setup.array
     if array is None or array.raw is None:
-        return ()
-    raw, channel = array.raw, array.channel
-
-    def planned(what: RawKind, can_id: int, lengths: list[int], rate_hz: float, *, sent: bool) -> PlannedFrames:
-        bits = sum(frame_bits(length, setup.bus) for length in lengths)
-        return PlannedFrames(can_id, channel, what, sent, len(lengths), max(lengths), rate_hz, bits)
-
-    lengths = [frame.length for frame in raw.image.frames]
-    found = [planned("image", can_id, lengths, array.rate_hz, sent=False) for can_id in raw.image.ids]
-    commands: tuple[tuple[RawKind, tuple[Frame, ...], float], ...] = (
+        return
+    raw = array.raw
+    images = tuple((can_id, bytes(frame.length)) for can_id in raw.image.ids for frame in raw.image.frames)
+    kinds: tuple[tuple[RawKind, tuple[Frame, ...], float], ...] = (
+        ("image", images, array.rate_hz),
         ("start", raw.start, 0.0),
         ("stop", raw.stop, 0.0),
         ("poll", raw.poll, array.rate_hz),
     )
-    for what, frames, rate_hz in commands:
+    for what, frames, rate_hz in kinds:
         for can_id in dict.fromkeys(can_id for can_id, _ in frames):
-            mine = [len(data) for each, data in frames if each == can_id]
-            found.append(planned(what, can_id, mine, rate_hz, sent=True))
-    return tuple(found)
+            lengths = [len(data) for each, data in frames if each == can_id]
+            yield PlannedFrames(
+                can_id=can_id,
+                channel=array.channel,
+                what=what,
+                sent=what != "image",
+                count=len(lengths),
+                length=max(lengths),
+                rate_hz=rate_hz,
+                bits_worst=sum(frame_bits(length, setup.bus) for length in lengths),
+            )
 
 
-def raw_frame_problems(
-    frames: tuple[PlannedFrames, ...], pdos: list[PlannedPdo], buses: Mapping[str, tuple[int, ...]], name: str
-) -> list[str]:
-    """Problems where other frames of the cell have the identifiers of raw frames.
+def raw_frame_problems(bus: BusPlan, array: Array) -> list[str]:
+    """Problems where other frames of the cell have the identifiers of an array's raw frames.
 
     The cell tells received frames apart by their identifiers, whatever their bus; a frame that it sends is on one bus.
-
-    Args:
-        frames: raw frames of the array.
-        pdos: PDOs of all nodes.
-        buses: node ids by channel.
-        name: name of the array.
     """
     problems = []
-    received, on_bus = _identifiers(pdos, buses)
-    for frame in frames:
+    received, on_bus = _identifiers(bus)
+    for frame in bus.raw:
         own = on_bus[frame.channel].get(frame.can_id)
         other = own or (None if frame.sent else received.get(frame.can_id))
         if other is None:
@@ -123,35 +115,32 @@ def raw_frame_problems(
             ways = f'on {frame.channel}; give it a separate bus (sensor.channel = "can1"), or take other node ids'
         else:
             ways = "on another bus, and the cell knows what it receives by the identifier alone; take other node ids"
-        problems.append(f"array {name}: its {frame.what} frame {frame.can_id:03X}h is {other} {ways}")
+        problems.append(f"array {array.name}: its {frame.what} frame {frame.can_id:03X}h is {other} {ways}")
     if len(problems) > 1:
         return [f"{problems[0]} ({len(problems) - 1} more of its identifiers are taken too)"]
     return problems
 
 
-def _identifiers(
-    pdos: list[PlannedPdo], buses: Mapping[str, tuple[int, ...]]
-) -> tuple[dict[int, str], dict[str, dict[int, str]]]:
+def _identifiers(bus: BusPlan) -> tuple[dict[int, str], dict[str, dict[int, str]]]:
     """Frames that the cell receives on any bus, and all frames of each bus, by identifier."""
+    common = {
+        NMT_ID: "NMT",
+        SYNC_ID: "SYNC",
+        HEARTBEAT_BASE + MASTER_NODE_ID: "the heartbeat of the master",
+    }
     received: dict[int, str] = {}
-    on_bus: dict[str, dict[int, str]] = {}
-    for channel, node_ids in buses.items():
-        here = on_bus[channel] = {
-            NMT_ID: "NMT",
-            SYNC_ID: "SYNC",
-            HEARTBEAT_BASE + MASTER_NODE_ID: "the heartbeat of the master",
-        }
+    on_bus = {channel: dict(common) for channel in bus.channels}
+    for channel, node_ids in bus.channels.items():
         for node_id in node_ids:
             its = {
                 HEARTBEAT_BASE + node_id: f"the heartbeat of node {node_id}",
                 EMCY_BASE + node_id: f"the EMCY of node {node_id}",
                 SDO_TX_BASE + node_id: f"the SDO answer of node {node_id}",
             }
-            mine = [pdo for pdo in pdos if pdo.node_id == node_id]
+            mine = [pdo for pdo in bus.pdos if pdo.node_id == node_id]
             its |= {pdo.cob_id: f"TPDO{pdo.number} of node {node_id}" for pdo in mine if pdo.direction == "tpdo"}
             received |= its
-            here |= its | {SDO_RX_BASE + node_id: f"the SDO request to node {node_id}"}
-            here |= {pdo.cob_id: f"RPDO{pdo.number} of node {node_id}" for pdo in mine if pdo.direction == "rpdo"}
-    for common in (NMT_ID, SYNC_ID, HEARTBEAT_BASE + MASTER_NODE_ID):
-        received[common] = next(iter(on_bus.values()))[common]
-    return received, on_bus
+            on_bus[channel] |= its | {SDO_RX_BASE + node_id: f"the SDO request to node {node_id}"}
+            commands = [pdo for pdo in mine if pdo.direction == "rpdo"]
+            on_bus[channel] |= {pdo.cob_id: f"RPDO{pdo.number} of node {node_id}" for pdo in commands}
+    return received | common, on_bus

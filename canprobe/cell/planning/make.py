@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from canprobe.cell.planning.advice import omitted_features, outputs, warnings
 from canprobe.cell.planning.array import array_problems, as_supported, cut_patch, speed_over_array_problems
 from canprobe.cell.planning.bridges import unavailable_bridges
-from canprobe.cell.planning.configuration import make_configurations
+from canprobe.cell.planning.configuration import configure
 from canprobe.cell.planning.device_capabilities import SECTIONS, DeviceCapabilities, lacks
 from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes
 from canprobe.cell.planning.identifiers import (
@@ -18,30 +18,19 @@ from canprobe.cell.planning.identifiers import (
     plan_raw_frames,
     raw_frame_problems,
 )
-from canprobe.cell.planning.model import (
-    SYNC_OVERFLOW,
-    Choice,
-    JointSpeeds,
-    NodeKind,
-    Plan,
-    PlannedNode,
-    PlannedPdo,
-    SyncPlan,
-    Traffic,
-)
-from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
+from canprobe.cell.planning.model import SYNC_OVERFLOW, Choice, JointSpeeds, Plan
+from canprobe.cell.planning.node_configuration import NodeKind
+from canprobe.cell.planning.pdos import BusPlan, plan_drive_pdos, plan_tactile_pdos
 from canprobe.cell.planning.sync import (
-    choose_mode,
     early_stops,
-    interpolations,
     is_profiled,
     operation_problems,
     period_problem,
     plan_ratio,
     plan_sync,
 )
-from canprobe.cell.planning.traffic import PlannedTraffic, plan_traffic
-from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
+from canprobe.cell.planning.traffic import plan_traffic
+from canprobe.cell.planning.units import range_problems, within_drives
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
 
@@ -63,20 +52,65 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
-    beyond = [*range_problems(setup), *(speed_problems(setup, devices) if not problems else ())]
-    setup, narrowed = within_drives(setup, devices) if not problems and not beyond else (setup, ())
-    unsuited = [*array_problems(setup)]
-    bus = _choose(setup, devices, problems) if not problems else None
-    problems += [*unsuited, *speed_over_array_problems(setup)]
-    if bus is not None:
+    beyond: list[str] = [*range_problems(setup)]
+    narrowed: tuple[str, ...] = ()
+    bus: BusPlan | None = None
+    if not problems:
+        setup, beyond, narrowed = within_drives(setup, devices)
+        bus = _choose(setup, devices)
         setup = bus.setup
-        problems += _cut_problems(setup)
-    problems += beyond
+        problems += [*bus.problems, *bus.overload]
+    joint_speeds, unsuited = _check_task(setup, narrowed)
+    problems += [*beyond, *unsuited]
+    if problems or bus is None or bus.budget is None:
+        ways = _ways_out(bus) if bus is not None and bus.overload and find_ways else []
+        alone = bus is not None and set(problems) <= {*bus.overload}
+        problems = [problem if bus is None else _with_rates(problem, bus) for problem in problems]
+        raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
+    bus.setup = setup = setup.with_choices({choice.key: choice.value for choice in bus.choices})
+    absent = omitted_features(setup)
+    bus.not_available += unavailable_bridges(setup)
+    nodes = [configure(bus, *role) for role in _roles(setup)]
+    if bus.problems:
+        raise PlanError(_shared(bus.problems))
+    return Plan(
+        setup=setup,
+        nodes=tuple(sorted(nodes, key=lambda node: node.node_id)),
+        pdos=tuple(bus.pdos),
+        raw=tuple(bus.raw),
+        sync=bus.sync,
+        buses=tuple(bus.buses),
+        budget=bus.budget,
+        choices=bus.choices,
+        joint_speeds=joint_speeds,
+        outputs=outputs(setup, dict(absent)),
+        left_out=(*absent, *_unused_axes(setup, devices)),
+        not_available=tuple(dict.fromkeys(bus.not_available)),
+        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
+    )
+
+
+def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpeeds | None, list[str]]:
+    """Joint speeds that the task needs, and why array, arm and plant cannot carry it out, whatever the bus carries.
+
+    Args:
+        setup: the setup; closed where its devices are known.
+        narrowed: what the drives allow less than the joints; where the arm cannot move, it may be the reason.
+    """
+    unsuited = [*array_problems(setup)]
+    speeds: JointSpeeds | None = None
+    unreachable: list[str] = []
+    if setup.arm is not None and not unsuited:
+        from canprobe.cell.planning.motion import check_motion
+
+        speeds, unreachable = check_motion(setup, setup.arm)
+    problems = [*unsuited, *speed_over_array_problems(setup)]
+    if (cut := cut_patch(setup)) is not None and not cut.safe:
+        problems.append(f"{cut.text}; take {' or '.join(cut.ways)}")
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
         problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
     if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
         problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
-    joint_speeds, unreachable = _check_motion(setup) if not unsuited else (None, [])
     problems += [*unreachable, *narrowed] if unreachable else []
     truth, arm = setup.truth, setup.arm
     if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in setup.drives):
@@ -84,32 +118,10 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
 
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
-    if problems or bus is None:
-        ways = _ways_out(bus) if bus is not None and bus.traffic.problems and find_ways else []
-        alone = bus is not None and set(problems) <= {*bus.traffic.problems}
-        problems = [problem if bus is None else _with_rates(problem, bus, devices) for problem in problems]
-        raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
-    chosen = {choice.key: choice.value for choice in bus.choices}
-    setup = setup.with_choices(chosen)
-    absent = omitted_features(setup)
-    plan = Plan(
-        setup=setup,
-        nodes=_nodes(setup, devices, bus.traffic.pdos, bus.sync),
-        pdos=bus.traffic.pdos,
-        raw=bus.traffic.raw,
-        sync=bus.sync,
-        buses=bus.traffic.buses,
-        choices=bus.choices,
-        joint_speeds=joint_speeds,
-        outputs=outputs(setup, dict(absent)),
-        left_out=(*absent, *_unused_axes(setup, devices)),
-        not_available=(*bus.not_available, *unavailable_bridges(setup)),
-        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.traffic.pdos)),
-    )
-    return _with_configurations(plan)
+    return speeds, problems
 
 
-def _ways_out(bus: _BusPlan) -> list[str]:
+def _ways_out(bus: BusPlan) -> list[str]:
     """Changes that make an overloaded bus fit and ask for nothing new of the rest of the plan."""
     setup, known, elsewhere = bus.setup, frozenset(bus.problems), frozenset(_problems_beside_bus(bus.setup))
 
@@ -128,24 +140,8 @@ def _images(setup: Setup) -> tuple[object, ...]:
 
 def _problems_beside_bus(setup: Setup) -> list[str]:
     """Problems of a setup with known devices, apart from those of its bus."""
-    devices, _ = _devices(setup)
-    found = [*speed_over_array_problems(setup), *range_problems(setup), *speed_problems(setup, devices)]
-    found += _cut_problems(setup)
-    return [*found, *([*array_problems(setup)] or _check_motion(within_drives(setup, devices)[0])[1])]
-
-
-def _check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
-    """As `check_motion`; of a cell without an arm nothing moves."""
-    if setup.arm is None:
-        return None, []
-    from canprobe.cell.planning.motion import check_motion
-
-    return check_motion(setup, setup.arm)
-
-
-def _cut_problems(setup: Setup) -> list[str]:
-    cut = cut_patch(setup)
-    return [] if cut is None or cut.safe else [f"{cut.text}; take {' or '.join(cut.ways)}"]
+    setup, beyond, _ = within_drives(setup, _devices(setup)[0])
+    return [*beyond, *_check_task(setup)[1]]
 
 
 def _shared(problems: Sequence[str]) -> list[str]:
@@ -158,123 +154,74 @@ def _shared(problems: Sequence[str]) -> list[str]:
     return [f"node{'s' * (',' in its)} {its}: {text}" if its else text for text, its in lists.items()]
 
 
-def _with_configurations(plan: Plan) -> Plan:
-    """The plan with the configuration of each node; wished writes that its device cannot take are not available.
-
-    Raises:
-        PlanError: when a device cannot take a required write.
-    """
-    nodes = make_configurations(plan)
-    if problems := [problem for node in nodes for problem in node.problems]:
-        raise PlanError(_shared(problems))
-    lacks = [(one.what, f"{node.eds}: {one.why}: {one.write.absence}") for node in nodes for one in node.left_out]
-    return replace(plan, configurations=nodes, not_available=tuple(dict.fromkeys((*plan.not_available, *lacks))))
-
-
-@dataclass(frozen=True, slots=True)
-class _BusPlan:
-    """The bus part of a plan.
-
-    Attributes:
-        setup: the closed setup: no key is "auto".
-        choices: values of the keys that were open.
-        traffic: traffic of its buses, with the problems of the bit rate.
-        problems: what is wrong at any bit rate.
-        untaken: problems with a rate, each with other rates as text and the setups that have them.
-    """
-
-    setup: Setup
-    choices: tuple[Choice, ...]
-    sync: SyncPlan
-    traffic: PlannedTraffic
-    problems: list[str]
-    not_available: tuple[tuple[str, str], ...]
-    untaken: list[tuple[str, list[tuple[str, Setup]]]]
-
-    @property
-    def rank(self) -> tuple[int, float]:
-        """Sort key of a candidate: number of problems, then the largest share of bus or trigger time used."""
-        shares = [bus.traffic.load for bus in self.traffic.buses]
-        shares += [demand.used_ns / demand.available_ns for bus in self.traffic.buses for demand in bus.traffic.demands]
-        return len(self.problems), max(shares)
-
-
 def device_problems(setup: Setup) -> list[str]:
     """What the devices of a setup lack for its task, whatever the rate."""
     return _devices(setup)[1]
 
 
-def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities], problems: list[str]) -> _BusPlan:
-    """The first candidate that fits; else the nearest to fitting, whose problems are added."""
-    found: list[_BusPlan] = []
+def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> BusPlan:
+    """The first candidate that fits; else the nearest to fitting."""
+    found: list[BusPlan] = []
     for candidate, choices in candidates(setup):
         bus = _plan_bus(candidate, devices, choices)
-        if not bus.traffic.problems and not bus.problems:
+        if not bus.overload and not bus.problems:
             return bus
         found.append(bus)
     wanted = setup.arm is None or setup.arm.torque
     found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque == wanted]
-    nearest = min(found, key=lambda bus: bus.rank)
+    nearest = min(found, key=_rank)
     if len(found) > 1:
         chosen = ", ".join(f"{choice.key} = {choice.written}" for choice in nearest.choices)
-        problems.append(f"none of {len(found)} ways to fill what is left open fits; the nearest: {chosen}")
-    problems += [*nearest.problems, *nearest.traffic.problems]
+        nearest.problems.insert(0, f"none of {len(found)} ways to fill what is left open fits; the nearest: {chosen}")
     return nearest
 
 
-def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
+def _rank(bus: BusPlan) -> tuple[int, float]:
+    """Sort key of a candidate: number of problems, then the largest share of bus or trigger time used."""
+    return len(bus.problems), max(max(one.load, *(demand.share for demand in one.demands)) for one in bus.buses)
+
+
+def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: tuple[Choice, ...] = ()) -> BusPlan:
     sync, exact = plan_sync(setup)
     drives = [devices[drive.node_id] for drive in setup.drives if not is_profiled(devices[drive.node_id])]
     unset, periods = period_problem(setup.rate_hz, sync.period_us, exact, drives)
     ratio, untimed, image_rates = plan_ratio(setup)
-    not_available = []
+    bus = BusPlan(setup, devices, sync, _channels(setup), choices)
     if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if not _counts_syncs(device)]:
-        sync = replace(sync, overflow=0)
-        not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
-    untaken: list[tuple[str, list[tuple[str, Setup]]]] = []
+        bus.sync = replace(sync, overflow=0)
+        bus.not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
     if unset is not None:
         slower = [(rate, *at_rate(setup, rate)) for rate in periods]
-        untaken.append((unset, [(f"{rate:.6g}{' Hz' * bool(more)}{more}", one) for rate, more, one in slower]))
+        bus.untaken[unset] = [(f"{rate:.6g}{' Hz' * bool(more)}{more}", one) for rate, more, one in slower]
     if untimed is not None:
         near = image_rates[:_TRIED_RATES]
-        untaken.append((untimed, [(f"{rate:.6g}", setup.changed("array", rate_hz=rate)) for rate in near]))
-    problems: list[str] = []
-    channels = _channels(setup)
-    channel_of = {node_id: channel for channel, node_ids in channels.items() for node_id in node_ids}
-    planning = PdoPlanning(setup, sync, devices, channel_of, problems=problems, not_available=not_available)
-    plan_drive_pdos(planning)
-    plan_tactile_pdos(planning, ratio)
-    by_deadline = setup.bus.cob_ids == "by_deadline"
-    planned = order_by_deadline(planning.pdos, devices.values()) if by_deadline else planning.pdos
-    planning.problems += identifier_problems(planned)
-    frames = plan_raw_frames(setup)
+        bus.untaken[untimed] = [(f"{rate:.6g}", setup.changed("array", rate_hz=rate)) for rate in near]
+    bus.problems += bus.untaken
+    plan_drive_pdos(bus)
+    plan_tactile_pdos(bus, ratio)
+    if setup.bus.cob_ids == "by_deadline":
+        bus.pdos = order_by_deadline(bus.pdos, devices.values())
+    bus.problems += identifier_problems(bus.pdos)
     if setup.array is not None:
-        planning.problems += raw_frame_problems(frames, planned, channels, setup.array.name)
-    traffic = plan_traffic(planned, sync, channels, setup.bus, setup.compute_ns, raw=frames)
-    return _BusPlan(
-        setup=setup,
-        choices=choices,
-        sync=sync,
-        traffic=traffic,
-        problems=[*(problem for problem, _ in untaken), *planning.problems],
-        not_available=tuple(dict.fromkeys(planning.not_available)),
-        untaken=untaken,
-    )
+        bus.raw = [*plan_raw_frames(setup)]
+        bus.problems += raw_frame_problems(bus, setup.array)
+    plan_traffic(bus)
+    return bus
 
 
 _OFFERED_RATES, _TRIED_RATES = 2, 12
 
 
-def _with_rates(problem: str, bus: _BusPlan, devices: Mapping[int, DeviceCapabilities]) -> str:
+def _with_rates(problem: str, bus: BusPlan) -> str:
     """A problem of a bus; one with a rate is followed by the first rates to take in its place that fit."""
-    changes = dict(bus.untaken).get(problem)
+    changes = bus.untaken.get(problem)
     if not changes:
         return problem
     known, elsewhere = set(bus.problems) - {problem}, _keys(_problems_beside_bus(bus.setup))
     fitting, in_turn = [], []
     for text, changed in changes:
-        other = _plan_bus(changed, devices)
-        if other.traffic.problems or not known.issuperset(other.problems):
+        other = _plan_bus(changed, bus.devices)
+        if other.overload or not known.issuperset(other.problems):
             continue
         if further := _keys(_problems_beside_bus(other.setup)) - elsewhere:
             in_turn.append((text, ", which asks for another " + " and ".join(sorted(further))))
@@ -322,19 +269,14 @@ def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
     return {name: tuple(sorted(node.node_id for node in nodes if node.channel == name)) for name in names}
 
 
-def _fits(setup: Setup, known: frozenset[str]) -> tuple[Setup, Traffic] | None:
-    """A changed setup, closed, and the traffic of its fullest bus; None where it does not fit or has a new problem.
+def _fits(setup: Setup, known: frozenset[str]) -> BusPlan | None:
+    """The bus plan of a changed setup; None where it does not fit or has a new problem.
 
     The motor torque may be given up for it, as in a plan.
     """
     devices, problems = _devices(setup)
-    if problems:
-        return None
-    for candidate, _ in candidates(setup):
-        bus = _plan_bus(candidate, devices)
-        if not bus.traffic.problems and known.issuperset(bus.problems):
-            return candidate, max((one.traffic for one in bus.traffic.buses), key=lambda traffic: traffic.load)
-    return None
+    buses = (_plan_bus(candidate, devices) for candidate, _ in (candidates(setup) if not problems else ()))
+    return next((bus for bus in buses if not bus.overload and known.issuperset(bus.problems)), None)
 
 
 def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
@@ -363,28 +305,3 @@ def _devices(setup: Setup) -> tuple[dict[int, DeviceCapabilities], list[str]]:
             problems += lacks(device, kind, setup)
             problems += operation_problems(device, setup) if kind == "drive" else []
     return devices, problems
-
-
-def _nodes(
-    setup: Setup, devices: Mapping[int, DeviceCapabilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
-) -> tuple[PlannedNode, ...]:
-    nodes = []
-    for kind, role, node in _roles(setup):
-        device, is_drive = devices[node.node_id], kind == "drive"
-        used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node.node_id}
-        nodes.append(
-            PlannedNode(
-                node_id=node.node_id,
-                kind=kind,
-                role=role,
-                eds=node.eds,
-                dictionary=device.od,
-                identity=replace(device.identity, serial_number=node.serial),
-                emulated=node.emulated,
-                channel=node.channel,
-                switched_off=tuple(one for one in device.switchable_pdos if one not in used),
-                mode=choose_mode(device) if is_drive else None,
-                interpolation=interpolations(device, sync.period_us) if is_drive and not is_profiled(device) else (),
-            )
-        )
-    return tuple(sorted(nodes, key=lambda node: node.node_id))

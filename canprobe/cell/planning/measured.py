@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from canprobe.cell.planning.model import (
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
+    Part,
     Plan,
     PlannedBus,
     PlannedFrames,
-    PlannedPdo,
 )
 from canprobe.cell.planning.traffic import SYNC_BITS, SYNC_BITS_LEAST, on_the_wire
 from canprobe.cell.planning.wire_time import exact_frame_bits, unstuffed_frame_bits
@@ -29,6 +29,7 @@ from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID,
 Kind = Literal[
     "SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "raw frame", "event PDO", "heartbeat", "NMT", "EMCY", "SDO"
 ]
+_KINDS: dict[Part, Kind] = {"event": "event PDO", "command": "drive RPDO", "tactile": "tactile PDO"}
 TOLERANCE = 0.02
 """Share by which a count may differ from the plan; a frame of each message may always be missing at the edges."""
 
@@ -221,7 +222,7 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
     for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.node_id in bus.node_ids]):
         triggered = pdo.layout.synchronous
         latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
-        found.append(Expected(pdo.cob_id, _kind(pdo), pdo.rate_hz, pdo.bits_worst, latest))
+        found.append(Expected(pdo.cob_id, _KINDS.get(pdo.part, "drive TPDO"), pdo.rate_hz, pdo.bits_worst, latest))
     raw: dict[int, list[PlannedFrames]] = {}
     for frames in plan.raw:
         if frames.channel == bus.channel:
@@ -237,14 +238,6 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
         found += [Expected(EMCY_BASE + node, "EMCY"), Expected(SDO_TX_BASE + node, "SDO")]
         found.append(Expected(SDO_RX_BASE + node, "SDO"))
     return {message.cob_id: message for message in found}
-
-
-def _kind(pdo: PlannedPdo) -> Kind:
-    if not pdo.layout.synchronous:
-        return "event PDO"
-    if pdo.kind == "tactile":
-        return "tactile PDO"
-    return "drive RPDO" if pdo.direction == "rpdo" else "drive TPDO"
 
 
 @dataclass(slots=True)
@@ -394,5 +387,5 @@ class TrafficMeter:
             unlisted={can_id: n for can_id, n in seen.items() if can_id not in self._expected},
             missing=tuple(cob_id for cob_id in pdos if cob_id not in seen),
             error_frames=self.error_frames,
-            planned_worst=self._bus.traffic.load,
+            planned_worst=self._bus.load,
         )

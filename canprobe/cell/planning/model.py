@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from canopen import ObjectDictionary
-
-from canprobe.cell.planning.node_configuration import NodeConfiguration
+from canprobe.cell.planning.node_configuration import Direction, NodeConfiguration, NodeKind
 from canprobe.cell.scene.load import SAVED_AS, dump_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.scene.toml_files import toml_value, written_by_line
-from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 
 MASTER_NODE_ID = 127
@@ -25,74 +22,9 @@ TASK_OVERHEAD_S = 3.0
 EVERY_SYNC = 1
 """Transmission type of a PDO that is sent in every cycle."""
 
-NodeKind = Literal["drive", "tactile"]
-Direction = Literal["tpdo", "rpdo"]
 RawKind = Literal["image", "start", "stop", "poll"]
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Object 1018h by the EDS, and the serial number of the scene; None where any value is good."""
-
-    vendor_id: int | None
-    product_code: int | None
-    revision_number: int | None
-    serial_number: int | None = None
-
-    @property
-    def numbers(self) -> tuple[int | None, int | None, int | None, int | None]:
-        """Values of 1018h:01 to :04."""
-        return self.vendor_id, self.product_code, self.revision_number, self.serial_number
-
-
-@dataclass(frozen=True, slots=True)
-class Interpolation:
-    """A time as 60C2h expresses it: value · 10^index s.
-
-    Attributes:
-        value: value of 60C2h:01.
-        index: value of 60C2h:02.
-    """
-
-    value: int
-    index: int
-
-    def __str__(self) -> str:
-        return f"{self.value}·10{str(self.index).translate(_SUPERSCRIPT)} s"
-
-
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedNode:
-    """A node that is brought up.
-
-    Attributes:
-        node_id: node id, 1–126.
-        kind: `drive` or `tactile`.
-        role: its name for people: `joint 1`, `tactile array`.
-        eds: name or path of its EDS.
-        identity: what 1018h must answer.
-        emulated: whether the emulator serves it.
-        channel: channel of its bus.
-        switched_off: PDOs of the EDS that the scene does not need, (direction, number).
-        mode: mode of operation, 6060h; None: the node is no drive.
-        interpolation: values of 60C2h that express the period, the first is tried first; empty: the node needs none.
-        dictionary: object dictionary of the package canopen, as the EDS was read for this plan. Treat it as read-only.
-    """
-
-    node_id: int
-    kind: NodeKind
-    role: str
-    eds: str
-    dictionary: ObjectDictionary = field(repr=False, compare=False)
-    identity: Identity
-    emulated: bool
-    channel: str
-    switched_off: tuple[tuple[Direction, int], ...]
-    mode: OperationMode | None = None
-    interpolation: tuple[Interpolation, ...] = ()
+Part = Literal["SYNC", "feedback", "controller", "command", "tactile", "other", "event"]
+"""Part of a frame, or of the controller, in the cycle; an event is a frame that SYNC does not trigger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +65,15 @@ class PlannedPdo:
     fixed_id: bool = False
     own_bits: int = 0
     constants: tuple[tuple[tuple[int, int], int], ...] = ()
+
+    @property
+    def part(self) -> Part:
+        """Its part in the cycle."""
+        if not self.layout.synchronous:
+            return "event"
+        if self.direction == "rpdo":
+            return "command"
+        return "tactile" if self.kind == "tactile" else "feedback" if self.used else "other"
 
     @property
     def cob_id(self) -> int:
@@ -216,6 +157,11 @@ class Demand:
     used_ns: int
     available_ns: int
 
+    @property
+    def share(self) -> float:
+        """Share of the cycles that the frames take."""
+        return self.used_ns / self.available_ns
+
 
 @dataclass(frozen=True, slots=True)
 class CycleBudget:
@@ -254,37 +200,24 @@ class CycleBudget:
 
 
 @dataclass(frozen=True, slots=True)
-class Traffic:
-    """Traffic of a bus, worst case.
-
-    Attributes:
-        load: share of the bit rate of everything that repeats.
-        parts: its parts, as (what, share).
-        demands: peaks behind one SYNC.
-        sync_response_ns: worst-case response time of SYNC.
-        budget: time budget of one cycle of the cell, over all its buses.
-    """
-
-    load: float
-    parts: tuple[tuple[str, float], ...]
-    demands: tuple[Demand, ...]
-    sync_response_ns: int | None
-    budget: CycleBudget
-
-
-@dataclass(frozen=True, slots=True)
 class PlannedBus:
-    """One bus of the cell.
+    """One bus of the cell with its traffic, worst case.
 
     Attributes:
         channel: its name in the scene.
         node_ids: ids of its nodes.
-        traffic: its worst-case traffic.
+        load: share of the bit rate of everything that repeats.
+        parts: its parts, as (what, share).
+        demands: peaks behind one SYNC.
+        sync_response_ns: worst-case response time of SYNC.
     """
 
     channel: str
     node_ids: tuple[int, ...]
-    traffic: Traffic
+    load: float
+    parts: tuple[tuple[str, float], ...]
+    demands: tuple[Demand, ...]
+    sync_response_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,33 +260,33 @@ class Plan:
 
     Attributes:
         setup: the resolved scene in SI units, with every choice of the plan; its `scene` has them too.
-        nodes: nodes that are brought up, by node id.
+        nodes: nodes that are brought up, with their configuration, by node id.
         pdos: PDOs of all nodes, by priority on the bus.
         raw: frames of an array that is no CANopen node.
         sync: rate and period of SYNC.
         buses: the bus of the first joint, then the others in the order of the joints, the array's last.
+        budget: time budget of one cycle, over all buses.
         choices: values that the scene left to the plan, with reasons.
         joint_speeds: needed and allowed joint speeds; None without an arm.
         outputs: files that a run writes.
         left_out: what this scene does not bring up, and why.
         not_available: what the devices lack by their EDS files, and what that means.
         warnings: what is carried out although a number of the plan does not hold for it.
-        configurations: configuration of each node, drives first.
     """
 
     setup: Setup
-    nodes: tuple[PlannedNode, ...]
+    nodes: tuple[NodeConfiguration, ...]
     pdos: tuple[PlannedPdo, ...]
     raw: tuple[PlannedFrames, ...]
     sync: SyncPlan
     buses: tuple[PlannedBus, ...]
+    budget: CycleBudget
     choices: tuple[Choice, ...]
     joint_speeds: JointSpeeds | None
     outputs: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
-    configurations: tuple[NodeConfiguration, ...] = ()
 
     @property
     def scene(self) -> Scene:
@@ -373,9 +306,9 @@ class Plan:
         return {SAVED_AS: text.encode(), **self.setup.files}
 
     @property
-    def traffic(self) -> Traffic:
-        """Traffic of the first bus, which is that of the first joint."""
-        return self.buses[0].traffic
+    def traffic(self) -> PlannedBus:
+        """The first bus, which is that of the first joint, with its traffic."""
+        return self.buses[0]
 
     @property
     def cycles(self) -> int:

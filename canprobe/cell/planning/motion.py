@@ -61,7 +61,12 @@ def check_motion(setup: Setup, arm: Arm) -> tuple[JointSpeeds | None, list[str]]
                 from canprobe.cell.planning.surface_path import surface_path
 
                 path = surface_path(task, setup.truth.object)
-                problems += _hollow_problems(path, task.probe)
+                if path.hollow_radius <= task.probe.radius:
+                    problems.append(
+                        f"object: a hollow of radius {1e3 * path.hollow_radius:.3g} mm is tighter than the probe of"
+                        f" radius {1e3 * task.probe.radius:g} mm, which touches it in more than one place; use a"
+                        " smaller probe or another object"
+                    )
                 contacts = [*_along_path(task, path)][_POSES_BEFORE_CONTACT:]
                 speeds, found = _check_touch(task, path, stops, _beginning(setup, task, contacts))
                 found += force_problems(setup, task)
@@ -292,15 +297,6 @@ def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeed
     keys = " and ".join(dict.fromkeys(f"swing_{joint.unit}" for joint in task.arm.model.joints))
     way_out = f"swing slower (task.swing_period_s = {at_least(slower)}) or less ({keys} of the joints)"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
-
-
-def _hollow_problems(path: SurfacePath, probe: Probe) -> list[str]:
-    if path.hollow_radius > probe.radius:
-        return []
-    return [
-        f"object: a hollow of radius {1e3 * path.hollow_radius:.3g} mm is tighter than the probe of radius "
-        f"{1e3 * probe.radius:g} mm, which touches it in more than one place; use a smaller probe or another object"
-    ]
 
 
 @dataclass(frozen=True, slots=True)

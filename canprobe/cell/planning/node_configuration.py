@@ -1,13 +1,18 @@
-"""The configuration of a node as data: what it must be, and the writes that make it so."""
+"""A node of the plan as data: what it must be, and the writes that make it so."""
 
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from canopen import ObjectDictionary
 
 from canprobe.errors import NodeError
+from canprobe.fieldbus.protocol.cia402 import OperationMode
+
+NodeKind = Literal["drive", "tactile"]
+Direction = Literal["tpdo", "rpdo"]
 
 MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
 _TOLERANCE = 1e-3
@@ -39,24 +44,6 @@ class Write:
     def place(self) -> str:
         """The entry for messages, such as ``60C2h:01``."""
         return f"{self.index:04X}h:{self.subindex:02X}"
-
-
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """A wished write that the EDS excludes.
-
-    Attributes:
-        write: the write that is not made.
-        why: what the EDS offers instead.
-    """
-
-    write: Write
-    why: str
-
-    @property
-    def what(self) -> str:
-        """Purpose and entry, for people."""
-        return f"{self.write.purpose} ({self.write.place})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,22 +100,64 @@ class TurnUnits:
 
 
 @dataclass(frozen=True, slots=True)
-class NodeConfiguration:
-    """Requirements on one node, and its configuration.
+class Identity:
+    """Object 1018h by the EDS, and the serial number of the scene; None where any value is good."""
+
+    vendor_id: int | None
+    product_code: int | None
+    revision_number: int | None
+    serial_number: int | None = None
+
+    @property
+    def numbers(self) -> tuple[int | None, int | None, int | None, int | None]:
+        """Values of 1018h:01 to :04."""
+        return self.vendor_id, self.product_code, self.revision_number, self.serial_number
+
+    @property
+    def stated(self) -> dict[int, int]:
+        """The values that are checked, by sub-index."""
+        return {sub: value for sub, value in enumerate(self.numbers, start=1) if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Interpolation:
+    """A time as 60C2h expresses it: value · 10^index s.
 
     Attributes:
-        node_id: the node.
-        name: its name in messages, such as ``joint 3``.
+        value: value of 60C2h:01.
+        index: value of 60C2h:02.
+    """
+
+    value: int
+    index: int
+
+    def __str__(self) -> str:
+        return f"{self.value}·10{str(self.index).translate(_SUPERSCRIPT)} s"
+
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True, slots=True)
+class NodeConfiguration:
+    """A node that is brought up: what it must be, and the writes that make it so.
+
+    Attributes:
+        node_id: node id, 1–126.
+        kind: `drive` or `tactile`.
+        name: its name for people: `joint 3`, `tactile array`.
+        eds: name or path of its EDS.
+        dictionary: object dictionary of the package canopen, as the EDS was read for this plan. Treat it as read-only.
+        identity: what 1018h must answer.
+        emulated: whether the emulator serves it.
         channel: channel of its bus.
-        eds: name of its EDS file, for messages.
-        dictionary: its object dictionary, from the EDS.
-        identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
+        switched_off: PDOs of the EDS that the scene does not need, (direction, number).
         writes: its configuration, in order.
         given: what it must hold by itself.
-        otherwise: other writes of the same interpolation time, tried in this order where the device refuses 60C2h.
         left_out: wished writes that the EDS excludes.
-        problems: why required writes are excluded by the EDS; empty in a plan.
         mode: mode of operation, which 6061h must confirm; None: the node is no drive.
+        interpolation: values of 60C2h that express the period, the first is tried first; empty: the node needs none.
+        otherwise: writes of the other values of `interpolation`, tried in order where the device refuses the first.
         homing: writes for homing, in order; empty: the drive is not homed. Where the drive is coupled to other
             joints, the home offset depends on their positions; here they are in the start posture.
         turn: position units of a motor turn, to compare with those that the device states; None: not known.
@@ -136,17 +165,20 @@ class NodeConfiguration:
     """
 
     node_id: int
+    kind: NodeKind
     name: str
-    channel: str
     eds: str
-    dictionary: ObjectDictionary
-    identity: dict[int, int]
+    dictionary: ObjectDictionary = field(repr=False, compare=False)
+    identity: Identity
+    emulated: bool
+    channel: str
+    switched_off: tuple[tuple[Direction, int], ...]
     writes: tuple[Write, ...]
-    given: tuple[FixedEntry, ...] = ()
+    given: tuple[FixedEntry, ...]
+    left_out: tuple[Write, ...]
+    mode: OperationMode | None = None
+    interpolation: tuple[Interpolation, ...] = ()
     otherwise: tuple[tuple[Write, ...], ...] = ()
-    left_out: tuple[LeftOut, ...] = ()
-    problems: tuple[str, ...] = ()
-    mode: int | None = None
     homing: tuple[Write, ...] = ()
     turn: TurnUnits | None = None
     speed_unit: float = 1.0
@@ -162,5 +194,5 @@ class NodeConfiguration:
         They follow from the values, so that any change of them, of the EDS or of the scene, gives another date.
         """
         values = [(write.index, write.subindex, write.value) for write in self.writes if write.read_back]
-        text = repr((self.eds, self.identity, values)).encode()
+        text = repr((self.eds, self.identity.stated, values)).encode()
         return {1: 1 + zlib.crc32(text) % MOST_DAYS, 2: 1 + zlib.adler32(text) % DAY_MS}

@@ -12,9 +12,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
-from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
+from canprobe.cell.planning.model import (
+    EVERY_SYNC,
+    Choice,
+    CycleBudget,
+    PlannedBus,
+    PlannedFrames,
+    PlannedPdo,
+    SyncPlan,
+)
+from canprobe.cell.planning.node_configuration import Direction, NodeKind
 from canprobe.cell.planning.sync import TARGETS, Place, choose_mode, is_profiled
-from canprobe.cell.planning.units import profile_values
+from canprobe.cell.planning.units import DriveAxis, profile_values
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, WINDOW_SIZE, has_known
@@ -46,37 +55,51 @@ FD_WORDS = (8, 6, 4, 3, 2, 1)
 """Objects of 8 bytes that fill a CAN FD frame without a byte left over."""
 
 
-@dataclass(frozen=True, slots=True)
-class ChosenPdo:
-    """A PDO of a device that carries objects of the scene.
-
-    Attributes:
-        number: number of the PDO, 1 for 1400h or 1800h.
-        entries: objects that it maps.
-    """
-
-    number: int
-    entries: tuple[PdoEntry, ...]
+Mapped = tuple[PdoEntry, ...]
+"""Objects that a PDO maps."""
 
 
 @dataclass(slots=True)
-class PdoPlanning:
-    """PDOs planned so far, with problems and with what a device lacks.
+class BusPlan:
+    """The bus part of a plan, which each step of the planning completes.
 
     Attributes:
-        setup: setup of the scene.
-        sync: rate and period of SYNC.
+        setup: closed setup: no key is "auto".
         devices: what each node can do, by node id.
-        channels: channel of each node's bus, by node id.
+        sync: rate and period of SYNC.
+        channels: ids of the nodes on each bus, by channel.
+        choices: values of the keys that were open.
+        pdos: PDOs of all nodes.
+        raw: frames of an array that is no CANopen node.
+        buses: the buses with their traffic.
+        budget: time budget of one cycle; None before the traffic is planned.
+        problems: what is wrong at any bit rate.
+        overload: what the bit rate does not carry.
+        not_available: what the devices lack, and what that means.
+        untaken: other rates, as text and as the setup that has them, for each problem with a rate.
     """
 
     setup: Setup
-    sync: SyncPlan
     devices: Mapping[int, DeviceCapabilities]
-    channels: Mapping[int, str]
+    sync: SyncPlan
+    channels: Mapping[str, tuple[int, ...]]
+    choices: tuple[Choice, ...] = ()
     pdos: list[PlannedPdo] = field(default_factory=list)
+    raw: list[PlannedFrames] = field(default_factory=list)
+    buses: list[PlannedBus] = field(default_factory=list)
+    budget: CycleBudget | None = None
     problems: list[str] = field(default_factory=list)
+    overload: list[str] = field(default_factory=list)
     not_available: list[tuple[str, str]] = field(default_factory=list)
+    untaken: dict[str, list[tuple[str, Setup]]] = field(default_factory=dict)
+
+    def axis_of(self, node_id: int) -> DriveAxis:
+        """A drive with its device."""
+        return DriveAxis(self.setup, self.setup.needed_arm().node_ids.index(node_id), self.devices[node_id])
+
+    def channel_of(self, node_id: int) -> str:
+        """Channel of a node's bus."""
+        return next(channel for channel, node_ids in self.channels.items() if node_id in node_ids)
 
     def entries(self, node_id: int, direction: Direction, *objects: tuple[int, int]) -> list[PdoEntry]:
         """The objects as entries; what the device cannot map becomes a problem."""
@@ -109,13 +132,13 @@ class PdoPlanning:
         on_event = layout.transmission_type == ON_EVENT
         fixed = device.fixed_cob_id(direction, number)
         if fixed is not None:
-            layout = PdoLayout(fixed, layout.entries, layout.transmission_type, fd=layout.fd)
+            layout = replace(layout, cob_id=fixed)
         self.pdos.append(
             PlannedPdo(
                 node_id=node_id,
                 direction=direction,
                 number=number,
-                channel=self.channels[node_id],
+                channel=self.channel_of(node_id),
                 layout=layout,
                 rate_hz=1000 / RESENT_MS if on_event else self.sync.rate_hz / layout.transmission_type,
                 bits_worst=frame_bits(layout.length, self.setup.bus),
@@ -128,36 +151,36 @@ class PdoPlanning:
             )
         )
 
-    def choose(self, node_id: int, direction: Direction, needed: Sequence[Place]) -> list[ChosenPdo]:
-        """PDOs of a device that carry these objects between them; none, and a problem, where there are none.
+    def choose(self, node_id: int, direction: Direction, needed: Sequence[Place]) -> dict[int, Mapped]:
+        """PDOs of a device that carry these objects between them, by number; none, and a problem, where there are none.
 
         One that carries nothing else comes first, by number; then one that carries more; then several.
         """
         device = self.devices[node_id]
-        numbers = [number for number in device.pdo_numbers(direction) if device.can_cycle(direction, number)]
-        mapped = tuple(entry for place in needed if (entry := device.entry(*place, direction)) is not None)
-        alone: list[tuple[bool, ChosenPdo]] = []
-        fixed: list[ChosenPdo] = []
-        for number in numbers:
-            if device.capacity(direction, number) >= len(needed):
-                if len(mapped) == len(needed):
-                    alone.append((False, ChosenPdo(number, mapped)))
-            elif not device.capacity(direction, number):
-                one = ChosenPdo(number, tuple(map(device.mapped_entry, device.fixed_mapping(direction, number))))
-                sends = all(entry.bits and _exists(device, entry) for entry in one.entries)
-                if sends and 0 < sum(entry.bits for entry in one.entries) <= MAX_PDO_BITS:
-                    fixed.append(one)
-                    if set(needed) <= _places(one):
-                        alone.append((len(one.entries) > len(needed), one))
+        mappable = tuple(entry for place in needed if (entry := device.entry(*place, direction)) is not None)
+        alone: dict[int, Mapped] = {}
+        fixed: dict[int, Mapped] = {}
+        for number in filter(lambda n: device.can_cycle(direction, n), device.pdo_numbers(direction)):
+            capacity = device.capacity(direction, number)
+            if not capacity:
+                mapped = tuple(map(device.mapped_entry, device.fixed_mapping(direction, number)))
+                sends = all(entry.bits and _exists(device, entry) for entry in mapped)
+                if sends and 0 < sum(entry.bits for entry in mapped) <= MAX_PDO_BITS:
+                    fixed[number] = mapped
+                    if set(needed) <= _places(mapped):
+                        alone[number] = mapped
+            elif capacity >= len(needed) == len(mappable):
+                alone[number] = mappable
         if alone:
-            return [min(alone, key=lambda option: (option[0], option[1].number))[1]]
-        several = {place: next((one for one in fixed if place in _places(one)), None) for place in needed}
-        if None not in several.values():
-            return sorted({one.number: one for one in several.values() if one}.values(), key=lambda one: one.number)
+            best = min(alone, key=lambda number: (len(alone[number]) > len(needed), number))
+            return {best: alone[best]}
+        carriers = [next((n for n, mapped in fixed.items() if place in _places(mapped)), None) for place in needed]
+        if None not in carriers:
+            return {number: mapped for number, mapped in fixed.items() if number in carriers}
         if len(self.entries(node_id, direction, *needed)) == len(needed):
             offered = "; ".join(_offered(device, direction, n, len(needed)) for n in device.pdo_numbers(direction))
             self.unmapped(node_id, offered or f"has no {direction.upper()}", needed)
-        return []
+        return {}
 
     def cob_id(self, node_id: int, direction: Direction, number: int, wanted: int) -> int:
         """An identifier for a PDO: not the wanted one where an RPDO that cannot be switched off listens to that."""
@@ -173,8 +196,8 @@ def _exists(device: DeviceCapabilities, entry: PdoEntry) -> bool:
     return entry.is_dummy or device.has(entry.index, entry.subindex)
 
 
-def _places(chosen: ChosenPdo) -> set[Place]:
-    return {(entry.index, entry.subindex) for entry in chosen.entries}
+def _places(mapped: Mapped) -> set[Place]:
+    return {(entry.index, entry.subindex) for entry in mapped}
 
 
 def _offered(device: DeviceCapabilities, direction: Direction, number: int, count: int) -> str:
@@ -190,71 +213,70 @@ def _offered(device: DeviceCapabilities, direction: Direction, number: int, coun
     return f"{name} has the fixed mapping {fixed}" + (f", and the EDS has no {' or '.join(lost)}" if lost else "")
 
 
-def plan_drive_pdos(planning: PdoPlanning) -> None:
+def plan_drive_pdos(bus: BusPlan) -> None:
     """Feedback and targets of the drives: one PDO each way where the device has it, or two targets sharing one RPDO."""
-    arm = planning.setup.arm
+    arm = bus.setup.arm
     if arm is None:
         return
     for node_id in arm.node_ids:
-        _plan_feedback(planning, node_id)
-    without = {node_id: why for node_id in arm.node_ids if (why := _ungrouped(planning.devices[node_id]))}
+        _plan_feedback(bus, node_id)
+    without = {node_id: why for node_id in arm.node_ids if (why := _ungrouped(bus.devices[node_id]))}
     for node_id, why in without.items() if arm.grouped else ():
-        text = f"{planning.devices[node_id].eds}: {why}, so each drive keeps its own target RPDO"
-        planning.not_available.append(("two targets in one RPDO", text))
+        text = f"{bus.devices[node_id].eds}: {why}, so each drive keeps its own target RPDO"
+        bus.not_available.append(("two targets in one RPDO", text))
     beside: dict[str, list[int]] = {}  # two drives share an RPDO on one bus only
     for node_id in arm.node_ids:
-        mine = beside.setdefault(planning.channels[node_id], [])
+        mine = beside.setdefault(bus.channel_of(node_id), [])
         mine.append(node_id)
         if not arm.grouped or without:
-            _plan_commands(planning, node_id)
+            _plan_commands(bus, node_id)
         else:
-            _plan_grouped(planning, node_id, mine[(len(mine) - 1) // 2 * 2])
+            _plan_grouped(bus, node_id, mine[(len(mine) - 1) // 2 * 2])
     for node_id in arm.node_ids:
-        _plan_tolerated(planning, node_id)
+        _plan_tolerated(bus, node_id)
 
 
-def _plan_feedback(planning: PdoPlanning, node_id: int) -> None:
+def _plan_feedback(bus: BusPlan, node_id: int) -> None:
     """Statusword and position, and the torque where the device can send it too."""
-    device, arm = planning.devices[node_id], planning.setup.needed_arm()
-    chosen = planning.choose(node_id, "tpdo", (STATUSWORD, POSITION))
-    if chosen and not any(TORQUE in _places(one) for one in chosen) and arm.torque:
-        first, torque = chosen[0], device.entry(*TORQUE, "tpdo")
-        capacity = device.capacity("tpdo", first.number)
-        if torque is not None and len(chosen) == 1 and capacity > len(first.entries):
-            chosen = [ChosenPdo(first.number, (*first.entries, torque))]
+    device, arm = bus.devices[node_id], bus.setup.needed_arm()
+    chosen = bus.choose(node_id, "tpdo", (STATUSWORD, POSITION))
+    if chosen and not any(TORQUE in _places(mapped) for mapped in chosen.values()) and arm.torque:
+        (number, mapped), torque = next(iter(chosen.items())), device.entry(*TORQUE, "tpdo")
+        if torque is not None and len(chosen) == 1 and device.capacity("tpdo", number) > len(mapped):
+            chosen = {number: (*mapped, torque)}
         else:
             problem = f"6077h is {'not mappable to a TPDO' if device.has(*TORQUE) else 'missing'}"
             if torque is not None:
-                problem = _offered(device, "tpdo", first.number, len(first.entries) + 1)
-            planning.not_available.append(("motor torque (torque_permille of log.npz)", f"{device.eds}: {problem}"))
-    for base, one in zip(DRIVE_TPDOS, chosen, strict=False):
-        planning.add(node_id, "tpdo", one.number, PdoLayout(base + node_id, one.entries, EVERY_SYNC))
+                problem = _offered(device, "tpdo", number, len(mapped) + 1)
+            bus.not_available.append(("motor torque (torque_permille of log.npz)", f"{device.eds}: {problem}"))
+    for base, (number, mapped) in zip(DRIVE_TPDOS, chosen.items(), strict=False):
+        bus.add(node_id, "tpdo", number, PdoLayout(base + node_id, mapped, EVERY_SYNC))
 
 
-def _plan_commands(planning: PdoPlanning, node_id: int) -> None:
+def _plan_commands(bus: BusPlan, node_id: int) -> None:
     """Controlword and target, in one RPDO or several."""
-    device = planning.devices[node_id]
+    device = bus.devices[node_id]
     mode = choose_mode(device)
     assert mode is not None  # else the plan has said no
     targets = set(TARGETS.values())
-    held = {MODE: int(mode), **(profile_values(planning.setup, node_id, device) if is_profiled(device) else {})}
-    for base, one in zip(DRIVE_RPDOS, planning.choose(node_id, "rpdo", (CONTROLWORD, TARGETS[mode])), strict=False):
+    held = {MODE: int(mode), **(profile_values(bus.axis_of(node_id)) if is_profiled(device) else {})}
+    chosen = bus.choose(node_id, "rpdo", (CONTROLWORD, TARGETS[mode]))
+    for base, (number, mapped) in zip(DRIVE_RPDOS, chosen.items(), strict=False):
         constants: list[tuple[Place, int]] = []
-        for entry in one.entries:
+        for entry in mapped:
             place = entry.index, entry.subindex
             if entry.is_dummy or place == CONTROLWORD or place in targets:
                 continue
             value = held.get(place, device.number(*place))
             if value is None:
-                planning.problems.append(
-                    f"node {node_id}: {device.eds}: RPDO{one.number} also writes {place[0]:04X}h:{place[1]:02X}, whose"
+                bus.problems.append(
+                    f"node {node_id}: {device.eds}: RPDO{number} also writes {place[0]:04X}h:{place[1]:02X}, whose"
                     " EDS entry has no default: state a safe DefaultValue there"
                 )
             else:
                 constants.append((place, value))
-        cob_id = planning.cob_id(node_id, "rpdo", one.number, base + node_id)
-        layout = PdoLayout(cob_id, one.entries, EVERY_SYNC)
-        planning.add(node_id, "rpdo", one.number, layout, constants=tuple(constants))
+        layout = PdoLayout(bus.cob_id(node_id, "rpdo", number, base + node_id), mapped, EVERY_SYNC)
+        bus.add(node_id, "rpdo", number, layout, constants=tuple(constants))
 
 
 def _ungrouped(device: DeviceCapabilities) -> str | None:
@@ -270,30 +292,30 @@ def _ungrouped(device: DeviceCapabilities) -> str | None:
     return None
 
 
-def _plan_grouped(planning: PdoPlanning, node_id: int, first: int) -> None:
+def _plan_grouped(bus: BusPlan, node_id: int, first: int) -> None:
     """The controlword alone on change and again every 100 ms; the target in this drive's half of its pair's RPDO.
 
     The half of the other drive is a dummy. The identifier is that of the pair's first drive.
     """
-    device = planning.devices[node_id]
+    device = bus.devices[node_id]
     mode = choose_mode(device)
     assert mode is not None  # else the plan has said no
-    entries = planning.entries(node_id, "rpdo", CONTROLWORD)
-    planning.add(node_id, "rpdo", 1, PdoLayout(DRIVE_RPDOS[0] + node_id, tuple(entries), ON_EVENT))
-    entries, dummy = planning.entries(node_id, "rpdo", TARGETS[mode]), device.dummy(DUMMY_INTEGER32, 32)
+    entries = bus.entries(node_id, "rpdo", CONTROLWORD)
+    bus.add(node_id, "rpdo", 1, PdoLayout(DRIVE_RPDOS[0] + node_id, tuple(entries), ON_EVENT))
+    entries, dummy = bus.entries(node_id, "rpdo", TARGETS[mode]), device.dummy(DUMMY_INTEGER32, 32)
     if entries and dummy is not None:
         halves = (*entries, dummy) if node_id == first else (dummy, *entries)
-        planning.add(node_id, "rpdo", 2, PdoLayout(DRIVE_RPDOS[1] + first, halves, EVERY_SYNC))
+        bus.add(node_id, "rpdo", 2, PdoLayout(DRIVE_RPDOS[1] + first, halves, EVERY_SYNC))
 
 
-def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
+def _plan_tolerated(bus: BusPlan, node_id: int) -> None:
     """Plan the TPDOs that are not needed and cannot be switched off.
 
     No EDS states how often one is sent on events. What only has a state is counted ten times a second; anything else,
     such as a position, changes in every cycle, unless the inhibit time allows less.
     """
-    device, sync = planning.devices[node_id], planning.sync
-    used = {pdo.number for pdo in planning.pdos if pdo.node_id == node_id and pdo.direction == "tpdo"}
+    device, sync = bus.devices[node_id], bus.sync
+    used = {pdo.number for pdo in bus.pdos if pdo.node_id == node_id and pdo.direction == "tpdo"}
     for number in device.pdo_numbers("tpdo"):
         cob_id = device.fixed_cob_id("tpdo", number)
         communication = COMMUNICATION["tpdo"] + number - 1
@@ -308,31 +330,29 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
             seldom = all(entry.index in STATES for entry in entries)
             rate = min(1000 / RESENT_MS if seldom else sync.rate_hz, 10_000 / (inhibit_100us or 1))
         why = f"{device.eds}: its COB-ID is read-only, so it is sent besides, counted with {rate:g} Hz"
-        planning.not_available.append((f"TPDO{number} switched off", why))
-        planning.add(node_id, "tpdo", number, PdoLayout(cob_id, entries, kind))
-        added, period_ns = planning.pdos.pop(), round(1e9 / rate)
-        planning.pdos.append(replace(added, used=False, rate_hz=rate, deadline_ns=period_ns, event_timer_ms=0))
+        bus.not_available.append((f"TPDO{number} switched off", why))
+        bus.add(node_id, "tpdo", number, PdoLayout(cob_id, entries, kind))
+        added, period_ns = bus.pdos.pop(), round(1e9 / rate)
+        bus.pdos.append(replace(added, used=False, rate_hz=rate, deadline_ns=period_ns, event_timer_ms=0))
 
 
-def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
+def plan_tactile_pdos(bus: BusPlan, ratio: int) -> None:
     """Header and payload of a tactile frame, all triggered by every `ratio`-th SYNC."""
-    array, fd = planning.setup.array, planning.setup.bus.fd
+    array, fd = bus.setup.array, bus.setup.bus.fd
     if array is None or array.raw is not None:
         return
-    device = planning.devices[array.node_id]
+    device = bus.devices[array.node_id]
     long = fd and has_known(device.od, LONG_PDOS)
     if fd and not long:
         why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
-        planning.not_available.append(("CAN FD frames from the sensor", why))
+        bus.not_available.append(("CAN FD frames from the sensor", why))
     if array.mode == "window" and not has_known(device.od, WINDOW_SIZE):
         why = f"{device.eds} has no window size (2008h), so the window keeps {DEFAULT_WINDOW}×{DEFAULT_WINDOW} taxels"
-        planning.not_available.append(("another window", why))
+        bus.not_available.append(("another window", why))
         if array.window != DEFAULT_WINDOW:
-            planning.problems.append(
-                f"node {array.node_id}: {why}: sensor.window = {DEFAULT_WINDOW}, not {array.window}"
-            )
+            bus.problems.append(f"node {array.node_id}: {why}: sensor.window = {DEFAULT_WINDOW}, not {array.window}")
     if (lacking := _lacking_words(device, array)) is not None:
-        planning.problems.append(f"node {array.node_id}: {lacking}")
+        bus.problems.append(f"node {array.node_id}: {lacking}")
         return
     header, *rest = tactile_objects(array)
     parcels = [[header]]  # the header alone, then an object each, or as many as 64 bytes hold
@@ -340,13 +360,13 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
         size = next(words for words in FD_WORDS if words <= len(rest)) if long else 1
         parcels.append(rest[:size])
         rest = rest[size:]
-    cob_ids = _tactile_cob_ids(planning, len(parcels))
+    cob_ids = _tactile_cob_ids(bus, len(parcels))
     for number, objects in enumerate(parcels, start=1):
-        entries = planning.entries(array.node_id, "tpdo", *objects)
-        if entries and _maps(planning, array.node_id, number, entries):
+        entries = bus.entries(array.node_id, "tpdo", *objects)
+        if entries and _maps(bus, array.node_id, number, entries):
             layout = PdoLayout(cob_ids[number - 1], tuple(entries), ratio, fd=long)
             cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
-            planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
+            bus.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
 
 
 def _lacking_words(device: DeviceCapabilities, array: Array) -> str | None:
@@ -361,10 +381,10 @@ def _lacking_words(device: DeviceCapabilities, array: Array) -> str | None:
     )
 
 
-def _tactile_cob_ids(planning: PdoPlanning, count: int) -> list[int]:
+def _tactile_cob_ids(bus: BusPlan, count: int) -> list[int]:
     """The lowest free identifiers from `TACTILE_TPDO1` on, ascending; lower ones where those are not enough."""
-    taken = {pdo.cob_id for pdo in planning.pdos}
-    for device in planning.devices.values():
+    taken = {pdo.cob_id for pdo in bus.pdos}
+    for device in bus.devices.values():
         words = [device.number(COMMUNICATION["rpdo"] + number - 1, 1) for number in device.pdo_numbers("rpdo")]
         taken |= {word & 0x7FF for word in words if word is not None and not word & INVALID}
     places = (*range(TACTILE_TPDO1, _LAST_COB_ID + 1), *range(TACTILE_TPDO1 - 1, _FIRST_COB_ID - 1, -1))
@@ -372,9 +392,9 @@ def _tactile_cob_ids(planning: PdoPlanning, count: int) -> list[int]:
     return sorted(itertools.islice(free, count))
 
 
-def _maps(planning: PdoPlanning, node_id: int, number: int, entries: Sequence[PdoEntry]) -> bool:
+def _maps(bus: BusPlan, node_id: int, number: int, entries: Sequence[PdoEntry]) -> bool:
     """Whether a TPDO of the array carries these entries; a problem where it does not."""
-    device = planning.devices[node_id]
+    device = bus.devices[node_id]
     words = tuple(entry.word for entry in entries)
     if number not in device.pdo_numbers("tpdo"):
         problem = f"has no TPDO{number}"
@@ -382,7 +402,7 @@ def _maps(planning: PdoPlanning, node_id: int, number: int, entries: Sequence[Pd
         return True
     else:
         problem = _offered(device, "tpdo", number, len(words))
-    planning.unmapped(node_id, problem, ((entry.index, entry.subindex) for entry in entries))
+    bus.unmapped(node_id, problem, ((entry.index, entry.subindex) for entry in entries))
     return False
 
 

@@ -19,10 +19,9 @@ from canprobe.cell.planning.model import (
     CycleBudget,
     Plan,
     PlannedBus,
-    PlannedNode,
     PlannedPdo,
-    Traffic,
 )
+from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.cell.planning.timeline import timeline, timeline_rows
 from canprobe.cell.scene.geometry import mesh_text
 from canprobe.cell.scene.setup import Setup
@@ -98,8 +97,8 @@ def _nodes(plan: Plan) -> str:
 def _load(plan: Plan) -> str:
     """The worst-case load, and where the least time is left: in a cycle, and before the deadline of a frame."""
     several = len(plan.buses) > 1
-    loads = " and ".join(f"{100 * b.traffic.load:.1f} %{f' on {b.channel}' * several}" for b in plan.buses)
-    budget = plan.traffic.budget
+    loads = " and ".join(f"{100 * b.load:.1f} %{f' on {b.channel}' * several}" for b in plan.buses)
+    budget = plan.budget
     parts = [f"{loads} at worst"]
     if budget.slack_ns is not None:
         parts.append(f"{budget.slack_ns / 1000:g} of {budget.period_ns / 1000:g} µs are left in a cycle")
@@ -161,9 +160,9 @@ def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan), width)
     yield from _titled("raw frames of the array, which is no CANopen node", _raw_rows(plan), width)
     for one in plan.buses:
-        yield from _titled(f"bus {one.channel}, worst case", _bus_rows(one.traffic), width)
+        yield from _titled(f"bus {one.channel}, worst case", _bus_rows(one), width)
     title = f"one cycle of {_us(sync.period_ns)} µs, worst case, µs after its SYNC is due"
-    yield from _titled(title, _budget_rows(plan.traffic.budget), width)
+    yield from _titled(title, _budget_rows(plan.budget), width)
     characters = TIMELINE_WIDTH if width is None else min(TIMELINE_WIDTH, width - _BESIDE_TIMELINE)
     each = f"as it goes, worst-case lengths, one character {_us(sync.period_ns // characters)} µs"
     other = "" if all(pdo.used for pdo in plan.pdos) else ", o not used"
@@ -213,7 +212,7 @@ def _node_rows(plan: Plan) -> Iterator[list[str]]:
         if node.identity.serial_number is not None:
             numbers += f" serial {node.identity.serial_number:08X}h"
         kind = "emulated" if node.emulated else "real"
-        yield [str(node.node_id), node.role, numbers, node.eds, kind, *[node.channel] * several]
+        yield [str(node.node_id), node.name, numbers, node.eds, kind, *[node.channel] * several]
 
 
 def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
@@ -264,14 +263,14 @@ def _content(entries: Sequence[PdoEntry]) -> str:
     )
 
 
-def _bus_rows(traffic: Traffic) -> Iterator[list[str]]:
-    parts = ", ".join(f"{what} {100 * share:.1f} %" for what, share in traffic.parts)
-    yield ["load", f"{100 * traffic.load:.1f} %", parts]
-    for demand in traffic.demands:
+def _bus_rows(bus: PlannedBus) -> Iterator[list[str]]:
+    parts = ", ".join(f"{what} {100 * share:.1f} %" for what, share in bus.parts)
+    yield ["load", f"{100 * bus.load:.1f} %", parts]
+    for demand in bus.demands:
         cycles = f"{demand.cycles} cycle" + ("s" if demand.cycles > 1 else "")
         yield [
             f"in {cycles}",
-            f"{100 * demand.used_ns / demand.available_ns:.1f} %",
+            f"{100 * demand.share:.1f} %",
             f"{demand.what}: {_us(demand.used_ns)} of {_us(demand.available_ns)} µs",
         ]
 
@@ -347,12 +346,12 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         },
         "nodes": [_node(node) for node in plan.nodes],
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
-        "raw_frames": [_in_us(asdict(frames)) for frames in plan.raw],
+        "raw_frames": [_picked(frames) for frames in plan.raw],
         "array": _array(setup),
         "object": _mesh(setup),
-        "bus_load": {one.channel: _bus(one) for one in plan.buses},
+        "bus_load": {one.channel: _bus(one, plan.budget) for one in plan.buses},
         "choices": [{"key": one.key, "value": one.written, "why": one.why} for one in plan.choices],
-        "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
+        "timeline": [_picked(slot) | {"channel": slot.channel or None} for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
         "witnesses": dict(witness_rows(plan)),
         "estimator": shape.method if shape is not None else None,
@@ -378,15 +377,14 @@ def refused_dict(name: str, problems: Sequence[str], ways_out: Sequence[str]) ->
     }
 
 
-def _bus(bus: PlannedBus) -> dict[str, Any]:
-    traffic, budget = bus.traffic, bus.traffic.budget
+def _bus(bus: PlannedBus, budget: CycleBudget) -> dict[str, Any]:
     return {
         "node_ids": list(bus.node_ids),
-        "planned_worst": traffic.load,
-        "parts": dict(traffic.parts),
-        "demands": [_in_us(asdict(demand)) for demand in traffic.demands],
-        "sync_response_us": _microseconds(traffic.sync_response_ns),
-        "budget": _in_us(asdict(budget) | {"bus_ns": budget.bus_ns}),
+        "planned_worst": bus.load,
+        "parts": dict(bus.parts),
+        "demands": [_picked(demand) for demand in bus.demands],
+        **_picked(bus, "sync_response_ns"),
+        "budget": _picked(budget) | _picked(budget, "bus_ns"),
     }
 
 
@@ -421,43 +419,37 @@ def _mesh(setup: Setup) -> dict[str, Any] | None:
     }
 
 
-def _node(node: PlannedNode) -> dict[str, Any]:
-    """A node without its dictionary, which is as large as its EDS."""
-    return _picked(node, *(item.name for item in fields(node) if item.name != "dictionary")) | {
+def _node(node: NodeConfiguration) -> dict[str, Any]:
+    return {
+        **_picked(node, "node_id", "kind"),
+        "role": node.name,
+        "eds": node.eds,
         "identity": asdict(node.identity),
+        **_picked(node, "emulated", "channel"),
         "switched_off": [{"direction": way, "number": number} for way, number in node.switched_off],
+        "mode": node.mode,
         "interpolation": [asdict(period) for period in node.interpolation],
     }
 
 
 def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
-    return _picked(pdo, "node_id", "channel", "direction", "number", "cob_id") | {
+    return {
+        **_picked(pdo, "node_id", "channel", "direction", "number", "cob_id"),
         "entries": [_picked(entry, "index", "subindex", "bits", "name") for entry in pdo.entries],
-        "transmission_type": pdo.transmission_type,
-        "rate_hz": pdo.rate_hz,
+        **_picked(pdo, "transmission_type", "rate_hz"),
         "bytes": pdo.layout.length,
-        "bits_worst": pdo.bits_worst,
-        "deadline_us": _microseconds(pdo.deadline_ns),
-        "response_us": _microseconds(pdo.response_ns),
-        "slack_us": _microseconds(pdo.slack_ns),
+        **_picked(pdo, "bits_worst", "deadline_ns", "response_ns", "slack_ns"),
         "event_timer_ms": pdo.event_timer_ms or None,
         "used": pdo.used,
     }
 
 
-def _picked(part: object, *names: str) -> dict[str, Any]:
-    return {name: getattr(part, name) for name in names}
-
-
-def _in_us(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with times in µs: `start_ns` becomes `start_us`."""
-    return {
-        f"{name.removesuffix('_ns')}_us" if name.endswith("_ns") else name: (
-            _microseconds(value) if name.endswith("_ns") else value
-        )
-        for name, value in values.items()
-    }
-
-
-def _microseconds(t_ns: Any) -> Any:
-    return None if t_ns is None else [t / 1000 for t in t_ns] if isinstance(t_ns, tuple) else t_ns / 1000
+def _picked(part: Any, *names: str) -> dict[str, Any]:
+    """Some values of a part of the plan, or all its fields; times in µs: `start_ns` becomes `start_us`."""
+    found: dict[str, Any] = {}
+    for name in names or [item.name for item in fields(part)]:
+        value = getattr(part, name)
+        if name.endswith("_ns") and value is not None:
+            value = [t_ns / 1000 for t_ns in value] if isinstance(value, tuple) else value / 1000
+        found[re.sub("_ns$", "_us", name)] = value
+    return found

@@ -24,7 +24,7 @@ from canprobe.mechanics.touch.probe_motion import (
     PoseSteps,
 )
 from canprobe.mechanics.touch.servo import ProbePose
-from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.touch.shapes import ClosestPoint, PlacedShape
 from canprobe.mechanics.touch.strategies import Rectangle
 from canprobe.mechanics.types import Floats
 
@@ -78,7 +78,7 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
         return SurfacePath(plane, np.tile(down, (len(plane), 1)), np.zeros((len(plane), 2)), math.inf)
     # a ball bridges gaps into which a point would fall
     radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
-    _check_approach(approach, _along(shape, approach.start, down, radius))
+    _check_approach(approach, _rest(shape, approach.start, down, radius))
     explores = isinstance(strategy, Rectangle)
     if not task.array.pad.is_flat:
         begins = _first_contact(shape, approach, task.probe.radius)
@@ -111,14 +111,10 @@ def touchable(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> F
     An exploration turns back from the others. The first contact is kept, and refused elsewhere.
     """
     ball = radius if shape.by_gaps else 0.0
-    heights = [_along(shape, point, up, ball) for point in plane]
-    found = [0]
-    for i, height in enumerate(heights[1:], start=1):
-        if height is not None:
-            at = shape.closest(plane[i] + (height + ball) * up).point
-            if shape.tightest_concave_radius(at[None]) > radius:
-                found.append(i)
-    return plane[found]
+    rests = [_rest(shape, point, up, ball) for point in plane]
+    one_place = [rest is not None and shape.tightest_concave_radius(rest[1].point[None]) > radius for rest in rests]
+    found: Floats = plane[np.array([True, *one_place[1:]])]
+    return found
 
 
 def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Floats:
@@ -126,10 +122,10 @@ def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Flo
 
     A curve lies round it; a rectangle stays where it is.
     """
-    height = _along(shape, approach.start, approach.normal, radius)
-    if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
+    rest = _rest(shape, approach.start, approach.normal, radius)
+    if rest is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
         return np.zeros(3)  # in a tighter hollow it touches in two places, which is refused elsewhere
-    beside = shape.closest(approach.start + (height + radius) * approach.normal).point - approach.start
+    beside = rest[1].point - approach.start
     return beside - float(beside @ approach.normal) * approach.normal
 
 
@@ -137,8 +133,8 @@ def _contacts(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> S
     """Contacts of a ball of `radius` that rests over each point (n, 3); with 0 the points of the surface."""
     contacts = []
     for point in plane:
-        height = _along(shape, point, up, radius)
-        if height is None:
+        rest = _rest(shape, point, up, radius)
+        if rest is None:
             raise PlanError(
                 [
                     f"task: at {in_mm(point)} mm the path leaves the object or meets it steeper than "
@@ -146,7 +142,7 @@ def _contacts(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> S
                     "task.heading_deg"
                 ]
             )
-        contacts.append(shape.closest(point + (height + radius) * up))
+        contacts.append(rest[1])
     points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
     kappas = np.zeros((len(contacts), 2)) if shape.by_gaps else np.array([c.kappa for c in contacts])
     return SurfacePath(points, normals, kappas, shape.tightest_concave_radius(points))
@@ -180,8 +176,8 @@ def in_mm(point: Floats) -> str:
     return f"({x:.1f}, {y:.1f}, {z:.1f})"
 
 
-def _along(shape: PlacedShape, point: Floats, up: Floats, radius: float = 0.0) -> float | None:
-    """Height along `up` over `point` at which the foot of a ball of `radius` rests on the surface, m, by Newton.
+def _rest(shape: PlacedShape, point: Floats, up: Floats, radius: float) -> tuple[float, ClosestPoint] | None:
+    """Height along `up` over `point` at which the foot of a ball of `radius` rests on the surface, m, and the foot.
 
     None where the line misses or grazes the surface, or the ball rests on its border.
     """
@@ -193,19 +189,20 @@ def _along(shape: PlacedShape, point: Floats, up: Floats, radius: float = 0.0) -
         if steepness < math.cos(_STEEPEST) or np.abs(at - foot.point - foot.distance * foot.normal).max() > _BESIDE_M:
             return None
         if abs(foot.distance - radius) < (_RESTS_M if radius else 1e-9):
-            return height
+            return height, foot
         height -= (foot.distance - radius) / steepness
     return None
 
 
-def _check_approach(approach: Approach, miss: float | None) -> None:
-    """Check that the approach finds the object, whose surface is `miss` above the end of the approach."""
+def _check_approach(approach: Approach, rest: tuple[float, ClosestPoint] | None) -> None:
+    """Check that the approach finds the object, on which the probe would rest at the end of the approach."""
     x, y, z = (1e3 * approach.start).tolist()
     where = f"task.start_mm = ({x:g}, {y:g}, {z:g})"
-    if miss is None:
+    if rest is None:
         raise PlanError(
             [f"{where}: the approach does not meet the object; move start_mm over it or the object under it"]
         )
+    miss, _ = rest
     if not -approach.search <= miss <= approach.clearance:
         side = "above" if miss > 0 else "below"
         searched = f"{1e3 * approach.clearance:g} mm above to {1e3 * approach.search:g} mm below"

@@ -14,7 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
-from canprobe.cell.planning.model import SYNC_OVERFLOW, Interpolation, SyncPlan
+from canprobe.cell.planning.model import SYNC_OVERFLOW, SyncPlan
+from canprobe.cell.planning.node_configuration import Interpolation
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, sync_patience
@@ -44,7 +45,7 @@ _MODE_NAMES: Mapping[int, str] = {
 TIME_INDICES = (-3, -4, -5, -6)
 FINEST, COARSEST = -6, 0
 """Indices between which a unit is a whole number of microseconds, and no more than a second."""
-MAX_TIME_UNITS = 0xFFFF
+MAX_TIME_UNITS, _MAX_PERIOD_US = 0xFFFF, 0xFFFF_FFFF
 
 
 def choose_mode(device: DeviceCapabilities) -> OperationMode | None:
@@ -166,70 +167,63 @@ def plan_ratio(setup: Setup) -> tuple[int, str | None, list[float]]:
 
 @dataclass(frozen=True, slots=True)
 class _Offer:
-    """Values that 60C2h:01 of a device takes, and indices that 60C2h:02 takes, the default first."""
+    """Periods that a device takes: value · 10^index s.
+
+    Attributes:
+        values: values of 60C2h:01; of a device that has none those of 1006h.
+        indices: values of 60C2h:02, the default first; -6 for 1006h.
+        text: the same in words.
+    """
 
     values: range
     indices: tuple[int, ...]
+    text: str
 
-    def __str__(self) -> str:
-        if not self.values:
-            return (
-                "60C2h:01 takes no value by the EDS: no integer, read-only without a default, or limits that leave none"
-            )
-        if not self.indices:
-            return f"60C2h:02 takes no unit of 10^{FINEST} to 10^{COARSEST} s by the EDS"
-        values = f"{self.values[0]} to {self.values[-1]}" if len(self.values) > 1 else str(self.values[0])
-        return f"60C2h takes {values} · 10^{' or '.join(map(str, sorted(self.indices)))} s"
+    def expressions(self, period_us: int) -> tuple[Interpolation, ...]:
+        """A period as the device may be given it, the first choice first; empty where it cannot."""
+        quotients = [(index, *divmod(period_us, 10 ** (index - FINEST))) for index in self.indices]
+        return tuple(Interpolation(n, index) for index, n, rest in quotients if not rest and n in self.values)
 
 
 def _offer(device: DeviceCapabilities) -> _Offer:
+    if follows_sync_period(device):
+        period = device.description.entry(SYNC_PERIOD)
+        assert period is not None
+        values = _values(period, _MAX_PERIOD_US)
+        text = f"1006h takes {period.low or 1} to {values.stop - 1} µs"
+        if not period.writable:
+            stated = "without a value" if period.initial is None else f"{period.initial!r} µs"
+            text = f"1006h is {period.access}, {stated}"
+        return _Offer(values, (FINEST,), text)
     value, index = (device.description.entry(INTERPOLATION_TIME, sub) for sub in (1, 2))
     default = index.initial if index is not None and isinstance(index.initial, int) else TIME_INDICES[0]
-    indices = [default]
+    able = [default]
     if index is not None and index.writable:
-        indices = [number for number in dict.fromkeys((default, *TIME_INDICES)) if index.allows(number)]
-    return _Offer(_values(value), tuple(number for number in indices if FINEST <= number <= COARSEST))
+        able = [number for number in dict.fromkeys((default, *TIME_INDICES)) if index.allows(number)]
+    values, indices = _values(value, MAX_TIME_UNITS), tuple(number for number in able if FINEST <= number <= COARSEST)
+    span = f"{values[0]} to {values[-1]}" if len(values) > 1 else "".join(map(str, values))
+    text = f"60C2h takes {span} · 10^{' or '.join(map(str, sorted(indices)))} s"
+    if not values:
+        text = "60C2h:01 takes no value by the EDS: no integer, read-only without a default, or limits that leave none"
+    elif not indices:
+        text = f"60C2h:02 takes no unit of 10^{FINEST} to 10^{COARSEST} s by the EDS"
+    return _Offer(values, indices, text)
 
 
-def _values(entry: DescribedEntry | None) -> range:
+def _values(entry: DescribedEntry | None, most: int) -> range:
+    """The values from 1 to `most` that an entry takes."""
     if entry is None:
         return range(0)
     if not entry.writable:
         return range(entry.initial, entry.initial + 1) if isinstance(entry.initial, int) else range(0)
-    most = min(MAX_TIME_UNITS, (1 << entry.bits) - 1)
+    most = min(most, (1 << entry.bits) - 1)
     low, high = 1 if entry.low is None else int(entry.low), most if entry.high is None else int(entry.high)
     return range(max(1, low), min(most, high) + 1)
 
 
 def interpolations(device: DeviceCapabilities, period_us: int) -> tuple[Interpolation, ...]:
-    """A period as the 60C2h of a device may express it, the first choice first; empty where it cannot."""
-    offer, found = _offer(device), []
-    for index in offer.indices:
-        value, rest = divmod(period_us, 10 ** (index - FINEST))
-        if not rest and value in offer.values:
-            found.append(Interpolation(value, index))
-    return tuple(found)
-
-
-def _can_take(device: DeviceCapabilities, period_us: int) -> bool:
-    """Whether a drive can be given a period, by 60C2h or else by 1006h."""
-    if not follows_sync_period(device):
-        return bool(interpolations(device, period_us))
-    entry = device.description.entry(SYNC_PERIOD)
-    assert entry is not None
-    return entry.allows(period_us) if entry.writable else entry.initial == period_us
-
-
-def _period_offer(device: DeviceCapabilities) -> str:
-    """The periods that a drive takes, in words."""
-    if not follows_sync_period(device):
-        return str(_offer(device))
-    entry = device.description.entry(SYNC_PERIOD)
-    assert entry is not None
-    if not entry.writable:
-        return f"1006h is {entry.access}, {'without a value' if entry.initial is None else f'{entry.initial!r} µs'}"
-    low, high = 1 if entry.low is None else entry.low, (1 << entry.bits) - 1 if entry.high is None else entry.high
-    return f"1006h takes {low} to {high} µs"
+    """A period as the 60C2h of a device may express it, the first choice first; empty without 60C2h."""
+    return () if follows_sync_period(device) else _offer(device).expressions(period_us)
 
 
 def period_problem(
@@ -243,32 +237,26 @@ def period_problem(
         exact: whether that period has exactly the rate.
         devices: the drives; without any, 1006h decides.
     """
-    makes = {device.eds: device for device in devices}
-    unable = [device for device in makes.values() if not _can_take(device, period_us)]
+    offers = {device.eds: _offer(device) for device in devices}
+    unable = [f"{eds}: {offer.text}" for eds, offer in offers.items() if not offer.expressions(period_us)]
     if exact and not unable:
         return None, []
-    why = "1006h counts µs" if not exact else "; ".join(f"{device.eds}: {_period_offer(device)}" for device in unable)
-    near = _nearest_rates(1e6 / rate_hz, list(makes.values()))
+    why = "1006h counts µs" if not exact else "; ".join(unable)
+    near = _nearest_rates(1e6 / rate_hz, list(offers.values()))
     unsuited = "" if near else "; no period suits all drives"
     what = f"cycle.rate_hz = {rate_hz:g}: a SYNC period of {1e6 / rate_hz:.6g} µs cannot be set ({why}){unsuited}"
     return what, near
 
 
-def _nearest_rates(period_us: float, devices: Sequence[DeviceCapabilities]) -> list[float]:
+def _nearest_rates(period_us: float, offers: Sequence[_Offer]) -> list[float]:
     """The rates next to a period that every device can express, Hz, ascending."""
-    timed = [device for device in devices if not follows_sync_period(device)]
-    if timed:
-        wanted = set.intersection(*map(_periods, timed))
+    few = [offer for offer in offers if len(offer.values) <= MAX_TIME_UNITS]  # 1006h may have too many to try each
+    if few:
+        each = ({n * 10 ** (index - FINEST) for index in one.indices for n in one.values} for one in few)
+        wanted = set.intersection(*each)
     else:
-        limits = [device.description.entry(SYNC_PERIOD) for device in devices]
-        stated = {value for entry in limits if entry is not None for value in (entry.low, entry.high, entry.initial)}
-        wanted = {int(period_us), int(period_us) + 1, *(int(us) for us in stated if isinstance(us, int | float))}
-    common = {us for us in wanted if us > 0 and all(_can_take(device, us) for device in devices)}
+        ends = {end for offer in offers for end in (offer.values[0], offer.values[-1])}
+        wanted = {int(period_us), int(period_us) + 1, *ends}
+    common = {us for us in wanted if us > 0 and all(offer.expressions(us) for offer in offers)}
     longer, shorter = [us for us in common if us >= period_us], [us for us in common if us < period_us]
     return [1e6 / us for us in (min(longer, default=0), max(shorter, default=0)) if us]
-
-
-def _periods(device: DeviceCapabilities) -> set[int]:
-    """Every period that 60C2h of a device can express, µs."""
-    offer = _offer(device)
-    return {value * 10 ** (index - FINEST) for index in offer.indices for value in offer.values}

@@ -10,13 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
-from typing import Literal
 
-from canprobe.cell.planning.model import Plan, PlannedBus, PlannedPdo
+from canprobe.cell.planning.model import Part, Plan, PlannedBus, PlannedPdo
 from canprobe.cell.planning.traffic import SYNC_BITS, on_the_wire, wire_ns
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 
-Part = Literal["SYNC", "feedback", "controller", "command", "tactile", "other"]
 _MAX_ROUNDS = 4
 
 
@@ -51,7 +49,7 @@ def timeline(plan: Plan) -> tuple[Slot, ...]:
     """
     cyclic = [pdo for pdo in plan.pdos if pdo.layout.synchronous]
     cycles = max((pdo.transmission_type for pdo in cyclic), default=1)
-    period, compute = plan.sync.period_ns, plan.traffic.budget.compute_ns
+    period, compute = plan.sync.period_ns, plan.budget.compute_ns
     starts: list[int | None] = [None] * cycles
     slots: list[Slot] = []
     for _ in range(_MAX_ROUNDS):  # commands follow the feedback, which earlier commands may delay
@@ -72,7 +70,7 @@ def _controller_start(plan: Plan, slots: Sequence[Slot], cycle: int) -> int:
     """The first look of a cycle that finds all its feedback."""
     begin = cycle * plan.sync.period_ns
     last = max((slot.end_ns for slot in slots if slot.part == "feedback" and slot.cycle == cycle), default=begin)
-    looks = [begin + look for look in plan.traffic.budget.looks_ns]
+    looks = [begin + look for look in plan.budget.looks_ns]
     return next((look for look in looks if look >= last), looks[-1])
 
 
@@ -90,11 +88,10 @@ def _released(
             length = wire_ns(pdo.bits_worst, bitrate)
             if pdo.direction == "rpdo":
                 if start is not None:
-                    out = start + plan.traffic.budget.compute_ns
+                    out = start + plan.budget.compute_ns
                     yield Slot("command", bus.channel, pdo.cob_id, cycle, out, out + length)
             elif cycle % pdo.transmission_type == 0:
-                part: Part = "tactile" if pdo.kind == "tactile" else "feedback" if pdo.used else "other"
-                yield Slot(part, bus.channel, pdo.cob_id, cycle, begin + sync_ns, begin + sync_ns + length)
+                yield Slot(pdo.part, bus.channel, pdo.cob_id, cycle, begin + sync_ns, begin + sync_ns + length)
 
 
 def _carried(released: Iterator[Slot]) -> Iterator[Slot]:

@@ -21,14 +21,14 @@ from canprobe.cell.planning.model import (
     SYNC_OVERFLOW,
     CycleBudget,
     Demand,
+    Part,
     PlannedBus,
     PlannedFrames,
     PlannedPdo,
     SyncPlan,
-    Traffic,
 )
-from canprobe.cell.scene.hardware import BusSettings
-from canprobe.fieldbus.protocol.frame_bits import best_case_bits, worst_case_bits
+from canprobe.cell.planning.pdos import BusPlan
+from canprobe.fieldbus.protocol.frame_bits import NS_PER_S, best_case_bits, worst_case_bits
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.response_times import (
     BusAnalysis,
@@ -49,26 +49,18 @@ SYNC_BITS_LEAST = best_case_bits(_SYNC_BYTES)
 
 @dataclass(frozen=True, slots=True)
 class _Messages:
-    """All messages of a bus, by their part in the cycle.
+    """All messages of a bus.
 
     Attributes:
-        sync: the SYNC; its offset is 0.
-        feedback: TPDOs that the controller waits for.
-        commands: RPDOs that it sends.
-        other: TPDOs that it does not wait for: those of the array, and unused ones.
-        strangers: messages that SYNC does not trigger.
-        best_sync_ns: shortest time of a SYNC on the wire.
-        best_feedback_ns: shortest time of the feedback.
+        all: the messages.
+        parts: part in the cycle of each, by identifier.
+        best_feedback_ns: shortest time of the SYNC and the feedback on the wire; None without feedback.
         fifo_nodes: node of every message in a FIFO transmit queue, by the message's name; empty: priority queues.
     """
 
-    sync: Message
-    feedback: tuple[Message, ...]
-    commands: tuple[Message, ...]
-    other: tuple[Message, ...]
-    strangers: tuple[Message, ...]
-    best_sync_ns: int
-    best_feedback_ns: int
+    all: tuple[Message, ...]
+    parts: Mapping[int, Part]
+    best_feedback_ns: int | None
     fifo_nodes: Mapping[str, int]
 
 
@@ -79,81 +71,48 @@ def on_the_wire(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
 
 def wire_ns(bits: int, bitrate: int) -> int:
     """Time of a number of bits, rounded up."""
-    return -(-bits * 1_000_000_000 // bitrate)
+    return -(-bits * NS_PER_S // bitrate)
 
 
 RAW_DEVICE = 0
 """Stands for the node id of an array that is no CANopen node, for its transmit queue."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedTraffic:
-    """Traffic of all buses.
-
-    Attributes:
-        buses: the buses with their traffic.
-        pdos, raw: PDOs and raw frames with their response times.
-        problems: what does not fit.
-    """
-
-    buses: tuple[PlannedBus, ...]
-    pdos: tuple[PlannedPdo, ...]
-    raw: tuple[PlannedFrames, ...]
-    problems: list[str]
-
-
-def plan_traffic(
-    pdos: Sequence[PlannedPdo],
-    sync: SyncPlan,
-    channels: Mapping[str, tuple[int, ...]],
-    bus: BusSettings,
-    compute_ns: int = 0,
-    *,
-    raw: Sequence[PlannedFrames] = (),
-) -> PlannedTraffic:
-    """The buses with their traffic, PDOs and raw frames with their response times, and what does not fit.
-
-    Args:
-        pdos: PDOs of all nodes.
-        sync: rate and period of SYNC, which every bus has.
-        channels: node ids by channel; each node produces heartbeats, and so does the master.
-        bus: settings of all buses, such as the bit rate.
-        compute_ns: longest computing time of the controller in a cycle.
-        raw: raw frames of an array that is no CANopen node.
-    """
-    wires = [on_the_wire([pdo for pdo in pdos if pdo.channel == channel]) for channel in channels]
-    raws = [[frames for frames in raw if frames.channel == channel] for channel in channels]
-    messages = [
-        _messages(wire, its, sync, ids, bus) for wire, its, ids in zip(wires, raws, channels.values(), strict=True)
-    ]
-    analyses, budget = _analyse(messages, compute_ns, bus.bitrate)
-    buses: list[PlannedBus] = []
-    timed: list[PlannedPdo] = []
-    raw_timed: list[PlannedFrames] = []
-    for (channel, node_ids), wire, its, analysis in zip(channels.items(), wires, raws, analyses, strict=True):
-        response_ns = {response.message.cob_id: response.response_ns for response in analysis.responses}
+def plan_traffic(plan: BusPlan) -> None:
+    """Fill in the buses with their traffic, the response times of PDOs and raw frames, and what does not fit."""
+    bitrate, sync = plan.setup.bus.bitrate, plan.sync
+    wires = {channel: on_the_wire([pdo for pdo in plan.pdos if pdo.channel == channel]) for channel in plan.channels}
+    messages = [_messages(plan, channel, wire) for channel, wire in wires.items()]
+    analyses, plan.budget = _analyse(messages, sync.period_ns, plan.setup.compute_ns, bitrate)
+    response_ns: dict[tuple[str, int], int | None] = {}
+    for (channel, wire), analysis in zip(wires.items(), analyses, strict=True):
+        response_ns |= {(channel, one.message.cob_id): one.response_ns for one in analysis.responses}
+        drives, tactile = (
+            sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == kind) for kind in ("drive", "tactile")
+        )
+        heartbeats = 1000 / HEARTBEAT_PRODUCED_MS * (len(plan.channels[channel]) + 1)
         bits_per_s = {
             "SYNC": SYNC_BITS * sync.rate_hz,
-            "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
-            "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile")
-            + sum(frames.bits_worst * frames.rate_hz for frames in its),
-            "heartbeats": worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1),
+            "drives": drives,
+            "tactile": tactile + sum(one.bits_worst * one.rate_hz for one in plan.raw if one.channel == channel),
+            "heartbeats": worst_case_bits(1) * heartbeats,
         }
-        traffic = Traffic(
+        bus = PlannedBus(
+            channel,
+            plan.channels[channel],
             load=analysis.load,
-            parts=tuple((what, bits / bus.bitrate) for what, bits in bits_per_s.items() if bits > 0),
-            demands=tuple(_demands(wire, sync, bus.bitrate)),
-            sync_response_ns=response_ns[SYNC_ID],
-            budget=budget,
+            parts=tuple((what, bits / bitrate) for what, bits in bits_per_s.items() if bits > 0),
+            demands=tuple(_demands(wire, sync, bitrate)),
+            sync_response_ns=response_ns[channel, SYNC_ID],
         )
-        buses.append(PlannedBus(channel, node_ids, traffic))
-        mine = [replace(pdo, response_ns=response_ns[pdo.cob_id]) for pdo in pdos if pdo.channel == channel]
-        timed += sorted(mine, key=lambda pdo: (pdo.cob_id, pdo.node_id))
-        raw_timed += [replace(frames, response_ns=response_ns.get(frames.can_id)) for frames in its]
-    return PlannedTraffic(tuple(buses), tuple(timed), tuple(raw_timed), _problems(buses, analyses, bus))
+        plan.buses.append(bus)
+    timed = [replace(pdo, response_ns=response_ns[pdo.channel, pdo.cob_id]) for pdo in plan.pdos]
+    plan.pdos = sorted(timed, key=lambda pdo: (list(wires).index(pdo.channel), pdo.cob_id, pdo.node_id))
+    plan.raw = [replace(one, response_ns=response_ns.get((one.channel, one.can_id))) for one in plan.raw]
+    plan.overload = _problems(plan, plan.budget, analyses)
 
 
-def _raw_messages(raw: Sequence[PlannedFrames], bus: BusSettings) -> Iterator[Message]:
+def _raw_messages(raw: Sequence[PlannedFrames], bitrate: int) -> Iterator[Message]:
     """Raw frames that repeat, one message for each identifier: its frames follow one another."""
     repeated: dict[int, list[PlannedFrames]] = {}
     for frames in raw:
@@ -163,70 +122,64 @@ def _raw_messages(raw: Sequence[PlannedFrames], bus: BusSettings) -> Iterator[Me
         bits = sum(frames.bits_worst for frames in all_of_it)
         period = round(1e9 / all_of_it[0].rate_hz)
         length = max(frames.length for frames in all_of_it)
-        yield Message(f"raw frames {can_id:03X}h", can_id, length, period, frame_ns=wire_ns(bits, bus.bitrate))
+        yield Message(f"raw frames {can_id:03X}h", can_id, length, period, frame_ns=wire_ns(bits, bitrate))
 
 
-def _messages(
-    wire: Sequence[PlannedPdo], raw: Sequence[PlannedFrames], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings
-) -> _Messages:
-    """Messages that SYNC triggers, by their part in the cycle, and those that it does not."""
-    queues = {"SYNC": MASTER_NODE_ID}
-    cyclic: dict[str, list[Message]] = {"feedback": [], "commands": [], "other": []}
-    strangers, feedback_bits = [], SYNC_BITS_LEAST
+def _messages(plan: BusPlan, channel: str, wire: Sequence[PlannedPdo]) -> _Messages:
+    """The messages of one bus: its SYNC, its PDOs, raw frames and heartbeats."""
+    settings, sync = plan.setup.bus, plan.sync
+    found: list[tuple[Message, Part, int]] = [
+        (Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns), "SYNC", MASTER_NODE_ID)
+    ]
     for pdo in wire:
-        triggered = pdo.layout.synchronous
         message = Message(
             f"{pdo.direction.upper()} {pdo.cob_id:03X}h",
             pdo.cob_id,
             pdo.layout.length,
-            sync.period_ns * pdo.transmission_type if triggered else round(1e9 / pdo.rate_hz),
+            sync.period_ns * pdo.transmission_type if pdo.layout.synchronous else round(1e9 / pdo.rate_hz),
             deadline_ns=pdo.deadline_ns,
-            frame_ns=wire_ns(pdo.bits_worst, bus.bitrate),
+            frame_ns=wire_ns(pdo.bits_worst, settings.bitrate),
         )
-        queues[message.name] = pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID
-        if not triggered:
-            strangers.append(message)
-        elif pdo.direction == "rpdo":
-            cyclic["commands"].append(message)
-        elif pdo.kind == "drive" and pdo.used:
-            cyclic["feedback"].append(message)
-            feedback_bits += best_case_bits(pdo.layout.length)
-        else:
-            cyclic["other"].append(message)
-    for message in _raw_messages(raw, bus):
-        strangers.append(message)
-        queues[message.name] = RAW_DEVICE
-    for node in (*node_ids, MASTER_NODE_ID):
-        name = f"heartbeat of node {node}"
-        strangers.append(Message(name, HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000))
-        queues[name] = node
+        found.append((message, pdo.part, pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID))
+    raw = [one for one in plan.raw if one.channel == channel]
+    found += [(message, "event", RAW_DEVICE) for message in _raw_messages(raw, settings.bitrate)]
+    for node in (*plan.channels[channel], MASTER_NODE_ID):
+        beat = Message(f"heartbeat of node {node}", HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
+        found.append((beat, "event", node))
+    feedback = [best_case_bits(message.n_data) for message, part, _ in found if part == "feedback"]
+    fifo = settings.transmit_queue == "fifo"
     return _Messages(
-        sync=Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns),
-        **{part: tuple(messages) for part, messages in cyclic.items()},
-        strangers=tuple(strangers),
-        best_sync_ns=SYNC_BITS_LEAST * 1_000_000_000 // bus.bitrate,
-        best_feedback_ns=feedback_bits * 1_000_000_000 // bus.bitrate,
-        fifo_nodes=queues if bus.transmit_queue == "fifo" else {},
+        all=tuple(message for message, _, _ in found),
+        parts={message.cob_id: part for message, part, _ in found},
+        best_feedback_ns=(SYNC_BITS_LEAST + sum(feedback)) * NS_PER_S // settings.bitrate if feedback else None,
+        fifo_nodes={message.name: node for message, _, node in found} if fifo else {},
     )
 
 
-def _analyse(buses: Sequence[_Messages], compute_ns: int, bitrate: int) -> tuple[list[BusAnalysis], CycleBudget]:
-    """Response times of each bus behind SYNC (of a stranger behind its own event), and the budget of one cycle.
+def _analyse(
+    buses: Sequence[_Messages], period_ns: int, compute_ns: int, bitrate: int
+) -> tuple[list[BusAnalysis], CycleBudget]:
+    """Response times of each bus behind SYNC (of an event behind itself), and the budget of one cycle.
 
     The controller couples the buses: it starts when the feedback of all of them is in.
     """
-    period = buses[0].sync.period_ns
-    best_ns = max(one.best_feedback_ns for one in buses) if any(one.feedback for one in buses) else None
-    syncs_ns: list[int] = [one.best_sync_ns for one in buses]
-    feedback_ns = max(*syncs_ns, best_ns or 0)
+    best_sync_ns = SYNC_BITS_LEAST * NS_PER_S // bitrate
+    best_ns = max((one.best_feedback_ns for one in buses if one.best_feedback_ns is not None), default=None)
+    awaited: Part = "SYNC" if best_ns is None else "feedback"
+    syncs_ns, feedback_ns = [best_sync_ns] * len(buses), best_ns or best_sync_ns
     for _ in range(MAX_ROUNDS):
-        looks = look_times(period, feedback_ns)
-        starts = controller_starts(best_ns, looks, feedback_ns)
-        analyses = [
-            _placed(one, sync_ns, starts, compute_ns, bitrate) for one, sync_ns in zip(buses, syncs_ns, strict=True)
-        ]
-        late_syncs = [_last([analysis], [one.sync]) for one, analysis in zip(buses, analyses, strict=True)]
-        late_feedback = _last(analyses, [m for one in buses for m in (one.feedback or ([] if best_ns else [one.sync]))])
+        looks = look_times(period_ns, feedback_ns)
+        earliest, latest = controller_starts(best_ns, looks, feedback_ns)
+        analyses = []
+        for one, sync_ns in zip(buses, syncs_ns, strict=True):
+            answers = best_sync_ns, sync_ns - best_sync_ns
+            commands = earliest, latest + compute_ns - earliest
+            queued: dict[Part, tuple[int, int]] = {
+                "SYNC": (0, 0), "feedback": answers, "tactile": answers, "other": answers, "command": commands,
+            }  # fmt: skip
+            analyses.append(_placed(one, queued, bitrate))
+        late_syncs = [_last([one], [analysis], "SYNC") for one, analysis in zip(buses, analyses, strict=True)]
+        late_feedback = _last(buses, analyses, awaited)
         moved = (late_syncs, late_feedback) != (syncs_ns, feedback_ns)
         full = any(analysis.load >= 1 for analysis in analyses)
         if None in late_syncs or late_feedback is None or full or not moved:
@@ -237,42 +190,37 @@ def _analyse(buses: Sequence[_Messages], compute_ns: int, bitrate: int) -> tuple
             replace(analysis, responses=tuple(replace(one, response_ns=None) for one in analysis.responses))
             for analysis in analyses
         ]
-    feedback = _last(analyses, [m for one in buses for m in one.feedback])
-    commands = _last(analyses, [m for one in buses for m in one.commands])
+    feedback, commands_ns = _last(buses, analyses, "feedback"), _last(buses, analyses, "command")
     _, start = controller_starts(best_ns, looks, feedback_ns)
     known = best_ns is None or feedback is not None
-    out = commands if any(one.commands for one in buses) else start + compute_ns if known else None
+    commanded = any("command" in one.parts.values() for one in buses)
+    out = commands_ns if commanded else start + compute_ns if known else None
     return analyses, CycleBudget(
-        period_ns=period,
+        period_ns=period_ns,
         looks_ns=looks,
-        sync_ns=_last(analyses, [buses[0].sync]),
+        sync_ns=_last(buses, analyses, "SYNC"),
         feedback_ns=feedback,
         start_ns=start if known else None,
         compute_ns=compute_ns,
-        commands_ns=commands,
-        tactile_ns=_last(analyses, [m for one in buses for m in one.other]),
-        slack_ns=None if out is None else period - out,
+        commands_ns=commands_ns,
+        tactile_ns=_last(buses, analyses, "tactile", "other"),
+        slack_ns=None if out is None else period_ns - out,
     )
 
 
-def _placed(
-    messages: _Messages, sync_ns: int, starts_ns: tuple[int, int], compute_ns: int, bitrate: int
-) -> BusAnalysis:
+def _placed(messages: _Messages, queued: Mapping[Part, tuple[int, int]], bitrate: int) -> BusAnalysis:
     """Response times of one bus.
 
     Args:
         messages: messages of the bus.
-        sync_ns: latest time when its SYNC is through.
-        starts_ns: earliest and latest start of the controller.
-        compute_ns: longest computing time of the controller.
+        queued: earliest queueing after SYNC and its jitter, ns, by part; a part that is missing hangs on no SYNC.
         bitrate: bit/s.
     """
-    answered, (earliest, start) = messages.best_sync_ns, starts_ns
     placed = [
-        replace(messages.sync, offset_ns=0),
-        *(replace(m, offset_ns=answered, jitter_ns=sync_ns - answered) for m in (*messages.feedback, *messages.other)),
-        *(replace(m, offset_ns=earliest, jitter_ns=start + compute_ns - earliest) for m in messages.commands),
-        *messages.strangers,
+        replace(message, offset_ns=at[0], jitter_ns=at[1])
+        if (at := queued.get(messages.parts[message.cob_id])) is not None
+        else message
+        for message in messages.all
     ]
     if messages.fifo_nodes:
         return worst_case_response_fifo(placed, messages.fifo_nodes, bitrate)
@@ -304,10 +252,14 @@ def controller_starts(best_ns: int | None, looks: Sequence[int], feedback_ns: in
     return earliest, next((look for look in looks if look >= feedback_ns), looks[-1])
 
 
-def _last(analyses: Sequence[BusAnalysis], messages: Sequence[Message]) -> int | None:
-    """The latest end of several messages after the SYNC, on any bus; None without a bound."""
-    names = {message.name for message in messages}
-    found = [one.response_ns for analysis in analyses for one in analysis.responses if one.message.name in names]
+def _last(buses: Sequence[_Messages], analyses: Sequence[BusAnalysis], *parts: Part) -> int | None:
+    """The latest end of the messages of some parts after the SYNC, on any bus; None without a bound."""
+    found = [
+        one.response_ns
+        for bus, analysis in zip(buses, analyses, strict=True)
+        for one in analysis.responses
+        if bus.parts[one.message.cob_id] in parts
+    ]
     return None if None in found or not found else max(ns for ns in found if ns is not None)
 
 
@@ -324,26 +276,27 @@ def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterat
         yield Demand("tactile frame and all above it", cycles, wire_ns(used, bitrate), cycles * sync.period_ns)
 
 
-def _problems(buses: Sequence[PlannedBus], analyses: Sequence[BusAnalysis], bus: BusSettings) -> list[str]:
+def _problems(plan: BusPlan, budget: CycleBudget, analyses: Sequence[BusAnalysis]) -> list[str]:
     """Problems: load and demands of a bus, or else the cycle, or else the first late message of each bus."""
-    found = [(one.channel, problem) for one in buses for problem in _excess(one.traffic)]
-    if not found and (behind := _behind(buses[0].traffic.budget)) is not None:
-        found = [(" and ".join(one.channel for one in buses), behind)]
+    settings = plan.setup.bus
+    found = [(one.channel, problem) for one in plan.buses for problem in _excess(one)]
+    if not found and (behind := _behind(budget)) is not None:
+        found = [(" and ".join(plan.channels), behind)]
     else:
         full = {channel for channel, _ in found}
-        for one, analysis in zip(buses, analyses, strict=True):
-            if one.channel not in full and (late := [each for each in analysis.responses if not each.fits]):
-                found.append((one.channel, _lateness(late)))
-    queue = ", every node's oldest frame first" if bus.transmit_queue == "fifo" else ""
-    return [f"bus {channel} at {bus.bitrate} bit/s{queue}: {problem}" for channel, problem in found]
+        for channel, analysis in zip(plan.channels, analyses, strict=True):
+            if channel not in full and (late := [each for each in analysis.responses if not each.fits]):
+                found.append((channel, _lateness(late)))
+    queue = ", every node's oldest frame first" if settings.transmit_queue == "fifo" else ""
+    return [f"bus {channel} at {settings.bitrate} bit/s{queue}: {problem}" for channel, problem in found]
 
 
-def _excess(traffic: Traffic) -> Iterator[str]:
+def _excess(bus: PlannedBus) -> Iterator[str]:
     """Load and demands of one bus that are more than it carries."""
-    if traffic.load > 1:
-        parts = ", ".join(f"{what} {100 * share:.0f} %" for what, share in traffic.parts)
-        yield f"worst-case load {100 * traffic.load:.0f} % ({parts})"
-    for demand in traffic.demands:
+    if bus.load > 1:
+        parts = ", ".join(f"{what} {100 * share:.0f} %" for what, share in bus.parts)
+        yield f"worst-case load {100 * bus.load:.0f} % ({parts})"
+    for demand in bus.demands:
         if demand.used_ns > demand.available_ns:
             yield (
                 f"{demand.what} take {demand.used_ns / 1000:.0f} µs of the {demand.available_ns / 1000:.0f} µs "

@@ -12,7 +12,7 @@ Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h, 60A9h, 60AAh; "So
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,45 +43,79 @@ ROUNDING_COUNTS = 2
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
 
 
-def turn_units(device: DeviceCapabilities, units: float | None, gear: float) -> TurnUnits | None:
-    """The units to compare with a device; None where the device states none, or the cell counts no turns.
+@dataclass(frozen=True, slots=True)
+class DriveAxis:
+    """A drive of the arm with its device.
 
-    Args:
+    Attributes:
+        setup: setup of the scene.
+        number: number of the drive from the base, 0-based.
         device: the device by its EDS.
-        units: position units of the cell per motor turn; None for a prismatic joint.
-        gear: turns of the motor per turn of the joint.
     """
-    whole = {index: device.has(index, 1) and device.has(index, 2) for index in (FEED, GEAR_RATIO, RESOLUTION)}
-    if units is None or not (whole[FEED] or whole[RESOLUTION]):
-        return None
-    if not whole[FEED]:
-        return TurnUnits(units, gear, RESOLUTION, None)
-    return TurnUnits(units, gear, FEED, GEAR_RATIO if whole[GEAR_RATIO] else None)
+
+    setup: Setup
+    number: int
+    device: DeviceCapabilities
+
+    @property
+    def drive(self) -> Drive:
+        """The drive as the cell describes it."""
+        return self.setup.drives[self.number]
+
+    @property
+    def model(self) -> ArmModel:
+        """The arm."""
+        return self.setup.needed_arm().model
+
+    @property
+    def fastest(self) -> float:
+        """Highest speed, position units/s: all joints that move the motor at their allowed speeds."""
+        return float(np.abs(self.model.units_per_q[self.number]) @ self.model.qd_max) * self.setup.limits.speed_share
+
+    @property
+    def following_window(self) -> int:
+        """Wanted value of 6065h, units: `FOLLOWING_WINDOW_DEG` of the joint."""
+        per_radian = self.model.units_per_q[self.number, self.number] * self.model.radian[self.number]
+        return round(abs(float(per_radian)) * math.radians(FOLLOWING_WINDOW_DEG))
+
+    @property
+    def turn(self) -> TurnUnits | None:
+        """The units to compare with the device; None where it states none, or the cell counts no turns."""
+        units, gear, has = self.drive.turn_units, self.drive.gear, self.device.has
+        whole = {index: has(index, 1) and has(index, 2) for index in (FEED, GEAR_RATIO, RESOLUTION)}
+        if units is None or not (whole[FEED] or whole[RESOLUTION]):
+            return None
+        if not whole[FEED]:
+            return TurnUnits(units, gear, RESOLUTION, None)
+        return TurnUnits(units, gear, FEED, GEAR_RATIO if whole[GEAR_RATIO] else None)
+
+    @property
+    def motor_turn(self) -> tuple[float | None, float]:
+        """Position units of a motor turn, None where neither states them; and motor turns per turn of the shaft."""
+        feed = self._quotient(FEED)
+        ratio = (self._quotient(GEAR_RATIO) or 1.0) if feed else 1.0
+        if self.drive.turn_units is not None:
+            return self.drive.turn_units, ratio
+        lines = self._quotient(RESOLUTION)
+        return (feed / ratio if feed and lines else lines), ratio
+
+    def unit(self, index: int) -> float | None:
+        """Position units/s in one velocity unit (60A9h) of the device, or /s² in one acceleration unit (60AAh).
+
+        None where its EDS names a unit that the cell's data cannot express.
+        """
+        turn, ratio = self.motor_turn
+        return rate_unit(self.device.number(index) or 0, turn=turn and turn * ratio, metre=self.drive.metre_units)
+
+    def _quotient(self, index: int) -> float | None:
+        """Quotient of :01 and :02 by the EDS; None where the device has none."""
+        over, under = self.device.number(index, 1), self.device.number(index, 2)
+        return over / (under or 1) if over else None
 
 
-def speed_unit(device: DeviceCapabilities, drive: Drive, index: int) -> float | None:
-    """Position units/s in one velocity unit (60A9h) of a device, or /s² in one acceleration unit (60AAh).
-
-    None where its EDS names a unit that the cell's data cannot express.
-    """
-    turn, ratio = _motor_turn(device, drive)
-    return rate_unit(device.number(index) or 0, turn=turn and turn * ratio, metre=drive.metre_units)
-
-
-def _motor_turn(device: DeviceCapabilities, drive: Drive) -> tuple[float | None, float]:
-    """Position units of a motor turn, None where neither states them; and motor turns per turn of the shaft."""
-    feed = _quotient(device, FEED)
-    ratio = (_quotient(device, GEAR_RATIO) or 1.0) if feed else 1.0
-    if drive.turn_units is not None:
-        return drive.turn_units, ratio
-    lines = _quotient(device, RESOLUTION)
-    return (feed / ratio if feed and lines else lines), ratio
-
-
-def _quotient(device: DeviceCapabilities, index: int) -> float | None:
-    """Quotient of :01 and :02 by the EDS; None where the device has none."""
-    over, under = device.number(index, 1), device.number(index, 2)
-    return over / (under or 1) if over else None
+def _axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> list[DriveAxis]:
+    """The drives of the arm, from the base; none without an arm."""
+    return [DriveAxis(setup, number, devices[drive.node_id]) for number, drive in enumerate(setup.drives)]
 
 
 def range_problems(setup: Setup) -> Iterator[str]:
@@ -120,32 +154,17 @@ class _SpeedLimit:
         return self.most - self.rounding
 
 
-def speed_problems(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> Iterator[str]:
+def _speed_problems(axes: Iterable[DriveAxis]) -> Iterator[str]:
     """Problems of drives whose limit of speed is no more than the rounding of targets takes from cycle to cycle."""
-    if (arm := setup.arm) is None:
-        return
-    for axis, joint in enumerate(arm.model.joints):
-        lowest = _lowest_limit(setup, axis, devices, math.inf)
+    for axis in axes:
+        lowest = _lowest_limit(axis, math.inf)
         if lowest.left <= 0.0:
             yield (
-                f"joints.{joint.name}: drive {arm.drives[axis].node_id} allows {lowest.most:.4g} units/s by its"
-                f" {lowest.index:04X}h, and whole targets differ by as much as {lowest.rounding:.4g} units/s at"
-                f" cycle.rate_hz = {setup.rate_hz:g}: check 60A9h in the EDS, then counts_per_turn and gear; if they"
-                " are right, lower cycle.rate_hz"
+                f"joints.{axis.model.joints[axis.number].name}: drive {axis.drive.node_id} allows {lowest.most:.4g}"
+                f" units/s by its {lowest.index:04X}h, and whole targets differ by as much as {lowest.rounding:.4g}"
+                f" units/s at cycle.rate_hz = {axis.setup.rate_hz:g}: check 60A9h in the EDS, then counts_per_turn and"
+                " gear; if they are right, lower cycle.rate_hz"
             )
-
-
-def motor_speed_limit(model: ArmModel, axis: int, share: float, period_ns: int) -> int:
-    """Highest speed of a motor, drive units/s: all joints that move it at their limits.
-
-    Args:
-        model: the arm.
-        axis: axis of the motor, 0-based.
-        share: allowed share of the joints' speed limits.
-        period_ns: period of the cycle; a target is a whole number of drive units.
-    """
-    fastest = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
-    return math.ceil(fastest + ROUNDING_COUNTS * 1e9 / period_ns)
 
 
 def software_limits(model: ArmModel) -> tuple[Floats, Floats]:
@@ -154,50 +173,50 @@ def software_limits(model: ArmModel) -> tuple[Floats, Floats]:
     return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)
 
 
-def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:
-    """The setup with joints kept within positions and speeds of their drives, and warnings where that is less."""
-    if setup.arm is None:
-        return setup, ()
+def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, list[str], tuple[str, ...]]:
+    """The setup with joints kept within positions and speeds of their drives.
+
+    Returns:
+        The setup, the problems of joints that have no room or speed left, and warnings where that is less.
+    """
+    beyond = [*range_problems(setup), *_speed_problems(_axes(setup, devices))]
+    if setup.arm is None or beyond:
+        return setup, beyond, ()
     setup, ranges = _within_ranges(setup, setup.arm, devices)
-    setup, speeds = _within_speeds(setup, setup.needed_arm(), devices)
+    setup, speeds = _within_speeds(setup, _axes(setup, devices))
     if not (profiled := [drive.node_id for drive in setup.drives if is_profiled(devices[drive.node_id])]):
-        return setup, (*ranges, *speeds)
+        return setup, [], (*ranges, *speeds)
     lag = 0.5 * PROFILE_STOP_S + PROFILE_CYCLES / setup.rate_hz
     warning = (
         f"nodes {', '.join(map(str, profiled))} have no mode for a target in every cycle (6502h) and go by profile"
         f" position: motions by hand are no faster than the arm stops in {1e3 * PROFILE_STOP_S:g} ms; a higher"
         " acceleration of its joints (acceleration_deg_s2) lets them be faster"
     )
-    return setup.changed("arm", profile_lag=lag), (*ranges, *speeds, warning)
+    return setup.changed("arm", profile_lag=lag), [], (*ranges, *speeds, warning)
 
 
-def profile_values(setup: Setup, node_id: int, device: DeviceCapabilities) -> dict[Place, int]:
+def profile_values(axis: DriveAxis) -> dict[Place, int]:
     """Velocity, acceleration and deceleration of a drive in profile position, those of its joints at their limits.
 
     A unit that the data of the cell cannot express gives the slowest.
     """
-    arm = setup.needed_arm()
-    axis = arm.node_ids.index(node_id)
-    per_q, drive = np.abs(arm.model.units_per_q[axis]), arm.drives[axis]
-    speed = float(per_q @ arm.model.qd_max) * setup.limits.speed_share
-    rate = float(per_q @ arm.model.qdd_max) / (speed_unit(device, drive, ACCELERATION_UNIT_INDEX) or math.inf)
-    speed /= speed_unit(device, drive, VELOCITY_UNIT_INDEX) or math.inf
+    speed = axis.fastest / (axis.unit(VELOCITY_UNIT_INDEX) or math.inf)
+    rate = float(np.abs(axis.model.units_per_q[axis.number]) @ axis.model.qdd_max)
+    rate /= axis.unit(ACCELERATION_UNIT_INDEX) or math.inf
     values = {PROFILE_SPEED: speed, PROFILE_ACCELERATION: rate, PROFILE_DECELERATION: rate}
     return {(index, 0): max(1, int(value)) for index, value in values.items()}
 
 
-def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:
+def _within_speeds(setup: Setup, axes: Iterable[DriveAxis]) -> tuple[Setup, tuple[str, ...]]:
     """Keep joints within 607Fh, 6080h and 6065h of their drives, beyond which a drive faults."""
-    model, share = arm.model, setup.limits.speed_share
+    model, share = setup.needed_arm().model, setup.limits.speed_share
     slowest, objects = np.ones(model.n), set()
-    for axis in range(model.n):
-        wanted = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
-        lowest = _lowest_limit(setup, axis, devices, wanted)
-        if wanted <= lowest.left:
-            continue
-        moved = np.flatnonzero(model.units_per_q[axis])
-        slowest[moved] = np.minimum(slowest[moved], lowest.left / wanted)
-        objects.add(lowest.index)
+    for axis in axes:
+        lowest = _lowest_limit(axis, axis.fastest)
+        if axis.fastest > lowest.left:
+            moved = np.flatnonzero(model.units_per_q[axis.number])
+            slowest[moved] = np.minimum(slowest[moved], lowest.left / axis.fastest)
+            objects.add(lowest.index)
     if not objects:
         return setup, ()
     limits = [replace(joint, qd_max=joint.qd_max * factor) for joint, factor in zip(model.joints, slowest, strict=True)]
@@ -215,36 +234,22 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilit
     return setup.changed("arm", model=replace(model, joints=tuple(limits))), (warning,)
 
 
-def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, DeviceCapabilities], wanted: float) -> _SpeedLimit:
-    """The lowest limit in the drive of an axis, where a speed of `wanted` position units/s is needed."""
-    arm, rounding = setup.needed_arm(), ROUNDING_COUNTS * setup.rate_hz
-    device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
+def _lowest_limit(axis: DriveAxis, wanted: float) -> _SpeedLimit:
+    """The lowest limit of a drive, where a speed of `wanted` position units/s is needed."""
+    device, rounding = axis.device, ROUNDING_COUNTS * axis.setup.rate_hz
     limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
-    entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY_UNIT_INDEX)
+    entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), axis.unit(VELOCITY_UNIT_INDEX)
     if entry is not None and unit is not None and (held := device.number(PROFILE_SPEED_LIMIT)):
         rises = entry.writable and (wanted == math.inf or entry.allows(math.ceil((wanted + rounding) / unit)))
         limits += [] if rises else [_SpeedLimit(PROFILE_SPEED_LIMIT, held * unit, rounding)]
-    turn, _ = _motor_turn(device, drive)
+    turn, _ = axis.motor_turn
     if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
         limits.append(_SpeedLimit(MOTOR_SPEED_LIMIT, rpm / 60.0 * turn, rounding))
-    window, lag = _fixed_window(device, following_window(arm.model, axis)), lag_s(setup)
-    if window is not None and lag > 0.0:
-        limits.append(_SpeedLimit(FOLLOWING_WINDOW, window / lag, ROUNDING_COUNTS / lag))
+    entry, window, lag = device.description.entry(FOLLOWING_WINDOW), device.number(FOLLOWING_WINDOW), lag_s(axis.setup)
+    if entry is not None and window is not None and window != NO_WINDOW and lag > 0.0:
+        widens = entry.writable and entry.allows(axis.following_window)
+        limits += [] if widens else [_SpeedLimit(FOLLOWING_WINDOW, window / lag, ROUNDING_COUNTS / lag)]
     return min(limits, key=lambda limit: limit.left)
-
-
-def following_window(model: ArmModel, axis: int) -> int:
-    """Wanted value of 6065h, units: `FOLLOWING_WINDOW_DEG` of the joint."""
-    return round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * math.radians(FOLLOWING_WINDOW_DEG))
-
-
-def _fixed_window(device: DeviceCapabilities, wanted: int) -> int | None:
-    """Value of 6065h, units, where it cannot be the wanted one; None where it can, or the drive watches no error."""
-    entry = device.description.entry(FOLLOWING_WINDOW)
-    if entry is None or (entry.writable and entry.allows(wanted)):
-        return None
-    window = device.number(FOLLOWING_WINDOW)
-    return None if window == NO_WINDOW else window
 
 
 def lag_s(setup: Setup) -> float:

@@ -171,7 +171,7 @@ def _check_heard(path: Path, plan: Plan, name: str, channel: _RecordedChannel) -
         missing = [pdo for pdo in plan.pdos_of(node.node_id, "tpdo") if pdo.cob_id not in channel.heard]
         if missing:
             ids = ", ".join(f"{pdo.cob_id:03X}h" for pdo in missing)
-            silent.append(f"node {node.node_id} ({node.role}) was never heard: no TPDO {ids}")
+            silent.append(f"node {node.node_id} ({node.name}) was never heard: no TPDO {ids}")
     if silent:
         where = f"{path}: on {name}" if name else f"{path}: no frame at all;"
         wrong = f" ({channel.malformed} PDOs of a wrong length)" if channel.malformed else ""

@@ -6,7 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, Plan, PlannedNode
+from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, Plan
+from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.errors import UsageError
 from canprobe.fieldbus.tools.conform.bench import HEARTBEAT_MS
 from canprobe.fieldbus.tools.conform.points.timing import HEARTBEAT_TIME, SDO_TIME, SYNC_TIME
@@ -90,13 +91,13 @@ def read_device_times(path: Path, plan: Plan) -> DeviceTimes:
     return DeviceTimes(report.title, tuple(row for node in nodes for row in _rows(node, report, plan)))
 
 
-def _is_device(node: PlannedNode, report: Report) -> bool:
+def _is_device(node: NodeConfiguration, report: Report) -> bool:
     wanted = (node.identity.vendor_id, node.identity.product_code)
     numbers = tuple(None if number is None else f"{number:#x}" for number in wanted)
     return None not in numbers and (report.facts.get("vendor"), report.facts.get("product")) == numbers
 
 
-def _rows(node: PlannedNode, report: Report, plan: Plan) -> list[DeviceTime]:
+def _rows(node: NodeConfiguration, report: Report, plan: Plan) -> list[DeviceTime]:
     rows = []
     for name, times in report.distributions.items():
         if name.startswith(SDO_TIME) and times:

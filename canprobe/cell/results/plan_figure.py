@@ -7,8 +7,8 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from canprobe.cell.planning.model import Plan
-from canprobe.cell.planning.timeline import Part, timeline
+from canprobe.cell.planning.model import Part, Plan
+from canprobe.cell.planning.timeline import timeline
 from canprobe.cell.planning.traffic import on_the_wire
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, SHADE, SKY, legend, picture
 
@@ -31,7 +31,7 @@ def draw_plan(plan: Plan, path: Path | str) -> None:
     """
     messages = on_the_wire(plan.pdos)
     heights = [0.45 * (len(plan.buses) + 1) + 0.5, _ROW_INCHES * len(messages) + 0.6]
-    loads = ", ".join(f"{bus.channel} {100 * bus.traffic.load:.0f} %" for bus in plan.buses)
+    loads = ", ".join(f"{bus.channel} {100 * bus.load:.0f} %" for bus in plan.buses)
     title = f"{plan.scene.name} at {plan.sync.rate_hz:g} Hz, {plan.scene.bus.bitrate / 1e6:g} Mbit/s"
     with picture(path, f"{title}: worst-case load {loads}", sum(heights) + 1.1) as figure:
         upper, lower = figure.subplots(2, 1, height_ratios=heights)

@@ -71,7 +71,7 @@ def summarise(
     log = dict(cell.log.columns()) if log is None else log
     contact, load = _contact(session, record, log), session.record.load
     buses = session.plan.buses
-    loads = {bus.channel: {"planned_worst": bus.traffic.load, "measured": load(bus.channel)} for bus in buses}
+    loads = {bus.channel: {"planned_worst": bus.load, "measured": load(bus.channel)} for bus in buses}
     summary = {
         "schema": SCHEMA,
         "written_by": f"canprobe {__version__}",

@@ -168,12 +168,12 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
         figures = LinkFigures(
             period_ns=plan.sync.period_ns,
             lateness_ns=sorted(list(lateness_ns)[first:]),
-            wait_ns=plan.traffic.budget.looks_ns[-1],
+            wait_ns=plan.budget.looks_ns[-1],
             answers=meter.answers(),
             torn=None if cell.tactile is None else _torn(cell) - torn,
             array_silent=_is_silent(cell),
             load=None if load is None else load / len(plan.buses),
-            planned_load=max(bus.traffic.load for bus in plan.buses),
+            planned_load=max(bus.load for bus in plan.buses),
             foreign_hz=meter.foreign / max(meter.seconds, 1e-9),
             queue_full=counters.transmit_full - full,
             dropped=counters.overruns,
@@ -219,7 +219,7 @@ def _traffic(plan: Plan) -> dict[str, Any]:
     bases = (EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE)
     known = {pdo.cob_id for pdo in plan.pdos} | {frames.can_id for frames in plan.raw}
     known |= {base + node_id for base in bases for node_id in (*plan.node_ids, MASTER_NODE_ID)}
-    return {"wait_ns": plan.traffic.budget.looks_ns[-1], "answers": answers, "known": known}
+    return {"wait_ns": plan.budget.looks_ns[-1], "answers": answers, "known": known}
 
 
 def _torn(cell: Cell) -> int:

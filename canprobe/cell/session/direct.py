@@ -115,7 +115,7 @@ class DirectCycle(Cycle):
     ) -> None:
         port.clock.sleep_until_ns(port.clock.now_ns() + round(SECOND_ANSWER_S * 1e9))  # as bring-up for second boot-ups
         super().__init__(port, plan, drives=drives, tactile=tactile, watch=watch, **more)
-        self._clock, self._first_look_ns = port.clock, plan.traffic.budget.looks_ns[0]
+        self._clock, self._first_look_ns = port.clock, plan.budget.looks_ns[0]
         self._counter = 0
         self._commands = drives.targets.commands if drives is not None else tuple
         self._take = drives.take if drives is not None else nothing
@@ -123,7 +123,7 @@ class DirectCycle(Cycle):
         self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
         self._nodes, self._recorder = world.nodes, world.recorder
         by_id, of_drives = {node.node_id: node for node in self._nodes}, [drive.node_id for drive in plan.setup.drives]
-        self._start({setup.node_id: setup for setup in plan.configurations}, of_drives, port.clock.now_ns())
+        self._start({setup.node_id: setup for setup in plan.nodes}, of_drives, port.clock.now_ns())
         self._stations = [(node.core, node.pdos.exchange, node.node_id in of_drives) for node in self._nodes]
         self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
         for node_id in of_drives:

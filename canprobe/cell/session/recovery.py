@@ -260,7 +260,7 @@ class _Wait:
 
     def __init__(self, plan: Plan, foreign: bool) -> None:
         self._plan, self._settings = plan, plan.setup.bring_up
-        self._setups = {setup.node_id: setup for setup in plan.configurations}
+        self._setups = {setup.node_id: setup for setup in plan.nodes}
         self._watch = NodeWatch(plan.node_ids)
         self._absent: set[int] = set()
         self._listen_s = MASTER_QUIET_S if foreign else max(self._settings.listen_s, ANSWER_S)

@@ -329,7 +329,7 @@ class FirstSecond:
         if cell.drives is not None:
             number = len(lateness) * len(cell.drives.axes)
             answers = (AnswerFigures(0, number, (), min(late, missed), max(0, missed - late), (1,) * missed),)
-        wait_ns = self._plan.traffic.budget.looks_ns[-1]
+        wait_ns = self._plan.budget.looks_ns[-1]
         figures = LinkFigures(period_ns, lateness, wait_ns, answers, queue_full=full)
         verdict = judge_link(figures, link_limits(self._plan))
         if verdict.fitness is not Fitness.FIT:

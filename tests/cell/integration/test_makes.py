@@ -16,9 +16,8 @@ from scenes import change, reasons
 import canprobe
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.model import Interpolation
+from canprobe.cell.planning.node_configuration import Interpolation
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.errors import NodeError
@@ -169,7 +168,7 @@ def test_profile_position_is_bounded_by_the_limits_whatever_else_a_fixed_pdo_wri
     model, (_, target) = plan.setup.arm.model, plan.pdos_of(1, "rpdo")
     speed, rate = (int(model.units_per_q[0, 0] * most[0]) for most in (model.qd_max, model.qdd_max))
     assert dict(target.constants) == {(0x6081, 0): speed}
-    writes = {write.index: write.value for write in plan.configurations[0].writes}
+    writes = {write.index: write.value for write in plan.nodes[0].writes}
     assert (writes[0x6060], writes[0x6081], writes[0x6083], writes[0x6084]) == (1, speed, rate, rate)
     assert "two targets in one RPDO" in dict(plan.not_available)
     assert any("go by profile position" in warning for warning in plan.warnings)
@@ -189,7 +188,7 @@ def test_what_a_bare_drive_lacks_is_listed_with_the_consequence(tmp_path):
 
 def wished(plan, index):
     """What is written there to the first drive, and how the plan says that it is not."""
-    written = [write.value for write in make_configurations(plan)[0].writes if write.index == index]
+    written = [write.value for write in plan.nodes[0].writes if write.index == index]
     return written, [why for what, why in plan.not_available if f"{index:04X}h" in what]
 
 
@@ -447,14 +446,14 @@ def test_a_pdo_that_follows_no_sync_is_not_used(tmp_path):
 
 def test_bits_29_and_30_are_written_as_the_eds_has_them(tmp_path):
     plan = canprobe.plan(scene_of("tpdo_without_rtr", tmp_path))
-    writes = {(w.index, w.subindex): w.value for w in make_configurations(plan)[2].writes}
+    writes = {(w.index, w.subindex): w.value for w in plan.nodes[2].writes}
     assert writes[0x1800, 1] == 0x4000_0183 and writes[0x1801, 1] == 0xC000_0283 and writes[0x1400, 1] == 0x203
 
 
 def test_targets_of_interpolated_position_go_to_60c1h(tmp_path):
     """The master alone: what is written, what is mapped."""
     plan = canprobe.plan(scene_of("interpolated", tmp_path))
-    writes = {(w.index, w.subindex): w.value for w in make_configurations(plan)[0].writes}
+    writes = {(w.index, w.subindex): w.value for w in plan.nodes[0].writes}
     assert writes[0x6060, 0] == 7 and writes[0x60C0, 0] == 0 and (writes[0x60C2, 1], writes[0x60C2, 2]) == (3, -3)
     assert [writes[0x1600, sub] for sub in (0, 1, 2)] == [2, 0x60400010, 0x60C10120]
 
@@ -487,7 +486,7 @@ def test_a_limit_of_speed_is_written_in_the_unit_of_the_drive(tmp_path):
         folder.mkdir()
     limited = zip((RPM, 0), folders, strict=True)
     plans = [canprobe.plan(scene_of(speed_limited(1300, unit), folder)) for unit, folder in limited]
-    rpm, counts = (next(w.value for w in make_configurations(plan)[0].writes if w.index == 0x607F) for plan in plans)
+    rpm, counts = (next(w.value for w in plan.nodes[0].writes if w.index == 0x607F) for plan in plans)
     assert 0.0 <= rpm - counts * 60 / 1000 <= 1.0
 
 

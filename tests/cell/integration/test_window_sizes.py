@@ -11,7 +11,6 @@ from undrawn import undrawn_run
 import canprobe
 import canprobe.fieldbus.eds.packaged
 from canprobe.cell.planning.array import patch_across_taxels, patch_radius_m, window_choices
-from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.planning.pdos import tactile_objects
 from canprobe.cell.plant.elastic_contact import elastic_contact
 from canprobe.cell.scene.load import dump_scene, parse_scene
@@ -51,7 +50,7 @@ def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
     (one,) = (one for one in measured.classes if one.kind == "tactile PDO")
     assert one.frames == pytest.approx(one.planned_frames, rel=0.02) and one.late == 0
     assert result.summary["cycle"]["torn_frames"] == 0
-    (setup,) = (setup for setup in make_configurations(result.plan) if setup.node_id == 16)
+    (setup,) = (setup for setup in result.plan.nodes if setup.node_id == 16)
     assert [(w.value, w.read_back) for w in setup.writes if w.index == 0x2008] == [(side, True)]
 
 
@@ -143,7 +142,7 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
     assert ("another window", f"{path} has no window size (2008h), so the window keeps 8×8 taxels") in (
         plan.not_available
     )
-    (setup,) = (setup for setup in make_configurations(plan) if setup.node_id == 16)
+    (setup,) = (setup for setup in plan.nodes if setup.node_id == 16)
     assert not any(write.index == 0x2008 for write in setup.writes) and setup.left_out == ()
     with pytest.raises(PlanError, match=r"sensor\.window = 8, not 6"):
         canprobe.plan(change(scene, sensor={"window": 6}))

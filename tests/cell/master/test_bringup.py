@@ -16,7 +16,6 @@ import canprobe
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.session.session import Session
 from canprobe.errors import BusError, InterfaceError, NodeError
 from canprobe.fieldbus.bus.sdo import upload
@@ -388,7 +387,7 @@ def test_any_write_over_sdo_takes_the_date_back():
     session = open_session(None, nodes=nodes, store=True)
     with session:
         drive = nodes[1]
-        date = make_configurations(session.plan)[0].configuration_date
+        date = session.plan.nodes[0].configuration_date
         assert {sub: drive.dictionary.number(0x1020, sub) for sub in (1, 2)} == date and min(date.values()) > 0
         drive.receive(0x601, bytes.fromhex("2b6660001e000000"), drive.core.now_ns)
         assert [drive.dictionary.number(0x1020, sub) for sub in (1, 2)] == [0, 0]
@@ -677,7 +676,7 @@ def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):
     scene = canprobe.load_scene("free")
     scene = replace(scene, arm=replace(scene.arm, eds=str(eds)))
     plan = canprobe.plan(scene)
-    (write,) = [one for one in make_configurations(plan)[0].writes if one.index == 0x1006 and one.value]
+    (write,) = [one for one in plan.nodes[0].writes if one.index == 0x1006 and one.value]
     assert (write.value, write.absence, plan.nodes[0].interpolation) == (2500, None, ())
     told = undrawn_run(canprobe.load_scene("free"), out=tmp_path / "told", duration_s=0.3)
     result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.3)

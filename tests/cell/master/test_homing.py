@@ -129,7 +129,7 @@ def test_homing_leaves_a_drive_in_profile_position_as_quick_as_it_was(tmp_path):
     scene = change(scene_of([17]), arm={"eds": str(write_eds("no_cyclic_mode", tmp_path))})
     bench = Bench(scene, tmp_path)
     assert "inside its range" in bench.home()[0]
-    wanted = [write.value for write in bench.plan.configurations[0].writes if write.index == 0x6081]
+    wanted = [write.value for write in bench.plan.nodes[0].writes if write.index == 0x6081]
     written = [int.from_bytes(d[4:], "little") for i, d in bench.frames if i == 0x601 and d[:4].hex() == "23816000"]
     assert written[0] == written[-1] == wanted[0] and len(written) == 3
 

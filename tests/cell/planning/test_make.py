@@ -122,7 +122,7 @@ def test_text_shows_every_node_pdo_and_omission(name):
     plan = packaged_plan(name)
     text = plan_text(plan)
     assert all(f"{pdo.cob_id:03X}h" in text for pdo in plan.pdos)
-    assert all(node.role in text for node in plan.nodes)
+    assert all(node.name in text for node in plan.nodes)
     assert all(what in text and why in text for what, why in plan.left_out)
     assert f"{100 * plan.traffic.load:.1f} %" in text
 

@@ -81,7 +81,7 @@ def test_rows_for_a_terminal(plan):
     assert len(rows) == cycles * (len(plan.buses) + 1)
     assert all(len(row[2]) == 50 for row in rows)
     busy = sum(character != "·" for row in rows if row[1] != "controller" for character in row[2])
-    load = sum(bus.traffic.load - dict(bus.traffic.parts)["heartbeats"] for bus in plan.buses)
+    load = sum(bus.load - dict(bus.parts)["heartbeats"] for bus in plan.buses)
     assert busy / (50 * cycles) == pytest.approx(load, abs=0.04 * len(plan.buses))
     assert rows[0][2].startswith("S")
 

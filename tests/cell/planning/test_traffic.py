@@ -14,7 +14,8 @@ from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.identifiers import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages
-from canprobe.cell.planning.model import Interpolation, PlannedPdo
+from canprobe.cell.planning.model import PlannedPdo
+from canprobe.cell.planning.node_configuration import Interpolation
 from canprobe.cell.planning.report import plan_dict
 from canprobe.cell.planning.traffic import controller_starts
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
@@ -119,7 +120,7 @@ def follow_ways_out(scene):
         for key in re.findall(r"without sensor\.(\w+)", text):
             file = re.sub(rf"^{key} = .*\n", "", file, count=1, flags=re.M)
         plan = canprobe.plan(parse_scene(file))
-        assert f"load {100 * max(bus.traffic.load for bus in plan.buses):.0f} %" in numbers, way
+        assert f"load {100 * max(bus.load for bus in plan.buses):.0f} %" in numbers, way
         assert ("without 6077h" in numbers) == (scene.arm.torque and not plan.setup.arm.torque), way
     return texts
 
@@ -257,7 +258,7 @@ def test_every_message_meets_its_deadline_and_tactile_waits_for_all_drives(press
 def test_nodes_with_identity_and_what_is_switched_off(press_plan):
     assert press_plan.node_ids == (1, 2, 3, 4, 5, 6, 16)
     joint, sensor = press_plan.nodes[0], press_plan.nodes[-1]
-    assert (joint.kind, joint.role, joint.emulated) == ("drive", "joint 1", True)
+    assert (joint.kind, joint.name, joint.emulated) == ("drive", "joint 1", True)
     assert (joint.identity.vendor_id, joint.identity.product_code) == (0xCA5E, 0x260)
     assert (sensor.kind, sensor.identity.product_code) == ("tactile", 0x1616)
     assert ("rpdo", 2) in joint.switched_off
@@ -273,7 +274,7 @@ def test_frames_that_may_be_on_the_bus(press_plan):
 
 def test_order_of_node_ids_is_the_order_of_joints():
     plan = canprobe.plan(with_joints(load_scene("free"), node_id=(16, 5, 4, 3, 2, 1)))
-    assert {node.node_id: node.role for node in plan.nodes}[16] == "joint 1"
+    assert {node.node_id: node.name for node in plan.nodes}[16] == "joint 1"
     assert plan.node_ids == (1, 2, 3, 4, 5, 16)
 
 
@@ -434,7 +435,7 @@ HEARTBEAT = 65
 )
 def test_cycle_budget(name, sections, sync_blocked, sneaks_in, compute):
     plan = canprobe.plan(change(load_scene(name), **sections))
-    budget = plan.traffic.budget
+    budget = plan.budget
     sync = sync_blocked + SYNC
     feedback = sync + sneaks_in + 6 * DRIVE_TPDO
     commands = feedback + compute + sneaks_in + 6 * DRIVE_RPDO
@@ -454,7 +455,7 @@ def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(be
 @pytest.mark.slow(reason="plans for every way out")
 def test_a_controller_that_takes_too_long_is_refused(press):
     setup = resolve(press)
-    budgets = [make_plan(setup.changed("arm", torque=torque)).traffic.budget for torque in (True, False)]
+    budgets = [make_plan(setup.changed("arm", torque=torque)).budget for torque in (True, False)]
     longest, without = [(budget.slack_ns + budget.compute_ns) / 1000 for budget in budgets]
     for compute_us, what in (
         (longest, ()),
@@ -463,7 +464,7 @@ def test_a_controller_that_takes_too_long_is_refused(press):
     ):
         plan = canprobe.plan(change(press, cycle={"compute_us": compute_us}))
         assert tuple(what for what, _ in plan.left_out if "torque" in what) == what
-        assert plan.traffic.budget.slack_ns >= 0
+        assert plan.budget.slack_ns >= 0
     longer = change(press, cycle={"compute_us": without + 1})
     assert "behind the next SYNC" in reasons(longer)[0]
     assert f"cycle.compute_us = {longest:.0f}" in [way.partition(":")[0] for way in ways_out(longer)]
@@ -479,7 +480,7 @@ def test_torque_is_given_up_before_the_window_is_narrowed(press):
 
 
 def test_a_sensor_alone_has_a_budget_too():
-    budget = canprobe.plan(load_scene("listen")).traffic.budget
+    budget = canprobe.plan(load_scene("listen")).budget
     assert (budget.feedback_ns, budget.commands_ns) == (None, None)
     assert budget.tactile_ns == (HEARTBEAT + SYNC + HEARTBEAT + 9 * FULL) * 1000
     assert budget.looks_ns == (625_000, 1_500_000)

@@ -10,7 +10,6 @@ import pytest
 import yaml
 
 import canprobe
-from canprobe.cell.planning.configuration import make_configurations
 from canprobe.cell.scene.load import load_scene
 from canprobe.cli import main
 from canprobe.errors import UsageError
@@ -33,7 +32,7 @@ def entry(od, index, subindex):
 
 
 def test_canopen_reads_back_every_value_that_bring_up_writes(plan, tmp_path):
-    setups = make_configurations(plan)
+    setups = plan.nodes
     for setup, path in zip(setups, write_dcfs(plan, tmp_path), strict=True):
         od = canopen.import_od(str(path))
         assert (od.node_id, od.bitrate) == (setup.node_id, 1_000_000)
@@ -43,7 +42,7 @@ def test_canopen_reads_back_every_value_that_bring_up_writes(plan, tmp_path):
 
 
 def test_dcf_tools_find_no_fault_and_read_the_same(plan, tmp_path):
-    for setup, path in list(zip(make_configurations(plan), write_dcfs(plan, tmp_path), strict=True))[-1:]:
+    for setup, path in list(zip(plan.nodes, write_dcfs(plan, tmp_path), strict=True))[-1:]:
         done = subprocess.run(
             [sys.executable, "-c", "import sys; from dcf.cli import main; sys.exit(main())", path],
             capture_output=True, text=True, check=False,
@@ -73,14 +72,14 @@ def test_dcfgen_makes_the_masters_files_of_bus_yml_with_the_same_writes(plan, tm
     kept = (plan.nodes[0], plan.nodes[-1])  # it reads every EDS anew, a second each
     document = yaml.safe_load((tmp_path / "bus.yml").read_text())
     for node in set(plan.nodes) - set(kept):
-        del document[node.role.replace(" ", "_")]
+        del document[node.name.replace(" ", "_")]
     (tmp_path / "bus.yml").write_text(yaml.safe_dump(document))
     (tmp_path / "out").mkdir()
     subprocess.run(
         [sys.executable, "-W", "ignore", "-c", "from dcfgen.cli import main; main()", "-d", "out", "-r", "bus.yml"],
         cwd=tmp_path, capture_output=True, text=True, check=True,
     )  # fmt: skip
-    for setup in (setup for setup in make_configurations(plan) if setup.node_id in {node.node_id for node in kept}):
+    for setup in (setup for setup in plan.nodes if setup.node_id in {node.node_id for node in kept}):
         written = concise((tmp_path / "out" / f"{setup.name.replace(' ', '_')}.bin").read_bytes())
         od = setup.dictionary
         for (index, subindex), value in final_values(setup).items():
@@ -120,7 +119,7 @@ def test_bus_yml_comes_back(plan, tmp_path):
     write_bus_yml(plan, tmp_path)
     found = read_bus_yml(tmp_path / "bus.yml")
     assert [(node.name.replace("_", " "), node.node_id) for node in found] == [
-        (node.role, node.node_id) for node in plan.nodes
+        (node.name, node.node_id) for node in plan.nodes
     ]
     assert {node.eds.parent for node in found} == {tmp_path}
 
