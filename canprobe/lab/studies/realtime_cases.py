@@ -31,7 +31,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock, wake_lateness
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.eds.packaged import eds_file
@@ -94,21 +94,6 @@ class CycleTimes:
         return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
 
 
-def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
-    """Wake at a number of deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
-
-    Yields:
-        The deadline, ns, or the last one that has passed by then.
-    """
-    deadline_ns = clock.now_ns() + period_ns
-    for _ in range(cycles):
-        clock.sleep_until_ns(deadline_ns)
-        lateness.append(clock.now_ns() - deadline_ns)
-        deadline_ns += lateness[-1] // period_ns * period_ns
-        yield deadline_ns
-        deadline_ns += period_ns
-
-
 def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -> Times:
     """Measure the time from each SYNC of a candump log to the last of the TPDOs that answer it within a period.
 
@@ -159,10 +144,11 @@ def measure_scan(seconds: float) -> Measured:
 
 def measure_bare(seconds: float) -> Measured:
     """A loop that wakes at every deadline and does nothing: the machine's own lateness."""
-    period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
+    clock, period_ns = MonotonicClock(), round(1e9 / RATE_HZ)
     with realtime(MASTER_PRIORITY, lambda _: None):  # the first case has reported missing permissions
-        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
-    times = CycleTimes(period_ns, np.array(lateness, np.int64), (deadlines[-1] - deadlines[0]) * 1e-9)
+        first_ns = clock.now_ns() + period_ns
+        lateness = wake_lateness(clock, period_ns, round(seconds * RATE_HZ))
+        times = CycleTimes(period_ns, np.array(lateness, np.int64), (clock.now_ns() - first_ns) * 1e-9)
     return Measured("bare clock", "none", RATE_HZ, times)
 
 
