@@ -9,6 +9,7 @@ condition; a test compares the two.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 from canprobe.cell.master.image_witness import UNSTATED_NS
@@ -36,40 +37,40 @@ NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
 ARRAY_RECOVERY_NS = 30 * NS_PER_MS
 """Time after a touch in which the array's creep and hysteresis may still show half of the touch force."""
 _BLIND_ADVICE = "look at the arm before anything moves, then press the array with a finger: `canprobe run listen`"
+Within = Callable[[Limits], int]
 Check = TypeVar("Check", bound=Callable[..., Any])
 _TABLE: list[Condition] = []
 
 
-def _unchecked(*row: Any, **more: Any) -> None:
-    """Add a row without a check: the condition shows by itself."""
-    _TABLE.append(Condition(*row, **more))
-
-
-def _checked(*row: Any, **more: Any) -> Callable[[Check], Check]:
+def _checked(key: str, what: str, reaction: Reaction, within: Within | None, **more: Any) -> Callable[[Check], Check]:
     """Add a row whose check looks at the cell in every cycle."""
-    return lambda check: _add(check, *row, check=check, **more)
+
+    def add(check: Check) -> Check:
+        _TABLE.append(Condition(key, what, reaction, within, check, **more))
+        return check
+
+    return add
 
 
-def _touch(*row: Any, **more: Any) -> Callable[[Check], Check]:
-    """Add a row whose check looks at a touch."""
-    return lambda check: _add(check, *row, check=check, touch=True, **more)
+_touch = partial(_checked, touch=True)
+"""Add a row whose check looks at a touch."""
 
 
-def _counted(key: str, what: str, within: Callable[[Limits], int], count: Callable[[CycleState], int]) -> None:
+def _counted(key: str, what: str, within: Within, count: Callable[[CycleState], int]) -> None:
     """Add a row of a condition that is counted and does not stop the cell."""
     _TABLE.append(Condition(key, what, Reaction.DEGRADE, within, count=count))
 
 
-def _add(function: Check, *row: Any, **more: Any) -> Check:
-    _TABLE.append(Condition(*row, **more))
-    return function
+def _unchecked(*row: Any) -> None:
+    """Add a row without a check: the condition shows by itself."""
+    _TABLE.append(Condition(*row))
 
 
-def _cycles(number: int) -> Callable[[Limits], int]:
+def _cycles(number: int) -> Within:
     return lambda limits: number * limits.period_ns
 
 
-def _after(time_ns: int, cycles: int = 1) -> Callable[[Limits], int]:
+def _after(time_ns: int, cycles: int = 1) -> Within:
     """A time, and the cycles until the check runs."""
     return lambda limits: time_ns + cycles * limits.period_ns
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.image_witness import ImageWitness
-from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
@@ -23,9 +22,7 @@ from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.touch.image.force_errors import upper_end
-from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
-from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.master.array import ArrayReceiver
@@ -214,25 +211,6 @@ class TouchState:
             self._since_ns.pop(what, None)
             return 0.0
         return (t_ns - self._since_ns.setdefault(what, t_ns)) * 1e-9
-
-    def look(self, sample: TactileSample, patch: Patch, centre: Floats | None, sigma: float | None = None) -> None:
-        """Look whether the array lives, by a sample and its patch.
-
-        Args:
-            sample: the sample.
-            patch: patch that it shows.
-            centre: (3,) centre of the probe then, m; None where it is not known.
-            sigma: standard deviation of the centroid from image to image, m, where the calibration states it.
-        """
-        self.images.look(
-            sample.t_sample_ns,
-            sample.image,
-            pressed=patch.force > TOUCH_FORCE,
-            uv=(patch.u, patch.v),
-            highest=COUNTS_MAX if sample.frame.features else int(sample.frame.taxels.max()),
-            centre=centre,
-            sigma=sigma,
-        )
 
 
 class Reaction(Enum):

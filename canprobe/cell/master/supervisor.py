@@ -234,7 +234,7 @@ class Supervisor:
         self._growing = GrowingForce(seen.limits.cycles_to_turn)
         self._look_ns = 0
         self._untouched = seen.limits.tares
-        self._late: deque[tuple[int, int]] = deque()  # while one of them is late, the last second's cycles
+        self._late: deque[tuple[int, int]] = deque()  # times of the last second's cycles, and whether they were late
         self._late_sum = 0
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
@@ -281,14 +281,9 @@ class Supervisor:
 
     def _count_late(self, late: int, t_ns: int) -> None:
         """Late cycles are longer than others: the last second has fewer of them."""
-        cycles = self._late
-        if not self._late_sum:
-            cycles.clear()
-            if not late:
-                self.seen.late_share = 0.0
-                return
-            in_time = range(self.seen.measurement.t_ns, t_ns - SECOND_NS, -self.seen.limits.period_ns)
-            cycles.extend((before_ns, 0) for before_ns in reversed(in_time))
+        cycles, period_ns = self._late, self.seen.limits.period_ns
+        if not cycles:  # as if a second in time had passed before the first one
+            cycles.extend((before_ns, 0) for before_ns in range(t_ns - SECOND_NS + period_ns, t_ns, period_ns))
         cycles.append((t_ns, late))
         self._late_sum += late
         while cycles[0][0] <= t_ns - SECOND_NS:
@@ -351,7 +346,7 @@ class Supervisor:
             patch = self._patch_from(sample)
             self._contact.update_force(patch, sample.t_sample_ns)
             if measurement.q is not None and self._guard is not None:
-                self._contact.look(sample, patch, self._guard.T_base_tip(measurement.q)[:3, 3])
+                self._contact.images.look(sample, patch, self._guard.T_base_tip(measurement.q)[:3, 3])
         self._contact.tactile_age = measurement.tactile_age
         return touch_finding(self._contact)
 
