@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
-from canprobe.cell.master.bringup import BringUp, FoundNodes
+from canprobe.cell.master.bringup import BringUp, FoundNodes, NodeAccess
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.held_arm import HeldArm
@@ -112,10 +112,9 @@ class Cell:
         if check:  # nothing is commanded or stored, such as a tare
             setups = tuple(replace(one, writes=tuple(w for w in one.writes if w.read_back)) for one in setups)
             settings = replace(settings, store=False)
-        self.bring_up = BringUp(
-            self._network, self.watch, setups, settings, self._say, listened=before is not None, resets=not check
-        )
-        self.found = FoundNodes(self._network, self.watch, setups, settings) if check else None
+        access = NodeAccess(self._network, self.watch, setups, settings, self._say)
+        self.bring_up = BringUp(access, listened=before is not None, resets=not check)
+        self.found = FoundNodes(access) if check else None
         self.stopped_by: Condition | None = None
         self.doubted: frozenset[int] = frozenset()
         self._stopped, self._before = False, before
@@ -127,11 +126,8 @@ class Cell:
 
             self._power = ArmPower(plan, self.drives, self.cycles, self.bring_up)
             self._lift_off = partial(lift_off, plan, self.cycles)
-        self.homing = (
-            Homing(plan, setups, self._network, self.watch, self._supervise_homing, record=zeros, say=self._say)
-            if any(one.homing for one in setups)
-            else None
-        )
+        homed = any(one.homing for one in setups)
+        self.homing = Homing(plan, access, self._supervise_homing, zeros) if homed else None
         self._holding = False
         self._held = HeldArm()
         self._running = False

@@ -23,19 +23,17 @@ from typing import Any
 
 import numpy as np
 
+from canprobe.cell.master.bringup import NodeAccess
 from canprobe.cell.master.node_bringup import IDENTITY, read_entry, write_entry
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
-from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.units import PROFILE_SPEED
-from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.port import nothing
-from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
+from canprobe.fieldbus.bus.sdo import Dialogue
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import (
     CHANGE_IMMEDIATELY_BIT,
@@ -70,9 +68,7 @@ class SdoLink:
     """Dialogues with one node after the other, and the master's heartbeats meanwhile.
 
     Args:
-        network: pumped; the nodes are operational.
-        watch: what the nodes report of themselves.
-        times: time-outs and retries.
+        access: the nodes, which are operational.
         supervise: called while time passes; it raises the error of whatever goes wrong.
 
     Attributes:
@@ -80,12 +76,10 @@ class SdoLink:
         attend: called as `supervise`, by whoever looks after the drive.
     """
 
-    def __init__(
-        self, network: PumpedNetwork, watch: NodeWatch, times: BringUpSettings, supervise: Callable[[], None]
-    ) -> None:
-        self.watch, self.times, self.clock = watch, times, network.port.clock
+    def __init__(self, access: NodeAccess, supervise: Callable[[], None]) -> None:
+        self.watch, self.times, self.clock = access.watch, access.settings, access.network.port.clock
         self.beats, self._heartbeat_ns = False, 0
-        self._network, self._supervise = network, supervise
+        self._access, self._supervise = access, supervise
         self.attend: Callable[[], None] = nothing
 
     def hold(self, node_id: int, dialogue: Dialogue) -> Any:
@@ -95,8 +89,7 @@ class SdoLink:
         def held() -> Dialogue:
             results.append((yield from dialogue))
 
-        timeout_s, retries = self.times.sdo_s, self.times.retries
-        with Dialogues(self._network, {node_id: held()}, timeout_s=timeout_s, retries=retries) as dialogues:
+        with self._access.dialogues({node_id: held()}) as dialogues:
             while waiting := dialogues.waiting:
                 self.pump(lambda: bool(waiting[0].inbox), POLL_S)
                 dialogues.serve()
@@ -114,11 +107,11 @@ class SdoLink:
 
     def pump(self, done: Callable[[], bool], timeout_s: float) -> None:
         """Wait until `done`, with a heartbeat where one is due."""
-        port = self._network.port
+        port = self._access.network.port
         if self.beats and (now_ns := port.clock.now_ns()) >= self._heartbeat_ns:
             self._heartbeat_ns = now_ns + HEARTBEAT_PRODUCED_MS * 1_000_000
             port.send_batch([pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL)])
-        self._network.pump_until(done, timeout_s)
+        self._access.network.pump_until(done, timeout_s)
 
 
 class LedDrive:
@@ -258,12 +251,9 @@ class Homing:
 
     Args:
         plan: plan of a cell with an arm.
-        setups: configurations of its nodes.
-        network: pumped; the nodes are operational.
-        watch: what the nodes report of themselves.
+        access: its nodes, which are operational.
         supervise: called meanwhile; it raises the error of whatever else goes wrong.
         record: file of the zeros; None: no record is kept.
-        say: called with each step.
 
     Attributes:
         link: SDO channel of the drives; its `keep_alive` lets time pass before a joint is homed.
@@ -271,23 +261,13 @@ class Homing:
         known: joints whose zeros are known, from 0: those with absolute encoders and those that canprobe emulates, too.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        setups: tuple[NodeConfiguration, ...],
-        network: PumpedNetwork,
-        watch: NodeWatch,
-        supervise: Callable[[], None],
-        *,
-        record: Path | None,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, plan: Plan, access: NodeAccess, supervise: Callable[[], None], record: Path | None) -> None:
         arm = plan.setup.needed_arm()
         self._command_line = plan.setup.line_to_type("home")
         self._model = arm.model
-        self.link = SdoLink(network, watch, plan.setup.bring_up, supervise)
-        by_id = {setup.node_id: setup for setup in setups}
-        self._drives = [LedDrive(by_id[node_id], self.link, say) for node_id in arm.node_ids]
+        self.link = SdoLink(access, supervise)
+        by_id = {setup.node_id: setup for setup in access.setups}
+        self._drives = [LedDrive(by_id[node_id], self.link, access.say) for node_id in arm.node_ids]
         self._record = NodeRecord(record, "home the drives again")
         guard = JointGuard(plan)
         inside = TOLERANCE_RAD * self._model.radian
