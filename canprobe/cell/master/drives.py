@@ -514,8 +514,7 @@ def make_drives(plan: Plan) -> DriveGroup | None:
         return None
     period_ns = plan.sync.period_ns
     repeat_cycles = max(1, COMMAND_REPEAT_NS // period_ns)
-    lag = (lag_s(plan.setup) or UNSTATED_LAG_S) + arm.profile_lag
-    return DriveGroup(drive_axes(plan), arm.model, repeat_cycles, period_ns, lag)
+    return DriveGroup(drive_axes(plan), arm.model, repeat_cycles, period_ns, lag_s(plan.setup, UNSTATED_LAG_S))
 
 
 def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:

@@ -93,7 +93,7 @@ def limits_of(plan: Plan) -> Limits:
         tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
         regain=scan.regain if scan is not None else 0.0,
         tares=setup.tares,
-        lag_ns=round((lag_s(setup) + (setup.arm.profile_lag if setup.arm is not None else 0.0)) * 1e9),
+        lag_ns=round(lag_s(setup) * 1e9),
     )
 
 

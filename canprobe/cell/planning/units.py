@@ -206,7 +206,7 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilit
         for joint, factor in zip(limits, slowest.tolist(), strict=True)
         if factor < 1.0
     )
-    lag = f"their lag of {1e3 * lag_s(setup):.3g} ms (servo.drive_lag_ms, plant.drive_bandwidth_hz), "
+    lag = f"their lag of {1e3 * stated_lag_s(setup):.3g} ms (servo.drive_lag_ms, plant.drive_bandwidth_hz), "
     warning = (
         f"{' and '.join(f'{index:04X}h' for index in sorted(objects))}: drives that fault below the speeds of their"
         f" joints; the plan keeps within {told}. If that is wrong, check {lag * (FOLLOWING_WINDOW in objects)}60A9h in"
@@ -227,7 +227,7 @@ def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, DeviceCapabilit
     turn, _ = _motor_turn(device, drive)
     if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
         limits.append(_SpeedLimit(MOTOR_SPEED_LIMIT, rpm / 60.0 * turn, rounding))
-    window, lag = _fixed_window(device, following_window(arm.model, axis)), lag_s(setup)
+    window, lag = _fixed_window(device, following_window(arm.model, axis)), stated_lag_s(setup)
     if window is not None and lag > 0.0:
         limits.append(_SpeedLimit(FOLLOWING_WINDOW, window / lag, ROUNDING_COUNTS / lag))
     return min(limits, key=lambda limit: limit.left)
@@ -247,11 +247,21 @@ def _fixed_window(device: DeviceCapabilities, wanted: int) -> int | None:
     return None if window == NO_WINDOW else window
 
 
-def lag_s(setup: Setup) -> float:
+def stated_lag_s(setup: Setup) -> float:
     """Lag of the drives behind a ramp, s: the larger of the scene's and the emulated drives'; 0: unknown."""
     believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
     emulated = any(drive.emulated for drive in setup.drives)
     return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
+
+
+def lag_s(setup: Setup, unstated_s: float = 0.0) -> float:
+    """Lag of the drives behind a ramp with that of profile position, s.
+
+    Args:
+        setup: the closed setup.
+        unstated_s: lag where none is stated: a bound takes the longest one, s.
+    """
+    return (stated_lag_s(setup) or unstated_s) + (setup.arm.profile_lag if setup.arm is not None else 0.0)
 
 
 def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:
