@@ -128,7 +128,6 @@ class Cell:
             self._lift_off = partial(lift_off, plan, self.cycles)
         homed = any(one.homing for one in setups)
         self.homing = Homing(plan, access, self._supervise_homing, zeros) if homed else None
-        self._holding = False
         self._held = HeldArm()
         self._running = False
         self._retreats_for: CanprobeError | None = None
@@ -351,14 +350,14 @@ class Cell:
         finding = self.supervisor.finding()
         if finding is None and not self.cycles.controller.retreats_itself:
             finding = self.supervisor.guard_contact(measurement)
-        if finding is None or finding.condition.reaction is not Reaction.HOLD:
-            self._holding = False
-            if finding is not None:
-                self._react(finding)
-        elif not self._holding:
-            self._holding = True
+        if finding is None:
+            return False
+        if finding.condition.reaction is not Reaction.HOLD:
+            self._react(finding)
+            return False
+        if not self._held.holds:
             self.notes.add_error(finding.error, "hold", self.cycles.run_s(measurement))
-        return self._holding
+        return True
 
     def _react(self, finding: Finding) -> None:
         controller = self.cycles.controller

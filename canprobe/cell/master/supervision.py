@@ -121,7 +121,7 @@ class CycleState:
         log_failure: why frames are no longer written down; None while they are.
         compares_motion: the controller compares the motion of the joints with its targets itself.
         unfelt: push in the drives' torques that the array does not measure, N; None without one.
-        force: force that the array measures, N.
+        patch: patch in the last image of the array; None before it, and without an arm that could press.
     """
 
     limits: Limits
@@ -144,7 +144,17 @@ class CycleState:
     log_failure: str | None = None
     compares_motion: bool = False
     unfelt: float | None = None
-    force: float = 0.0
+    patch: Patch | None = None
+
+    @property
+    def force(self) -> float:
+        """Force that the array measures, N; 0 where nothing can press."""
+        return 0.0 if self.patch is None else self.patch.force
+
+    @property
+    def shows_a_part(self) -> bool:
+        """Whether the array shows only a part of the force: it is saturated, or the contact runs off it."""
+        return self.patch is not None and not math.isfinite(self.patch.sigma.total)
 
 
 @dataclass(slots=True, eq=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,14 +15,13 @@ from canprobe.cell.master.supervision import CycleState, Finding, Reaction, Touc
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
-from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.master.push_witness import PushWitness
-    from canprobe.mechanics.touch import Patch
 
 MAX_SPEED_SHARE = 1.5
 """Share of the speed limit above which a measured motion is no motion of the arm; SYNCs may be late by a period."""
@@ -205,7 +203,6 @@ class Supervisor:
     Args:
         seen: the cell; brought up to date by :meth:`step`.
         guard: guard of the joints; None without an arm.
-        patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
         push: witness of the force by the drives' torques; None without touch.
 
     Attributes:
@@ -214,18 +211,11 @@ class Supervisor:
         array_alive: whether an image of the array has changed since bring-up.
     """
 
-    def __init__(
-        self,
-        seen: CycleState,
-        guard: JointGuard | None,
-        patch_from: Callable[[TactileSample], Patch] | None,
-        push: PushWitness | None = None,
-    ) -> None:
+    def __init__(self, seen: CycleState, guard: JointGuard | None, push: PushWitness | None = None) -> None:
         self.seen = seen
         self.counts: dict[str, int] = dict.fromkeys((key for key, _ in COUNTERS), 0)
         self.first: dict[str, int] = {}
         self.array_alive = False
-        self._patch_from = patch_from
         self._guard = guard
         self._contact = TouchState(seen.limits)
         self._push = push
@@ -239,26 +229,16 @@ class Supervisor:
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
 
-    def step(
-        self,
-        measurement: Measurement,
-        *,
-        sync_ns: int,
-        overruns: int,
-        counters: PortCounters,
-        controller_state: ControllerState,
-        log_failure: str | None = None,
-    ) -> None:
-        """Take in one cycle."""
+    def step(self, measurement: Measurement, sync_ns: int, overruns: int) -> None:
+        """Take in one cycle, of which `seen` has what lies outside of the measurement: bus, patch, controller, log."""
         seen = self.seen
         self._count_late(overruns - seen.overruns, measurement.t_ns)
         seen.overruns = overruns
         seen.gap_ns = sync_ns - seen.sync_ns if seen.sync_ns else 0
-        seen.measurement, seen.sync_ns, seen.counters = measurement, sync_ns, counters
-        if controller_state is not ControllerState.PASSIVE:
+        seen.measurement, seen.sync_ns = measurement, sync_ns
+        if seen.controller_state is not ControllerState.PASSIVE:
             self._active_ns = measurement.t_ns
         seen.passive_ns = measurement.t_ns - self._active_ns
-        seen.controller_state, seen.log_failure = controller_state, log_failure
         seen.speeding = self._guard.measure(measurement) if self._guard is not None else None
         if (sample := measurement.tactile) is not None:
             self.array_alive = self.array_alive or (self._sample is not None and sample.differs_from(self._sample))
@@ -266,9 +246,8 @@ class Supervisor:
         if self._untouched:
             self._untouched = not measurement.enabled
             if measurement.tactile is not None:
-                seen.preload = max(seen.preload, self.felt())
+                seen.preload = max(seen.preload, seen.force)
         if self._push is not None:
-            seen.force = self.felt()
             self._push.step(measurement, seen.force)
             seen.unfelt = self._push.unfelt
         if measurement.t_ns >= self._look_ns:
@@ -307,43 +286,29 @@ class Supervisor:
         """Whether a condition holds that forbids every motion."""
         return any(c.reaction is Reaction.STOP and c.check(self.seen) is not None for c in CYCLE_CHECKS)  # type: ignore[misc]
 
-    def felt(self) -> float:
-        """The force of the last tactile sample, N; 0 where nothing can press."""
-        if self._sample is None or self._patch_from is None:
-            return 0.0
-        return self._patch_from(self._sample).force
-
-    @property
-    def shows_a_part(self) -> bool:
-        """Whether the array shows only a part of the force: it is saturated, or the contact runs off it."""
-        if self._sample is None or self._patch_from is None:
-            return False
-        return not math.isfinite(self._patch_from(self._sample).sigma.total)
-
     def begin_way_back(self) -> None:
         """Begin to watch a way back of the probe."""
         self._growing = GrowingForce(self.seen.limits.cycles_to_turn)
 
     def witness_grows(self, measurement: Measurement) -> bool:
         """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
-        return self._growing.grows(measurement.cycle, self.felt(), a_part=self.shows_a_part)
+        return self._growing.grows(measurement.cycle, self.seen.force, a_part=self.seen.shows_a_part)
 
     def pressing(self) -> float:
         """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""
         self._look()
-        force = self.felt()
+        force = self.seen.force
         return force if self._press.holds(force) else 0.0
 
     def _look(self) -> None:
         q = self.seen.measurement.q
         if self._sample is not None and q is not None and self._guard is not None:
-            self._press.look(self.felt(), self._guard.T_base_tip(q))
+            self._press.look(self.seen.force, self._guard.T_base_tip(q))
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
         """The first condition of a touch that holds, for a controller that does not guard its contact itself."""
-        sample = measurement.tactile
-        if self._patch_from is not None and sample is not None:
-            patch = self._patch_from(sample)
+        sample, patch = measurement.tactile, self.seen.patch
+        if sample is not None and patch is not None:
             self._contact.update_force(patch, sample.t_sample_ns)
             if measurement.q is not None and self._guard is not None:
                 self._contact.images.look(sample, patch, self._guard.T_base_tip(measurement.q)[:3, 3])

@@ -65,23 +65,19 @@ class Force(float):
 class Run:
     """A supervisor of two nodes without an arm, cycle by cycle."""
 
-    def __init__(self, patch_from=None):
+    def __init__(self):
         self.seen = CycleState(LIMITS, NodeWatch((1, 2)), None, None, PortCounters())
-        self.supervisor = Supervisor(self.seen, None, patch_from)
+        self.supervisor = Supervisor(self.seen, None)
         self.cycle = 0
 
     def step(self, *, late=0, state=ControllerState.ACTIVE, periods=1, **measured):
         self.cycle += 1
         if "tactile" in measured:
             measured["tactile"] = Force(measured["tactile"])
+            self.seen.patch = SimpleNamespace(force=measured["tactile"])
+        self.seen.controller_state = state
         t_ns = self.seen.measurement.t_ns + periods * PERIOD_NS
-        self.supervisor.step(
-            Measurement(self.cycle, t_ns, **measured),
-            sync_ns=1000 + t_ns,
-            overruns=self.seen.overruns + late,
-            counters=self.seen.counters,
-            controller_state=state,
-        )
+        self.supervisor.step(Measurement(self.cycle, t_ns, **measured), 1000 + t_ns, self.seen.overruns + late)
         return self.seen
 
 
@@ -119,7 +115,7 @@ def test_a_condition_that_does_not_stop_the_cell_is_noted_with_its_number_and_it
 
 
 def test_alive_is_what_has_changed_once():
-    run = Run(lambda sample: SimpleNamespace(force=sample))
+    run = Run()
     for force in (0.0, 0.0, 0.0):
         run.step(tactile=force)
     assert not run.supervisor.array_alive
@@ -130,14 +126,14 @@ def test_alive_is_what_has_changed_once():
 
 
 def test_the_preload_is_the_highest_force_before_the_drives_are_enabled():
-    run = Run(lambda sample: SimpleNamespace(force=sample))
+    run = Run()
     for force in (0.1, 0.4, 0.2):
         run.step(tactile=force)
-    assert run.supervisor.felt() == 0.2
+    assert run.seen.force == 0.2
     run.step(enabled=True)
     run.step(tactile=3.0, enabled=True)
     run.step(tactile=2.0)
-    assert run.seen.preload == 0.4 and run.supervisor.felt() == 2.0
+    assert run.seen.preload == 0.4 and run.seen.force == 2.0
 
 
 def test_something_worse_comes_before_a_hold_and_the_first_hold_before_the_second():
@@ -156,11 +152,11 @@ def test_something_worse_comes_before_a_hold_and_the_first_hold_before_the_secon
 
 
 def test_without_an_arm_nothing_presses_and_commands_pass():
-    run = Run(lambda sample: SimpleNamespace(force=sample))
+    run = Run()
     run.step(tactile=2.0)
     command = Command()
     assert run.supervisor.guard_target(command) == (command, None)
-    assert run.supervisor.felt() == 2.0 and Run().supervisor.felt() == 0.0
+    assert run.seen.force == 2.0 and Run().seen.force == 0.0
 
 
 # The joint guard.
@@ -286,7 +282,7 @@ def test_a_target_outside_of_the_workspace_is_not_sent(plan, guard):
 def test_the_command_that_may_be_sent(plan, guard):
     """As it is, nearer where it is too far, and without a target where that is out of bounds."""
     seen = CycleState(LIMITS, NodeWatch((1, 2)), None, None, PortCounters())
-    supervisor = Supervisor(seen, guard, None)
+    supervisor = Supervisor(seen, guard)
     seen.measurement = at(ELBOW_FORM, 0)
     near = Command(ELBOW_FORM, columns={"mine": 1.0})
     assert supervisor.guard_target(near) == (near, None)
