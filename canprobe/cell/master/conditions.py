@@ -14,10 +14,6 @@ from typing import Any, TypeVar
 
 from canprobe.cell.master.image_witness import UNSTATED_NS
 from canprobe.cell.master.supervision import (
-    CONTACT_LOST_NS,
-    FORCE_HIDDEN_NS,
-    HOLD_CYCLES,
-    MAX_HOLD_NS,
     TORQUE_MEAN_NS,
     Condition,
     CycleState,
@@ -34,6 +30,14 @@ from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.touch.depth_witness import CONTRADICTED_S
 
 NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
+HOLD_CYCLES = 3
+"""Cycles without a TPDO of one drive after which all of them hold."""
+MAX_HOLD_NS = 1_000_000_000
+"""Longest hold."""
+CONTACT_LOST_NS = 30_000_000
+"""Time without contact force in a touch after which the contact is lost."""
+FORCE_HIDDEN_NS = 20_000_000
+"""Time with a force that the array shows only in part, after which the force may be above the limit."""
 ARRAY_RECOVERY_NS = 30 * NS_PER_MS
 """Time after a touch in which the array's creep and hysteresis may still show half of the touch force."""
 _BLIND_ADVICE = "look at the arm before anything moves, then press the array with a finger: `canprobe run listen`"

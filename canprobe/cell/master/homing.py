@@ -35,28 +35,8 @@ from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.bus.sdo import Dialogue
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.protocol.cia402 import (
-    CHANGE_IMMEDIATELY_BIT,
-    CONTROLWORD,
-    DISABLED_STATES,
-    ENABLE_WORD,
-    HOMING_ATTAINED_BIT,
-    HOMING_ERROR_BIT,
-    HOMING_START_BIT,
-    MODE_DISPLAY,
-    NEW_SETPOINT_BIT,
-    POSITION,
-    SETPOINT_ACKNOWLEDGE_BIT,
-    STATUSWORD,
-    TARGET_POSITION,
-    TARGET_REACHED_BIT,
-    UNPOWERED_STATES,
-    DriveState,
-    OperationMode,
-    controlword_toward,
-    describe_state,
-    known_state,
-)
+from canprobe.fieldbus.protocol import cia402
+from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.frames import NmtState, pack_heartbeat
 from canprobe.mechanics.robot.model import coupled_joints, drive_position_at
 from canprobe.mechanics.types import Floats
@@ -137,7 +117,7 @@ class LedDrive:
 
     def command(self, word: int) -> None:
         """Write the controlword."""
-        self.write(Write(CONTROLWORD, 0, word, "controlword", read_back=False))
+        self.write(Write(cia402.CONTROLWORD, 0, word, "controlword", read_back=False))
 
     def error(self, what: str) -> NodeError:
         """The error of this drive, with its last EMCY."""
@@ -147,7 +127,7 @@ class LedDrive:
         """Enable the drive in a mode."""
         self.write(Write(MODE, 0, mode, "mode of operation"))
         timeout_s, late = self._link.times.enable_s, f"is not in mode {mode} (6061h) after it was written to 6060h"
-        self.wait_until(lambda: self.read(MODE_DISPLAY) == mode, timeout_s, lambda: late)
+        self.wait_until(lambda: self.read(cia402.MODE_DISPLAY) == mode, timeout_s, lambda: late)
         enabled = DriveState.OPERATION_ENABLED
         self._lead(enabled, frozenset({enabled}), timeout_s)
 
@@ -158,11 +138,11 @@ class LedDrive:
         wanted = sum(1 << bit for bit in bits)
 
         def reached() -> bool:
-            word = self.read(STATUSWORD)
+            word = self.read(cia402.STATUSWORD)
             if error is not None and word >> error & 1:
                 raise self.error(f"could not {what}: its statusword (6041h) has bit {error}")
-            if known_state(word) is not DriveState.OPERATION_ENABLED:
-                raise self.error(f"could not {what}: it is {describe_state(word)}")
+            if cia402.known_state(word) is not DriveState.OPERATION_ENABLED:
+                raise self.error(f"could not {what}: it is {cia402.describe_state(word)}")
             return word & wanted == wanted
 
         self.wait_until(reached, timeout_s, lambda: late)
@@ -199,8 +179,8 @@ class LedDrive:
             try:
                 stop_s = self._link.times.stop_s
                 with contextlib.suppress(NodeError):  # by 605Ah it may stay in quick stop
-                    self._lead(DriveState.QUICK_STOP_ACTIVE, UNPOWERED_STATES, stop_s, supervised=False)
-                self._lead(DriveState.SWITCH_ON_DISABLED, DISABLED_STATES, stop_s, supervised=False)
+                    self._lead(DriveState.QUICK_STOP_ACTIVE, cia402.UNPOWERED_STATES, stop_s, supervised=False)
+                self._lead(DriveState.SWITCH_ON_DISABLED, cia402.DISABLED_STATES, stop_s, supervised=False)
                 if self.setup.mode is not None:
                     self.write(Write(MODE, 0, self.setup.mode, "mode of operation"))
             except KeyboardInterrupt:
@@ -218,16 +198,16 @@ class LedDrive:
 
         def arrived() -> bool:
             nonlocal word, previous
-            word = self.read(STATUSWORD)
-            state = known_state(word)
+            word = self.read(cia402.STATUSWORD)
+            state = cia402.known_state(word)
             if state in states:
                 return True
-            previous = 0 if state is None else controlword_toward(state, goal, previous)
+            previous = 0 if state is None else cia402.controlword_toward(state, goal, previous)
             self.command(previous)
             return False
 
         def late() -> str:
-            return f"is {describe_state(word)} {timeout_s:g} s after the command for {goal.name}"
+            return f"is {cia402.describe_state(word)} {timeout_s:g} s after the command for {goal.name}"
 
         self.wait_until(arrived, timeout_s, late, supervised=supervised)
 
@@ -343,7 +323,7 @@ class Homing:
             "identity": [drive.read(IDENTITY, sub) for sub in there],
             "settings": [zero.method, zero.home, *model.units_per_q[axis].tolist(), model.zero_units[axis]],
             "objects": {write.place: drive.read(write.index, write.subindex) for write in drive.setup.homing},
-            "position": drive.read(POSITION),
+            "position": drive.read(cia402.POSITION),
         }
 
     def _tolerance(self, axis: int) -> float:
@@ -385,12 +365,12 @@ class Homing:
             for write in setup.homing:
                 drive.write(replace(write, value=-home) if write.index == HOME_OFFSET else write)
             drive.enable(OperationMode.HOMING)
-            drive.command(ENABLE_WORD | 1 << HOMING_START_BIT)
+            drive.command(cia402.ENABLE_WORD | 1 << cia402.HOMING_START_BIT)
             what = f"find its home position by method {zero.method}"
             late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
-            found_bits = HOMING_ATTAINED_BIT, TARGET_REACHED_BIT
-            drive.wait_for_bits(found_bits, zero.timeout_s, what, late, error=HOMING_ERROR_BIT)
-        found, braking = drive.read(POSITION), zero.zero_speed**2 / (2.0 * zero.acceleration)
+            found_bits = cia402.HOMING_ATTAINED_BIT, cia402.TARGET_REACHED_BIT
+            drive.wait_for_bits(found_bits, zero.timeout_s, what, late, error=cia402.HOMING_ERROR_BIT)
+        found, braking = drive.read(cia402.POSITION), zero.zero_speed**2 / (2.0 * zero.acceleration)
         per_q = abs(float(self._model.units_per_q[axis, axis]))
         if abs(found - home) > self._tolerance(axis) + braking * per_q:
             why = "it has no home offset (607Ch)"
@@ -418,24 +398,24 @@ class Homing:
             if other not in self.known:
                 setup, its = self._drives[axis].setup, self._drives[other].setup.name
                 raise setup.error(f"cannot be homed: its zero depends on {its}: home it first")
-            units[other] = self._drives[other].read(POSITION)
+            units[other] = self._drives[other].read(cia402.POSITION)
         return units
 
     def _move(self, drive: LedDrive, target: int, speed: int, timeout_s: float, tolerance: float) -> None:
         """Move a drive to a target in profile position."""
         drive.write(Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         drive.enable(OperationMode.PROFILE_POSITION)
-        drive.write(Write(TARGET_POSITION, 0, target, "target position"))
-        drive.command(ENABLE_WORD | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT)
+        drive.write(Write(cia402.TARGET_POSITION, 0, target, "target position"))
+        drive.command(cia402.ENABLE_WORD | 1 << cia402.NEW_SETPOINT_BIT | 1 << cia402.CHANGE_IMMEDIATELY_BIT)
         what, late = "move back into its range", f"is homed, but did not reach {target} (607Ah), inside its range"
-        drive.wait_for_bits((SETPOINT_ACKNOWLEDGE_BIT,), self.link.times.enable_s, what, late)
-        drive.command(ENABLE_WORD)
-        drive.wait_for_bits((TARGET_REACHED_BIT,), timeout_s, what, late)
+        drive.wait_for_bits((cia402.SETPOINT_ACKNOWLEDGE_BIT,), self.link.times.enable_s, what, late)
+        drive.command(cia402.ENABLE_WORD)
+        drive.wait_for_bits((cia402.TARGET_REACHED_BIT,), timeout_s, what, late)
         # Bit 10 may still be that of the homing, or of a drive whose position window (6067h) is switched off.
-        drive.wait_until(lambda: abs(drive.read(POSITION) - target) <= tolerance, timeout_s, lambda: late)
+        drive.wait_until(lambda: abs(drive.read(cia402.POSITION) - target) <= tolerance, timeout_s, lambda: late)
 
 
 def _has_profile_position(setup: NodeConfiguration) -> bool:
     drive = Description(setup.dictionary)
     listed = drive.modes is None or OperationMode.PROFILE_POSITION in drive.modes
-    return listed and drive.entry(TARGET_POSITION) is not None and drive.entry(PROFILE_SPEED) is not None
+    return listed and drive.entry(cia402.TARGET_POSITION) is not None and drive.entry(PROFILE_SPEED) is not None

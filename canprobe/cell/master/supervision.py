@@ -30,14 +30,6 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch import Patch
     from canprobe.mechanics.touch.depth_witness import DepthWitness
 
-HOLD_CYCLES = 3
-"""Cycles without a TPDO of one drive after which all of them hold."""
-MAX_HOLD_NS = 1_000_000_000
-"""Longest hold."""
-CONTACT_LOST_NS = 30_000_000
-"""Time without contact force in a touch after which the contact is lost."""
-FORCE_HIDDEN_NS = 20_000_000
-"""Time with a force that the array shows only in part, after which the force may be above the limit."""
 TORQUE_MEAN_NS = 25_000_000
 """Time over which torques are averaged for the push that they show; two in a row must show a push."""
 TACTILE_TIMEOUT_PERIODS = 6
