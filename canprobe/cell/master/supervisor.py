@@ -13,7 +13,6 @@ from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touc
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import CycleState, Finding, Reaction, TouchState
 from canprobe.cell.master.tactile_frame import TactileSample
-from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.mechanics.robot.chain import forward
@@ -221,7 +220,6 @@ class Supervisor:
         self._push = push
         self._sample: TactileSample | None = None
         self._press = PressDetector()
-        self._growing = GrowingForce(seen.limits.cycles_to_turn)
         self._look_ns = 0
         self._untouched = seen.limits.tares
         self._late: deque[tuple[int, int]] = deque()  # times of the last second's cycles, and whether they were late
@@ -285,14 +283,6 @@ class Supervisor:
     def must_stop(self) -> bool:
         """Whether a condition holds that forbids every motion."""
         return any(c.reaction is Reaction.STOP and c.check(self.seen) is not None for c in CYCLE_CHECKS)  # type: ignore[misc]
-
-    def begin_way_back(self) -> None:
-        """Begin to watch a way back of the probe."""
-        self._growing = GrowingForce(self.seen.limits.cycles_to_turn)
-
-    def witness_grows(self, measurement: Measurement) -> bool:
-        """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
-        return self._growing.grows(measurement.cycle, self.seen.force, a_part=self.seen.shows_a_part)
 
     def pressing(self) -> float:
         """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""
