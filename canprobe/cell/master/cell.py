@@ -29,7 +29,6 @@ from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import DriveState
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
 if TYPE_CHECKING:
     from canprobe.cell.master.arm_power import ArmPower
@@ -131,9 +130,6 @@ class Cell:
         self._held = HeldArm()
         self._running = False
         self._retreats_for: CanprobeError | None = None
-        for node_id in self.watch.node_ids:
-            for base in (HEARTBEAT_BASE, EMCY_BASE):
-                self._network.subscribe(base + node_id, self.watch.push)
         if before is not None:  # the counters go on
             if self.drives is not None and before.drives is not None:
                 for name in ("late", "missed", "malformed", "implausible"):

@@ -127,7 +127,7 @@ class LedDrive:
         """Enable the drive in a mode."""
         self.write(Write(MODE, 0, mode, "mode of operation"))
         timeout_s, late = self._link.times.enable_s, f"is not in mode {mode} (6061h) after it was written to 6060h"
-        self.wait_until(lambda: self.read(cia402.MODE_DISPLAY) == mode, timeout_s, lambda: late)
+        self.wait_for(cia402.MODE_DISPLAY, lambda held: held == mode, timeout_s, late)
         enabled = DriveState.OPERATION_ENABLED
         self._lead(enabled, frozenset({enabled}), timeout_s)
 
@@ -136,25 +136,30 @@ class LedDrive:
     ) -> None:
         """Wait until the statusword has these bits; a time-out, the error bit or a drive that is off is an error."""
         wanted = sum(1 << bit for bit in bits)
-
-        def reached() -> bool:
+        for _ in self._looks(timeout_s):
             word = self.read(cia402.STATUSWORD)
             if error is not None and word >> error & 1:
                 raise self.error(f"could not {what}: its statusword (6041h) has bit {error}")
             if cia402.known_state(word) is not DriveState.OPERATION_ENABLED:
                 raise self.error(f"could not {what}: it is {cia402.describe_state(word)}")
-            return word & wanted == wanted
+            if word & wanted == wanted:
+                return
+        raise self.error(late)
 
-        self.wait_until(reached, timeout_s, lambda: late)
+    def wait_for(self, index: int, fits: Callable[[int], bool], timeout_s: float, late: str) -> None:
+        """Wait until the value of an entry fits; a time-out is an error."""
+        for _ in self._looks(timeout_s):
+            if fits(self.read(index)):
+                return
+        raise self.error(late)
 
-    def wait_until(
-        self, reached: Callable[[], bool], timeout_s: float, late: Callable[[], str], *, supervised: bool = True
-    ) -> None:
-        """Wait, supervised or with heartbeats alone; `late` has the words of the error after the time-out."""
+    def _looks(self, timeout_s: float, *, supervised: bool = True) -> Iterator[None]:
+        """Looks at the drive until the time-out; between two time passes, supervised or with heartbeats alone."""
         until_ns = self._link.clock.now_ns() + round(timeout_s * 1e9)
-        while not reached():
+        while True:
+            yield
             if self._link.clock.now_ns() >= until_ns:
-                raise self.error(late())
+                return
             if supervised:
                 self._link.keep_alive()
             else:
@@ -195,21 +200,14 @@ class LedDrive:
     ) -> None:
         """Bring the drive into one of some states."""
         word = previous = 0
-
-        def arrived() -> bool:
-            nonlocal word, previous
+        for _ in self._looks(timeout_s, supervised=supervised):
             word = self.read(cia402.STATUSWORD)
             state = cia402.known_state(word)
             if state in states:
-                return True
+                return
             previous = 0 if state is None else cia402.controlword_toward(state, goal, previous)
             self.command(previous)
-            return False
-
-        def late() -> str:
-            return f"is {cia402.describe_state(word)} {timeout_s:g} s after the command for {goal.name}"
-
-        self.wait_until(arrived, timeout_s, late, supervised=supervised)
+        raise self.error(f"is {cia402.describe_state(word)} {timeout_s:g} s after the command for {goal.name}")
 
 
 TOLERANCE_RAD = math.radians(1.0)
@@ -412,7 +410,7 @@ class Homing:
         drive.command(cia402.ENABLE_WORD)
         drive.wait_for_bits((cia402.TARGET_REACHED_BIT,), timeout_s, what, late)
         # Bit 10 may still be that of the homing, or of a drive whose position window (6067h) is switched off.
-        drive.wait_until(lambda: abs(drive.read(cia402.POSITION) - target) <= tolerance, timeout_s, lambda: late)
+        drive.wait_for(cia402.POSITION, lambda there: abs(there - target) <= tolerance, timeout_s, late)
 
 
 def _has_profile_position(setup: NodeConfiguration) -> bool:

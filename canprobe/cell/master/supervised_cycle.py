@@ -98,16 +98,14 @@ class SupervisedCycle:
             self.reader = controller.reader
 
     def begin(self) -> Measurement:
-        """SYNC, TPDOs, measurement. A cycle that an error has left before its commands and its row gets both first."""
+        """SYNC, TPDOs, measurement, for supervision and controller to see; what is new is noted.
+
+        A cycle that an error has left before its commands and its row gets both first.
+        """
         self.record_last()
         if self.cycle.begun:  # the next SYNC keeps the period
             self.cycle.end(None)
         measurement = self.cycle.begin()
-        self._look(measurement, self.cycle)
-        return measurement
-
-    def _look(self, measurement: Measurement, cycle: Cycle) -> None:
-        """Let the supervision see the cycle, and the controller the array; note what is new."""
         self.note_alarms()
         supervisor, controller = self.supervisor, self.controller
         seen = supervisor.seen
@@ -122,8 +120,9 @@ class SupervisedCycle:
             patch = self.reader.read(measurement.tactile)
             seen.patch = patch if seen.drives is not None else None
             seen.silent_taxels = self.reader.found
-        supervisor.step(measurement, cycle.sync_ns, cycle.statistics.overruns)
+        supervisor.step(measurement, self.cycle.sync_ns, self.cycle.statistics.overruns)
         controller.array_alive = supervisor.array_alive
+        return measurement
 
     def record(self, measurement: Measurement, command: Command | None) -> None:
         """Write the row of a cycle, and show it to the observers."""
