@@ -439,9 +439,7 @@ def _contact_not_regained(contact: TouchState) -> SafetyStop | None:
     return SafetyStop(f"contact lost, and not found again within {contact.limits.regain * 1e3:.1f} mm")
 
 
-@_touch("joint or workspace limit", Reaction.RETREAT, _cycles(1))
-def _joint_stop(contact: TouchState) -> SafetyStop | None:
-    return SafetyStop(contact.limit) if contact.limit is not None else None
+_unchecked("joint_stop", "joint or workspace limit", Reaction.RETREAT, _cycles(1))
 
 
 _counted("target_speed", "target too far for one cycle", _cycles(1), lambda seen: seen.slowed)

@@ -165,7 +165,6 @@ class TouchState:
         bridged_s: time for which that share has been above `MAX_BRIDGED_SHARE`.
         path: the touch is a scan, which may search for a contact that it has lost.
         searched: distance towards the object that was searched since then, m.
-        limit: message of a joint or workspace limit that is reached; None without one.
         force_sigma: standard deviation of the force, N; infinite where the array shows only a lower bound of it.
         images: whether the images of the array live.
         depth: depth of the probe in the surface that it has touched before; None where nobody follows it.
@@ -181,7 +180,6 @@ class TouchState:
     bridged_s: float = 0.0
     path: bool = False
     searched: float = 0.0
-    limit: str | None = None
     force_sigma: float = 0.0
     images: ImageWitness = field(default_factory=ImageWitness)
     depth: DepthWitness | None = None
@@ -236,8 +234,8 @@ class Condition:
         reaction: reaction of the cell.
         within: longest time from the fault to the reaction, ns; None where no such time applies.
         check: function of a `CycleState` in every cycle, or of a `TouchState` in a touch; it returns the error that
-            names what is wrong, or None. A condition without check and count shows by itself: an exception, a dead
-            master.
+            names what is wrong, or None. A condition without check and count shows by itself: a target beyond a
+            limit, an exception, a dead master.
         count: function of a `CycleState`; it returns how often a condition that does not stop the cell has happened.
         touch: the check takes a `TouchState`.
         enabling: the check holds already while the drives are enabled.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +14,7 @@ from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import CycleState, Finding, Reaction, TouchState
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
+from canprobe.errors import SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
@@ -29,14 +30,6 @@ ENCODER_TOLERANCE_COUNTS = 2
 _ROUNDING = 1e-9
 _NUMBER_KINDS = "fiu"
 """Kinds of numpy dtypes that can be joint positions."""
-
-
-@dataclass(frozen=True, slots=True)
-class GuardedTarget:
-    """A joint target as it may be sent (n,), rad or m; or why it may not."""
-
-    q: Floats | None
-    limit: str | None = None
 
 
 def outside_workspace(tip: Floats, workspace: Floats, name: str = "the probe's tip") -> str | None:
@@ -109,8 +102,12 @@ class JointGuard:
         way = self.model.joints[joint].text(abs(self._q[joint] - before[joint]))
         return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
 
-    def command(self, q_target: Floats, measurement: Measurement) -> GuardedTarget:
-        """The target that may be sent for `q_target` (n,), rad or m."""
+    def command(self, q_target: Floats, measurement: Measurement) -> Floats:
+        """The target that may be sent for `q_target` (n,), rad or m: it or, where that is too far, one on the way.
+
+        Raises:
+            SafetyStop: it is no target, or beyond a limit of a joint or of the workspace.
+        """
         n = len(self._range)
         if type(q_target) is not np.ndarray or q_target.dtype != np.float64:
             try:
@@ -118,7 +115,7 @@ class JointGuard:
             except (TypeError, ValueError):
                 given = np.array(None)
             if given.dtype.kind not in _NUMBER_KINDS or isinstance(given, np.ma.MaskedArray):
-                return GuardedTarget(None, f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
+                raise SafetyStop(f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
             target = np.asarray(given, dtype=np.float64)
         else:
             target = q_target
@@ -130,21 +127,21 @@ class JointGuard:
         if not all(inside) and not self._goes_back(wanted, last):
             if not all(map(math.isfinite, wanted)):
                 got = f"is {target}" if target.shape == (n,) else f"has shape {target.shape}"
-                return GuardedTarget(None, f"the controller's q_target {got}: expected {n} finite {self._si}")
+                raise SafetyStop(f"the controller's q_target {got}: expected {n} finite {self._si}")
             joint = inside.index(False)
             where = self.model.joints[joint].text(wanted[joint])
-            return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")
+            raise SafetyStop(f"joint {joint + 1} at {where}, its stop")
         if self._workspace is not None and (left := self.outside(target)) is not None:
-            return GuardedTarget(None, left)
+            raise SafetyStop(left)
         if last is not None:
             joints = zip(wanted, last, self._speed, strict=True)
             share = max([abs(q - was) / speed for q, was, speed in joints]) / (self._period_ns * 1e-9)
             if share > 1.0 + _ROUNDING:
                 self.slowed += 1
                 self._target = [was + (q - was) / share for q, was in zip(wanted, last, strict=True)]
-                return GuardedTarget(np.array(self._target))
+                return np.array(self._target)
         self._target = wanted
-        return GuardedTarget(q_target)
+        return q_target
 
     def _goes_back(self, wanted: list[float], last: list[float] | None) -> bool:
         """Whether joints that are out of their range stand or move back into it, as far as the last target knows."""
@@ -309,11 +306,12 @@ class Supervisor:
         """The command that may be sent: a target too far away is approached, a target out of bounds is left out."""
         if command.q_target is None or self._guard is None:
             return command, None
-        guarded = self._guard.command(command.q_target, self.seen.measurement)
+        try:
+            q = self._guard.command(command.q_target, self.seen.measurement)
+        except SafetyStop as stop:
+            return replace(command, q_target=None), Finding(BY_KEY["joint_stop"], stop)
         self.seen.slowed = self._guard.slowed
-        if guarded.limit is not None:
-            return replace(command, q_target=None), touch_finding(TouchState(self.seen.limits, limit=guarded.limit))
-        return (command if guarded.q is command.q_target else replace(command, q_target=guarded.q)), None
+        return (command if q is command.q_target else replace(command, q_target=q)), None
 
     def notes(self) -> list[str]:
         """Conditions that happened and did not stop the cell, a line each."""

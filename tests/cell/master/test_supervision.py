@@ -125,7 +125,6 @@ def felt(**patch):
             "a push of 3.4 N beyond the 0.20 N that the array",
         ),
         ("contact_not_regained", scan(searched=3e-3), scan(searched=3.01e-3), "not found again within 3.0 mm"),
-        ("joint_stop", touch(), touch(limit="joint 1 at 90 deg, its stop"), "joint 1 at 90 deg, its stop"),
         ("preload", seen(TARING, preload=0.15), seen(TARING, preload=0.151), "measures 0.15 N before the run"),
         ("preload", seen(preload=0.2), seen(TARING, preload=0.2), "limits.preload_max_n = 0.15"),
         ("joint_speed", seen(), seen(speeding="joint 2 reports a motion"), "joint 2 reports a motion"),
