@@ -16,15 +16,7 @@ from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.scene.setup import Arm, Array, Probe
 from canprobe.mechanics.robot.chain import ending_in, forward
 from canprobe.mechanics.robot.model import ArmModel, position_sigma
-from canprobe.mechanics.touch import (
-    ContactSample,
-    MomentImage,
-    Patch,
-    Slope,
-    contact_sample,
-    indentation_from_force,
-    make_patch_calibration,
-)
+from canprobe.mechanics.touch import MomentImage, contact_sample, indentation_from_force, make_patch_calibration
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE
 from canprobe.mechanics.touch.image.moments import Moments
 from canprobe.mechanics.touch.image.pad_lag import PadLag
@@ -33,7 +25,7 @@ from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import SurfaceEstimate
+    from canprobe.mechanics.touch import ContactSample, Patch, Slope, SurfaceEstimate
 
 
 MAX_STIFFNESS_RATIO = 6.0
