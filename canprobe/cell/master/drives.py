@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
 
 import numpy as np
 
@@ -367,7 +366,7 @@ class DriveTargets:
                 cob_id,
                 parts[0][1].synchronous,  # in every cycle, else on change
                 [layout.pack for _, layout in parts],
-                [_fetcher(self._places_of(axes[i], i, layout)) for i, layout in parts],
+                [self._places_of(axes[i], i, layout) for i, layout in parts],
                 tuple(i for i, _ in parts),
             )
             for cob_id, parts in sorted(rpdos.items())
@@ -458,10 +457,10 @@ class DriveTargets:
             values[i], values[len(self._words) + i] = offer.step(drives.statuswords[i], values[i], targets[i])
         heard_all = drives.heard_all
         commands = []
-        for cob_id, every_cycle, packs, fetches, axes in self._plan:
+        for cob_id, every_cycle, packs, places, axes in self._plan:
             if not heard_all and any(drives.tracks[axis].cycle < 0 for axis in axes):
                 continue
-            parts = [fetch(values) for fetch in fetches]
+            parts = [tuple([values[place] for place in part]) for part in places]
             if every_cycle or self._due(cob_id, parts):
                 commands.append((cob_id, packs, parts))
         return commands
@@ -489,13 +488,6 @@ def _controlword(state: DriveState | None, goal: DriveState, previous: int, inte
     word = cia402.controlword_toward(state, goal, previous)
     follows = interpolated and state is goal is DriveState.OPERATION_ENABLED
     return word | 1 << cia402.ENABLE_INTERPOLATION_BIT if follows else word
-
-
-def _fetcher(places: Sequence[int]) -> Callable[[Sequence[int]], tuple[int, ...]]:
-    """A function that reads all of these places by one call into C."""
-    if len(places) == 1:
-        return lambda values, place=places[0]: (values[place],)  # type: ignore[misc]
-    return itemgetter(*places)
 
 
 def make_drives(plan: Plan) -> DriveGroup | None:
