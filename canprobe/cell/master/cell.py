@@ -162,7 +162,7 @@ class Cell:
                 other=self._network.feed,
                 on_arrival=not isinstance(self.port.clock, VirtualClock),
                 kept=self._options.rows_kept,
-                **({} if self._before is None else {"before": self._before.cycle}),
+                before=None if self._before is None else self._before.cycle,
             )
             if self._before is not None and self.tactile is not None:
                 self.tactile.newest_cycle = self.cycle.number  # its age counts from the first SYNC of this cell

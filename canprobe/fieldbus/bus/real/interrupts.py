@@ -30,7 +30,7 @@ def raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def signal_handlers(handlers: Mapping[int, Callable[[int, FrameType | None], object]]) -> Iterator[None]:
-    """Within the block signals have these handlers; outside the main thread, which has them all, nothing changes."""
+    """Within the block signals have these handlers. In another thread than the main one nothing changes."""
     before: dict[int, Any] = {}
     try:
         with contextlib.suppress(ValueError):  # not the main thread
