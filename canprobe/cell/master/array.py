@@ -219,11 +219,6 @@ class RawReceiver(ArrayReceiver):
             raise UsageError("tare: the array file states wire.unloaded_counts; give it wire.tare_images instead")
         self._unloaded, self._taring = None, []
 
-    @property
-    def images(self) -> int:
-        """Count of whole images so far."""
-        return self.assembler.frames
-
     def start(self, network: PumpedNetwork, boot_up_s: float, say: Callable[[str], None]) -> None:
         """Start the array, and wait for as many images as its tare takes, at least one.
 
@@ -245,19 +240,18 @@ class RawReceiver(ArrayReceiver):
             say(f"tare the array: {wire.tare_images} images, with nothing on it")
         needed, period_s = max(1, wire.tare_images), 1.0 / self.rate_hz
         end_ns = clock.now_ns() + round(1e9 * (boot_up_s + 2.0 * needed * period_s))
-        while self.images < needed:
+        while (came := self.assembler.frames) < needed:
             if clock.now_ns() >= end_ns:
                 first, last = min(self.cob_ids), max(self.cob_ids)
                 ids = f"{first:03X}h" if first == last else f"{first:03X}h-{last:03X}h"
                 raise BusError(
-                    f"{self.channel}: the array sent {self.images} of {needed} images of its frames {ids} in time"
+                    f"{self.channel}: the array sent {came} of {needed} images of its frames {ids} in time"
                     f" ({self.torn} were not whole); check its power, its channel (sensor.channel), and wire.ids,"
                     " wire.frames and wire.start of its array file"
                 )
             if wire.poll:
                 send_on(port, self.channel, wire.poll)
-            before = self.images
-            network.pump_until(lambda: self.images > before, 1.5 * period_s)  # noqa: B023 - called before the next
+            network.pump_until(lambda: self.assembler.frames > came, 1.5 * period_s)
 
     def stop(self, port: Port) -> None:
         """Stop the array if it was started."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
@@ -40,15 +41,39 @@ RELEASE_S = 0.1
 """Longest time to an answer of a node that is released."""
 
 
-class BringUp:
-    """Brings the planned nodes up over one network.
+@dataclass(frozen=True, slots=True)
+class NodeAccess:
+    """The planned nodes as bring-up, a check and homing reach them.
 
-    Args:
+    Attributes:
         network: SDO and NMT, pumped.
         watch: sees every boot-up, heartbeat and EMCY that arrives meanwhile.
         setups: configurations of the nodes.
         settings: times, retries, and whether the nodes store their configuration.
         say: called with each step, for the user.
+    """
+
+    network: PumpedNetwork
+    watch: NodeWatch
+    setups: tuple[NodeConfiguration, ...]
+    settings: BringUpSettings
+    say: Callable[[str], None]
+
+    def dialogues(self, dialogues: Mapping[int, Dialogue]) -> Dialogues:
+        """Dialogues by node id, for a caller that serves them."""
+        return Dialogues(self.network, dialogues, timeout_s=self.settings.sdo_s, retries=self.settings.retries)
+
+    def talk(self, dialogues: Mapping[int, Dialogue], timeout_s: float | None = None) -> dict[int, int]:
+        """Hold dialogues by node id to their end; the number of requests that were sent again, by node id."""
+        timeout_s = self.settings.sdo_s if timeout_s is None else timeout_s
+        return hold_dialogues(self.network, dialogues, timeout_s=timeout_s, retries=self.settings.retries)
+
+
+class BringUp:
+    """Brings the planned nodes up over one network.
+
+    Args:
+        access: the nodes.
         listened: whether the caller has listened for another master until now.
         resets: whether the nodes are reset; else they are only made pre-operational, and keep what they hold.
 
@@ -57,23 +82,10 @@ class BringUp:
         released: nodes that confirmed on the way out that they watch this master no more.
     """
 
-    def __init__(
-        self,
-        network: PumpedNetwork,
-        watch: NodeWatch,
-        setups: tuple[NodeConfiguration, ...],
-        settings: BringUpSettings,
-        say: Callable[[str], None],
-        *,
-        listened: bool,
-        resets: bool,
-    ) -> None:
-        self._network = network
-        self._watch = watch
-        self._setups = setups
-        self._nodes = {setup.node_id: NodeBringUp(setup, watch) for setup in setups}
-        self._settings = settings
-        self._say = say
+    def __init__(self, access: NodeAccess, *, listened: bool, resets: bool) -> None:
+        self._access, self._network, self._watch = access, access.network, access.watch
+        self._setups, self._settings, self._say = access.setups, access.settings, access.say
+        self._nodes = {setup.node_id: NodeBringUp(setup, access.watch) for setup in access.setups}
         self._booted: dict[int, int] = {}
         self._listened = listened
         self._resets = resets
@@ -183,7 +195,7 @@ class BringUp:
     def _configure_all(self) -> None:
         self._say("identify and configure the nodes")
         nodes, stores = self._nodes, self._settings.store
-        repeated = self._talk({i: node.configure(store=stores) for i, node in nodes.items()}, self._settings.sdo_s)
+        repeated = self._access.talk({i: node.configure(store=stores) for i, node in nodes.items()})
         failures = [self._error(n.failure.reason, n.setup) for n in nodes.values() if n.failure is not None]
         if failures:
             first, *others = failures
@@ -210,7 +222,7 @@ class BringUp:
             self._network.pump_until(lambda: not self._not_operational(), self._settings.start_s)
             if not (waiting := self._not_operational()):
                 return
-        self._talk({setup.node_id: self._nodes[setup.node_id].recall() for setup in waiting}, RELEASE_S)
+        self._access.talk({setup.node_id: self._nodes[setup.node_id].recall() for setup in waiting}, RELEASE_S)
         state = self._watch.states.get(waiting[0].node_id)
         tries = f", {1 + self._settings.retries} times" if self._settings.retries else ""
         raise self._error(
@@ -249,13 +261,12 @@ class BringUp:
         """
         until_ns = self._network.port.clock.now_ns() + round(timeout_s * 1e9)
         asked = {s.node_id: self._confirm_mode(s, s.mode, until_ns) for s in self._setups if s.mode is not None}
-        return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
+        return self._access.dialogues(asked)
 
     def tares(self, node_id: int) -> Dialogues:
         """Have the array tared anew: to be served while cycling."""
         write = Write(TARE_COMMAND, 0, TARE, "tare", read_back=False)
-        asked = {s.node_id: write_entry(s, write) for s in self._setups if s.node_id == node_id}
-        return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
+        return self._access.dialogues({s.node_id: write_entry(s, write) for s in self._setups if s.node_id == node_id})
 
     def _confirm_mode(self, setup: NodeConfiguration, mode: int, until_ns: int) -> Dialogue:
         while (got := (yield from read_entry(setup, MODE_DISPLAY, 0))) != mode:
@@ -274,7 +285,7 @@ class BringUp:
             with contextlib.suppress(NodeError):
                 found[setup.node_id] = yield from read_entry(setup, IDENTITY, SERIAL_SUBINDEX)
 
-        self._talk({s.node_id: ask(s) for s in self._setups if s.node_id in node_ids}, self._settings.sdo_s)
+        self._access.talk({s.node_id: ask(s) for s in self._setups if s.node_id in node_ids})
         return found
 
     # the way out
@@ -298,14 +309,9 @@ class BringUp:
             except NodeError as error:
                 failures.append(error)
 
-        self._talk({setup.node_id: consumer_off(setup) for setup in self._setups}, RELEASE_S)
+        self._access.talk({setup.node_id: consumer_off(setup) for setup in self._setups}, RELEASE_S)
         if failures:
             raise failures[0]
-
-    # parts of the steps
-
-    def _talk(self, dialogues: Mapping[int, Dialogue], timeout_s: float) -> dict[int, int]:
-        return hold_dialogues(self._network, dialogues, timeout_s=timeout_s, retries=self._settings.retries)
 
     def _error(self, reason: str, *setups: NodeConfiguration) -> NodeError:
         """The error of these nodes, with the last EMCY of each of them."""
@@ -325,19 +331,14 @@ class FoundNodes:
     """Reads the nodes, and puts back what was changed.
 
     Args:
-        network: SDO and NMT, pumped.
-        watch: what the nodes reported so far.
-        setups: the configurations that bring-up writes.
-        settings: times and retries.
+        access: the nodes.
 
     Attributes:
         remarks: what could not be put back.
     """
 
-    def __init__(
-        self, network: PumpedNetwork, watch: NodeWatch, setups: tuple[NodeConfiguration, ...], settings: BringUpSettings
-    ) -> None:
-        self._network, self._watch, self._setups, self._settings = network, watch, setups, settings
+    def __init__(self, access: NodeAccess) -> None:
+        self._access, self._setups = access, access.setups
         self._values: dict[int, dict[tuple[int, int], int]] = {}
         self._states: dict[int, NmtState] = {}
         self.remarks: list[str] = []
@@ -348,18 +349,15 @@ class FoundNodes:
         Raises:
             NodeError: a drive is under power: somebody works with it.
         """
-        self._states = dict(self._watch.states)
+        self._states = dict(self._access.watch.states)
         self._values = {setup.node_id: {} for setup in self._setups}
-        self._talk({setup.node_id: self._read(setup) for setup in self._setups})
+        self._access.talk({setup.node_id: self._read(setup) for setup in self._setups})
 
     def restore(self) -> None:
         """Put back what was changed, then the NMT states; a node whose state was not known stays pre-operational."""
-        self._talk({setup.node_id: self._write(setup) for setup in self._setups})
-        states = self._states.items()
-        self._network.port.send_batch([pack_nmt(_COMMANDS[s], node_id) for node_id, s in states if s in _COMMANDS])
-
-    def _talk(self, dialogues: dict[int, Dialogue]) -> None:
-        hold_dialogues(self._network, dialogues, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
+        self._access.talk({setup.node_id: self._write(setup) for setup in self._setups})
+        known = [(node_id, state) for node_id, state in self._states.items() if state in _COMMANDS]
+        self._access.network.port.send_batch([pack_nmt(_COMMANDS[state], node_id) for node_id, state in known])
 
     def _read(self, setup: NodeConfiguration) -> Dialogue:
         found = self._values[setup.node_id]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
-from canprobe.cell.master.bringup import BringUp, FoundNodes
+from canprobe.cell.master.bringup import BringUp, FoundNodes, NodeAccess
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.held_arm import HeldArm
@@ -29,7 +29,6 @@ from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import DriveState
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
 if TYPE_CHECKING:
     from canprobe.cell.master.arm_power import ArmPower
@@ -112,10 +111,9 @@ class Cell:
         if check:  # nothing is commanded or stored, such as a tare
             setups = tuple(replace(one, writes=tuple(w for w in one.writes if w.read_back)) for one in setups)
             settings = replace(settings, store=False)
-        self.bring_up = BringUp(
-            self._network, self.watch, setups, settings, self._say, listened=before is not None, resets=not check
-        )
-        self.found = FoundNodes(self._network, self.watch, setups, settings) if check else None
+        access = NodeAccess(self._network, self.watch, setups, settings, self._say)
+        self.bring_up = BringUp(access, listened=before is not None, resets=not check)
+        self.found = FoundNodes(access) if check else None
         self.stopped_by: Condition | None = None
         self.doubted: frozenset[int] = frozenset()
         self._stopped, self._before = False, before
@@ -127,18 +125,11 @@ class Cell:
 
             self._power = ArmPower(plan, self.drives, self.cycles, self.bring_up)
             self._lift_off = partial(lift_off, plan, self.cycles)
-        self.homing = (
-            Homing(plan, setups, self._network, self.watch, self._supervise_homing, record=zeros, say=self._say)
-            if any(one.homing for one in setups)
-            else None
-        )
-        self._holding = False
+        homed = any(one.homing for one in setups)
+        self.homing = Homing(plan, access, self._supervise_homing, zeros) if homed else None
         self._held = HeldArm()
         self._running = False
         self._retreats_for: CanprobeError | None = None
-        for node_id in self.watch.node_ids:
-            for base in (HEARTBEAT_BASE, EMCY_BASE):
-                self._network.subscribe(base + node_id, self.watch.push)
         if before is not None:  # the counters go on
             if self.drives is not None and before.drives is not None:
                 for name in ("late", "missed", "malformed", "implausible"):
@@ -171,7 +162,7 @@ class Cell:
                 other=self._network.feed,
                 on_arrival=not isinstance(self.port.clock, VirtualClock),
                 kept=self._options.rows_kept,
-                **({} if self._before is None else {"before": self._before.cycle}),
+                before=None if self._before is None else self._before.cycle,
             )
             if self._before is not None and self.tactile is not None:
                 self.tactile.newest_cycle = self.cycle.number  # its age counts from the first SYNC of this cell
@@ -355,14 +346,14 @@ class Cell:
         finding = self.supervisor.finding()
         if finding is None and not self.cycles.controller.retreats_itself:
             finding = self.supervisor.guard_contact(measurement)
-        if finding is None or finding.condition.reaction is not Reaction.HOLD:
-            self._holding = False
-            if finding is not None:
-                self._react(finding)
-        elif not self._holding:
-            self._holding = True
+        if finding is None:
+            return False
+        if finding.condition.reaction is not Reaction.HOLD:
+            self._react(finding)
+            return False
+        if not self._held.holds:
             self.notes.add_error(finding.error, "hold", self.cycles.run_s(measurement))
-        return self._holding
+        return True
 
     def _react(self, finding: Finding) -> None:
         controller = self.cycles.controller

@@ -20,14 +20,7 @@ from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import decode_text, hold_dialogues, upload
-from canprobe.fieldbus.protocol.frames import (
-    HEARTBEAT_BASE,
-    SDO_TX_BASE,
-    NmtCommand,
-    NmtState,
-    pack_nmt,
-    unpack_heartbeat,
-)
+from canprobe.fieldbus.protocol import frames
 from canprobe.fieldbus.protocol.lss import LssAddress
 
 IDENTITY_SUBINDICES = {"vendor_id": 1, "product_code": 2, "revision_number": 3, "serial_number": 4}
@@ -48,13 +41,13 @@ class _Sighting:
         answers: answer to each SDO request, by index and sub-index as on the wire.
     """
 
-    state: NmtState | None = None
+    state: frames.NmtState | None = None
     answers: dict[bytes, list[bytes]] = field(default_factory=dict)
 
     def take_heartbeat(self, _id: int, data: bytes, _t_ns: int) -> None:
         """Keep the state; another frame on this identifier is not a heartbeat."""
         with suppress(ProtocolError):
-            self.state = unpack_heartbeat(data)
+            self.state = frames.unpack_heartbeat(data)
 
     def take_answer(self, _id: int, data: bytes, _t_ns: int) -> None:
         """Keep an answer that names its entry; segments do not name one."""
@@ -91,8 +84,8 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
     network = PumpedNetwork(port)
     seen = {node_id: _Sighting() for node_id in range(1, MAX_NODES + 1)}
     for node_id, sighting in seen.items():
-        network.subscribe(HEARTBEAT_BASE + node_id, sighting.take_heartbeat)
-        network.subscribe(SDO_TX_BASE + node_id, sighting.take_answer)
+        network.subscribe(frames.HEARTBEAT_BASE + node_id, sighting.take_heartbeat)
+        network.subscribe(frames.SDO_TX_BASE + node_id, sighting.take_answer)
     end_ns = port.clock.now_ns() + round(LISTEN_S * 1e9)
     read = {node_id: dict[str, Any]() for node_id in answering_nodes(network, seen, timeout_s)}
     hold_dialogues(network, {node_id: _identify(node) for node_id, node in read.items()}, timeout_s=timeout_s)
@@ -294,7 +287,7 @@ def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True
         if data == b"\0":
             booted.append(t_ns)
 
-    network.subscribe(HEARTBEAT_BASE + node_id, take)
+    network.subscribe(frames.HEARTBEAT_BASE + node_id, take)
     try:
         lss.release()
         if not lss.select(address):
@@ -303,7 +296,7 @@ def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True
         kept = store and lss.store()
         lss.release()
         if assignment.before is not None:
-            network.port.send_batch([pack_nmt(NmtCommand.RESET_COMMUNICATION, assignment.before)])
+            network.port.send_batch([frames.pack_nmt(frames.NmtCommand.RESET_COMMUNICATION, assignment.before)])
         if not network.pump_until(lambda: bool(booted), BOOT_UP_S):
             raise NodeError(node_id, f"the device {address} took the id but sent no boot-up within {BOOT_UP_S:g} s")
         return kept
@@ -311,7 +304,7 @@ def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True
         lss.release()
         raise NodeError(node_id, f"the device {address} did not take the id: {error}") from error
     finally:
-        network.unsubscribe(HEARTBEAT_BASE + node_id, take)
+        network.unsubscribe(frames.HEARTBEAT_BASE + node_id, take)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,11 @@ condition; a test compares the two.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 from canprobe.cell.master.image_witness import UNSTATED_NS
 from canprobe.cell.master.supervision import (
-    CONTACT_LOST_NS,
-    FORCE_HIDDEN_NS,
-    HOLD_CYCLES,
-    MAX_HOLD_NS,
     TORQUE_MEAN_NS,
     Condition,
     CycleState,
@@ -33,43 +30,51 @@ from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.touch.depth_witness import CONTRADICTED_S
 
 NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
+HOLD_CYCLES = 3
+"""Cycles without a TPDO of one drive after which all of them hold."""
+MAX_HOLD_NS = 1_000_000_000
+"""Longest hold."""
+CONTACT_LOST_NS = 30_000_000
+"""Time without contact force in a touch after which the contact is lost."""
+FORCE_HIDDEN_NS = 20_000_000
+"""Time with a force that the array shows only in part, after which the force may be above the limit."""
 ARRAY_RECOVERY_NS = 30 * NS_PER_MS
 """Time after a touch in which the array's creep and hysteresis may still show half of the touch force."""
 _BLIND_ADVICE = "look at the arm before anything moves, then press the array with a finger: `canprobe run listen`"
+Within = Callable[[Limits], int]
 Check = TypeVar("Check", bound=Callable[..., Any])
 _TABLE: list[Condition] = []
 
 
-def _unchecked(*row: Any, **more: Any) -> None:
-    """Add a row without a check: the condition shows by itself."""
-    _TABLE.append(Condition(*row, **more))
+def _checked(what: str, reaction: Reaction, within: Within | None, **more: Any) -> Callable[[Check], Check]:
+    """Add a row whose check looks at the cell in every cycle; its key is the name of the check."""
+
+    def add(check: Check) -> Check:
+        _TABLE.append(Condition(check.__name__.removeprefix("_"), what, reaction, within, check, **more))
+        return check
+
+    return add
 
 
-def _checked(*row: Any, **more: Any) -> Callable[[Check], Check]:
-    """Add a row whose check looks at the cell in every cycle."""
-    return lambda check: _add(check, *row, check=check, **more)
+_touch = partial(_checked, touch=True)
+"""Add a row whose check looks at a touch."""
 
 
-def _touch(*row: Any, **more: Any) -> Callable[[Check], Check]:
-    """Add a row whose check looks at a touch."""
-    return lambda check: _add(check, *row, check=check, touch=True, **more)
-
-
-def _counted(key: str, what: str, within: Callable[[Limits], int], count: Callable[[CycleState], int]) -> None:
+def _counted(key: str, what: str, within: Within, count: Callable[[CycleState], int]) -> None:
     """Add a row of a condition that is counted and does not stop the cell."""
     _TABLE.append(Condition(key, what, Reaction.DEGRADE, within, count=count))
 
 
-def _add(function: Check, *row: Any, **more: Any) -> Check:
-    _TABLE.append(Condition(*row, **more))
-    return function
+def _unchecked(*row: Any) -> None:
+    """Add a row without a check: the condition shows by itself."""
+    _TABLE.append(Condition(*row))
 
 
-def _cycles(number: int) -> Callable[[Limits], int]:
+def _cycles(number: int) -> Within:
     return lambda limits: number * limits.period_ns
 
 
-def _after(time_ns: int, cycles: int = 1) -> Callable[[Limits], int]:
+def _after(time_ns: int, cycles: int = 1) -> Within:
     """A time, and the cycles until the check runs."""
     return lambda limits: time_ns + cycles * limits.period_ns
 
@@ -95,15 +100,13 @@ def _lost(limits: Limits) -> int:
 # nodes; another master first: what the nodes then report is what it made of them
 
 
-@_checked("foreign_master", "another master on the bus", Reaction.STOP, _cycles(2), enabling=True)
+@_checked("another master on the bus", Reaction.STOP, _cycles(2), enabling=True)
 def _foreign_master(seen: CycleState) -> SafetyStop | None:
     words = seen.watch.another_master
     return SafetyStop(words) if words is not None else None
 
 
-@_checked(
-    "heartbeat", "heartbeat of a node lost", Reaction.LIFT, _after(HEARTBEAT_CONSUMED_MS * NS_PER_MS), enabling=True
-)
+@_checked("heartbeat of a node lost", Reaction.LIFT, _after(HEARTBEAT_CONSUMED_MS * NS_PER_MS), enabling=True)
 def _heartbeat(seen: CycleState) -> NodeError | None:
     node_id = seen.watch.silent(seen.sync_ns)
     if node_id is None:
@@ -112,11 +115,7 @@ def _heartbeat(seen: CycleState) -> NodeError | None:
 
 
 @_checked(
-    "nmt_state",
-    "node not operational, or booted again",
-    Reaction.LIFT,
-    _after(HEARTBEAT_PRODUCED_MS * NS_PER_MS),
-    enabling=True,
+    "node not operational, or booted again", Reaction.LIFT, _after(HEARTBEAT_PRODUCED_MS * NS_PER_MS), enabling=True
 )
 def _nmt_state(seen: CycleState) -> NodeError | None:
     node_id = seen.watch.not_in(NmtState.OPERATIONAL)
@@ -126,7 +125,7 @@ def _nmt_state(seen: CycleState) -> NodeError | None:
     return NodeError(node_id, f"left operation: NMT state {state}{seen.watch.last_words(node_id)}")
 
 
-@_checked("drive_fault", "drive leaves operation enabled (fault, quick stop)", Reaction.LIFT, _cycles(2))
+@_checked("drive leaves operation enabled (fault, quick stop)", Reaction.LIFT, _cycles(2))
 def _drive_fault(seen: CycleState) -> NodeError | None:
     drives = seen.drives
     if drives is None or seen.measurement.enabled:
@@ -153,7 +152,7 @@ def _held_up(seen: CycleState) -> str:
     )
 
 
-@_checked("emcy", "EMCY of a device error", Reaction.LIFT, _cycles(2), enabling=True)
+@_checked("EMCY of a device error", Reaction.LIFT, _cycles(2), enabling=True)
 def _emcy(seen: CycleState) -> NodeError | None:
     event = seen.watch.device_alarm
     return NodeError(event.node_id, event.what) if event is not None else None
@@ -174,12 +173,12 @@ def _pdo_missed(seen: CycleState) -> int:
 _counted("pdo_missed", "TPDO of a drive missed, late, twice, malformed or impossible", _cycles(1), _pdo_missed)
 
 
-@_checked("drive_late", "drive late", Reaction.HOLD, lambda limits: (HOLD_CYCLES + 1) * limits.period_ns)
+@_checked("drive late", Reaction.HOLD, lambda limits: (HOLD_CYCLES + 1) * limits.period_ns)
 def _drive_late(seen: CycleState) -> NodeError | None:
     return _not_heard(seen, HOLD_CYCLES, "")
 
 
-@_checked("drive_silent", "drive silent", Reaction.LIFT, lambda limits: (limits.missed_cycles + 2) * limits.period_ns)
+@_checked("drive silent", Reaction.LIFT, lambda limits: (limits.missed_cycles + 2) * limits.period_ns)
 def _drive_silent(seen: CycleState) -> NodeError | None:
     return _not_heard(seen, seen.limits.missed_cycles + 1, "lost: ")
 
@@ -194,7 +193,7 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> NodeError | None:
     return NodeError(seen.drives.axes[i].node_id, f"{word}no usable TPDO for {ages[i]} cycles")
 
 
-@_checked("following", "joint that does not follow its targets", Reaction.LIFT, _cycles(2))
+@_checked("joint that does not follow its targets", Reaction.LIFT, _cycles(2))
 def _following(seen: CycleState) -> NodeError | None:
     drives = seen.drives
     if drives is None or seen.compares_motion or not (beyond := drives.targets.beyond_lag()):
@@ -230,7 +229,6 @@ _counted(
 
 
 @_touch(
-    "sensor_stale",
     "no usable tactile frame",
     Reaction.RETREAT,
     lambda limits: (limits.tactile_timeout + limits.tactile_cycles + 1) * limits.period_ns,
@@ -253,21 +251,21 @@ _counted(
 )
 
 
-@_checked("error_passive", "CAN controller error-passive", Reaction.HOLD, _cycles(2), enabling=True)
+@_checked("CAN controller error-passive", Reaction.HOLD, _cycles(2), enabling=True)
 def _error_passive(seen: CycleState) -> SafetyStop | None:
     if seen.controller_state is not ControllerState.PASSIVE or seen.passive_ns > MAX_HOLD_NS:
         return None
     return SafetyStop("CAN controller error-passive")
 
 
-@_checked("error_passive_long", "CAN controller error-passive for 1 s", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
+@_checked("CAN controller error-passive for 1 s", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
 def _error_passive_long(seen: CycleState) -> SafetyStop | None:
     if seen.passive_ns <= MAX_HOLD_NS:
         return None
     return SafetyStop(f"CAN controller error-passive for {seen.passive_ns * 1e-9:.1f} s: check termination and cabling")
 
 
-@_checked("bus_off", "CAN controller bus-off", Reaction.STOP, _cycles(2), enabling=True)
+@_checked("CAN controller bus-off", Reaction.STOP, _cycles(2), enabling=True)
 def _bus_off(seen: CycleState) -> InterfaceError | None:
     if seen.controller_state is not ControllerState.BUS_OFF:
         return None
@@ -283,7 +281,7 @@ _unchecked("interface", "interface removed or down", Reaction.STOP, _cycles(1))
 _counted("clock_step", "wall clock set", _cycles(2), lambda seen: seen.counters.clock_steps)
 
 
-@_checked("overruns", "overrun budget used up", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
+@_checked("overrun budget used up", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
 def _overruns(seen: CycleState) -> SafetyStop | None:
     if seen.late_share <= seen.limits.safety.late_share:
         return None
@@ -296,7 +294,7 @@ def _overruns(seen: CycleState) -> SafetyStop | None:
 # the touch and the arm
 
 
-@_checked("preload", "probe pressed before the run", Reaction.STOP, None, enabling=True)
+@_checked("probe pressed before the run", Reaction.STOP, None, enabling=True)
 def _preload(seen: CycleState) -> SafetyStop | None:
     limits = seen.limits
     if not limits.tares or seen.preload <= limits.safety.preload_max:
@@ -308,7 +306,7 @@ def _preload(seen: CycleState) -> SafetyStop | None:
     )
 
 
-@_touch("force", "upper end of the measured force above `limits.force_max_n`", Reaction.RETREAT, _sample)
+@_touch("upper end of the measured force above `limits.force_max_n`", Reaction.RETREAT, _sample)
 def _force(contact: TouchState) -> SafetyStop | None:
     limit = contact.limits.safety.force_max
     if contact.force_upper <= limit:
@@ -317,7 +315,7 @@ def _force(contact: TouchState) -> SafetyStop | None:
     return SafetyStop(f"measured force {contact.force:.2f} N{upper} above the limit of {limit:.2f} N")
 
 
-@_touch("force_hidden", "force hidden by a saturated array", Reaction.RETREAT, _hidden)
+@_touch("force hidden by a saturated array", Reaction.RETREAT, _hidden)
 def _force_hidden(contact: TouchState) -> SafetyStop | None:
     if contact.hidden_s * 1e9 <= FORCE_HIDDEN_NS:
         return None
@@ -327,7 +325,7 @@ def _force_hidden(contact: TouchState) -> SafetyStop | None:
     )
 
 
-@_touch("off_pad", "contact that runs off the array", Reaction.RETREAT, _hidden)
+@_touch("contact that runs off the array", Reaction.RETREAT, _hidden)
 def _off_pad(contact: TouchState) -> SafetyStop | None:
     if contact.off_pad_s * 1e9 <= FORCE_HIDDEN_NS:
         return None
@@ -338,7 +336,7 @@ def _off_pad(contact: TouchState) -> SafetyStop | None:
     )
 
 
-@_touch("taxels_hidden", "force on taxels that do not measure", Reaction.RETREAT, _hidden)
+@_touch("force on taxels that do not measure", Reaction.RETREAT, _hidden)
 def _taxels_hidden(contact: TouchState) -> SafetyStop | None:
     if contact.bridged_s * 1e9 <= FORCE_HIDDEN_NS:
         return None
@@ -349,7 +347,6 @@ def _taxels_hidden(contact: TouchState) -> SafetyStop | None:
 
 
 @_touch(
-    "image_dead",
     "pressed array whose images do not change though the probe moves",
     Reaction.RETREAT,
     lambda limits: UNSTATED_NS + _sample(limits),
@@ -363,7 +360,6 @@ def _image_dead(contact: TouchState) -> SafetyStop | None:
 
 
 @_touch(
-    "force_fell",
     "measured force that falls faster than the probe moves off",
     Reaction.RETREAT,
     lambda limits: round(NS_PER_S * CONTRADICTED_S) + _sample(limits) + _frame(limits),
@@ -381,7 +377,6 @@ def _force_fell(contact: TouchState) -> SafetyStop | None:
 
 
 @_touch(
-    "depth",
     "probe far deeper in what it touched before than the measured force means, or gone aside in a hold",
     Reaction.RETREAT,
     lambda limits: round(NS_PER_S * CONTRADICTED_S) + 4 * _sample(limits),
@@ -404,7 +399,6 @@ def _depth(contact: TouchState) -> SafetyStop | None:
 
 
 @_checked(
-    "push_unfelt",
     "push in the drives' torques that the array does not measure",
     Reaction.RETREAT,
     _after(4 * TORQUE_MEAN_NS, 2),
@@ -419,14 +413,14 @@ def _push_unfelt(seen: CycleState) -> SafetyStop | None:
     )
 
 
-@_touch("contact_lost", "contact lost in a hold", Reaction.RETREAT, _lost)
+@_touch("contact lost in a hold", Reaction.RETREAT, _lost)
 def _contact_lost(contact: TouchState) -> SafetyStop | None:
     if _is_doubtful(contact) or (contact.path and contact.limits.regain > 0.0):
         return None
     return SafetyStop("contact lost") if contact.lost_s * 1e9 > CONTACT_LOST_NS else None
 
 
-@_touch("contact_to_regain", "contact lost in a scan", Reaction.SEARCH, _lost)
+@_touch("contact lost in a scan", Reaction.SEARCH, _lost)
 def _contact_to_regain(contact: TouchState) -> SafetyStop | None:
     if not contact.path or _is_doubtful(contact) or contact.lost_s * 1e9 <= CONTACT_LOST_NS:
         return None
@@ -438,22 +432,20 @@ def _is_doubtful(contact: TouchState) -> bool:
     return contact.depth is not None and contact.depth.fall is not None
 
 
-@_touch("contact_not_regained", "lost contact not found again", Reaction.RETREAT, _cycles(1))
+@_touch("lost contact not found again", Reaction.RETREAT, _cycles(1))
 def _contact_not_regained(contact: TouchState) -> SafetyStop | None:
     if contact.searched <= contact.limits.regain:
         return None
     return SafetyStop(f"contact lost, and not found again within {contact.limits.regain * 1e3:.1f} mm")
 
 
-@_touch("joint_stop", "joint or workspace limit", Reaction.RETREAT, _cycles(1))
-def _joint_stop(contact: TouchState) -> SafetyStop | None:
-    return SafetyStop(contact.limit) if contact.limit is not None else None
+_unchecked("joint_stop", "joint or workspace limit", Reaction.RETREAT, _cycles(1))
 
 
 _counted("target_speed", "target too far for one cycle", _cycles(1), lambda seen: seen.slowed)
 
 
-@_checked("joint_speed", "measured joint motion that no joint can make", Reaction.STOP, _cycles(2), enabling=True)
+@_checked("measured joint motion that no joint can make", Reaction.STOP, _cycles(2), enabling=True)
 def _joint_speed(seen: CycleState) -> SafetyStop | None:
     return SafetyStop(seen.speeding) if seen.speeding is not None else None
 
@@ -480,7 +472,7 @@ _unchecked(
 )
 
 
-@_checked("log", "frames cannot be written down (full disk)", Reaction.RETREAT, _cycles(2), enabling=True)
+@_checked("frames cannot be written down (full disk)", Reaction.RETREAT, _cycles(2), enabling=True)
 def _log(seen: CycleState) -> ResultsError | None:
     return ResultsError(seen.log_failure) if seen.log_failure is not None else None
 

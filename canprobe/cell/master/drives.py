@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
 
 import numpy as np
 
@@ -18,18 +17,8 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import TARGETS, Place
 from canprobe.cell.planning.units import lag_s
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.cia402 import (
-    CHANGE_IMMEDIATELY_BIT,
-    ENABLE_INTERPOLATION_BIT,
-    ENABLE_WORD,
-    NEW_SETPOINT_BIT,
-    SETPOINT_ACKNOWLEDGE_BIT,
-    DriveState,
-    OperationMode,
-    controlword_toward,
-    describe_state,
-    known_state,
-)
+from canprobe.fieldbus.protocol import cia402
+from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
@@ -132,15 +121,16 @@ class SetPointOffer:
             word: controlword towards the goal of the drive; it gets targets where that keeps it enabled.
             target: where it is sent, counts.
         """
-        if word & ENABLE_WORD != ENABLE_WORD or known_state(statusword) is not DriveState.OPERATION_ENABLED:
+        enabled = cia402.known_state(statusword) is DriveState.OPERATION_ENABLED
+        if not enabled or word & cia402.ENABLE_WORD != cia402.ENABLE_WORD:
             self._target, self._offered = None, False
-        elif statusword >> SETPOINT_ACKNOWLEDGE_BIT & 1:
+        elif statusword >> cia402.SETPOINT_ACKNOWLEDGE_BIT & 1:
             self._offered = False
         elif target != self._target and not self._offered:
             self._target, self._offered = target, True
         if not self._offered or self._target is None:
             return word, target
-        return word | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT, self._target
+        return word | 1 << cia402.NEW_SETPOINT_BIT | 1 << cia402.CHANGE_IMMEDIATELY_BIT, self._target
 
 
 DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
@@ -246,7 +236,7 @@ class DriveGroup:
         word = self.statuswords[i] if source.word is None else values[source.word]
         if source.counts is not None:
             track, counts = self.tracks[i], values[source.counts]
-            doubtful = self.cycle - track.cycle <= DOUBTED_CYCLES or known_state(word) in _UNTOLD
+            doubtful = self.cycle - track.cycle <= DOUBTED_CYCLES or cia402.known_state(word) in _UNTOLD
             enabled = self.statuswords[i] & _STATE_BITS == _ENABLED and doubtful
             guarded = enabled and self.targets.sent is not None  # a log does not say where it was to go
             if not track.take(counts, self.cycle, self.deadline_ns, guarded=guarded):
@@ -307,12 +297,12 @@ class DriveGroup:
     @property
     def states(self) -> tuple[DriveState | None, ...]:
         """CiA 402 state of each drive, from its last statusword; None where that is a word of no state."""
-        return tuple([known_state(word) for word in self.statuswords])
+        return tuple([cia402.known_state(word) for word in self.statuswords])
 
     def first_not_in(self, state: DriveState) -> tuple[int, str]:
         """The first drive that is not in a state: its number from 0, and the state that it is in."""
         i = next(i for i, other in enumerate(self.states) if other is not state)
-        return i, describe_state(self.statuswords[i])
+        return i, cia402.describe_state(self.statuswords[i])
 
     @property
     def enabled(self) -> bool:
@@ -376,7 +366,7 @@ class DriveTargets:
                 cob_id,
                 parts[0][1].synchronous,  # in every cycle, else on change
                 [layout.pack for _, layout in parts],
-                [_fetcher(self._places_of(axes[i], i, layout)) for i, layout in parts],
+                [self._places_of(axes[i], i, layout) for i, layout in parts],
                 tuple(i for i, _ in parts),
             )
             for cob_id, parts in sorted(rpdos.items())
@@ -467,10 +457,10 @@ class DriveTargets:
             values[i], values[len(self._words) + i] = offer.step(drives.statuswords[i], values[i], targets[i])
         heard_all = drives.heard_all
         commands = []
-        for cob_id, every_cycle, packs, fetches, axes in self._plan:
+        for cob_id, every_cycle, packs, places, axes in self._plan:
             if not heard_all and any(drives.tracks[axis].cycle < 0 for axis in axes):
                 continue
-            parts = [fetch(values) for fetch in fetches]
+            parts = [tuple([values[place] for place in part]) for part in places]
             if every_cycle or self._due(cob_id, parts):
                 commands.append((cob_id, packs, parts))
         return commands
@@ -495,16 +485,9 @@ def _controlword(state: DriveState | None, goal: DriveState, previous: int, inte
     """
     if state is None:
         return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
-    word = controlword_toward(state, goal, previous)
+    word = cia402.controlword_toward(state, goal, previous)
     follows = interpolated and state is goal is DriveState.OPERATION_ENABLED
-    return word | 1 << ENABLE_INTERPOLATION_BIT if follows else word
-
-
-def _fetcher(places: Sequence[int]) -> Callable[[Sequence[int]], tuple[int, ...]]:
-    """A function that reads all of these places by one call into C."""
-    if len(places) == 1:
-        return lambda values, place=places[0]: (values[place],)  # type: ignore[misc]
-    return itemgetter(*places)
+    return word | 1 << cia402.ENABLE_INTERPOLATION_BIT if follows else word
 
 
 def make_drives(plan: Plan) -> DriveGroup | None:
@@ -514,8 +497,7 @@ def make_drives(plan: Plan) -> DriveGroup | None:
         return None
     period_ns = plan.sync.period_ns
     repeat_cycles = max(1, COMMAND_REPEAT_NS // period_ns)
-    lag = (lag_s(plan.setup) or UNSTATED_LAG_S) + arm.profile_lag
-    return DriveGroup(drive_axes(plan), arm.model, repeat_cycles, period_ns, lag)
+    return DriveGroup(drive_axes(plan), arm.model, repeat_cycles, period_ns, lag_s(plan.setup, UNSTATED_LAG_S))
 
 
 def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:

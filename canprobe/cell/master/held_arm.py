@@ -21,10 +21,13 @@ class HeldArm:
 
     In the first cycle of a hold they do: it is often the only one, and to stop and go on for it presses harder. Where
     the arm is then says the target that the heard joints have come nearest to: the place of an unheard one is a guess.
+
+    Attributes:
+        holds: whether the last cycle was one of a hold.
     """
 
     def __init__(self) -> None:
-        self._holds = False
+        self.holds = False
         self._sent: deque[Floats] = deque(maxlen=KEPT)
         self._frozen: Floats | None = None
         self._behind: Floats | None = None
@@ -32,9 +35,9 @@ class HeldArm:
 
     def freeze(self, measurement: Measurement) -> Command:
         """The command of a cycle of the hold: from the second one on, where the arm was in that."""
-        if self._holds and self._frozen is None:
+        if self.holds and self._frozen is None:
             self._frozen = self._place(measurement)
-        self._holds = True
+        self.holds = True
         return Command(self._frozen)
 
     def _place(self, measurement: Measurement) -> Floats | None:
@@ -46,7 +49,7 @@ class HeldArm:
 
     def thaw(self, command: Command, measurement: Measurement) -> Command:
         """The controller's command; after a hold it makes up little by little for the way from there."""
-        self._holds = False
+        self.holds = False
         if isinstance(command.q_target, np.ndarray):  # another kind may be no target at all, which the guard refuses
             self._sent.append(command.q_target)
         if command.q_target is None or (self._frozen is None and self._behind is None):

@@ -23,42 +23,20 @@ from typing import Any
 
 import numpy as np
 
+from canprobe.cell.master.bringup import NodeAccess
 from canprobe.cell.master.node_bringup import IDENTITY, read_entry, write_entry
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
-from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.units import PROFILE_SPEED
-from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import CanprobeError, NodeError
 from canprobe.fieldbus.bus.port import nothing
-from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
+from canprobe.fieldbus.bus.sdo import Dialogue
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.protocol.cia402 import (
-    CHANGE_IMMEDIATELY_BIT,
-    CONTROLWORD,
-    DISABLED_STATES,
-    ENABLE_WORD,
-    HOMING_ATTAINED_BIT,
-    HOMING_ERROR_BIT,
-    HOMING_START_BIT,
-    MODE_DISPLAY,
-    NEW_SETPOINT_BIT,
-    POSITION,
-    SETPOINT_ACKNOWLEDGE_BIT,
-    STATUSWORD,
-    TARGET_POSITION,
-    TARGET_REACHED_BIT,
-    UNPOWERED_STATES,
-    DriveState,
-    OperationMode,
-    controlword_toward,
-    describe_state,
-    known_state,
-)
+from canprobe.fieldbus.protocol import cia402
+from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.frames import NmtState, pack_heartbeat
 from canprobe.mechanics.robot.model import coupled_joints, drive_position_at
 from canprobe.mechanics.types import Floats
@@ -70,9 +48,7 @@ class SdoLink:
     """Dialogues with one node after the other, and the master's heartbeats meanwhile.
 
     Args:
-        network: pumped; the nodes are operational.
-        watch: what the nodes report of themselves.
-        times: time-outs and retries.
+        access: the nodes, which are operational.
         supervise: called while time passes; it raises the error of whatever goes wrong.
 
     Attributes:
@@ -80,12 +56,10 @@ class SdoLink:
         attend: called as `supervise`, by whoever looks after the drive.
     """
 
-    def __init__(
-        self, network: PumpedNetwork, watch: NodeWatch, times: BringUpSettings, supervise: Callable[[], None]
-    ) -> None:
-        self.watch, self.times, self.clock = watch, times, network.port.clock
+    def __init__(self, access: NodeAccess, supervise: Callable[[], None]) -> None:
+        self.watch, self.times, self.clock = access.watch, access.settings, access.network.port.clock
         self.beats, self._heartbeat_ns = False, 0
-        self._network, self._supervise = network, supervise
+        self._access, self._supervise = access, supervise
         self.attend: Callable[[], None] = nothing
 
     def hold(self, node_id: int, dialogue: Dialogue) -> Any:
@@ -95,8 +69,7 @@ class SdoLink:
         def held() -> Dialogue:
             results.append((yield from dialogue))
 
-        timeout_s, retries = self.times.sdo_s, self.times.retries
-        with Dialogues(self._network, {node_id: held()}, timeout_s=timeout_s, retries=retries) as dialogues:
+        with self._access.dialogues({node_id: held()}) as dialogues:
             while waiting := dialogues.waiting:
                 self.pump(lambda: bool(waiting[0].inbox), POLL_S)
                 dialogues.serve()
@@ -114,11 +87,11 @@ class SdoLink:
 
     def pump(self, done: Callable[[], bool], timeout_s: float) -> None:
         """Wait until `done`, with a heartbeat where one is due."""
-        port = self._network.port
+        port = self._access.network.port
         if self.beats and (now_ns := port.clock.now_ns()) >= self._heartbeat_ns:
             self._heartbeat_ns = now_ns + HEARTBEAT_PRODUCED_MS * 1_000_000
             port.send_batch([pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL)])
-        self._network.pump_until(done, timeout_s)
+        self._access.network.pump_until(done, timeout_s)
 
 
 class LedDrive:
@@ -144,7 +117,7 @@ class LedDrive:
 
     def command(self, word: int) -> None:
         """Write the controlword."""
-        self.write(Write(CONTROLWORD, 0, word, "controlword", read_back=False))
+        self.write(Write(cia402.CONTROLWORD, 0, word, "controlword", read_back=False))
 
     def error(self, what: str) -> NodeError:
         """The error of this drive, with its last EMCY."""
@@ -154,7 +127,7 @@ class LedDrive:
         """Enable the drive in a mode."""
         self.write(Write(MODE, 0, mode, "mode of operation"))
         timeout_s, late = self._link.times.enable_s, f"is not in mode {mode} (6061h) after it was written to 6060h"
-        self.wait_until(lambda: self.read(MODE_DISPLAY) == mode, timeout_s, lambda: late)
+        self.wait_for(cia402.MODE_DISPLAY, lambda held: held == mode, timeout_s, late)
         enabled = DriveState.OPERATION_ENABLED
         self._lead(enabled, frozenset({enabled}), timeout_s)
 
@@ -163,25 +136,30 @@ class LedDrive:
     ) -> None:
         """Wait until the statusword has these bits; a time-out, the error bit or a drive that is off is an error."""
         wanted = sum(1 << bit for bit in bits)
-
-        def reached() -> bool:
-            word = self.read(STATUSWORD)
+        for _ in self._looks(timeout_s):
+            word = self.read(cia402.STATUSWORD)
             if error is not None and word >> error & 1:
                 raise self.error(f"could not {what}: its statusword (6041h) has bit {error}")
-            if known_state(word) is not DriveState.OPERATION_ENABLED:
-                raise self.error(f"could not {what}: it is {describe_state(word)}")
-            return word & wanted == wanted
+            if cia402.known_state(word) is not DriveState.OPERATION_ENABLED:
+                raise self.error(f"could not {what}: it is {cia402.describe_state(word)}")
+            if word & wanted == wanted:
+                return
+        raise self.error(late)
 
-        self.wait_until(reached, timeout_s, lambda: late)
+    def wait_for(self, index: int, fits: Callable[[int], bool], timeout_s: float, late: str) -> None:
+        """Wait until the value of an entry fits; a time-out is an error."""
+        for _ in self._looks(timeout_s):
+            if fits(self.read(index)):
+                return
+        raise self.error(late)
 
-    def wait_until(
-        self, reached: Callable[[], bool], timeout_s: float, late: Callable[[], str], *, supervised: bool = True
-    ) -> None:
-        """Wait, supervised or with heartbeats alone; `late` has the words of the error after the time-out."""
+    def _looks(self, timeout_s: float, *, supervised: bool = True) -> Iterator[None]:
+        """Looks at the drive until the time-out; between two time passes, supervised or with heartbeats alone."""
         until_ns = self._link.clock.now_ns() + round(timeout_s * 1e9)
-        while not reached():
+        while True:
+            yield
             if self._link.clock.now_ns() >= until_ns:
-                raise self.error(late())
+                return
             if supervised:
                 self._link.keep_alive()
             else:
@@ -206,8 +184,8 @@ class LedDrive:
             try:
                 stop_s = self._link.times.stop_s
                 with contextlib.suppress(NodeError):  # by 605Ah it may stay in quick stop
-                    self._lead(DriveState.QUICK_STOP_ACTIVE, UNPOWERED_STATES, stop_s, supervised=False)
-                self._lead(DriveState.SWITCH_ON_DISABLED, DISABLED_STATES, stop_s, supervised=False)
+                    self._lead(DriveState.QUICK_STOP_ACTIVE, cia402.UNPOWERED_STATES, stop_s, supervised=False)
+                self._lead(DriveState.SWITCH_ON_DISABLED, cia402.DISABLED_STATES, stop_s, supervised=False)
                 if self.setup.mode is not None:
                     self.write(Write(MODE, 0, self.setup.mode, "mode of operation"))
             except KeyboardInterrupt:
@@ -222,21 +200,14 @@ class LedDrive:
     ) -> None:
         """Bring the drive into one of some states."""
         word = previous = 0
-
-        def arrived() -> bool:
-            nonlocal word, previous
-            word = self.read(STATUSWORD)
-            state = known_state(word)
+        for _ in self._looks(timeout_s, supervised=supervised):
+            word = self.read(cia402.STATUSWORD)
+            state = cia402.known_state(word)
             if state in states:
-                return True
-            previous = 0 if state is None else controlword_toward(state, goal, previous)
+                return
+            previous = 0 if state is None else cia402.controlword_toward(state, goal, previous)
             self.command(previous)
-            return False
-
-        def late() -> str:
-            return f"is {describe_state(word)} {timeout_s:g} s after the command for {goal.name}"
-
-        self.wait_until(arrived, timeout_s, late, supervised=supervised)
+        raise self.error(f"is {cia402.describe_state(word)} {timeout_s:g} s after the command for {goal.name}")
 
 
 TOLERANCE_RAD = math.radians(1.0)
@@ -258,12 +229,9 @@ class Homing:
 
     Args:
         plan: plan of a cell with an arm.
-        setups: configurations of its nodes.
-        network: pumped; the nodes are operational.
-        watch: what the nodes report of themselves.
+        access: its nodes, which are operational.
         supervise: called meanwhile; it raises the error of whatever else goes wrong.
         record: file of the zeros; None: no record is kept.
-        say: called with each step.
 
     Attributes:
         link: SDO channel of the drives; its `keep_alive` lets time pass before a joint is homed.
@@ -271,23 +239,13 @@ class Homing:
         known: joints whose zeros are known, from 0: those with absolute encoders and those that canprobe emulates, too.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        setups: tuple[NodeConfiguration, ...],
-        network: PumpedNetwork,
-        watch: NodeWatch,
-        supervise: Callable[[], None],
-        *,
-        record: Path | None,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, plan: Plan, access: NodeAccess, supervise: Callable[[], None], record: Path | None) -> None:
         arm = plan.setup.needed_arm()
         self._command_line = plan.setup.line_to_type("home")
         self._model = arm.model
-        self.link = SdoLink(network, watch, plan.setup.bring_up, supervise)
-        by_id = {setup.node_id: setup for setup in setups}
-        self._drives = [LedDrive(by_id[node_id], self.link, say) for node_id in arm.node_ids]
+        self.link = SdoLink(access, supervise)
+        by_id = {setup.node_id: setup for setup in access.setups}
+        self._drives = [LedDrive(by_id[node_id], self.link, access.say) for node_id in arm.node_ids]
         self._record = NodeRecord(record, "home the drives again")
         guard = JointGuard(plan)
         inside = TOLERANCE_RAD * self._model.radian
@@ -363,7 +321,7 @@ class Homing:
             "identity": [drive.read(IDENTITY, sub) for sub in there],
             "settings": [zero.method, zero.home, *model.units_per_q[axis].tolist(), model.zero_units[axis]],
             "objects": {write.place: drive.read(write.index, write.subindex) for write in drive.setup.homing},
-            "position": drive.read(POSITION),
+            "position": drive.read(cia402.POSITION),
         }
 
     def _tolerance(self, axis: int) -> float:
@@ -405,12 +363,12 @@ class Homing:
             for write in setup.homing:
                 drive.write(replace(write, value=-home) if write.index == HOME_OFFSET else write)
             drive.enable(OperationMode.HOMING)
-            drive.command(ENABLE_WORD | 1 << HOMING_START_BIT)
+            drive.command(cia402.ENABLE_WORD | 1 << cia402.HOMING_START_BIT)
             what = f"find its home position by method {zero.method}"
             late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
-            found_bits = HOMING_ATTAINED_BIT, TARGET_REACHED_BIT
-            drive.wait_for_bits(found_bits, zero.timeout_s, what, late, error=HOMING_ERROR_BIT)
-        found, braking = drive.read(POSITION), zero.zero_speed**2 / (2.0 * zero.acceleration)
+            found_bits = cia402.HOMING_ATTAINED_BIT, cia402.TARGET_REACHED_BIT
+            drive.wait_for_bits(found_bits, zero.timeout_s, what, late, error=cia402.HOMING_ERROR_BIT)
+        found, braking = drive.read(cia402.POSITION), zero.zero_speed**2 / (2.0 * zero.acceleration)
         per_q = abs(float(self._model.units_per_q[axis, axis]))
         if abs(found - home) > self._tolerance(axis) + braking * per_q:
             why = "it has no home offset (607Ch)"
@@ -438,24 +396,24 @@ class Homing:
             if other not in self.known:
                 setup, its = self._drives[axis].setup, self._drives[other].setup.name
                 raise setup.error(f"cannot be homed: its zero depends on {its}: home it first")
-            units[other] = self._drives[other].read(POSITION)
+            units[other] = self._drives[other].read(cia402.POSITION)
         return units
 
     def _move(self, drive: LedDrive, target: int, speed: int, timeout_s: float, tolerance: float) -> None:
         """Move a drive to a target in profile position."""
         drive.write(Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         drive.enable(OperationMode.PROFILE_POSITION)
-        drive.write(Write(TARGET_POSITION, 0, target, "target position"))
-        drive.command(ENABLE_WORD | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT)
+        drive.write(Write(cia402.TARGET_POSITION, 0, target, "target position"))
+        drive.command(cia402.ENABLE_WORD | 1 << cia402.NEW_SETPOINT_BIT | 1 << cia402.CHANGE_IMMEDIATELY_BIT)
         what, late = "move back into its range", f"is homed, but did not reach {target} (607Ah), inside its range"
-        drive.wait_for_bits((SETPOINT_ACKNOWLEDGE_BIT,), self.link.times.enable_s, what, late)
-        drive.command(ENABLE_WORD)
-        drive.wait_for_bits((TARGET_REACHED_BIT,), timeout_s, what, late)
+        drive.wait_for_bits((cia402.SETPOINT_ACKNOWLEDGE_BIT,), self.link.times.enable_s, what, late)
+        drive.command(cia402.ENABLE_WORD)
+        drive.wait_for_bits((cia402.TARGET_REACHED_BIT,), timeout_s, what, late)
         # Bit 10 may still be that of the homing, or of a drive whose position window (6067h) is switched off.
-        drive.wait_until(lambda: abs(drive.read(POSITION) - target) <= tolerance, timeout_s, lambda: late)
+        drive.wait_for(cia402.POSITION, lambda there: abs(there - target) <= tolerance, timeout_s, late)
 
 
 def _has_profile_position(setup: NodeConfiguration) -> bool:
     drive = Description(setup.dictionary)
     listed = drive.modes is None or OperationMode.PROFILE_POSITION in drive.modes
-    return listed and drive.entry(TARGET_POSITION) is not None and drive.entry(PROFILE_SPEED) is not None
+    return listed and drive.entry(cia402.TARGET_POSITION) is not None and drive.entry(PROFILE_SPEED) is not None

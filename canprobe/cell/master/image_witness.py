@@ -9,10 +9,17 @@ surface for millimetres, with many counts in its image, before a repetition coun
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from canprobe.cell.master.tactile_frame import TactileSample
+from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch import Patch
 
 FROZEN_NS = 50_000_000
 """Time for which an image repeats before it counts."""
@@ -48,31 +55,20 @@ class ImageWitness:
         self._quiet_at: Floats | None = None
         self._t_ns = 0
 
-    def look(
-        self,
-        t_ns: int,
-        image: object,
-        *,
-        pressed: bool,
-        uv: tuple[float, float],
-        highest: int,
-        centre: Floats | None,
-        sigma: float | None,
-    ) -> None:
+    def look(self, sample: TactileSample, patch: Patch, centre: Floats | None, sigma: float | None = None) -> None:
         """Take an image.
 
         Args:
-            t_ns: time of the sample.
-            image: its bytes, or features: what repeats where the array has stopped.
-            pressed: whether it shows a contact.
-            uv: centroid, m.
-            highest: highest count; of features, which have none, that of a good image.
+            sample: sample with the image or the features, which repeat where the array has stopped.
+            patch: patch that it shows.
             centre: (3,) centre of the probe then, m; None where it is not known.
             sigma: standard deviation of the centroid from image to image, m, as a calibration found it; None where
                 none states it.
         """
         if centre is None:
             return
+        t_ns, image, pressed, uv = sample.t_sample_ns, sample.image, patch.force > TOUCH_FORCE, (patch.u, patch.v)
+        highest = COUNTS_MAX if sample.frame.features else int(sample.frame.taxels.max())
         same = image == self._image
         if not same or not pressed or self._at is None:
             self._image, self._same_ns, self._at = image, t_ns, centre

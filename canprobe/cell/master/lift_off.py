@@ -20,7 +20,7 @@ from canprobe.cell.master.controller import Command
 from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.master.supervisor import Supervisor
-from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, Retrace, TakenWay, way_gone
+from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, GrowingForce, Retrace, TakenWay, way_gone
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import CanprobeError, NodeError
@@ -104,7 +104,7 @@ class LiftOff:
         self._trail = trail if self._free.all() else None  # with a drive at rest the others do not go where they were
         self._step_max: Floats = model.qd_max * plan.setup.limits.speed_share * self._period_s
         self._retrace: Retrace | None = None
-        self._begun = False
+        self._growing: GrowingForce | None = None  # until the way begins
         booted = any(watch.states.get(axis.node_id) is NmtState.INITIALISING for axis in drives.axes)
         self._all_there = not booted and not any(ages)
 
@@ -123,13 +123,12 @@ class LiftOff:
         self._drives.targets.stopped = frozenset(axis.node_id for axis, free, brakes in axes if not (free or brakes))
 
     def command(self, supervisor: Supervisor) -> Command | None:
-        """The command of this cycle; None at the end, and where a witness shows that the force grows."""
-        measurement = supervisor.seen.measurement
+        """The command of this cycle; None at the end, and where the array shows that the force grows."""
+        seen, measurement = supervisor.seen, supervisor.seen.measurement
         if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
             return None
-        if not self._begun:
-            self._begun = True
-            supervisor.begin_way_back()
+        if self._growing is None:
+            self._growing = GrowingForce(seen.limits.cycles_to_turn)
             self._retrace = self._trail.back(measurement.q, self._step_max) if self._trail is not None else None
         retrace = self._retrace
         # a drive that is silent or has booted stands where it lost its power: the others do not go on without it
@@ -138,7 +137,7 @@ class LiftOff:
         if q is None:
             return None
         command, finding = supervisor.guard_target(Command(q))
-        grows = supervisor.witness_grows(measurement)
+        grows = self._growing.grows(measurement.cycle, seen.force, a_part=seen.shows_a_part)
         return None if finding is not None or supervisor.must_stop() or grows else command
 
     def _still_obeyed(self) -> bool:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, MutableSequence, Sequence
-from copy import copy
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,73 +19,39 @@ from canprobe.cell.rows import BLOCK_ROWS, NUMBER, ROWS_SUFFIX, LazyColumns, Row
 from canprobe.mechanics.types import Floats
 
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
-_Part = tuple[NDArray[np.int64], Mapping[str, Sequence[Any] | Floats]]
-"""Numbers of rows in the log, and the values of each column there."""
 
 
 class _RowKind:
-    """Rows with the same names: how their values lie in one block of float64, as the first whole row has them.
+    """Rows with the same names, each of them one block of float64.
 
     Args:
-        names: names of the columns, in order.
+        shapes: shape of each column, by its name.
         file: file of the rows; None keeps them in memory.
         kept: number of rows that are kept; None for all.
 
     Attributes:
-        odd: rows with a value that is no number or has another shape, with their number in the log; in memory.
+        last: number of its last row in the log.
     """
 
-    def __init__(self, names: tuple[str, ...], file: Path | None, kept: int | None) -> None:
-        self.names = names
-        self.odd: MutableSequence[tuple[int, tuple[Any, ...]]] = [] if kept is None else deque(maxlen=kept)
-        self.rows: Rows | None = None
-        self._file, self._kept = file, kept
-        self._block = np.empty(0)
-        self._views: list[Floats] = []
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], file: Path | None, kept: int | None) -> None:
+        self.names = tuple(shapes)
+        self.last = -1
+        self.rows = Rows([(NUMBER, np.float64), *((name, np.float64, shapes[name]) for name in shapes)], file, kept)
+        ends = np.cumsum([1, *map(math.prod, shapes.values())])
+        self._block = np.empty(ends[-1])
+        parts = zip(ends, ends[1:], shapes.values(), strict=False)
+        self._views = [self._block[start:end].reshape(shape) for start, end, shape in parts]
 
-    def add(self, number: int, values: Iterable[Any]) -> None:
-        """Append a row with its number in the log; nothing in it changes with the arrays that were given."""
+    def add(self, number: int, values: Iterable[Any]) -> bool:
+        """Append a row with its number in the log, unless a value does not fit; it keeps nothing of given arrays."""
         try:
-            if self.rows is None:
-                self._lay_out([np.asarray(value) for value in values])
             for view, value in zip(self._views, values, strict=True):
                 view[...] = value
         except _NO_NUMBERS:
-            self.odd.append((number, tuple(copy(value) for value in values)))
-            return
-        assert self.rows is not None
-        self._block[0] = number
+            return False
+        self._block[0] = self.last = number
         self.rows.add(self._block.tobytes())
-
-    def _lay_out(self, values: Sequence[NDArray[Any]]) -> None:
-        if any(value.dtype.kind not in "biuf" for value in values):
-            raise TypeError("a value that is no number")
-        fields = [(name, np.float64, value.shape) for name, value in zip(self.names, values, strict=True)]
-        self.rows = Rows([(NUMBER, np.float64), *fields], self._file, self._kept)
-        self._block = np.empty(1 + sum(value.size for value in values))
-        start = 1
-        for value in values:
-            self._views.append(self._block[start : start + value.size].reshape(value.shape))
-            start += value.size
-
-    def stored(self, first: int) -> Iterator[_Part]:
-        """The rows from the row `first` of the log on, in blocks."""
-        for block in self.rows.blocks() if self.rows is not None else ():
-            numbers = block[NUMBER].astype(np.int64)
-            start = int(np.searchsorted(numbers, first))
-            if start < len(numbers):
-                yield numbers[start:], {name: block[name][start:] for name in self.names}
-
-    def single(self, first: int) -> Iterator[_Part]:
-        """The odd rows from the row `first` on, without values that are None."""
-        for number, values in self.odd:
-            if number >= first:
-                known = zip(self.names, values, strict=True)
-                yield np.array([number]), {name: [value] for name, value in known if value is not None}
-
-    def has_rows(self, first: int) -> bool:
-        """Whether there are rows from the row `first` on."""
-        return any(True for _ in self.stored(first)) or any(number >= first for number, _ in self.odd)
+        return True
 
 
 def since_first_sync(t_s: Floats, start_s: float) -> Floats:
@@ -116,40 +80,59 @@ class RunLog:
         self.start_s = 0.0
         self._added = 0
         self._kinds: dict[tuple[str, ...], _RowKind] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._unknown: dict[str, int] = {}  # columns without a number so far, with the last row that has them
+        self._misfits: Counter[str] = Counter()
 
     def __len__(self) -> int:
         return self._added if self._kept is None else min(self._added, self._kept)
 
     def add(self, row: dict[str, object]) -> None:
         """Append one row."""
-        names = tuple(row)
-        kind = self._kinds.get(names)
-        if kind is None:
-            file = self._folder / f"log-{len(self._kinds)}{ROWS_SUFFIX}" if self._folder is not None else None
-            kind = self._kinds[names] = _RowKind(names, file, self._kept)
-        kind.add(self._added, row.values())
+        kind = self._kinds.get(tuple(row))
+        if kind is None or not kind.add(self._added, row.values()):
+            values = self._fitting(row)
+            names = tuple(values)
+            if names not in self._kinds:
+                file = self._folder / f"log-{len(self._kinds)}{ROWS_SUFFIX}" if self._folder is not None else None
+                self._kinds[names] = _RowKind({name: self._shapes[name] for name in names}, file, self._kept)
+            self._kinds[names].add(self._added, values.values())
         self._added += 1
         if self._folder is not None and self._added % BLOCK_ROWS == 0:
             self.flush()
 
-    @property
-    def _stored(self) -> list[Rows]:
-        return [kind.rows for kind in self._kinds.values() if kind.rows is not None]
+    def _fitting(self, row: dict[str, object]) -> dict[str, NDArray[Any]]:
+        """The row as its columns take it. The first number of a column decides its shape; what does not fit is NaN."""
+        fitting = {}
+        for name, value in row.items():
+            try:
+                number = np.asarray(value)
+            except _NO_NUMBERS:  # rows of unequal length
+                number = np.asarray(None)
+            if number.dtype.kind in "biuf" and number.shape == self._shapes.setdefault(name, number.shape):
+                fitting[name] = number
+                continue
+            self._misfits[name] += value is not None
+            if name in self._shapes:
+                fitting[name] = np.full(self._shapes[name], np.nan)
+            else:
+                self._unknown[name] = self._added
+        return fitting
 
     def flush(self) -> None:
         """Write the rows that wait."""
-        for rows in self._stored:
-            rows.flush()
+        for kind in self._kinds.values():
+            kind.rows.flush()
 
     @property
     def failure(self) -> str | None:
         """Why rows are no longer written; None while they are."""
-        return next((rows.failure for rows in self._stored if rows.failure is not None), None)
+        return next((kind.rows.failure for kind in self._kinds.values() if kind.rows.failure is not None), None)
 
     def remove(self) -> None:
         """Remove the files of the rows; they are in ``log.npz`` by now."""
-        for rows in self._stored:
-            rows.remove()
+        for kind in self._kinds.values():
+            kind.rows.remove()
 
     def columns(self) -> LazyColumns:
         """Every column that the rows have, (n,) or (n, k); without a row ``t_s`` alone.
@@ -157,7 +140,8 @@ class RunLog:
         A value of another shape than its column's first, or none, is NaN, with a warning: one must not cost the others.
         """
         first = self._added - len(self)
-        names = dict.fromkeys(name for kind in self._kinds.values() if kind.has_rows(first) for name in kind.names)
+        names = dict.fromkeys(name for kind in self._kinds.values() if kind.last >= first for name in kind.names)
+        names.update(dict.fromkeys(name for name, last in self._unknown.items() if last >= first))
         return LazyColumns(tuple(names or ("t_s",)), partial(self._make, first))
 
     def arrays(self) -> dict[str, Floats]:
@@ -167,38 +151,19 @@ class RunLog:
 
     def _make(self, first: int, names: Sequence[str]) -> dict[str, Floats]:
         """Columns of the rows from the row `first` on, in one pass."""
-        made = {name: np.full((len(self), *self._shape(name, first)), np.nan) for name in names}
-        misfits: Counter[str] = Counter()
-        for numbers, part in (part for way in self._ways(*names) for part in way(first)):
-            for name in made.keys() & part.keys():
-                out, values = made[name], part[name]
-                if isinstance(values, np.ndarray) and values.shape[1:] == out.shape[1:]:
-                    out[numbers - first] = values
-                    continue
-                for i, value in zip(numbers - first, values, strict=True):
-                    try:
-                        out[i] = value
-                    except _NO_NUMBERS:
-                        misfits[name] += 1
-        for name, count in misfits.items():
-            wanted = f"numbers of shape {made[name].shape[1:]}, as its first is"
-            warnings.warn(f"log: {count} values of column {name!r} are no {wanted}: left NaN", stacklevel=3)
+        made = {name: np.full((len(self), *self._shapes.get(name, ())), np.nan) for name in names}
+        for kind in self._kinds.values():
+            held = made.keys() & kind.names
+            for block in kind.rows.blocks() if held else ():
+                start = int(np.searchsorted(block[NUMBER], first))
+                places = block[NUMBER][start:].astype(np.int64) - first
+                for name in held:
+                    made[name][places] = block[name][start:]
+        for name in names:
+            if count := self._misfits[name]:
+                wanted = f"numbers of shape {made[name].shape[1:]}, as its first is"
+                warnings.warn(f"log: {count} values of column {name!r} are no {wanted}: left NaN", stacklevel=3)
         return made
-
-    def _ways(self, *names: str) -> list[Callable[[int], Iterator[_Part]]]:
-        """Iterators over the rows of kinds that have some of these columns."""
-        kinds = [kind for kind in self._kinds.values() if not set(names).isdisjoint(kind.names)]
-        return [way for kind in kinds for way in (kind.stored, kind.single)]
-
-    def _shape(self, name: str, first: int) -> tuple[int, ...]:
-        """Shape of a column's values; the first of all decides it."""
-        ways = self._ways(name)
-        heads = [next(((n[0], part[name][0]) for n, part in way(first) if name in part), None) for way in ways]
-        known = [head for head in heads if head is not None]
-        try:
-            return np.shape(min(known, key=itemgetter(0))[1]) if known else ()
-        except ValueError:  # rows of unequal length
-            return ()
 
 
 _NO_FEATURES = (math.nan,) * 7

@@ -19,7 +19,6 @@ from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.master.supervision import CycleState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
-from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.rows import joint_columns
 from canprobe.errors import CanprobeError
@@ -27,7 +26,6 @@ from canprobe.fieldbus.bus.port import Port
 
 if TYPE_CHECKING:
     from canprobe.cell.master.patch_reader import PatchReader
-    from canprobe.mechanics.touch import Patch
 
 SILENT_TAXELS = (
     ": interpolated; have the array repaired, or state the taxels as `dead` in [taxels] of its calibration file"
@@ -75,12 +73,12 @@ class SupervisedCycle:
         self.port = port
         self.recorded = seen.measurement
         guard = JointGuard(plan) if plan.setup.arm is not None else None
-        push, patch_from = None, None
+        push = None
         if guard is not None and self.reader is not None:
             from canprobe.cell.master.push_witness import PushWitness
 
-            push, patch_from = PushWitness(guard.model, guard.T_flange_tip, plan.setup.limits.force_max), self.patch
-        self.supervisor = Supervisor(seen, guard, patch_from, push)
+            push = PushWitness(guard.model, guard.T_flange_tip, plan.setup.limits.force_max)
+        self.supervisor = Supervisor(seen, guard, push)
         self._observers, self._log_failure, self._origin_ns = observers, log_failure, origin_ns
         slides = plan.setup.arm.model.chain.prismatic if plan.setup.arm is not None else ()
         self._slides = np.array(slides, dtype=bool) if any(slides) else None
@@ -92,11 +90,6 @@ class SupervisedCycle:
         self.start_ns = cycle.t_first_ns - self._origin_ns
         self.log.start_s = self.start_ns * 1e-9
 
-    def patch(self, sample: TactileSample) -> Patch:
-        """The patch of a sample by the present reader."""
-        assert self.reader is not None
-        return self.reader.read(sample)
-
     def attend(self, controller: Controller) -> None:
         """Report on this controller from now on."""
         self.controller, self._remarks_noted = controller, 0
@@ -105,36 +98,31 @@ class SupervisedCycle:
             self.reader = controller.reader
 
     def begin(self) -> Measurement:
-        """SYNC, TPDOs, measurement. A cycle that an error has left before its commands and its row gets both first."""
+        """SYNC, TPDOs, measurement, for supervision and controller to see; what is new is noted.
+
+        A cycle that an error has left before its commands and its row gets both first.
+        """
         self.record_last()
         if self.cycle.begun:  # the next SYNC keeps the period
             self.cycle.end(None)
         measurement = self.cycle.begin()
-        self._look(measurement, self.cycle)
-        return measurement
-
-    def _look(self, measurement: Measurement, cycle: Cycle) -> None:
-        """Let the supervision see the cycle, and the controller the array; note what is new."""
         self.note_alarms()
         supervisor, controller = self.supervisor, self.controller
         seen = supervisor.seen
         seen.restarts, seen.compares_motion = controller.restarts, controller.compares_motion
+        seen.counters, seen.controller_state = self.port.counters, self.port.state
+        seen.log_failure = self._log_failure() or self.log.failure
         for remark in controller.remarks[self._remarks_noted :]:
             self._remarks_noted += 1
             self.notes.add(remark, t_s=self.run_s(measurement))
             self.say(remark)
         if self.reader is not None and measurement.tactile is not None:
-            self.reader.read(measurement.tactile)
+            patch = self.reader.read(measurement.tactile)
+            seen.patch = patch if seen.drives is not None else None
             seen.silent_taxels = self.reader.found
-        supervisor.step(
-            measurement,
-            sync_ns=cycle.sync_ns,
-            overruns=cycle.statistics.overruns,
-            counters=self.port.counters,
-            controller_state=self.port.state,
-            log_failure=self._log_failure() or self.log.failure,
-        )
+        supervisor.step(measurement, self.cycle.sync_ns, self.cycle.statistics.overruns)
         controller.array_alive = supervisor.array_alive
+        return measurement
 
     def record(self, measurement: Measurement, command: Command | None) -> None:
         """Write the row of a cycle, and show it to the observers."""
@@ -201,5 +189,5 @@ class SupervisedCycle:
                 f" {blind}; look, and {free}"
             )
         elif force := self.supervisor.pressing():
-            least = "at least " if self.supervisor.shows_a_part else ""
+            least = "at least " if self.supervisor.seen.shows_a_part else ""
             self.notes.add(f"the probe is left pressing with {least}{force:.1f} N: {free}")

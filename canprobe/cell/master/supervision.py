@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.image_witness import ImageWitness
-from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
@@ -23,9 +22,7 @@ from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.touch.image.force_errors import upper_end
-from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
-from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.master.array import ArrayReceiver
@@ -33,14 +30,6 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch import Patch
     from canprobe.mechanics.touch.depth_witness import DepthWitness
 
-HOLD_CYCLES = 3
-"""Cycles without a TPDO of one drive after which all of them hold."""
-MAX_HOLD_NS = 1_000_000_000
-"""Longest hold."""
-CONTACT_LOST_NS = 30_000_000
-"""Time without contact force in a touch after which the contact is lost."""
-FORCE_HIDDEN_NS = 20_000_000
-"""Time with a force that the array shows only in part, after which the force may be above the limit."""
 TORQUE_MEAN_NS = 25_000_000
 """Time over which torques are averaged for the push that they show; two in a row must show a push."""
 TACTILE_TIMEOUT_PERIODS = 6
@@ -96,7 +85,7 @@ def limits_of(plan: Plan) -> Limits:
         tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
         regain=scan.regain if scan is not None else 0.0,
         tares=setup.tares,
-        lag_ns=round((lag_s(setup) + (setup.arm.profile_lag if setup.arm is not None else 0.0)) * 1e9),
+        lag_ns=round(lag_s(setup) * 1e9),
     )
 
 
@@ -124,7 +113,7 @@ class CycleState:
         log_failure: why frames are no longer written down; None while they are.
         compares_motion: the controller compares the motion of the joints with its targets itself.
         unfelt: push in the drives' torques that the array does not measure, N; None without one.
-        force: force that the array measures, N.
+        patch: patch in the last image of the array; None before it, and without an arm that could press.
     """
 
     limits: Limits
@@ -147,7 +136,17 @@ class CycleState:
     log_failure: str | None = None
     compares_motion: bool = False
     unfelt: float | None = None
-    force: float = 0.0
+    patch: Patch | None = None
+
+    @property
+    def force(self) -> float:
+        """Force that the array measures, N; 0 where nothing can press."""
+        return 0.0 if self.patch is None else self.patch.force
+
+    @property
+    def shows_a_part(self) -> bool:
+        """Whether the array shows only a part of the force: it is saturated, or the contact runs off it."""
+        return self.patch is not None and not math.isfinite(self.patch.sigma.total)
 
 
 @dataclass(slots=True, eq=False)
@@ -166,7 +165,6 @@ class TouchState:
         bridged_s: time for which that share has been above `MAX_BRIDGED_SHARE`.
         path: the touch is a scan, which may search for a contact that it has lost.
         searched: distance towards the object that was searched since then, m.
-        limit: message of a joint or workspace limit that is reached; None without one.
         force_sigma: standard deviation of the force, N; infinite where the array shows only a lower bound of it.
         images: whether the images of the array live.
         depth: depth of the probe in the surface that it has touched before; None where nobody follows it.
@@ -182,7 +180,6 @@ class TouchState:
     bridged_s: float = 0.0
     path: bool = False
     searched: float = 0.0
-    limit: str | None = None
     force_sigma: float = 0.0
     images: ImageWitness = field(default_factory=ImageWitness)
     depth: DepthWitness | None = None
@@ -215,25 +212,6 @@ class TouchState:
             return 0.0
         return (t_ns - self._since_ns.setdefault(what, t_ns)) * 1e-9
 
-    def look(self, sample: TactileSample, patch: Patch, centre: Floats | None, sigma: float | None = None) -> None:
-        """Look whether the array lives, by a sample and its patch.
-
-        Args:
-            sample: the sample.
-            patch: patch that it shows.
-            centre: (3,) centre of the probe then, m; None where it is not known.
-            sigma: standard deviation of the centroid from image to image, m, where the calibration states it.
-        """
-        self.images.look(
-            sample.t_sample_ns,
-            sample.image,
-            pressed=patch.force > TOUCH_FORCE,
-            uv=(patch.u, patch.v),
-            highest=COUNTS_MAX if sample.frame.features else int(sample.frame.taxels.max()),
-            centre=centre,
-            sigma=sigma,
-        )
-
 
 class Reaction(Enum):
     """The reaction of the cell to a condition, the mildest first."""
@@ -256,8 +234,8 @@ class Condition:
         reaction: reaction of the cell.
         within: longest time from the fault to the reaction, ns; None where no such time applies.
         check: function of a `CycleState` in every cycle, or of a `TouchState` in a touch; it returns the error that
-            names what is wrong, or None. A condition without check and count shows by itself: an exception, a dead
-            master.
+            names what is wrong, or None. A condition without check and count shows by itself: a target beyond a
+            limit, an exception, a dead master.
         count: function of a `CycleState`; it returns how often a condition that does not stop the cell has happened.
         touch: the check takes a `TouchState`.
         enabling: the check holds already while the drives are enabled.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,16 +13,15 @@ from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touc
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.supervision import CycleState, Finding, Reaction, TouchState
 from canprobe.cell.master.tactile_frame import TactileSample
-from canprobe.cell.master.trail import GrowingForce
 from canprobe.cell.planning.model import Plan
-from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.errors import SafetyStop
+from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.master.push_witness import PushWitness
-    from canprobe.mechanics.touch import Patch
 
 MAX_SPEED_SHARE = 1.5
 """Share of the speed limit above which a measured motion is no motion of the arm; SYNCs may be late by a period."""
@@ -32,14 +30,6 @@ ENCODER_TOLERANCE_COUNTS = 2
 _ROUNDING = 1e-9
 _NUMBER_KINDS = "fiu"
 """Kinds of numpy dtypes that can be joint positions."""
-
-
-@dataclass(frozen=True, slots=True)
-class GuardedTarget:
-    """A joint target as it may be sent (n,), rad or m; or why it may not."""
-
-    q: Floats | None
-    limit: str | None = None
 
 
 def outside_workspace(tip: Floats, workspace: Floats, name: str = "the probe's tip") -> str | None:
@@ -112,8 +102,12 @@ class JointGuard:
         way = self.model.joints[joint].text(abs(self._q[joint] - before[joint]))
         return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
 
-    def command(self, q_target: Floats, measurement: Measurement) -> GuardedTarget:
-        """The target that may be sent for `q_target` (n,), rad or m."""
+    def command(self, q_target: Floats, measurement: Measurement) -> Floats:
+        """The target that may be sent for `q_target` (n,), rad or m: it or, where that is too far, one on the way.
+
+        Raises:
+            SafetyStop: it is no target, or beyond a limit of a joint or of the workspace.
+        """
         n = len(self._range)
         if type(q_target) is not np.ndarray or q_target.dtype != np.float64:
             try:
@@ -121,7 +115,7 @@ class JointGuard:
             except (TypeError, ValueError):
                 given = np.array(None)
             if given.dtype.kind not in _NUMBER_KINDS or isinstance(given, np.ma.MaskedArray):
-                return GuardedTarget(None, f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
+                raise SafetyStop(f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
             target = np.asarray(given, dtype=np.float64)
         else:
             target = q_target
@@ -133,21 +127,21 @@ class JointGuard:
         if not all(inside) and not self._goes_back(wanted, last):
             if not all(map(math.isfinite, wanted)):
                 got = f"is {target}" if target.shape == (n,) else f"has shape {target.shape}"
-                return GuardedTarget(None, f"the controller's q_target {got}: expected {n} finite {self._si}")
+                raise SafetyStop(f"the controller's q_target {got}: expected {n} finite {self._si}")
             joint = inside.index(False)
             where = self.model.joints[joint].text(wanted[joint])
-            return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")
+            raise SafetyStop(f"joint {joint + 1} at {where}, its stop")
         if self._workspace is not None and (left := self.outside(target)) is not None:
-            return GuardedTarget(None, left)
+            raise SafetyStop(left)
         if last is not None:
             joints = zip(wanted, last, self._speed, strict=True)
             share = max([abs(q - was) / speed for q, was, speed in joints]) / (self._period_ns * 1e-9)
             if share > 1.0 + _ROUNDING:
                 self.slowed += 1
                 self._target = [was + (q - was) / share for q, was in zip(wanted, last, strict=True)]
-                return GuardedTarget(np.array(self._target))
+                return np.array(self._target)
         self._target = wanted
-        return GuardedTarget(q_target)
+        return q_target
 
     def _goes_back(self, wanted: list[float], last: list[float] | None) -> bool:
         """Whether joints that are out of their range stand or move back into it, as far as the last target knows."""
@@ -205,7 +199,6 @@ class Supervisor:
     Args:
         seen: the cell; brought up to date by :meth:`step`.
         guard: guard of the joints; None without an arm.
-        patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
         push: witness of the force by the drives' torques; None without touch.
 
     Attributes:
@@ -214,51 +207,33 @@ class Supervisor:
         array_alive: whether an image of the array has changed since bring-up.
     """
 
-    def __init__(
-        self,
-        seen: CycleState,
-        guard: JointGuard | None,
-        patch_from: Callable[[TactileSample], Patch] | None,
-        push: PushWitness | None = None,
-    ) -> None:
+    def __init__(self, seen: CycleState, guard: JointGuard | None, push: PushWitness | None = None) -> None:
         self.seen = seen
         self.counts: dict[str, int] = dict.fromkeys((key for key, _ in COUNTERS), 0)
         self.first: dict[str, int] = {}
         self.array_alive = False
-        self._patch_from = patch_from
         self._guard = guard
         self._contact = TouchState(seen.limits)
         self._push = push
         self._sample: TactileSample | None = None
         self._press = PressDetector()
-        self._growing = GrowingForce(seen.limits.cycles_to_turn)
         self._look_ns = 0
         self._untouched = seen.limits.tares
-        self._late: deque[tuple[int, int]] = deque()  # while one of them is late, the last second's cycles
+        self._late: deque[tuple[int, int]] = deque()  # times of the last second's cycles, and whether they were late
         self._late_sum = 0
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
 
-    def step(
-        self,
-        measurement: Measurement,
-        *,
-        sync_ns: int,
-        overruns: int,
-        counters: PortCounters,
-        controller_state: ControllerState,
-        log_failure: str | None = None,
-    ) -> None:
-        """Take in one cycle."""
+    def step(self, measurement: Measurement, sync_ns: int, overruns: int) -> None:
+        """Take in one cycle, of which `seen` has what lies outside of the measurement: bus, patch, controller, log."""
         seen = self.seen
         self._count_late(overruns - seen.overruns, measurement.t_ns)
         seen.overruns = overruns
         seen.gap_ns = sync_ns - seen.sync_ns if seen.sync_ns else 0
-        seen.measurement, seen.sync_ns, seen.counters = measurement, sync_ns, counters
-        if controller_state is not ControllerState.PASSIVE:
+        seen.measurement, seen.sync_ns = measurement, sync_ns
+        if seen.controller_state is not ControllerState.PASSIVE:
             self._active_ns = measurement.t_ns
         seen.passive_ns = measurement.t_ns - self._active_ns
-        seen.controller_state, seen.log_failure = controller_state, log_failure
         seen.speeding = self._guard.measure(measurement) if self._guard is not None else None
         if (sample := measurement.tactile) is not None:
             self.array_alive = self.array_alive or (self._sample is not None and sample.differs_from(self._sample))
@@ -266,9 +241,8 @@ class Supervisor:
         if self._untouched:
             self._untouched = not measurement.enabled
             if measurement.tactile is not None:
-                seen.preload = max(seen.preload, self.felt())
+                seen.preload = max(seen.preload, seen.force)
         if self._push is not None:
-            seen.force = self.felt()
             self._push.step(measurement, seen.force)
             seen.unfelt = self._push.unfelt
         if measurement.t_ns >= self._look_ns:
@@ -281,14 +255,9 @@ class Supervisor:
 
     def _count_late(self, late: int, t_ns: int) -> None:
         """Late cycles are longer than others: the last second has fewer of them."""
-        cycles = self._late
-        if not self._late_sum:
-            cycles.clear()
-            if not late:
-                self.seen.late_share = 0.0
-                return
-            in_time = range(self.seen.measurement.t_ns, t_ns - SECOND_NS, -self.seen.limits.period_ns)
-            cycles.extend((before_ns, 0) for before_ns in reversed(in_time))
+        cycles, period_ns = self._late, self.seen.limits.period_ns
+        if not cycles:  # as if a second in time had passed before the first one
+            cycles.extend((before_ns, 0) for before_ns in range(t_ns - SECOND_NS + period_ns, t_ns, period_ns))
         cycles.append((t_ns, late))
         self._late_sum += late
         while cycles[0][0] <= t_ns - SECOND_NS:
@@ -312,46 +281,24 @@ class Supervisor:
         """Whether a condition holds that forbids every motion."""
         return any(c.reaction is Reaction.STOP and c.check(self.seen) is not None for c in CYCLE_CHECKS)  # type: ignore[misc]
 
-    def felt(self) -> float:
-        """The force of the last tactile sample, N; 0 where nothing can press."""
-        if self._sample is None or self._patch_from is None:
-            return 0.0
-        return self._patch_from(self._sample).force
-
-    @property
-    def shows_a_part(self) -> bool:
-        """Whether the array shows only a part of the force: it is saturated, or the contact runs off it."""
-        if self._sample is None or self._patch_from is None:
-            return False
-        return not math.isfinite(self._patch_from(self._sample).sigma.total)
-
-    def begin_way_back(self) -> None:
-        """Begin to watch a way back of the probe."""
-        self._growing = GrowingForce(self.seen.limits.cycles_to_turn)
-
-    def witness_grows(self, measurement: Measurement) -> bool:
-        """Whether a witness shows that the way back leads into the object: it is asked in each cycle of one."""
-        return self._growing.grows(measurement.cycle, self.felt(), a_part=self.shows_a_part)
-
     def pressing(self) -> float:
         """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""
         self._look()
-        force = self.felt()
+        force = self.seen.force
         return force if self._press.holds(force) else 0.0
 
     def _look(self) -> None:
         q = self.seen.measurement.q
         if self._sample is not None and q is not None and self._guard is not None:
-            self._press.look(self.felt(), self._guard.T_base_tip(q))
+            self._press.look(self.seen.force, self._guard.T_base_tip(q))
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
         """The first condition of a touch that holds, for a controller that does not guard its contact itself."""
-        sample = measurement.tactile
-        if self._patch_from is not None and sample is not None:
-            patch = self._patch_from(sample)
+        sample, patch = measurement.tactile, self.seen.patch
+        if sample is not None and patch is not None:
             self._contact.update_force(patch, sample.t_sample_ns)
             if measurement.q is not None and self._guard is not None:
-                self._contact.look(sample, patch, self._guard.T_base_tip(measurement.q)[:3, 3])
+                self._contact.images.look(sample, patch, self._guard.T_base_tip(measurement.q)[:3, 3])
         self._contact.tactile_age = measurement.tactile_age
         return touch_finding(self._contact)
 
@@ -359,11 +306,12 @@ class Supervisor:
         """The command that may be sent: a target too far away is approached, a target out of bounds is left out."""
         if command.q_target is None or self._guard is None:
             return command, None
-        guarded = self._guard.command(command.q_target, self.seen.measurement)
+        try:
+            q = self._guard.command(command.q_target, self.seen.measurement)
+        except SafetyStop as stop:
+            return replace(command, q_target=None), Finding(BY_KEY["joint_stop"], stop)
         self.seen.slowed = self._guard.slowed
-        if guarded.limit is not None:
-            return replace(command, q_target=None), touch_finding(TouchState(self.seen.limits, limit=guarded.limit))
-        return (command if guarded.q is command.q_target else replace(command, q_target=guarded.q)), None
+        return (command if q is command.q_target else replace(command, q_target=q)), None
 
     def notes(self) -> list[str]:
         """Conditions that happened and did not stop the cell, a line each."""

@@ -112,8 +112,6 @@ class NodeWatch:
 
     def news(self) -> list[EmcyEvent]:
         """Alarms since the last call, the last `MAX_NEW_ALARMS` of them."""
-        if not self._untold:
-            return []
         news = list(self._untold)
         self._untold.clear()
         return news
@@ -142,12 +140,8 @@ class NodeWatch:
     def silent(self, t_ns: int) -> int | None:
         """A node that has been silent for longer than the time-out, or None."""
         limit = t_ns - HEARTBEAT_CONSUMED_MS * 1_000_000
-        if min(self.heard_ns.values(), default=limit) >= limit:
-            return None  # as in every cycle
         return next((node_id for node_id, heard in self.heard_ns.items() if heard < limit), None)
 
     def not_in(self, state: NmtState) -> int | None:
         """A node whose last heartbeat has another state than `state`, or None."""
-        if list(self.states.values()).count(state) == len(self.states):
-            return None  # as in every cycle
         return next((node_id for node_id, seen in self.states.items() if seen is not state), None)

@@ -225,7 +225,7 @@ def _within_speeds(setup: Setup, axes: Iterable[DriveAxis]) -> tuple[Setup, tupl
         for joint, factor in zip(limits, slowest.tolist(), strict=True)
         if factor < 1.0
     )
-    lag = f"their lag of {1e3 * lag_s(setup):.3g} ms (servo.drive_lag_ms, plant.drive_bandwidth_hz), "
+    lag = f"their lag of {1e3 * stated_lag_s(setup):.3g} ms (servo.drive_lag_ms, plant.drive_bandwidth_hz), "
     warning = (
         f"{' and '.join(f'{index:04X}h' for index in sorted(objects))}: drives that fault below the speeds of their"
         f" joints; the plan keeps within {told}. If that is wrong, check {lag * (FOLLOWING_WINDOW in objects)}60A9h in"
@@ -245,18 +245,29 @@ def _lowest_limit(axis: DriveAxis, wanted: float) -> _SpeedLimit:
     turn, _ = axis.motor_turn
     if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
         limits.append(_SpeedLimit(MOTOR_SPEED_LIMIT, rpm / 60.0 * turn, rounding))
-    entry, window, lag = device.description.entry(FOLLOWING_WINDOW), device.number(FOLLOWING_WINDOW), lag_s(axis.setup)
+    entry, window = device.description.entry(FOLLOWING_WINDOW), device.number(FOLLOWING_WINDOW)
+    lag = stated_lag_s(axis.setup)
     if entry is not None and window is not None and window != NO_WINDOW and lag > 0.0:
         widens = entry.writable and entry.allows(axis.following_window)
         limits += [] if widens else [_SpeedLimit(FOLLOWING_WINDOW, window / lag, ROUNDING_COUNTS / lag)]
     return min(limits, key=lambda limit: limit.left)
 
 
-def lag_s(setup: Setup) -> float:
+def stated_lag_s(setup: Setup) -> float:
     """Lag of the drives behind a ramp, s: the larger of the scene's and the emulated drives'; 0: unknown."""
     believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
     emulated = any(drive.emulated for drive in setup.drives)
     return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
+
+
+def lag_s(setup: Setup, unstated_s: float = 0.0) -> float:
+    """Lag of the drives behind a ramp with that of profile position, s.
+
+    Args:
+        setup: the closed setup.
+        unstated_s: lag where none is stated: a bound takes the longest one, s.
+    """
+    return (stated_lag_s(setup) or unstated_s) + (setup.arm.profile_lag if setup.arm is not None else 0.0)
 
 
 def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, DeviceCapabilities]) -> tuple[Setup, tuple[str, ...]]:

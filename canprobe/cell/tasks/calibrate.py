@@ -105,6 +105,18 @@ class TouchSeries(ProbingTask):
             self.retreat(f"{self._found_nothing(f'touch {self._number + 1}: no {what} found', way)}; or {remedy}")
         return self._at(self._gone)
 
+    def _press_on(self, force: float, longest: float, where: str, remedy: str) -> bool:
+        """Press on slowly until a force is reached, N; whether it is. Words for one that is not, a way beyond, m."""
+        if self._touch.force >= force:
+            self._enter(Phase.SCAN)
+            return True
+        if self._gone > longest:
+            got = f"got {self._touch.force:.2f} N{remedy}"
+            self.retreat(f"touch {self._number + 1}: expected {force:g} N {where}, {got}")
+        else:
+            self._gone += PRESS_SPEED * self._dt
+        return False
+
 
 class CalibrateTask(TouchSeries):
     """Touches the ball again and again, and estimates the tool in the end.
@@ -161,17 +173,10 @@ class CalibrateTask(TouchSeries):
         return self._come(TOUCH_FORCE, "ball", remedy)
 
     def _settle(self) -> ProbePose:
-        """Press on slowly until the force is reached."""
-        if self._touch.force >= self._task.force:
+        way = self._approach_of.search
+        remedy = f" {way * 1e3:g} mm beyond: fix the ball in its place, or correct task.start_mm"
+        if self._press_on(self._task.force, way, "at the ball", remedy):
             self._felt = []
-            self._enter(Phase.SCAN)
-        elif self._gone > self._approach_of.search:
-            self.retreat(
-                f"touch {self._number + 1}: expected {self._task.force:g} N at the ball, got {self._touch.force:.2f} N"
-                f" {self._approach_of.search * 1e3:g} mm beyond: fix the ball in its place, or correct task.start_mm"
-            )
-        else:
-            self._gone += PRESS_SPEED * self._dt
         return self._at(self._gone)
 
     def _scan(self) -> ProbePose:
@@ -368,18 +373,10 @@ class RollTask(TouchSeries):
         return self._come(TOUCH_FORCE + self._floor, "object", "move the object there, or correct its place")
 
     def _settle(self) -> ProbePose:
-        """Press on slowly until the force is reached."""
-        press = self.presses[self._number]
-        if self._touch.force >= press.force:
+        press, where = self.presses[self._number], f"within {MAX_PRESS_WAY * 1e3:g} mm of the first touch"
+        remedy = ": fix the object in its place"
+        if self._press_on(press.force, self._touched_at + MAX_PRESS_WAY, where, remedy):
             self.pressed.append(RollRecord(press))
-            self._enter(Phase.SCAN)
-        elif self._gone > self._touched_at + MAX_PRESS_WAY:
-            self.retreat(
-                f"touch {self._number + 1}: expected {press.force:g} N within {MAX_PRESS_WAY * 1e3:g} mm of the first"
-                f" touch, got {self._touch.force:.2f} N: fix the object in its place"
-            )
-        else:
-            self._gone += PRESS_SPEED * self._dt
         return self._at(self._gone)
 
     def _scan(self) -> ProbePose:

@@ -36,19 +36,9 @@ REFINED_METHODS = ("recursive", "ml")
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
     """The contact sensing of a task, for its arm, probe and array."""
     from canprobe.cell.tasks.sensing import ContactSensing
-    from canprobe.mechanics.touch import MomentImage, make_patch_calibration
 
-    calibration = make_patch_calibration(task.array.calibration, task.array.pad)
-    return ContactSensing(
-        task.arm.model,
-        task.probe.T_flange_probe,
-        calibration,
-        task.probe.radius,
-        task.probe.stiffness,
-        noise=task.array.calibration.noise,
-        moment_image=MomentImage(calibration) if isinstance(task, Touch) and _uses_patch(task) else None,
-        lag=task.array.calibration.centroid.lag,
-    )
+    moments = isinstance(task, Touch) and _uses_patch(task)
+    return ContactSensing(task.arm, task.probe, task.array, moments=moments)
 
 
 def centroid_coupling(probe: Probe) -> float:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.planning.units import lag_s
+from canprobe.cell.planning.units import stated_lag_s
 from canprobe.cell.tasks.hand_motion import HandMotion
 from canprobe.cell.tasks.hand_way import HandWay
 from canprobe.errors import UsageError
@@ -50,7 +50,7 @@ class GuidedArm(Controller):
     def __init__(self, plan: Plan, attend: Callable[[Measurement], None], update: Callable[[], None] = nothing) -> None:
         self._plan, self._attend, self._update = plan, attend, update
         self.reader = make_patch_reader(plan.setup)
-        settle_s = SETTLE_LAGS * (lag_s(plan.setup) or USUAL_LAG_S)
+        settle_s = SETTLE_LAGS * (stated_lag_s(plan.setup) or USUAL_LAG_S)
         settle_ns = round(1e9 * (settle_s + PROFILE_LAGS * plan.setup.needed_arm().profile_lag))
         self._standing_ns = settle_ns + CYCLES * plan.sync.period_ns
         if 1e-9 * self._standing_ns + RENEWED_S >= LIFETIME_S:

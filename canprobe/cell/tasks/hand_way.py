@@ -346,5 +346,4 @@ def touch_speed(plan: Plan) -> float | None:
     shown = setup.limits.jog_force
     forces = (shown, 0.5 * (shown + setup.limits.force_max))
     depths = [depth_at(force, setup.probe, setup.array, (0.0, 0.0)) for force in forces]
-    lag = lag_s(setup) + setup.needed_arm().profile_lag
-    return (depths[1] - depths[0]) / blind_s(setup.rate_hz, setup.array, lag)
+    return (depths[1] - depths[0]) / blind_s(setup.rate_hz, setup.array, lag_s(setup))

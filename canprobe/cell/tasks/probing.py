@@ -237,7 +237,7 @@ class ProbingTask(Task):
         touch, sensing = self._touch, self.sensing
         centre = contact.T_base_probe[:3, 3] if contact is not None else sensing.probe_centre(sample.t_sample_ns)
         normal = contact.n_base if contact is not None else None
-        touch.look(sample, patch, centre, sensing.image_sigma if contact is not None else None)
+        touch.images.look(sample, patch, centre, sensing.image_sigma if contact is not None else None)
         if not self._follows_depth or self.phase not in _IN_CONTACT:
             return
         if centre is None or patch.saturated or patch.off_pad:

@@ -13,19 +13,11 @@ import numpy as np
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.patch_reader import PatchReader
 from canprobe.cell.master.tactile_frame import TactileSample
+from canprobe.cell.scene.setup import Arm, Array, Probe
 from canprobe.mechanics.robot.chain import ending_in, forward
 from canprobe.mechanics.robot.model import ArmModel, position_sigma
-from canprobe.mechanics.touch import (
-    ContactSample,
-    MomentImage,
-    Patch,
-    PatchCalibration,
-    Slope,
-    contact_sample,
-    indentation_from_force,
-)
+from canprobe.mechanics.touch import MomentImage, contact_sample, indentation_from_force, make_patch_calibration
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE
-from canprobe.mechanics.touch.image.calibration import ContactNoise, Lag
 from canprobe.mechanics.touch.image.moments import Moments
 from canprobe.mechanics.touch.image.pad_lag import PadLag
 from canprobe.mechanics.touch.image.silent_taxels import mended
@@ -33,7 +25,7 @@ from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import SurfaceEstimate
+    from canprobe.mechanics.touch import ContactSample, Patch, Slope, SurfaceEstimate
 
 
 MAX_STIFFNESS_RATIO = 6.0
@@ -86,36 +78,24 @@ class ContactSensing:
     """Turns tactile samples into contacts in the base frame.
 
     Args:
-        model: the arm.
-        flange_probe: transform (4, 4) from the probe's centre frame (z = pole) to the flange.
-        calibration: calibration of the array.
-        radius: radius of the probe, m.
-        stiffness: K/h of the layer, N/m³.
-        moment_image: gives the contacts the second moments of their images; None leaves them out.
-        noise: noise of the contacts; None: they do not state any.
-        lag: lag of the array's centroids behind the contact; None: no lag.
+        arm, probe, array: the arm, and what it touches with.
+        moments: the contacts have the second moments of their images.
 
     Attributes:
+        model: the arm.
+        flange_probe: transform (4, 4) from the probe's centre frame (z = pole) to the flange.
+        radius: radius of the probe, m.
+        stiffness: K/h of the layer, N/m³.
         slope: slope that the last touch showed; None before.
     """
 
-    def __init__(
-        self,
-        model: ArmModel,
-        flange_probe: Floats,
-        calibration: PatchCalibration,
-        radius: float,
-        stiffness: float,
-        *,
-        noise: ContactNoise | None = None,
-        moment_image: MomentImage | None = None,
-        lag: Lag | None = None,
-    ) -> None:
-        self.model = model
-        self.flange_probe = flange_probe
-        self._chain = ending_in(model.chain, flange_probe)
-        self.radius = radius
-        self.stiffness = stiffness
+    def __init__(self, arm: Arm, probe: Probe, array: Array, *, moments: bool) -> None:
+        calibration = make_patch_calibration(array.calibration, array.pad)
+        self.model: ArmModel = arm.model
+        self.flange_probe: Floats = probe.T_flange_probe
+        self._chain = ending_in(arm.model.chain, probe.T_flange_probe)
+        self.radius: float = probe.radius
+        self.stiffness: float = probe.stiffness
         self.slope: Slope | None = None
         self._settled = True
         self.set_kappa(np.zeros(2))
@@ -124,9 +104,11 @@ class ContactSensing:
         self.image_sigma: float | None = None
         """Standard deviation of the last centroid from image to image, m; None where the calibration states none."""
         self.reader = PatchReader(calibration)
-        self._noise = noise
-        self._level_pa = MomentImage(calibration).level_pa
-        self._moment_image = moment_image
+        self._noise = array.calibration.noise
+        moment_image = MomentImage(calibration)
+        self._level_pa = moment_image.level_pa
+        self._moment_image = moment_image if moments else None
+        lag = array.calibration.centroid.lag
         self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
 
@@ -195,8 +177,8 @@ class ContactSensing:
         depth = self.depth(patch.force)
         # over the peak of the layer at this depth: that of one image has the noise of one taxel, and steers the servo
         lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
-        image_sigma = 0.0 if self._noise is None else self._noise.image(lightness)
-        self.image_sigma = image_sigma if self._noise is not None and not self._noise.assumed else None
+        image_sigma = self._noise.image(lightness)
+        self.image_sigma = None if self._noise.assumed else image_sigma
         found = contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,
@@ -204,12 +186,12 @@ class ContactSensing:
             depth=depth,
             radius=self.radius,
             force_n=patch.force,
-            sigma_point=None if self._noise is None else self._noise.lateral(lightness),
+            sigma_point=self._noise.lateral(lightness),
             moments=self._moments(patch),
             doubts=patch.doubts,
             slope=self.slope,
-            sigma_height=None if self._noise is None else self._noise.height,
-            sigma_slow=0.0 if self._noise is None else self._noise.slow,
+            sigma_height=self._noise.height,
+            sigma_slow=self._noise.slow,
         )
         if not sample.t_sigma_s:
             return found

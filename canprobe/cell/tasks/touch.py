@@ -331,17 +331,14 @@ class TouchTask(ProbingTask):
             self._doubt_array(finding)
             self.retreat(str(finding.error))
 
-    def retreat(self, reason: str | None) -> None:
-        """Let go, for a reason or because the work is done; nothing changes where the task is letting go already."""
-        if not self._begun or self.phase in LEAVING:
-            return
+    def retreat(self, reason: str) -> None:
+        if self.phase not in LEAVING:  # where the task is letting go already nothing changes
+            super().retreat(reason)
+
+    def _let_go(self) -> None:
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
-        self.reason = reason
         self._draw_back(-RETREAT_WAY * self._motion.pose.pole)
-
-    def stop(self) -> None:
-        self.retreat(None)
 
     # phases: each returns the pose for this cycle
 
@@ -403,7 +400,7 @@ class TouchTask(ProbingTask):
             self._velocity = (pose.centre - self._asked.centre) / self._dt
         self._asked = pose
         if left <= 0:
-            self.retreat(None)
+            self.stop()
         return pose
 
     def _pace(self, left: float) -> float:
@@ -423,7 +420,7 @@ class TouchTask(ProbingTask):
 
     def _regain(self) -> ProbePose:
         if self._scan_t >= self._task.duration_s:
-            self.retreat(None)
+            self.stop()
         if self._search is None:
             if self._t >= REST_S:
                 self._enter(Phase.SCAN)

@@ -16,7 +16,7 @@ from canprobe.cell.scene.setup import SafetyLimits
 from canprobe.cell.tasks.task import MotionTime
 from canprobe.errors import UsageError
 from canprobe.mechanics.robot.model import ArmModel
-from canprobe.mechanics.touch.checks import checked, instance, real_numbers
+from canprobe.mechanics.touch.checks import checked, instance
 from canprobe.mechanics.types import Floats
 
 FIRST_POINT_TOLERANCE_RAD = 0.01
@@ -173,22 +173,13 @@ class Trajectory(Controller):
 def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Floats, Floats]:
     """Times (m,) s and positions (m, n) of the points, finite and in the order of time."""
     try:
-        rows = list(points)
-    except TypeError as error:
+        rows = [(time, positions) for time, positions in points]
+    except (TypeError, ValueError) as error:
         raise UsageError(f"trajectory: expected (time, positions) of each point, got {points!r}") from error
     if not rows:
         raise UsageError("trajectory: expected (time, positions) of each point, got no point")
-    try:
-        times = real_numbers([time for time, _ in rows])
-        q = real_numbers([positions for _, positions in rows])
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"trajectory: expected (time, positions) of each point: {error}") from error
-    if times.shape != (len(rows),):
-        raise UsageError(f"trajectory: expected one time in each point, got shape {times.shape[1:]}")
-    if q.shape != (len(rows), n):
-        raise UsageError(f"trajectory: expected {n} positions in each point, got {q.shape[1:]}")
-    if not (np.isfinite(times).all() and np.isfinite(q).all()):
-        raise UsageError("trajectory: expected finite times and positions, got NaN or infinity")
+    times = checked("trajectory: times of the points", [time for time, _ in rows], (len(rows),))
+    q = checked("trajectory: positions of the points", [positions for _, positions in rows], (len(rows), n))
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
         raise UsageError("trajectory: expected times from 0 on, each later than the one before")
     return times, q

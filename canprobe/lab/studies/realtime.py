@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
-from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock, wake_lateness
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
@@ -140,21 +140,6 @@ class Measured:
         return 1e4 * self.overruns / max(1, self.cycles)
 
 
-def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
-    """Wake at a number of deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
-
-    Yields:
-        The deadline, ns, or the last one that has passed by then.
-    """
-    deadline_ns = clock.now_ns() + period_ns
-    for _ in range(cycles):
-        clock.sleep_until_ns(deadline_ns)
-        lateness.append(clock.now_ns() - deadline_ns)
-        deadline_ns += lateness[-1] // period_ns * period_ns
-        yield deadline_ns
-        deadline_ns += period_ns
-
-
 def measure_scan(seconds: float) -> Measured:
     """The scene `cylinder` with servo and estimator."""
     return _measured("whole controller", _scene({"task.duration_s": seconds}), make_task)
@@ -162,10 +147,12 @@ def measure_scan(seconds: float) -> Measured:
 
 def measure_bare(seconds: float) -> Measured:
     """A loop that wakes at every deadline and does nothing: the machine's own lateness."""
-    period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
+    clock, period_ns = MonotonicClock(), round(1e9 / RATE_HZ)
     with realtime(MASTER_PRIORITY, lambda _: None):  # the first case has reported missing permissions
-        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
-    return Measured("bare clock", "none", RATE_HZ, lateness, (deadlines[-1] - deadlines[0]) * 1e-9)
+        first_ns = clock.now_ns() + period_ns
+        lateness = wake_lateness(clock, period_ns, round(seconds * RATE_HZ))
+        held_s = (clock.now_ns() - first_ns) * 1e-9
+    return Measured("bare clock", "none", RATE_HZ, lateness, held_s)
 
 
 def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:

@@ -30,7 +30,7 @@ from canprobe.fieldbus.tools.faults.fault import Effect, Fault
 from canprobe.lab.studies.linear_loop import ForceLoop
 from canprobe.lab.studies.result import Row
 from canprobe.lab.studies.witnessed_run import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
-from canprobe.mechanics.touch import Slope, indentation_from_force, make_patch_calibration
+from canprobe.mechanics.touch import Slope, indentation_from_force
 
 LOOK_NS = 1_250_000
 HUNTING_SPREAD = 0.2
@@ -116,9 +116,7 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     """The scene's sensing, of another kind."""
     setup = resolve(scene)
     assert setup.arm is not None and setup.array is not None
-    array, probe = setup.array, setup.probe
-    patch = make_patch_calibration(array.calibration, array.pad)
-    return kind(setup.arm.model, probe.T_flange_probe, patch, probe.radius, probe.stiffness)
+    return kind(setup.arm, setup.probe, setup.array, moments=False)
 
 
 def delay(world: World, late_ids: Container[int], late_ns: Callable[[int], int]) -> None:

@@ -13,6 +13,7 @@ from injected import HOLD_CYCLE, Injected, altered, send
 
 import canprobe
 from canprobe.cell.master.controller import Command
+from canprobe.cell.master.supervision import CycleState
 from canprobe.cell.master.trail import WAY_BACK
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -260,7 +261,7 @@ def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
     for pressed_again in (False, True):
         with Session(scene) as session:
             session.run(make_task(session.plan))
-            remembered.append(session.cell.supervisor.felt())
+            remembered.append(session.cell.supervisor.seen.force)
             if pressed_again:
                 task = make_task(session.plan)
                 session.run(lambda m, step=task.step: replace(step(m), done=task.phase is Phase.SCAN))  # noqa: B023
@@ -350,10 +351,10 @@ def test_a_second_interrupt_stops_at_once():
     assert 0.2 * WAY_BACK < back < 0.5 * WAY_BACK, "10 of 64 cycles, the fast ones"
 
 
-def test_a_way_back_on_which_the_force_grows_ends():
+def test_a_way_back_on_which_the_force_grows_ends(monkeypatch):
     def misfeel(run):
         force = count(2.0, 0.02)
-        run.session.cell.supervisor.felt = lambda: next(force)
+        monkeypatch.setattr(CycleState, "force", property(lambda _: next(force)))
         run.inject("node 4: mute")
 
     run = Injected("press", HOLD_CYCLE, misfeel)

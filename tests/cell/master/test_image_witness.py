@@ -1,5 +1,7 @@
 """Whether the images of an array live: what repeats or scatters too little, and what must not trip."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -16,8 +18,10 @@ def look(witness, images, *, speed=5e-3, sigma=SIGMA, pressed=True, highest=130,
         t_ns = k * PERIOD_NS
         centre = np.array([speed * t_ns * 1e-9, 0.0, 0.0])
         rolled = 2e-3 - 4e-3 * t_ns * 1e-9 * np.array([1.0, 2.0])  # a centroid that moves on steadily
-        uv = tuple(rolled + rng.normal(0.0, scatter, 2)) if scatter else (1e-3, 1e-3)
-        witness.look(t_ns, image, pressed=pressed, uv=uv, highest=highest, centre=centre, sigma=sigma)
+        u, v = rolled + rng.normal(0.0, scatter, 2) if scatter else (1e-3, 1e-3)
+        frame = SimpleNamespace(features=None, taxels=np.array([highest]))
+        sample = SimpleNamespace(t_sample_ns=t_ns, image=image, frame=frame)
+        witness.look(sample, SimpleNamespace(force=1.0 if pressed else 0.0, u=u, v=v), centre, sigma)
         if witness.dead_since_ns is not None:
             return t_ns
     return None

@@ -152,14 +152,9 @@ class Cell:
     """What a lift-off asks of the supervisor."""
 
     def __init__(self):
-        self.seen = SimpleNamespace(measurement=Measurement(1000, 0, q=ELBOW_FORM), limits=limits_of(PLAN))
-        self.grows, self.begun, self.stops, self.finding = False, False, False, None
-
-    def begin_way_back(self):
-        self.begun = True
-
-    def witness_grows(self, measurement):
-        return self.grows
+        measurement = Measurement(1000, 0, q=ELBOW_FORM)
+        self.seen = SimpleNamespace(measurement=measurement, limits=limits_of(PLAN), force=2.0, shows_a_part=False)
+        self.stops, self.finding = False, None
 
     def must_stop(self):
         return self.stops
@@ -187,7 +182,8 @@ ENDS = {
     "a condition that forbids motion": (lambda d, c: setattr(c, "stops", True), True),
     "a joint at its stop": (lambda d, c: setattr(c, "finding", object()), True),
     "no positions": (lambda d, c: setattr(c.seen, "measurement", replace(c.seen.measurement, q=None)), True),
-    "a witness that shows a growing force": (lambda d, c: setattr(c, "grows", True), True),
+    "a force that does not grow": (lambda d, c: setattr(c.seen, "force", 2.25), False),
+    "a force that grows": (lambda d, c: setattr(c.seen, "force", 2.3), True),
     "a joint that stands": (lambda d, c: d.beyond.update({4: 3.0}), True),
 }
 
@@ -211,7 +207,7 @@ def test_a_drive_that_was_lost_before_does_not_end_it():
 def test_a_drive_that_stood_before_does_not_end_it():
     drives, cell = Drives(), Cell()
     drives.beyond = {2: 3.0}
-    assert lift(drives, error=NodeError(3, "does not follow")).command(cell) is not None and cell.begun
+    assert lift(drives, error=NodeError(3, "does not follow")).command(cell) is not None
     assert lift(drives).command(cell) is None
 
 

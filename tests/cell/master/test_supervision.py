@@ -118,9 +118,13 @@ def felt(**patch):
             touch(depth=depth(contradicts=True, wandered=1.2e-3)),
             "1.2 mm aside in a touch",
         ),
-        ("push_unfelt", seen(), seen(unfelt=3.4, force=0.2), "a push of 3.4 N beyond the 0.20 N that the array"),
+        (
+            "push_unfelt",
+            seen(),
+            seen(unfelt=3.4, patch=felt(force=0.2)),
+            "a push of 3.4 N beyond the 0.20 N that the array",
+        ),
         ("contact_not_regained", scan(searched=3e-3), scan(searched=3.01e-3), "not found again within 3.0 mm"),
-        ("joint_stop", touch(), touch(limit="joint 1 at 90 deg, its stop"), "joint 1 at 90 deg, its stop"),
         ("preload", seen(TARING, preload=0.15), seen(TARING, preload=0.151), "measures 0.15 N before the run"),
         ("preload", seen(preload=0.2), seen(TARING, preload=0.2), "limits.preload_max_n = 0.15"),
         ("joint_speed", seen(), seen(speeding="joint 2 reports a motion"), "joint 2 reports a motion"),
@@ -215,20 +219,18 @@ def test_only_an_unbroken_run_of_saturated_samples_counts():
     assert told == pytest.approx([0.0, 0.005, 0.01, 0.0, 0.0, 0.005])
 
 
-def supervisor(patches):
-    seen = CycleState(LIMITS, NodeWatch(()), None, None, PortCounters())
-    return Supervisor(seen, None, lambda sample: patches[sample.cycle])
-
-
 def findings(saturated):
     patches = [felt(force=2.0, saturated=one, off_pad=False, bridged=0.0) for one in saturated]
     return guarded(patches)
 
 
 def guarded(patches):
-    guard = supervisor(patches)
-    samples = [SimpleNamespace(cycle=k, t_sample_ns=k * PERIOD_NS) for k in range(len(patches))]
-    return [guard.guard_contact(Measurement(2 * k, 0, tactile=s, tactile_age=2)) for k, s in enumerate(samples)]
+    supervisor, found = Supervisor(seen(), None), []
+    for k, patch in enumerate(patches):
+        supervisor.seen.patch = patch
+        sample = SimpleNamespace(cycle=k, t_sample_ns=k * PERIOD_NS)
+        found.append(supervisor.guard_contact(Measurement(2 * k, 0, tactile=sample, tactile_age=2)))
+    return found
 
 
 def test_an_own_controller_is_guarded_against_it():
@@ -256,7 +258,7 @@ def test_nor_may_its_contact_run_off_the_array():
 
 def test_a_press_between_two_retreats_is_not_forgotten():
     """4 N for 30 ms, then 4 mm straight back within 200 ms: what the array still shows is its memory, and no press."""
-    force, back = [0.0], [0.0]
+    back = [0.0]
 
     class Guard:
         measure = staticmethod(lambda _: None)
@@ -266,18 +268,13 @@ def test_a_press_between_two_retreats_is_not_forgotten():
             T[2, 3] = -back[0]
             return T
 
-    watched = Supervisor(
-        CycleState(LIMITS, NodeWatch(()), None, None, PortCounters()),
-        Guard(),
-        lambda _: SimpleNamespace(force=force[0]),
-    )
+    watched = Supervisor(seen(), Guard())
     for cycle in range(80):
-        force[0] = 4.0 if 4 <= cycle < 16 else 0.3 * (cycle >= 16)
+        watched.seen.patch = SimpleNamespace(force=4.0 if 4 <= cycle < 16 else 0.3 * (cycle >= 16))
         back[0] = max(cycle - 16, 0) / 64 * 4e-3
         sample = SimpleNamespace(cycle=cycle, t_sample_ns=0, differs_from=lambda _: True)
         measurement = Measurement(cycle, cycle * 2_500_000, q=np.zeros(6), q_age=(0,) * 6, tactile=sample)
-        more = {"counters": PortCounters(), "controller_state": ControllerState.ACTIVE}
-        watched.step(measurement, sync_ns=0, overruns=0, **more)
+        watched.step(measurement, 0, 0)
         if cycle == 20:
             assert watched.pressing() == 0.3, "not yet clear of it"
     assert watched.pressing() == 0.0

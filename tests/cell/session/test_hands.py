@@ -11,7 +11,7 @@ import canprobe
 from canprobe.cell.planning import make
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
-from canprobe.cell.planning.units import PROFILE_CYCLES, PROFILE_STOP_S, lag_s
+from canprobe.cell.planning.units import PROFILE_CYCLES, PROFILE_STOP_S, stated_lag_s
 from canprobe.cell.scene.load import packaged
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks.hand_way import joint_way
@@ -69,7 +69,7 @@ def test_profile_position_ends_within_a_count_near_the_way_and_within_the_limits
     rates = np.abs(np.diff(log["q_rad"], axis=0)) * rate_hz  # of axes that overshoot a sharp turn by a little
     assert (rates <= 1.02 * model.qd_max).all() and (not quick or (rates / model.qd_max).max() > 0.9)
     off = np.abs(log["q_target_rad"] - log["q_rad"])[np.isfinite(log["q_target_rad"]).all(axis=1)].max(axis=0)
-    lag = 0.5 * PROFILE_STOP_S + lag_s(opened.plan.setup) + (CYCLES_TO_EFFECT + PROFILE_CYCLES + 1) / rate_hz
+    lag = 0.5 * PROFILE_STOP_S + stated_lag_s(opened.plan.setup) + (CYCLES_TO_EFFECT + PROFILE_CYCLES + 1) / rate_hz
     assert (off <= lag * way.speed * np.abs(way.q[1] - way.q[0]) + 1e-3).all()
 
 

@@ -48,7 +48,7 @@ def test_velocities_of_the_points_are_kept():
     ("points", "complaint"),
     [
         ([], "no point"),
-        ([(1.0, Q0[:3])], "expected 6 positions"),
+        ([(1.0, Q0[:3])], r"positions of the points: expected shape \(1, 6\), got \(1, 3\)"),
         ([(1.0, "x")], "expected"),
         ([(-1.0, Q0)], "times from 0 on"),
         ([(1.0, Q0), (1.0, Q0)], "each later"),

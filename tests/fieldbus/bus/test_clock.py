@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 import pytest
 
 from canprobe.fieldbus import MonotonicClock, VirtualClock
+from canprobe.fieldbus.bus.clock import wake_lateness
 from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.port import Reports
 from canprobe.fieldbus.bus.real.mmsg import Row
@@ -28,6 +29,18 @@ def test_virtual_time_stands_still_and_jumps() -> None:
     clock.sleep_until_ns(1)
     assert clock.now_ns() == 2_500_000
     assert VirtualClock(7).now_ns() == 7
+
+
+def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past() -> None:
+    asked, naps = list[int](), iter((0, 100, 2600, 0))
+
+    class LateClock(VirtualClock):
+        def sleep_until_ns(self, t_ns: int) -> None:
+            asked.append(t_ns)
+            super().sleep_until_ns(t_ns + next(naps))
+
+    assert wake_lateness(LateClock(), 1000, 4) == [0, 0, 100, 2600]
+    assert asked == [1000, 2000, 3000, 6000]
 
 
 @pytest.mark.parametrize("native", [True, False])

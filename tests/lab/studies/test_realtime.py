@@ -8,7 +8,7 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
-from canprobe.lab.studies.realtime import Measured, findings, holding_scene, woken
+from canprobe.lab.studies.realtime import Measured, findings, holding_scene
 from canprobe.lab.studies.realtime_soak import findings as findings_of_soak
 from canprobe.lab.studies.realtime_soak import resident_mib
 
@@ -48,21 +48,8 @@ def test_the_studies_scenes_leave_every_node_to_a_process_of_its_own():
     assert (scene.cycle.rate_hz, scene.sensor.rate_hz, scene.sensor.mode) == (800.0, 400.0, "features")
 
 
-def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
-    class Clock:
-        now = 0
-        naps = iter((0, 100, 2600, 0))
-
-        def now_ns(self):
-            return self.now
-
-        def sleep_until_ns(self, t_ns):
-            self.now = max(self.now, t_ns) + next(self.naps)
-
-    lateness: list[int] = []
-    assert list(woken(Clock(), 1000, 4, lateness)) == [1000, 2000, 5000, 6000]
-    assert lateness == [0, 100, 2600, 0]
-    loop = Measured("", "", 1e6, lateness, 5e-6)
+def test_a_cycle_is_an_overrun_from_half_a_period_on():
+    loop = Measured("", "", 1e6, np.array([0, 100, 2600, 0]), 5e-6)
     assert (loop.overruns, loop.cycles, loop.missed) == (1, 4, 0)
 
 

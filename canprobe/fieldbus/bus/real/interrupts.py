@@ -7,12 +7,14 @@ import contextlib
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType, TracebackType
 from typing import Any
 
 from canprobe.fieldbus.bus.system import system
 
+INTERRUPTS = (signal.SIGINT, *system.TERMINATION_SIGNALS)
+"""Signals that end a program from outside, of which Ctrl-C is one."""
 REPEAT_PERIOD_S = 0.1
 """Time between two repetitions of an interrupt."""
 
@@ -27,22 +29,31 @@ def raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
+def signal_handlers(handlers: Mapping[int, Callable[[int, FrameType | None], object]]) -> Iterator[None]:
+    """Within the block signals have these handlers. In another thread than the main one nothing changes."""
+    before: dict[int, Any] = {}
+    try:
+        with contextlib.suppress(ValueError):  # not the main thread
+            for number, handler in handlers.items():
+                before[number] = signal.signal(number, handler)
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
+
+
+@contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
     """Hold an interrupt until the end of the block, so that the block is done whole. It works in the main thread only.
 
     Ignored signals stay ignored: SIGHUP under `nohup`, and SIGINT in the background of a shell without job control.
     """
     came: list[int] = []
-    before: dict[int, Any] = {}
-    with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
-        for number in (signal.SIGINT, *system.TERMINATION_SIGNALS):
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                before[number] = signal.signal(number, lambda n, _: came.append(n))
+    heeded = [number for number in INTERRUPTS if signal.getsignal(number) is not signal.SIG_IGN]
     try:
-        yield
+        with signal_handlers(dict.fromkeys(heeded, lambda number, _: came.append(number))):
+            yield
     finally:
-        for held, handler in before.items():
-            signal.signal(held, handler)
         if came:
             signal.raise_signal(came[0])
 
@@ -59,8 +70,7 @@ def interrupts_repeated() -> Iterator[None]:
         return
     came: list[signal.Signals] = []
     left = threading.Event()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *system.TERMINATION_SIGNALS)}
-    handlers = {number: handler for number, handler in before.items() if callable(handler)}
+    handlers = {number: handler for number in INTERRUPTS if callable(handler := signal.getsignal(number))}
     hook = sys.unraisablehook
 
     def raise_it(number: int, frame: FrameType | None) -> None:
@@ -80,15 +90,14 @@ def interrupts_repeated() -> Iterator[None]:
     repeater = threading.Thread(target=repeat, daemon=True)
     sys.unraisablehook = unraisable
     try:
-        for number in handlers:
-            signal.signal(number, raise_it)
-        repeater.start()
-        yield
+        with signal_handlers(dict.fromkeys(handlers, raise_it)):
+            try:
+                repeater.start()
+                yield
+            finally:
+                left.set()
+                repeater.join()
     finally:
-        left.set()
-        repeater.join()
-        for number in handlers:
-            signal.signal(number, before[number])
         sys.unraisablehook = hook
     if came:
         signal.raise_signal(came[0])
@@ -108,28 +117,24 @@ class Interrupts:
     def __init__(self, stuck: Callable[[], bool] = lambda: False) -> None:
         self._stuck = stuck
         self._before: dict[int, Callable[[int, FrameType | None], object]] = {}
-        self._restore: dict[int, object] = {}
         self._came = False
         self._waiting: int | None = None
 
     def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, *system.TERMINATION_SIGNALS):
-            before = signal.getsignal(number)
-            handler = raise_terminated if before is signal.SIG_DFL and number in system.TERMINATION_SIGNALS else before
-            if not callable(handler):
-                continue
-            try:
-                signal.signal(number, self._note)
-            except ValueError:  # not the main thread: signals are not ours to receive
-                break
-            self._before[number], self._restore[number] = handler, before
+        for number in INTERRUPTS:
+            handler = signal.getsignal(number)
+            if handler is signal.SIG_DFL and number in system.TERMINATION_SIGNALS:
+                handler = raise_terminated
+            if callable(handler):
+                self._before[number] = handler
+        self._handlers = signal_handlers(dict.fromkeys(self._before, self._note))
+        self._handlers.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for number, before in self._restore.items():
-            signal.signal(number, before)  # type: ignore[arg-type]  # as getsignal gave it
+        self._handlers.__exit__(kind, error, trace)
         if error is None:
             self.take()
 
