@@ -53,40 +53,35 @@ _REAL_SLACK_S = 0.05
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument("--node", metavar="N", type=whole(1, 127), help="node id of the device")
-    parser.add_argument(
-        "--eds", metavar="FILE", type=word, help="EDS, DCF, XDD or XDC file of the device, or a packaged name"
-    )
+    parser.add_option("--node N", "node id of the device", whole(1, 127))
+    parser.add_option("--eds FILE", "EDS, DCF, XDD or XDC file of the device, or a packaged name", word)
     parser.add_real_bus(", or lockstep")
-    parser.add_argument(
-        "--data-bitrate",
-        metavar="BIT/S",
-        type=whole(50_000, 8_000_000),
-        help="the bus carries CAN FD: bit rate of the data phase [classical CAN]",
+    parser.add_option(
+        "--data-bitrate BIT/S",
+        "the bus carries CAN FD: bit rate of the data phase [classical CAN]",
+        whole(50_000, 8_000_000),
     )
-    parser.add_argument("--points", metavar="LIST", type=word, help="groups, numbers or points [all]")
-    parser.add_argument(
-        "--write",
-        metavar="LIST",
-        default="",
-        help="objects that may be written, as 2000h-20FFh,6081h,60C2h:01; and the words reset (NMT reset node), history"
+    parser.add_option("--points LIST", "groups, numbers or points [all]", word)
+    parser.add_option(
+        "--write LIST",
+        "objects that may be written, as 2000h-20FFh,6081h,60C2h:01; and the words reset (NMT reset node), history"
         " (clear 1003h)",
+        default="",
     )
-    parser.add_argument("--motion", action="store_true", help="also switch the power stage on and move the axis")
-    parser.add_argument("--yes", action="store_true", help="with --motion: do not ask whether the axis may move")
-    parser.add_argument("--own", metavar="FILE", type=Path, help="a TOML file with points of your own")
-    parser.add_argument("--timeout", metavar="S", type=seconds, default=1.0, help="longest time to an SDO answer [1]")
-    parser.add_argument("--listen", metavar="S", type=seconds, default=1.5, help="time to hear the bus before [1.5]")
-    parser.add_argument(
-        "--snapshot",
-        metavar="FILE",
-        type=Path,
-        help="keep the snapshot in this file [conform-node<N>.snapshot.json, removed when all is put back]",
+    parser.add_option("--motion", "also switch the power stage on and move the axis")
+    parser.add_option("--yes", "with --motion: do not ask whether the axis may move")
+    parser.add_option("--own FILE", "a TOML file with points of your own", Path)
+    parser.add_option("--timeout S", "longest time to an SDO answer [1]", seconds, default=1.0)
+    parser.add_option("--listen S", "time to hear the bus before [1.5]", seconds, default=1.5)
+    parser.add_option(
+        "--snapshot FILE",
+        "keep the snapshot in this file [conform-node<N>.snapshot.json, removed when all is put back]",
+        Path,
     )
-    parser.add_argument("--restore", metavar="FILE", type=Path, help="put back a snapshot, and end")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="record all frames as a candump log")
-    parser.add_argument("--full", action="store_true", help="print all points below the verdict")
-    parser.add_argument("--list", action="store_true", help="list the points, and end")
+    parser.add_option("--restore FILE", "put back a snapshot, and end", Path)
+    parser.add_option("--log FILE", "record all frames as a candump log", Path)
+    parser.add_option("--full", "print all points below the verdict")
+    parser.add_option("--list", "list the points, and end")
     add_report_options(parser)
     parser.add_shared("-v")
 

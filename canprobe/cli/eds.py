@@ -57,14 +57,12 @@ def add_arguments(parser: Parser) -> None:
         epilog=_CHECK,
     )
     check.add_argument("file", metavar="FILE", help="path of an EDS, DCF, XDD or XDC file, or name of a packaged file")
-    check.add_argument(
-        "--node-id", metavar="N", type=whole(1, 127), help="node id that replaces $NODEID [that of the DCF, or 1]"
-    )
+    check.add_option("--node-id N", "node id that replaces $NODEID [that of the DCF, or 1]", whole(1, 127))
     check.add_shared("--json")
     check.set_defaults(run=run_check)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print the names of the files, or the path of one."""
     from canprobe.fieldbus.eds.packaged import eds_names, eds_path
 
@@ -72,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
         print(eds_path(args.eds))
     else:
         print_answer(args, list(eds_names()), "\n".join(eds_names()))
-    return 0
 
 
 def run_check(args: argparse.Namespace) -> int:

@@ -56,22 +56,19 @@ def add_arguments(parser: Parser) -> None:
     parser.usage = "canprobe judge [SCENE | --eds FILE --node-id N ...] [--record FILE] [options] [-- COMMAND...]"
     parser.add_shared("[SCENE]", "BUS")
     parser.add_eds_nodes()
-    parser.add_argument("--record", metavar="FILE", type=Path, help="judge a log, and serve nothing")
-    parser.add_argument(
-        "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"
-    )
+    parser.add_option("--record FILE", "judge a log, and serve nothing", Path)
+    parser.add_option("--seconds S", "end after S seconds [at the end of COMMAND, or at Ctrl-C]", seconds)
     parser.add_inject("throw this fault in the place of the sequence")
-    parser.add_argument("--passive", action="store_true", help="throw no faults")
-    parser.add_argument(
-        "--without",
-        metavar="RULES",
-        type=rule_numbers,
+    parser.add_option("--passive", "throw no faults")
+    parser.add_option(
+        "--without RULES",
+        "leave out rules, such as 32,33,34,45 on a machine that keeps no time",
+        rule_numbers,
         default=(),
-        help="leave out rules, such as 32,33,34,45 on a machine that keeps no time",
     )
-    parser.add_argument("--output", metavar="FILE", type=Path, help="file for the output of COMMAND [a temporary one]")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="write the frames as a candump log")
-    parser.add_argument("--list", action="store_true", help="list the rules, and end")
+    parser.add_option("--output FILE", "file for the output of COMMAND [a temporary one]", Path)
+    parser.add_option("--log FILE", "write the frames as a candump log", Path)
+    parser.add_option("--list", "list the rules, and end")
     add_report_options(parser)
     parser.add_shared("-v")
 

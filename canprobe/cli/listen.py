@@ -35,9 +35,9 @@ _CLEAR = "\x1b[H\x1b[J"
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
-    parser.add_argument("--duration", metavar="S", type=seconds, default=10.0, help="end after S seconds [10]")
-    parser.add_argument("--every", metavar="S", type=seconds, default=0.1, help="time between two images [0.1]")
-    parser.add_argument("--json", action="store_true", help="print one JSON document a line")
+    parser.add_option("--duration S", "end after S seconds [10]", seconds, default=10.0)
+    parser.add_option("--every S", "time between two images [0.1]", seconds, default=0.1)
+    parser.add_option("--json", "print one JSON document a line")
     parser.add_shared("-v")
 
 
@@ -53,7 +53,7 @@ def array_only(scene: Scene) -> Scene:
     return replace(alone, task=replace(scene.task, kind="listen"))
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print images until the time is over, or Ctrl-C."""
     from canprobe.cell.master.controller import Command
 
@@ -77,7 +77,6 @@ def run(args: argparse.Namespace) -> int:
             return Command(done=t_s >= duration_s)
 
         cell.run(step)
-    return 0
 
 
 def array_values(cell: OpenCell, measurement: Measurement) -> dict[str, Any]:

@@ -18,16 +18,15 @@ if TYPE_CHECKING:
 
 def add_report_options(parser: Parser) -> None:
     """Add --baseline, --fail-on, --junit, --html and --json."""
-    parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
-    parser.add_argument(
-        "--fail-on",
-        metavar="WHAT",
+    parser.add_option("--baseline FILE", "compare with an older --json report", Path)
+    parser.add_option(
+        "--fail-on WHAT",
+        "exit with 1 for any deviation, or for a new one: not in the --baseline [deviation]",
         choices=("deviation", "new"),
         default="deviation",
-        help="exit with 1 for any deviation, or for a new one: not in the --baseline [deviation]",
     )
-    parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
+    parser.add_option("--junit FILE", "write JUnit XML, for CI servers", Path)
+    parser.add_option("--html FILE", "write one HTML file, for people", Path)
     parser.add_shared("--json")
 
 

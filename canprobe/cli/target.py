@@ -86,7 +86,7 @@ def target_of(args: argparse.Namespace, scene: Scene) -> Target:
     from canprobe.cell.session.target import LOCKSTEP, Target
 
     (main, *_), bitrate = scene.channels, args.bitrate
-    channels = _channels(args.channel or [], scene.channels)
+    channels = _channels(args.channel, scene.channels)
     interface, channel = args.bus, channels.pop(main, None)
     open_to_configuration = args.bus is None and scene.bus.interface == LOCKSTEP and _has_real_nodes(scene)
     if (args.bus == CONFIG or open_to_configuration) and (found := _configured(args.bus)) is not None:

@@ -34,23 +34,18 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("what", metavar="SCENE|RUN_DIR", help="scene to run, or folder of a recorded run")
-    parser.add_argument(
-        "--host",
-        metavar="H",
-        default="127.0.0.1",
-        help="address of the server; 0.0.0.0 serves other machines [127.0.0.1]",
+    parser.add_option(
+        "--host H", "address of the server; 0.0.0.0 serves other machines [127.0.0.1]", default="127.0.0.1"
     )
-    parser.add_argument(
-        "--port", metavar="N", type=whole(0, 65_535), default=8080, help="port of the server; 0: any free port [8080]"
-    )
-    parser.add_argument("--no-open", action="store_true", help="print the address and open no browser")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
+    parser.add_option("--port N", "port of the server; 0: any free port [8080]", whole(0, 65_535), default=8080)
+    parser.add_option("--no-open", "print the address and open no browser")
+    parser.add_option("--html FILE", "write the replay to one HTML file, and end", Path)
     of_scene = parser.add_argument_group("options of a SCENE")
     parser.add_shared("--set", "BUS", "--out", "--force", "--seed", "--duration", to=of_scene)
     parser.add_shared("-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Show it until Ctrl-C, or write the file."""
     from canprobe.cell.planning.bridges import check_view
 
@@ -78,7 +73,6 @@ def run(args: argparse.Namespace) -> int:
                 say=args.report.say,
                 whole=interrupts_held,
             )
-    return 0
 
 
 def _is_scene(what: str) -> bool:
