@@ -10,6 +10,8 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
+from canprobe.fieldbus.bus.real.interrupts import handled_signals, heeded_signals
+
 TIMED_OUT_STATUS = 124
 _GRACE_S = 5.0
 _POLL_PERIOD_S = 0.02
@@ -25,16 +27,14 @@ def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
         keyboard: False drops SIGINT and SIGQUIT, which the terminal sends to a shell in this group as well.
     """
     signals: list[int] = []
-    before = {number: signal.getsignal(number) for number in _FORWARDED_SIGNALS}
-    try:
-        for number, handler in before.items():
-            if handler != signal.SIG_IGN:
-                kept = keyboard or number not in (signal.SIGINT, signal.SIGQUIT)
-                signal.signal(number, (lambda n, _: signals.append(n)) if kept else lambda *_: None)
+    dropped = () if keyboard else (signal.SIGINT, signal.SIGQUIT)
+
+    def take(number: int, _: object) -> None:
+        if number not in dropped:
+            signals.append(number)
+
+    with handled_signals(dict.fromkeys(heeded_signals(*_FORWARDED_SIGNALS), take)):
         yield signals
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class Job(Protocol):

@@ -7,7 +7,7 @@ import contextlib
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -27,22 +27,40 @@ def raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
+def handled_signals(handlers: Mapping[int, Callable[[int, FrameType | None], object]]) -> Iterator[None]:
+    """Within the block signals have these handlers. Outside the main thread, which alone receives signals, nothing
+    changes.
+    """
+    before = {number: signal.getsignal(number) for number in handlers}
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    try:
+        if in_main_thread:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        yield
+    finally:
+        if in_main_thread:
+            for number, former in before.items():
+                signal.signal(number, former)
+
+
+def heeded_signals(*numbers: int) -> list[int]:
+    """Those of some signals that are not ignored: SIGHUP is under `nohup`, SIGINT in the background of some shells."""
+    return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+@contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
     """Hold an interrupt until the end of the block, so that the block is done whole. It works in the main thread only.
 
-    Ignored signals stay ignored: SIGHUP under `nohup`, and SIGINT in the background of a shell without job control.
+    Ignored signals stay ignored.
     """
     came: list[int] = []
-    before: dict[int, Any] = {}
-    with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
-        for number in (signal.SIGINT, *system.TERMINATION_SIGNALS):
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                before[number] = signal.signal(number, lambda n, _: came.append(n))
+    heeded = heeded_signals(signal.SIGINT, *system.TERMINATION_SIGNALS)
     try:
-        yield
+        with handled_signals(dict.fromkeys(heeded, lambda number, _: came.append(number))):
+            yield
     finally:
-        for held, handler in before.items():
-            signal.signal(held, handler)
         if came:
             signal.raise_signal(came[0])
 
@@ -78,18 +96,15 @@ def interrupts_repeated() -> Iterator[None]:
             hook(dropped)
 
     repeater = threading.Thread(target=repeat, daemon=True)
-    sys.unraisablehook = unraisable
-    try:
-        for number in handlers:
-            signal.signal(number, raise_it)
-        repeater.start()
-        yield
-    finally:
-        left.set()
-        repeater.join()
-        for number in handlers:
-            signal.signal(number, before[number])
-        sys.unraisablehook = hook
+    with handled_signals(dict.fromkeys(handlers, raise_it)):
+        try:
+            sys.unraisablehook = unraisable
+            repeater.start()
+            yield
+        finally:
+            left.set()
+            repeater.join()
+            sys.unraisablehook = hook
     if came:
         signal.raise_signal(came[0])
 
@@ -108,7 +123,6 @@ class Interrupts:
     def __init__(self, stuck: Callable[[], bool] = lambda: False) -> None:
         self._stuck = stuck
         self._before: dict[int, Callable[[int, FrameType | None], object]] = {}
-        self._restore: dict[int, object] = {}
         self._came = False
         self._waiting: int | None = None
 
@@ -116,20 +130,16 @@ class Interrupts:
         for number in (signal.SIGINT, *system.TERMINATION_SIGNALS):
             before = signal.getsignal(number)
             handler = raise_terminated if before is signal.SIG_DFL and number in system.TERMINATION_SIGNALS else before
-            if not callable(handler):
-                continue
-            try:
-                signal.signal(number, self._note)
-            except ValueError:  # not the main thread: signals are not ours to receive
-                break
-            self._before[number], self._restore[number] = handler, before
+            if callable(handler):
+                self._before[number] = handler
+        self._handled = handled_signals(dict.fromkeys(self._before, self._note))
+        self._handled.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for number, before in self._restore.items():
-            signal.signal(number, before)  # type: ignore[arg-type]  # as getsignal gave it
+        self._handled.__exit__(kind, error, trace)
         if error is None:
             self.take()
 
