@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from canprobe import fieldbus
 from canprobe.cli.argument_types import seconds, whole, word
 from canprobe.cli.output import print_answer, print_json, print_table
 from canprobe.cli.parser import Parser
@@ -26,12 +27,11 @@ from canprobe.cli.stdin import yes_typed
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.port import Port
-    from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.conform import Examination, Point
-    from canprobe.fieldbus.tools.reports import Report
 
 HELP = "examine a device of any maker for conformance"
 EXAMPLE = """\
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     if args.node is None:
         how = "any, such as --node 1" if args.bus == "lockstep" else "`canprobe scan` lists the nodes on a bus"
         raise UsageError(f"conform: --node N names the device; {how}")
-    from canprobe.fieldbus.tools.conform import ExaminationSettings, WriteList, restore_snapshot
+    from canprobe.fieldbus.tools.conform import Examination, ExaminationSettings, WriteList, restore_snapshot
     from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 
     points, description = _points(args), _description(args)
@@ -118,13 +118,11 @@ def run(args: argparse.Namespace) -> int:
             times=BenchTimes() if virtual else times,
             ask=yes_typed if sys.stdin.isatty() else None,
         )
-        from canprobe.fieldbus.tools.conform import Examination
-
         report = _examine(args, Examination(port, args.node, description, settings), points)
     return _finish(args, report, baseline)
 
 
-def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> Report:
+def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> reports.Report:
     """Run the examination, with its progress on stderr."""
     bar = args.report.bar(".0f points") or nothing
     examination.report.facts.update(_bench_facts(args))
@@ -135,29 +133,25 @@ def _examine(args: argparse.Namespace, examination: Examination, points: Sequenc
     return report
 
 
-def _finish(args: argparse.Namespace, report: Report, baseline: Report | None) -> int:
-    from canprobe.fieldbus.tools.reports import closing_text, report_document, row_text, verdict_text
-
+def _finish(args: argparse.Namespace, report: reports.Report, baseline: reports.Report | None) -> int:
     if baseline is not None and args.points:
         asked = {(row.group, row.name) for row in report.rows}
         baseline.rows = [row for row in baseline.rows if (row.group, row.name) in asked]
     change = write_report(args, report, baseline)
     if args.json:
-        print_json(report_document(report))
+        print_json(reports.report_document(report))
         return report.exit_status
-    print(verdict_text(report, change))
+    print(reports.verdict_text(report, change))
     if args.full:
-        print("", *map(row_text, report.rows), closing_text(report), sep="\n")
+        print("", *map(reports.row_text, report.rows), reports.closing_text(report), sep="\n")
     else:
         print(f"all points: type it again with --full, or --html FILE for the frames{_again(report)}")
     return report.exit_status
 
 
-def _again(report: Report) -> str:
+def _again(report: reports.Report) -> str:
     """How to examine again what failed."""
-    from canprobe.fieldbus.tools.reports import Verdict
-
-    groups = dict.fromkeys(row.group for row in report.rows if row.verdict is Verdict.FAIL)
+    groups = dict.fromkeys(row.group for row in report.rows if row.verdict is reports.Verdict.FAIL)
     return f"; after a change --points {','.join(groups)}" if groups else ""
 
 
@@ -172,14 +166,8 @@ def _points(args: argparse.Namespace) -> tuple[Point, ...]:
     return chosen_points(points, (args.points or "").split(","))
 
 
-def _description(args: argparse.Namespace) -> Description | None:
-    if args.eds is None:
-        return None
-    from canprobe.fieldbus.eds.description import Description
-    from canprobe.fieldbus.eds.packaged import eds_file
-    from canprobe.fieldbus.eds.reading import read_eds
-
-    return Description(read_eds(eds_file(args.eds), args.node, serving=False).usable())
+def _description(args: argparse.Namespace) -> fieldbus.Description | None:
+    return None if args.eds is None else fieldbus.Description(fieldbus.load_eds(args.eds, args.node))
 
 
 @contextlib.contextmanager
@@ -206,13 +194,8 @@ def _emulated(args: argparse.Namespace) -> Port:
     """A port of a bus in virtual time with the emulated node of the EDS."""
     if args.eds is None:
         raise UsageError("conform: --bus lockstep examines the emulated node of an EDS: name it with --eds")
-    from canprobe.fieldbus.bus.clock import VirtualClock
-    from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
-    from canprobe.fieldbus.drive.from_eds import make_eds_node
-    from canprobe.fieldbus.eds.packaged import load_eds
-
-    bus = LockstepBus(VirtualClock(), "lockstep", fd=True)
-    bus.attach(make_eds_node(load_eds(args.eds, args.node), args.node, eds=args.eds))
+    bus = fieldbus.LockstepBus(fieldbus.VirtualClock(), "lockstep", fd=True)
+    bus.attach(fieldbus.make_eds_node(fieldbus.load_eds(args.eds, args.node), args.node, eds=args.eds))
     return bus.port()
 
 
@@ -227,9 +210,7 @@ def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
         or "nothing beyond the default",
     }
     if args.eds is not None:
-        from canprobe.fieldbus.eds.packaged import check_eds
-
-        reading = check_eds(args.eds, args.node)
+        reading = fieldbus.check_eds(args.eds, args.node)
         facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
         facts["EDS"] = eds_and_hash(args.eds)
     return facts
