@@ -20,13 +20,7 @@ from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.session.target import VIRTUAL
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG
-from canprobe.lab.bridge.description import (
-    axis_transforms,
-    flange_transform,
-    link_transforms,
-    quaternion_of,
-    robot_description,
-)
+from canprobe.lab.bridge import description
 from canprobe.lab.bridge.sample import BASE, CONTACT, FLANGE, PROBE, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.types import Floats
@@ -170,7 +164,7 @@ class Messages:
         arm, probe = plan.setup.arm, plan.scene.probe
         self._chain = arm.model.chain if arm is not None else None
         self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
-        self._description = robot_description(plan)
+        self._description = description.robot_description(plan)
         self._is_virtual = plan.scene.bus.interface in VIRTUAL
         self._wanted = wanted
         self._static_every_ns = static_every_ns
@@ -221,7 +215,7 @@ class Messages:
             yield CLOCK, t_ns, lambda: self._make(CLOCK.type_name, clock=self._time(t_ns))
         if q is not None and (chain := self._chain) is not None:
             yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, chain, q)
-            yield TF, t_ns, lambda: self._tf(t_ns, link_transforms(chain, q))
+            yield TF, t_ns, lambda: self._tf(t_ns, description.link_transforms(chain, q))
         if touch is not None:
             if (counts := touch.counts) is not None:
                 yield TAXELS, touch.t_ns, lambda: self._image(touch.t_ns, counts)
@@ -244,10 +238,10 @@ class Messages:
 
     def _static(self, t_ns: int) -> Any:
         assert self._chain is not None
-        fixed = [flange_transform(self._chain)]
+        fixed = [description.flange_transform(self._chain)]
         if self._T_flange_probe is not None:
             fixed.append((FLANGE, PROBE, self._T_flange_probe))
-        return self._tf(t_ns, [*fixed, *axis_transforms(self._chain)])
+        return self._tf(t_ns, [*fixed, *description.axis_transforms(self._chain)])
 
     def _wrench(self, touch: TouchFrame) -> Any:
         force, torque = self._vector(touch.force), self._vector(np.zeros(3))
@@ -317,7 +311,7 @@ class Messages:
     def _tf(self, t_ns: int, transforms: list[tuple[str, str, Floats]]) -> Any:
         stamped = []
         for parent, child, T in transforms:
-            x, y, z, w = quaternion_of(T[:3, :3])
+            x, y, z, w = description.quaternion_of(T[:3, :3])
             rotation = self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
             transform = self._make("geometry_msgs/msg/Transform", translation=self._vector(T[:3, 3]), rotation=rotation)
             header, name = self._header(t_ns, parent), "geometry_msgs/msg/TransformStamped"
