@@ -9,19 +9,17 @@ from __future__ import annotations
 import argparse
 import signal
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import node_ids, number_of_32_bits, whole
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
-from canprobe.cli.target import loaded, one_channel, real_target, target_of
+from canprobe.cli.target import loaded, one_channel, real_target, scene_target
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
     from canprobe.cell.scene.model import Scene
-    from canprobe.cell.session.target import Target
 
 HELP = "serve emulated nodes on a bus"
 EXAMPLE = """\
@@ -140,17 +138,6 @@ def eds_files(command: str, args: argparse.Namespace) -> list[tuple[str | Path, 
             f"{command}: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own"
         )
     return list(zip(args.eds, args.node_id, strict=True))
-
-
-def scene_target(args: argparse.Namespace, scene: Scene) -> Target:
-    """The bus of the nodes: a channel without a name is for all of them, else each has that of the scene."""
-    given = args.channel
-    real = real_target(args.bus, given[0][1] if given else None, args.bitrate, bitrate_else=scene.bus.bitrate)
-    given = given or [(scene.bus.channel, real.channel)]
-    args = argparse.Namespace(bus=real.interface, channel=given, bitrate=real.bitrate)
-    target = target_of(args, scene)
-    one = given[0][1] if given[0][0] is None else None
-    return replace(target, others={name: one or target.others.get(name, name) for name in scene.channels[1:]})
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:

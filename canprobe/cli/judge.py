@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING
 
 from canprobe import fieldbus
 from canprobe.cli.argument_types import seconds
-from canprobe.cli.emulate import eds_files, scene_target
+from canprobe.cli.emulate import eds_files
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
-from canprobe.cli.target import loaded, one_channel, real_target
+from canprobe.cli.target import loaded, one_channel, real_target, scene_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.tools import reports
 

@@ -16,7 +16,7 @@ from canprobe.cli.argument_types import seconds
 from canprobe.cli.hands import opened
 from canprobe.cli.parser import Parser
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.clock import Pace
 
 if TYPE_CHECKING:
     from canprobe.cell.master.controller import Command, Measurement
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> None:
 
     duration_s, args.duration = args.duration, None
     on_terminal = sys.stdout.isatty() and not args.json
-    next_s, clock = 0.0, MonotonicClock()
+    next_s, pace = 0.0, Pace()
     with opened(args, prepared=array_only) as cell:
 
         def step(measurement: Measurement) -> Command:
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> None:
                     text = f"{t_s:7.2f} s  {array_line(cell, measurement)}"
                     print(_CLEAR + text + "\n" + _picture(measurement) if on_terminal else text, flush=True)
                 if cell.session.virtual and on_terminal:
-                    clock.sleep_until_ns(clock.now_ns() + round(1e9 * args.every))
+                    pace.keep(measurement.t_ns)
             return Command(done=t_s >= duration_s)
 
         cell.run(step)

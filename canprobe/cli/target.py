@@ -136,6 +136,20 @@ def real_target(
     return Target(interface, channel, bitrate or bitrate_else)
 
 
+def scene_target(args: argparse.Namespace, scene: Scene) -> Target:
+    """The real bus of a scene's nodes: a channel without a name is for all of them, else each has that of the scene."""
+    from dataclasses import replace
+
+    from canprobe.cell.session.target import Target
+
+    name, channel = args.channel[0] if args.channel else ("", None)
+    real = real_target(args.bus, channel, args.bitrate, bitrate_else=scene.bus.bitrate)
+    channels = _channels(args.channel, scene.channels) or {scene.bus.channel: real.channel}
+    target = Target.over(scene, real.interface, channels, real.bitrate)
+    one = channel if name is None else None
+    return replace(target, others={each: one or target.others.get(each, each) for each in scene.channels[1:]})
+
+
 def _configured(bus: str | None) -> ConfiguredBus | None:
     from canprobe.fieldbus.bus.real.adapters import configured_bus
 

@@ -12,16 +12,13 @@ import os
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import whole
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import target_of
+from canprobe.fieldbus.bus.clock import Pace
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
-
-if TYPE_CHECKING:
-    from canprobe.cell.master.observers import AnyObserver
 
 HELP = "show a scene or a run in a browser"
 EXAMPLE = """\
@@ -101,6 +98,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         raise
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
     scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
+    pace = Pace()
     live = args.html is None and not BRIDGES["view"].lacks
     folder = api.results_folder(scene, args.out)
     api.run(
@@ -110,7 +108,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         duration_s=args.duration,
         force=args.force,
         bridge=("view",) if live else (),
-        observers=[_paced()] if live and scene.bus.interface in VIRTUAL else [],
+        observers=[lambda seen: pace.keep(seen.t_ns)] if live and scene.bus.interface in VIRTUAL else [],
         say=browser.say,
     )
     return folder
@@ -149,21 +147,3 @@ class _Browser:
             self.show(where)
         else:
             self._say(line)
-
-
-def _paced() -> AnyObserver:
-    """An observer that lets virtual time pass no faster than the clock on the wall."""
-    from canprobe.cell.master.observers import Observation
-    from canprobe.fieldbus.bus.clock import MonotonicClock
-
-    clock = MonotonicClock()
-    offset_ns: int | None = None
-
-    def wait(observation: Observation) -> None:
-        nonlocal offset_ns
-        now_ns = clock.now_ns()
-        if offset_ns is None or now_ns > offset_ns + observation.t_ns:  # behind: lost time is not caught up
-            offset_ns = now_ns - observation.t_ns
-        clock.sleep_until_ns(offset_ns + observation.t_ns)
-
-    return wait

@@ -14,7 +14,7 @@ from canprobe.fieldbus.bus.real.interrupts import handled_signals, heeded_signal
 
 TIMED_OUT_STATUS = 124
 _GRACE_S = 5.0
-_POLL_PERIOD_S = 0.02
+POLL_PERIOD_S = 0.02
 _MAX_SIGNALS = 3
 _FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
@@ -81,7 +81,7 @@ def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[in
             timed_out = True
             job.send_signal(signal.SIGTERM)
             deadline += _GRACE_S
-        time.sleep(_POLL_PERIOD_S)
+        time.sleep(POLL_PERIOD_S)
     return (TIMED_OUT_STATUS if timed_out or status is None else status), timed_out
 
 
