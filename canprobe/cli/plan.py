@@ -18,7 +18,7 @@ from canprobe.cell.session.terminal import columns
 from canprobe.cli.output import print_answer, print_json, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, with_scene
-from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
+from canprobe.errors import CanprobeError, PlanError, UsageError, needed_module
 
 if TYPE_CHECKING:
     from canprobe.cell.planning.model import Plan
@@ -75,14 +75,11 @@ def add_arguments(parser: Parser) -> None:
 
 
 def _draw(plan: Plan, path: Path) -> Path:
-    try:
-        from canprobe.cell.results.plan_figure import draw_plan
-    except ImportError as error:
-        raise UsageError(f"--figure needs matplotlib: {install_line('study')}") from error
+    drawing = needed_module("canprobe.cell.results.plan_figure", "study", "--figure needs matplotlib:")
     if not path.suffix:
         path = path.with_suffix(".png")  # as matplotlib would do without a message
     try:
-        draw_plan(plan, path)
+        drawing.draw_plan(plan, path)
     except ValueError as error:  # matplotlib does not know the format
         raise UsageError(f"--figure {path}: {error}") from error
     return path
