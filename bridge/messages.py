@@ -86,10 +86,6 @@ class Encoder:
         """A message as CDR, little-endian, with its four bytes of encapsulation."""
         return bytes(self.store.serialize_cdr(message, type_name))
 
-    def decode(self, type_name: str, data: bytes) -> Any:
-        """The inverse of `encode`."""
-        return self.store.deserialize_cdr(data, type_name)
-
     def definition(self, type_name: str) -> str:
         """The definition for MCAP's `ros2msg` and Foxglove, with all types that it refers to."""
         text, _ = self.store.generate_msgdef(type_name, ros_version=2)
