@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe import fieldbus
 from canprobe.cli.argument_types import seconds, whole, word
 from canprobe.cli.output import print_answer, print_json, print_table
 from canprobe.cli.parser import Parser
@@ -27,10 +26,12 @@ from canprobe.cli.stdin import yes_typed
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.eds.packaged import check_eds, load_eds
 from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.port import Port
+    from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.conform import Examination, Point
 
 HELP = "examine a device of any maker for conformance"
@@ -166,8 +167,10 @@ def _points(args: argparse.Namespace) -> tuple[Point, ...]:
     return chosen_points(points, (args.points or "").split(","))
 
 
-def _description(args: argparse.Namespace) -> fieldbus.Description | None:
-    return None if args.eds is None else fieldbus.Description(fieldbus.load_eds(args.eds, args.node))
+def _description(args: argparse.Namespace) -> Description | None:
+    from canprobe.fieldbus.eds.description import Description
+
+    return None if args.eds is None else Description(load_eds(args.eds, args.node))
 
 
 @contextlib.contextmanager
@@ -194,8 +197,12 @@ def _emulated(args: argparse.Namespace) -> Port:
     """A port of a bus in virtual time with the emulated node of the EDS."""
     if args.eds is None:
         raise UsageError("conform: --bus lockstep examines the emulated node of an EDS: name it with --eds")
-    bus = fieldbus.LockstepBus(fieldbus.VirtualClock(), "lockstep", fd=True)
-    bus.attach(fieldbus.make_eds_node(fieldbus.load_eds(args.eds, args.node), args.node, eds=args.eds))
+    from canprobe.fieldbus.bus.clock import VirtualClock
+    from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+    from canprobe.fieldbus.drive.from_eds import make_eds_node
+
+    bus = LockstepBus(VirtualClock(), "lockstep", fd=True)
+    bus.attach(make_eds_node(load_eds(args.eds, args.node), args.node, eds=args.eds))
     return bus.port()
 
 
@@ -210,7 +217,7 @@ def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
         or "nothing beyond the default",
     }
     if args.eds is not None:
-        reading = fieldbus.check_eds(args.eds, args.node)
+        reading = check_eds(args.eds, args.node)
         facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
         facts["EDS"] = eds_and_hash(args.eds)
     return facts

@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from canprobe import fieldbus
 from canprobe.cli.argument_types import whole
 from canprobe.cli.output import print_answer
 from canprobe.cli.parser import Parser
-from canprobe.fieldbus.eds.packaged import eds_names
+from canprobe.fieldbus.eds.packaged import check_eds, eds_names, eds_path
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.eds.findings import EdsFinding
@@ -67,14 +66,14 @@ def add_arguments(parser: Parser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Print the names of the files, or the path of one."""
     if args.action == "path":
-        print(fieldbus.eds_path(args.eds))
+        print(eds_path(args.eds))
     else:
         print_answer(args, list(eds_names()), "\n".join(eds_names()))
 
 
 def run_check(args: argparse.Namespace) -> int:
     """Print the faults and warnings of a file; status 2 when it cannot be served."""
-    reading = fieldbus.check_eds(args.file, args.node_id)
+    reading = check_eds(args.file, args.node_id)
     found = [f"{'fault' if fault.prevents else 'warning'}: {fault}" for fault in reading.found]
     print_answer(args, _document(reading), "\n".join([*found, f"{reading.path}: {_summary(reading)}"]))
     return 2 if reading.faults else 0

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe import fieldbus
 from canprobe.cli.argument_types import seconds
 from canprobe.cli.emulate import eds_files
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
@@ -27,10 +26,12 @@ from canprobe.cli.parser import Parser
 from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
 from canprobe.cli.target import loaded, one_channel, real_target, scene_target
 from canprobe.errors import UsageError
+from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
     from canprobe.cell.session.target import Target
+    from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.judge import Judge
     from canprobe.fieldbus.tools.judge.bench import MasterBench
 
@@ -49,7 +50,7 @@ examples:
 """
 _TIMED_OUT = 124
 _SHOWN_FRAMES = 6
-Nodes = Mapping[int, "fieldbus.Description"]
+Nodes = Mapping[int, "Description"]
 """What is known of each node, by its id."""
 
 
@@ -193,6 +194,8 @@ def _status_of_command(bench: MasterBench) -> int:
 
 def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Nodes:
     """What is known of each node, by its id; of a scene with several channels, those on one of them."""
+    from canprobe.fieldbus.eds.description import Description
+
     if args.scene is None:
         files = eds_files("judge", args)
         if any(one == 255 for _, one in files):
@@ -204,7 +207,7 @@ def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Nodes
         planned = make_plan(resolve(loaded(args))).nodes
         several = len({node.channel for node in planned}) > 1
         files = [(node.eds, node.node_id) for node in planned if not several or channel in (None, node.channel)]
-    return {one: fieldbus.Description(fieldbus.load_eds(name, one)) for name, one in files}
+    return {one: Description(load_eds(name, one)) for name, one in files}
 
 
 def _report_of(
