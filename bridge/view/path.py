@@ -66,7 +66,7 @@ def deviation_scale(shape: PlacedShape | None, scan: Scan | None) -> DeviationSc
     """
     if scan is not None and isinstance(scan.strategy, Rectangle):
         high = EXPLORED_TARGETS * 1e6 * scan.strategy.target_sigma
-        return DeviationScale(high, "stated deviation of the height (µm)", of_height=True)
+        return DeviationScale(high, "deviation of the height, without tool and arm (µm)", of_height=True)
     high = UNCERTAIN_PER_M
     if shape is not None:
         kappa = shape.closest(shape.T_base_object[:3, 3]).kappa

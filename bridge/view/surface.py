@@ -33,7 +33,7 @@ def drawn(surface_map: SurfaceMap, scale: DeviationScale) -> tuple[Mesh, NDArray
     """Triangles of a map, and the colours of its vertices (n, 3): the deviation of K or height that it states there."""
     mesh = surface_map.mesh(cell=CELL_M * max(1.0, math.sqrt(len(surface_map) / NODES_IN_DETAIL)))
     if scale.of_height:
-        return mesh, scale.colours(1e6 * mesh.sigma)
+        return mesh, scale.colours(1e6 * mesh.sigma_relative)
     V = surface_map.curvature(mesh.vertices).covariance
     return mesh, scale.colours(np.sqrt(V[:, 0, 0] + 2.0 * V[:, 1, 1] + V[:, 2, 2]))
 

@@ -3,7 +3,7 @@
 39 touches take about five minutes. They give the force, the stiffness of the layer, the blur, the crosstalk, the noise
 and the lag of the array. An emulated cell has the objects; at a real one you are asked to place them. Images alone do
 not show newtons: --force-reference names what you measured the force with, else the calibration is in nominal newtons.
-The result is a file for the key sensor.calibration.
+The result is a file for the key sensor.calibration. --verify says in a minute whether the file of the cell still holds.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from datetime import date
 
 from canprobe.cell.session.terminal import StepReport
@@ -25,6 +26,7 @@ EXAMPLE = """\
 examples:
   canprobe calibrate array puma260 --force-reference scale --sigma 0.5
   canprobe calibrate array mycell.toml --bus socketcan --channel can0
+  canprobe calibrate array mycell.toml --verify
 """
 
 
@@ -50,9 +52,12 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_option(
         "--spread PERCENT",
-        "with --make: standard deviation of the force from array to array, by its data sheet [5]",
+        "with --make: standard deviation of the force from array to array, by its data sheet [10]",
         positive,
-        default=5.0,
+        default=10.0,
+    )
+    parser.add_option(
+        "--verify", "touch the ball three times, and say whether the calibration of the cell still holds [status 1: no]"
     )
     parser.add_option("--yes", "do not ask for objects; for an emulated cell only")
     parser.add_shared("BUS")
@@ -61,13 +66,13 @@ def add_arguments(parser: Parser) -> None:
     parser.add_shared("--force", "--json", "-v")
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> int:
     """Touch, fit, print, and write calibration.toml, calibration.png and the recorded buses."""
     from canprobe import api
-    from canprobe.cell.results.array_report import as_document, calibration_text, draw_calibration
+    from canprobe.cell.results.array_report import as_document, calibration_text, draw_calibration, verification_text
     from canprobe.cell.scene.calibrations import dump_calibration
     from canprobe.cell.scene.load import load_scene, read_cell
-    from canprobe.cell.session.array_calibration import CalibrationRequest, calibrate
+    from canprobe.cell.session.array_calibration import CalibrationRequest, calibrate, verify
     from canprobe.fieldbus.bus.files import write_text
 
     today = date.today().isoformat()
@@ -85,7 +90,15 @@ def run(args: argparse.Namespace) -> None:
         spread=1e-2 * args.spread,
         seed=args.seed,
     )
-    found = calibrate(request, date=today, ask=None if args.yes else _ask, say=_steps(args.report), out=out)
+    ask, say = None if args.yes else _ask, _steps(args.report)
+    if args.verify:
+        calibration, verification = verify(request, date=today, ask=ask, say=say, out=out)
+        if args.json:
+            print_json({**asdict(verification), "holds": verification.holds, "verified": calibration.verified})
+        else:
+            print(verification_text(calibration, verification))
+        return 0 if verification.holds else 1
+    found = calibrate(request, date=today, ask=ask, say=say, out=out)
     write_text(out / "calibration.toml", dump_calibration(found.fit.calibration))
     try:
         draw_calibration(found.fit, out / "calibration.png")
@@ -98,8 +111,9 @@ def run(args: argparse.Namespace) -> None:
         print(calibration_text(found.fit))
         print(f"  unloaded   {len(found.restless)} taxels show counts, drift {found.drift_counts:.2f} counts")
         for note in found.notes:
-            print(f"  left out   {note}")
+            print(f"  note       {note}")
         print(f'  file       {out / "calibration.toml"}; name it in the cell: [sensor] calibration = "..."')
+    return 0
 
 
 def _steps(report: StepReport) -> Callable[[str], None]:

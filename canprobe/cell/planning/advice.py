@@ -187,11 +187,14 @@ def _calibration_warnings(array: Array) -> Iterator[str]:
             f"sensor.calibration: a file of an earlier form: {'; '.join(lacking)};"
             " `canprobe calibrate array CELL` measures what is missing"
         )
-    if array.calibration.serial_number not in (None, array.serial):
+    if array.calibrated and array.calibration.of_make:
+        its, this = array.calibration.serial_number, array.serial
+        named = "this one has no name" if this is None else f"this one is {this:#x} (1018h:04)"
+        same = f'; or, if it is that one: sensor.serial_number = "{its}"' if this is None else ""
         yield (
-            f"sensor.calibration: of the array {array.calibration.serial_number:#x} (1018h:04), and this one is"
-            f" {array.serial:#x}: its forces are known to {100 * MAKE_SPREAD:g} % (1σ), as of any array of the make;"
-            " type: canprobe calibrate array CELL"
+            f"sensor.calibration: of the array {its if isinstance(its, str) else f'{its:#x}'}, and {named}: its forces"
+            f" are known to {100 * MAKE_SPREAD:g} % (1σ), as of any array of the make;"
+            f" type: canprobe calibrate array CELL{same}"
         )
 
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from canprobe.cell.results.summary import without_nan
 from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
+from canprobe.mechanics.touch.array_calibration.verify import Verification
+from canprobe.mechanics.touch.image.calibration import ArrayCalibration
 
 
 def calibration_text(fit: ArrayFit) -> str:
@@ -44,6 +46,19 @@ def calibration_text(fit: ArrayFit) -> str:
         mine, its = (", ".join(f"{1e6 * x:.0f}" for x in offset) for offset in (fit.offset, fit.object_offset))
         lines.append(f"  offset     ({mine}) µm turns with the probe, ({its}) µm stays with the object")
     return "\n".join(lines)
+
+
+def verification_text(calibration: ArrayCalibration, found: Verification) -> str:
+    """What touches show beside a calibration, line by line."""
+    c = calibration
+    way, stated = found.stiffness_sigma / found.stiffness, found.stated_sigma / found.stated
+    return "\n".join([
+        f"{c.array}, calibrated {c.date}, last verified {c.verified or 'never'}",
+        f"  moments    err by {100 * found.moments:.1f} %; the calibration says {100 * found.moments_sigma:.1f} %",
+        f"  stiffness  {found.stiffness:.3g} N/m³ ± {100 * way:.0f} % by the arm's way; the calibration says"
+        f" {found.stated:.3g} ± {100 * stated:.0f} %",
+        "  it holds" if found.holds else "  it does not hold: type canprobe calibrate array CELL",
+    ])  # fmt: skip
 
 
 def _percent(value: float, before: str = "") -> str:

@@ -245,9 +245,9 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
     from canprobe.mechanics.touch.linear_algebra import rms
     from canprobe.mechanics.touch.map import nodes as column
 
-    names = ("sigma_um", "disagree_fraction", "stiffness_n_m3", "stiffness_sigma_percent", "common")
+    names = ["sigma_um", "sigma_relative_um", "disagree_fraction", "stiffness_n_m3", "stiffness_sigma_percent"]
+    names += ["common", "rms_error_um", "within_2_sigma_fraction", "within_2_sigma_relative_fraction"]
     found: dict[str, Any] = {"contacts": 0, "nodes": len(surface_map)} | dict.fromkeys(names)
-    found |= dict.fromkeys(("rms_error_um", "within_2_sigma_fraction"))
     if not len(surface_map):
         return found
     found["contacts"] = int(surface_map.nodes.rows[:, column.COUNT].sum())
@@ -256,6 +256,7 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
     known = np.isfinite(feet.sigma)
     if known.any():
         found["sigma_um"] = 1e6 * float(np.median(feet.sigma[known]))
+        found["sigma_relative_um"] = 1e6 * float(np.median(feet.sigma_relative[known]))
         found["disagree_fraction"] = float(np.mean(surface_map.disagreement(places[known]) > 0.0))
     if (stiffness := surface_map.stiffness) is not None:
         found["stiffness_n_m3"], found["stiffness_sigma_percent"] = stiffness.value, 1e2 * stiffness.sigma
@@ -267,6 +268,11 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
         off = np.array([shape.nearest((x, y, z)).distance for x, y, z in feet.point[known].tolist()])
         found["rms_error_um"] = 1e6 * rms(off)
         found["within_2_sigma_fraction"] = float(np.mean(np.abs(off) < TWO_SIGMA * feet.sigma[known]))
+        # a tool that is off displaces a turning probe's surface along its normals, and another's as it is
+        displaced = np.column_stack([np.ones(len(off)), feet.normal[known]])
+        bent = off - displaced @ np.linalg.lstsq(displaced, off, rcond=1e-6)[0]
+        held = np.abs(bent) < TWO_SIGMA * feet.sigma_relative[known]
+        found["within_2_sigma_relative_fraction"] = float(np.mean(held))
     return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in found.items()}
 
 

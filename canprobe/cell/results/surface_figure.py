@@ -74,7 +74,7 @@ def true_surface(shape: PlacedShape, path: Floats, plane: MapPlane) -> Floats:
 
 
 def map_surface(surface_map: SurfaceMap, plane: MapPlane) -> tuple[Floats, Floats]:
-    """The surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its contacts.
+    """The surface of a map: points (rows, columns, 3) of base, m, and its relative σ, m; NaN beyond its contacts.
 
     A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
     """
@@ -88,7 +88,7 @@ def map_surface(surface_map: SurfaceMap, plane: MapPlane) -> tuple[Floats, Float
     us, vs = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, counts, strict=True)))
     nearest = cKDTree(contacts[:, :2]).query(np.stack((us, vs), axis=-1))[1]
     feet = surface_map.closest(plane.base(np.stack((us, vs, contacts[nearest, 2]), axis=-1)).reshape(-1, 3))
-    return feet.point.reshape(*us.shape, 3), feet.sigma.reshape(us.shape)
+    return feet.point.reshape(*us.shape, 3), feet.sigma_relative.reshape(us.shape)
 
 
 def add_sheet(axes: Any, corners: Floats, colours: Floats | str, **style: Any) -> None:
@@ -128,7 +128,7 @@ def draw_map_surface(part: Part, view: MapView) -> None:
 def _values(points: Floats, sigma: Floats, shape: PlacedShape | None) -> tuple[Floats, str, Colormap]:
     """Values (rows, columns) of a surface, µm, their name, and their colours."""
     if shape is None:
-        return 1e6 * sigma, "σ of the surface's height (µm)", colormaps["viridis"]
+        return 1e6 * sigma, "σ of the height, without tool and arm (µm)", colormaps["viridis"]
     above = np.full(sigma.shape, np.nan)
     for place in zip(*np.nonzero(np.isfinite(points[:, :, 0])), strict=True):
         above[place] = shape.nearest(tuple(points[place].tolist())).distance

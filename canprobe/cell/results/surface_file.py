@@ -4,7 +4,7 @@ The file has the nodes of the map (`canprobe.mechanics.touch.map`), from which t
 Base frame; n nodes:
 
 =========================  =========  ================================================================================
-``format_version``         ()         2
+``format_version``         ()         3
 ``pad_radius_m``           ()         radius of the probe; NaN where the contacts are points
 ``pad_stiffness_n_m3``     ()         stated stiffness of its layer; NaN likewise
 ``stiffness_n_m3``         ()         stiffness that the contacts show; NaN likewise
@@ -14,6 +14,7 @@ Base frame; n nodes:
 ``sigma_normal_rad``       ()         standard deviation of a normal; infinite: not used
 ``path_per_sample_m``      (3,)       path per independent height, normal, image; 0: every contact is independent
 ``sigma_common``           (4,)       of lag (m), relative scale of the pad, its offsets (m); 0: none
+``sigma_place_m``          ()         of where the whole surface is along its normals, by tool and arm
 ``centre_m``               (n, 3)     centre of the probe; the contact point where there is none
 ``normal``                 (n, 3)     outward unit normal of the object
 ``pad_axes``               (n, 3, 3)  rows: axes x, y, z of the probe
@@ -44,13 +45,14 @@ from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.stiffness import Stiffness
 from canprobe.mechanics.types import Floats
 
-SURFACE, FORMAT_VERSION = "surface.npz", 2
+SURFACE, FORMAT_VERSION = "surface.npz", 3
 _OF_LAYER = ("pad_radius_m", "pad_stiffness_n_m3", "stiffness_n_m3", "stiffness_log_sigma")
 _OF_NOISE = ("sigma_lateral_m", "sigma_height_m", "sigma_normal_rad")
 _PER_MAP: dict[str, tuple[int, ...]] = {
     **dict.fromkeys((*_OF_LAYER, *_OF_NOISE), ()),
     "path_per_sample_m": (3,),
     "sigma_common": (4,),
+    "sigma_place_m": (),
 }
 _PER_NODE: dict[str, tuple[slice | int, tuple[int, ...]]] = {
     "centre_m": (column.CENTRE, (3,)),
@@ -82,7 +84,7 @@ def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None
     usual = (noise.lateral, noise.height, noise.normal)
     columns |= {name: np.array(value) for name, value in zip(_OF_NOISE, usual, strict=True)}
     columns["path_per_sample_m"] = np.array([noise.height_path, noise.normal_path, noise.image_path])
-    columns["sigma_common"] = np.array(noise.common)
+    columns["sigma_common"], columns["sigma_place_m"] = np.array(noise.common), np.array(noise.place)
     columns |= {name: rows[:, where].reshape(-1, *shape) for name, (where, shape) in _PER_NODE.items()}
     write_npz(Path(path), columns)
 
@@ -129,7 +131,8 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
     lateral, height, normal = (float(values[name]) for name in _OF_NOISE)
     lag, scale, x, y = values["sigma_common"].tolist()
     of_height, of_normal, of_image = values["path_per_sample_m"].tolist()
-    noise = MapNoise(lateral, height, normal, of_height, of_normal, of_image, (lag, scale, x, y))
+    common, place = (lag, scale, x, y), float(values["sigma_place_m"])
+    noise = MapNoise(lateral, height, normal, of_height, of_normal, of_image, common, place)
     return SurfaceMap.of_nodes(
         rows,
         None if math.isnan(radius) else PadLayer(radius, stated),

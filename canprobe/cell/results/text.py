@@ -195,7 +195,8 @@ def _map_text(surface: Mapping[str, Any]) -> str:
         return f"{surface['contacts']} contacts, no surface"
     off = surface["rms_error_um"]
     return (
-        f"{surface['contacts']} contacts in {surface['nodes']} nodes, σ {surface['sigma_um']:.0f} µm"
+        f"{surface['contacts']} contacts in {surface['nodes']} nodes, σ {surface['sigma_relative_um']:.0f} µm,"
+        f" with tool and arm {surface['sigma_um']:.0f} µm"
         + (f"; RMS error {off:.0f} µm" if off is not None else "")
         + f"; contacts disagree on {100 * surface['disagree_fraction']:.0f} %"
     )

@@ -17,7 +17,7 @@ from canprobe.errors import SceneError
 from canprobe.mechanics.robot.tool_calibration import ToolEstimate
 
 FILE = "tool.toml"
-KEYS = ("centre_offset_mm", "centre_lateral_mm")
+KEYS = ("centre_offset_mm", "centre_lateral_mm", "position_sd_mm")
 
 
 def summarise_calibration(scene: Scene, estimate: ToolEstimate | None) -> dict[str, Any] | None:
@@ -73,9 +73,11 @@ def tool_text(found: Mapping[str, Any], name: str) -> str | None:
     sigma = ", ".join(f"{value:.3f}" for value in found["sigma_mm"])
     return (
         f"# The probe's centre on the flange, by {found['touches']} touches of a ball (scene {name}); standard\n"
-        f"# deviation of x, y, z: {sigma} mm. For a scene's own [probe], or: canprobe run SCENE --tool THIS_FILE\n\n"
+        f"# deviation of x, y, z: {sigma} mm, of which the file states the largest.\n"
+        f"# For a scene's own [probe], or: canprobe run SCENE --tool THIS_FILE\n\n"
         f"{written_by_line()}\n"
         f"[probe]\ncentre_offset_mm = {z:.4f}\ncentre_lateral_mm = [{x:.4f}, {y:.4f}]\n"
+        f"position_sd_mm = {max(found['sigma_mm']):.3f}\n"
     )
 
 
@@ -93,8 +95,8 @@ def with_tool(scene: Scene, path: Path | str) -> Scene:
     """
     (document, file), reader = with_writer(read_toml(Path(path), str(path)), str(path)), Reader()
     table = document.get("probe")
-    if set(document) != {"probe"} or not isinstance(table, dict) or set(table) != set(KEYS):
-        raise SceneError([f"{file}: expected the section [probe] with {' and '.join(KEYS)}, and nothing else"])
+    if set(document) != {"probe"} or not isinstance(table, dict) or not set(KEYS[:2]) <= set(table) <= set(KEYS):
+        raise SceneError([f"{file}: expected the section [probe] with {', '.join(KEYS)}, and nothing else"])
     found = reader.section(ProbeSettings, table, "probe")
     if reader.problems:
         raise SceneError([f"{file}: {problem}" for problem in reader.problems])

@@ -58,8 +58,10 @@ class About:
     """`sensor.full_scale_kpa` of the touches."""
     force_sigma_percent: Percent | None = None
     """Standard deviation of the reference. Left out with `none`."""
-    serial_number: Annotated[int, Range(1, 0xFFFFFFFF)] | None = None
-    """Serial number (1018h:04) of the array. Left out: the file is for a make, or the array states no number."""
+    serial_number: Annotated[int, Range(1, 0xFFFFFFFF)] | str | None = None
+    """Serial number (1018h:04) of the array, or its name. Left out: the file is for a make, or nobody named it."""
+    verified: str | None = None
+    """Date of the last `canprobe calibrate array --verify` for which it held."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -143,8 +143,10 @@ class SensorSettings:
     """Rate of the images. A SYNC triggers each, or what `wire.sampling` names."""
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
     """Pressure at the largest count of a taxel."""
-    serial_number: SerialNumber | None = None
-    """Serial number (1018h:04) that the array must have. Left out: that of its calibration file, or any."""
+    serial_number: SerialNumber | str | None = None
+    """Serial number (1018h:04) that the array must have; of an array that is no CANopen node, its name, as on its
+    label. Left out: the number of its calibration file, or any; an array without a name is another one than its
+    file's."""
     calibration: Annotated[str | None, ScenePath()] = None
     """Calibration file of the array, by `canprobe calibrate array`: a packaged name, or a path relative to the file.
     Left out: that of the emulated array; a real array then measures in nominal newtons."""
@@ -206,6 +208,8 @@ class ProbeSettings:
     """Distance of the centre of the sphere from the flange along tool z. `canprobe run calibrate` finds it."""
     centre_lateral_mm: Vec2 = (0.0, 0.0)
     """Offset of the centre along tool x and y. `canprobe run calibrate` finds it."""
+    position_sd_mm: Annotated[float, Range(0, 10)] = 0.2
+    """Standard deviation of where the centre is on the flange, along each axis. `canprobe run calibrate` finds it."""
     mass_kg: Annotated[float, Range(0, 5)] = 0.3
     """Mass of the probe; the dynamic arm carries it."""
     stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, refuse_narrow, scan_axes, true_object
-from canprobe.cell.scene.hardware import MM, EmulateSettings, JointSettings
+from canprobe.cell.scene.hardware import MM, ArmSettings, EmulateSettings, JointSettings
 from canprobe.cell.scene.load import read_cell, with_files
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -60,6 +60,9 @@ SEARCH = 8e-3
 """Distance beyond the expected place at which an approach gives up, m."""
 LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
+ARM_ACCURACY_MM = 0.5
+"""Standard deviation of the flange's place of a real arm whose file states none: arms of this size whose chain nobody
+has calibrated are off by some tenths of a millimetre."""
 EMULATED_ARRAY = "inch16"
 """Calibration of the emulated array."""
 LATENCY_SIGMAS = 3.0
@@ -92,7 +95,10 @@ def resolve(scene: Scene) -> Setup:
     keep_out, lacking = _keep_out(scene, arm, None if bare else settings)
     if arm is not None:
         arm = replace(arm, warnings=(*arm.warnings, *lacking))
-    probe = Probe(np.eye(4), 0.0, stiffness, 0.0) if bare else Probe(T, radius, stiffness, settings.mass_kg)
+    probe = Probe(np.eye(4), 0.0, stiffness, 0.0)
+    if not bare:
+        sd = settings.position_sd_mm * MM
+        probe = Probe(T, radius, stiffness, settings.mass_kg, sd, math.hypot(sd, _arm_accuracy(scene.arm)))
     return Setup(
         scene=scene,
         saved=saved,
@@ -115,6 +121,14 @@ def resolve(scene: Scene) -> Setup:
         task=_task(scene, arm, array, probe),
         truth=_truth(scene, arm, array, bodies, probe),
     )
+
+
+def _arm_accuracy(settings: ArmSettings | None) -> float:
+    """Standard deviation of the flange's place in base, per axis, m."""
+    if settings is None:
+        return 0.0
+    stated = 0.0 if settings.emulated else ARM_ACCURACY_MM
+    return (stated if settings.accuracy_mm is None else settings.accuracy_mm) * MM
 
 
 def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
@@ -187,11 +201,13 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
 
     calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
     calibrated = settings.calibration is not None or settings.emulated
-    serial = settings.serial_number if settings.serial_number is not None else calibration.serial_number
-    if calibration.serial_number not in (None, serial):
-        calibration = calibration.of_another()
+    serial = settings.serial_number
+    if serial is None and scene.array_is_node:  # which bring-up asks
+        serial = calibration.serial_number
     if not calibrated:  # creep of the emulated array says nothing about a real one
         calibration = replace(calibration, force=UNSTATED)
+    if not calibrated or calibration.serial_number not in (None, serial):
+        calibration = calibration.of_another()
     positions, normals = (
         np.array(one) if one is not None else None for one in (settings.positions_mm, settings.normals)
     )
@@ -223,7 +239,7 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
         channel=settings.channel or scene.bus.channel,
         eds=settings.eds,
         emulated=settings.emulated,
-        serial=serial if scene.array_is_node else None,
+        serial=serial if scene.array_is_node and isinstance(serial, int) else None,
         name=settings.array,
         mode=settings.mode,
         window=settings.window,

@@ -204,6 +204,12 @@ def _sensor_rate(cycle: float, sensor: float) -> _Complaint:
         yield "sensor.rate_hz", f"expected at most cycle.rate_hz = {cycle:g}, got {sensor:g}: {why}"
 
 
+@_across("sensor.serial_number", "wire.kind?")
+def _name_of_a_node(serial: int | str, wire: str | None) -> _Complaint:
+    if isinstance(serial, str) and wire != "frames":
+        yield "sensor.serial_number", f"expected the number of 1018h:04, which a CANopen node has, got {serial!r}"
+
+
 @_across("sensor.rows", "sensor.columns", "sensor.pitch_mm", "sensor.positions_mm?", "sensor.normals?")
 def _taxel_positions(rows: int, columns: int, pitch: object, positions: object, normals: object) -> _Complaint:
     if positions is None and normals is not None:

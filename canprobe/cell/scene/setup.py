@@ -213,12 +213,16 @@ class Probe:
         radius: radius of the sphere, m; 0 without a probe.
         stiffness: stiffness K/h of the layer, N/m³.
         mass: mass of the probe, kg.
+        position_sd: standard deviation of its centre on the flange, per axis, m.
+        place_sd: standard deviation of its centre in base, per axis, m: on the flange, and of the flange by the arm.
     """
 
     T_flange_probe: Floats
     radius: float
     stiffness: float
     mass: float
+    position_sd: float = 0.0
+    place_sd: float = 0.0
 
     @property
     def tip(self) -> str:

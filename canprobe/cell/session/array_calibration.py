@@ -21,6 +21,7 @@ from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.motion import reach_problems
+from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
 from canprobe.cell.scene.hardware import Vec3
 from canprobe.cell.scene.load import load_scene, packaged_files
 from canprobe.cell.scene.model import ObjectSettings, Scene
@@ -32,13 +33,15 @@ from canprobe.cell.tasks.calibrate import Press, RollRecord, RollTask
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.task import Phase
 from canprobe.errors import PlanError, UsageError
+from canprobe.fieldbus.bus.files import write_text
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import task_rows
 from canprobe.mechanics.touch import calibrate_array
 from canprobe.mechanics.touch.array_calibration.calibrate import ArrayFit
 from canprobe.mechanics.touch.array_calibration.touches import Dwell
+from canprobe.mechanics.touch.array_calibration.verify import Verification, verify_calibration
 from canprobe.mechanics.touch.contact import direction_to_pad
-from canprobe.mechanics.touch.image.calibration import ForceReference
+from canprobe.mechanics.touch.image.calibration import ArrayCalibration, ForceReference
 from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD
 from canprobe.mechanics.types import Floats
 
@@ -53,6 +56,8 @@ REST_S = 30.0
 PLANE_FORCES_N, BALL_FORCES_N, LOADS_N = (0.7, 1.5, 3.0), (0.8, 2.0), (1.0, 2.0, 3.0)
 CORNERS_M = tuple((u, v) for u in (-2e-3, 2e-3) for v in (-2e-3, 2e-3))
 GRID_M = tuple((u, v) for u in (-2e-3, 0.0, 2e-3) for v in (-2e-3, 0.0, 2e-3))
+VERIFIED_FORCES_N = (0.8, 1.4, 2.0)
+"""Forces of the touches that verify a calibration: within those of its own touches of the ball."""
 LOAD_S = 9.0
 """Time of a reference load, s: creep has ended by then, and a scale shows a steady value."""
 STROKE_M, STROKE_HZ, STROKE_S = (0.5e-3, 0.0), (0.5, 1.5), 8.0
@@ -181,7 +186,7 @@ class Calibrated:
         fit: the fit, which has the calibration.
         restless: taxels that show counts without load, (row, column).
         drift_counts: RMS change of the images from the first to the last second without load.
-        notes: steps that were left out, and why.
+        notes: steps that were left out, and what is to be done by hand.
     """
 
     fit: ArrayFit
@@ -220,11 +225,20 @@ def calibrate(
     for number, visit in enumerate(every, start=1):
         there = _turned(scene) if visit.turned else scene
         if there is None:
-            notes.append(f"the {visit.known.name} with the probe turned: the last joint cannot turn by half a turn")
+            notes.append(
+                f"left out: the {visit.known.name} with the probe turned, as the last joint cannot turn by half a turn"
+            )
             continue
         planned.append((number, visit, _plan(replace(there, object=visit.known.settings(at)), visit)))
     array = resolve(scene).array  # read before the touches: its files may change meanwhile
     assert array is not None
+    name = scene.sensor.serial_number
+    if array.raw is not None and name is None and ask is not None and not emulated and request.own_gains:
+        name = ask("Name of this array, as on its label (Enter: it has none): ").strip() or None
+        if name is not None:
+            notes.append(
+                f'nothing on the bus shows which array it is: put sensor.serial_number = "{name}" into the cell'
+            )
     dwells: list[Dwell] = []
     unloaded: list[NDArray[np.uint8]] = []
     placed: KnownObject | None = None
@@ -253,8 +267,48 @@ def calibrate(
         spread=request.spread,
     )
     if request.own_gains:
-        fit = replace(fit, calibration=replace(fit.calibration, serial_number=serial))
+        fit = replace(fit, calibration=replace(fit.calibration, serial_number=serial or name))
     return Calibrated(fit, *_without_load(unloaded, array.rate_hz), tuple(notes))
+
+
+def verify(
+    request: CalibrationRequest, *, date: str, ask: Ask | None = None, say: Say = quiet, out: Path | None = None
+) -> tuple[ArrayCalibration, Verification]:
+    """Touch the ball at one place with three forces, and compare them with the calibration file that the cell names.
+
+    Where it holds the date is written into the file.
+
+    Args:
+        request, date, ask, say, out: as of `calibrate`.
+
+    Returns:
+        The calibration as it was, and what the touches show beside it.
+
+    Raises:
+        UsageError: the cell names no calibration of this array; and as `calibrate`.
+    """
+    scene = _scene(request)
+    array = resolve(scene).array
+    assert array is not None and scene.sensor is not None
+    file = Path(scene.sensor.calibration or "")
+    if not file.is_file() or array.calibration.of_make:
+        raise UsageError(
+            f"{request.cell}: sensor.calibration: expected the file of this array, got"
+            f" {scene.sensor.calibration or 'none'}; make one first: canprobe calibrate array {request.cell}"
+        )
+    ball = KnownObject("ball", request.ball_radius)
+    if not array.emulated:
+        if ask is None:
+            raise UsageError("a real array: a person has to place the ball; leave --yes out")
+        ask(f"{ball.asked_for(scene.task.start_mm)} Then press Enter: ")
+    visit = Visit(ball, tuple(Press(force) for force in VERIFIED_FORCES_N))
+    plan = _plan(replace(scene, object=ball.settings(scene.task.start_mm)), visit)
+    dwells, *_ = touch_object(plan, visit, out, say, ask)
+    calibration = load_calibration(str(file))
+    found = verify_calibration(calibration, dwells, array.pad)
+    if found.holds:
+        write_text(file, dump_calibration(replace(calibration, verified=date)))
+    return calibration, found
 
 
 def _scene(request: CalibrationRequest) -> Scene:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Controller
@@ -95,7 +96,7 @@ def _stages(task: Touch, memory: float, rolling_share: float) -> Iterator[Answer
     if _uses_patch(task):
         yield PatchFusion(PatchCurvature(_image_model(task), SIGMA_STIFFNESS), memory)
     yield NoiseLevel(memory)
-    yield SystematicErrors.of_scan(memory, rolling_share)
+    yield SystematicErrors.of_scan(memory, rolling_share, task.probe.position_sd)
     if task.shape.revisit:
         yield MapFusion(make_surface_map(task), memory)
 
@@ -122,7 +123,8 @@ def make_surface_map(task: Touch) -> SurfaceMap:
     """An empty map for the contacts of a task's pad."""
     from canprobe.mechanics.touch import PAD_NOISE, PadLayer, SurfaceMap  # only where a shape is asked for
 
-    return SurfaceMap(PadLayer(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
+    noise = replace(PAD_NOISE, place=task.probe.place_sd)
+    return SurfaceMap(PadLayer(task.probe.radius, task.probe.stiffness), noise, _image_model(task))
 
 
 def _uses_patch(task: Touch) -> bool:

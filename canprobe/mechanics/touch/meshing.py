@@ -31,6 +31,7 @@ class Feet(NamedTuple):
         normal: (n, 3) outward unit normals there.
         height: (n,) signed distances of the query points from the surface, m, positive outside.
         sigma: (n,) standard deviations of the surface's height, m; NaN where they are not known.
+        sigma_relative: (n,) the same of its height against the rest of the surface: without what displaces all of it.
         pieces: (n,) numbers of local fits that were blended.
     """
 
@@ -38,6 +39,7 @@ class Feet(NamedTuple):
     normal: Floats
     height: Floats
     sigma: Floats
+    sigma_relative: Floats
     pieces: NDArray[np.intp]
 
 
@@ -63,22 +65,23 @@ class Mesh:
         vertices: (n, 3) points on the surface, m.
         triangles: (m, 3) indices of vertices, anticlockwise seen from outside the body.
         normals: (n, 3) outward unit normals of the surface at the vertices.
-        sigma: (n,) standard deviation of the surface's height at the vertices, m; NaN where it is not known.
+        sigma, sigma_relative: (n,) standard deviations of the surface's height at the vertices, m, as those of `Feet`.
     """
 
     vertices: Floats
     triangles: NDArray[np.int32]
     normals: Floats
     sigma: Floats
+    sigma_relative: Floats
 
     def save_ply(self, path: Path | str) -> None:
-        """Write a binary PLY file: vertices in m, normals, σ as the property `sigma`, and triangles.
+        """Write a binary PLY file: vertices in m, normals, `sigma` and `sigma_relative`, and triangles.
 
         Raises:
             ResultsError: the file cannot be written.
         """
-        columns = ("x", "y", "z", "nx", "ny", "nz", "sigma")
-        points = np.column_stack([self.vertices, self.normals, self.sigma]).astype("<f4")
+        columns = ("x", "y", "z", "nx", "ny", "nz", "sigma", "sigma_relative")
+        points = np.column_stack([self.vertices, self.normals, self.sigma, self.sigma_relative]).astype("<f4")
         faces = np.empty(len(self.triangles), [("n", "u1"), ("i", "<i4", 3)])
         faces["n"], faces["i"] = 3, self.triangles
         head = ["ply", "format binary_little_endian 1.0", "comment lengths in m", f"element vertex {len(points)}"]
@@ -127,10 +130,12 @@ def mesh_of(field: Field, seeds: Floats, cell: float) -> Mesh:
     cells, height = cells[order], np.concatenate(heights)[order]
     start = _place(cells, cell) + cell * _crossing(height)
     feet = field(start)  # twice: the first foot may be off where the start is far from the surface
-    vertices, normals, _, sigma, _ = field(np.where(np.isfinite(feet.point), feet.point, start))
+    feet = field(np.where(np.isfinite(feet.point), feet.point, start))
+    vertices = feet.point
     triangles = _triangles(cells, height, vertices)
     used, renumbered = np.unique(triangles, return_inverse=True)
-    return Mesh(vertices[used], renumbered.reshape(-1, 3).astype(np.int32), normals[used], sigma[used])
+    sigmas = feet.sigma[used], feet.sigma_relative[used]
+    return Mesh(vertices[used], renumbered.reshape(-1, 3).astype(np.int32), feet.normal[used], *sigmas)
 
 
 def _place(number: Numbers, cell: float) -> Floats:

@@ -65,7 +65,9 @@ def test_terminal_and_files_say_it(calibrated):
     assert "5 touches, condition number" in text
     assert "true 0.400, error" in text
     assert json.loads((calibrated.out / "summary.json").read_text())["calibration"] == calibrated.summary["calibration"]
-    assert "centre_lateral_mm = [0." in (calibrated.out / "tool.toml").read_text()
+    text = (calibrated.out / "tool.toml").read_text()
+    assert "centre_lateral_mm = [0." in text
+    assert f"position_sd_mm = {max(calibrated.summary['calibration']['sigma_mm']):.3f}\n" in text
 
 
 @pytest.mark.slow(reason="a scan after the calibration")
@@ -77,11 +79,28 @@ def test_a_scan_with_a_wrong_tool_gets_better_by_it(calibrated):
     np.testing.assert_allclose(believed + better.plant.tool_error_mm, real, atol=1e-9)  # the real tool stays
     runs = [canprobe.run(each, bus="direct", files=False, duration_s=3.0) for each in (scene, better)]
     wrong, right = (result.summary["shape"] for result in runs)
+    assert right["map"]["sigma_um"] < 0.7 * wrong["map"]["sigma_um"]  # five touches, and 0.2 mm that nobody measured
+    assert right["map"]["within_2_sigma_fraction"] > 0.9
+    assert wrong["map"]["within_2_sigma_relative_fraction"] > 0.9
     assert wrong["position_rms_mm"] > 0.4
     assert right["position_rms_mm"] < 0.2
     assert right["position_rms_mm"] < 0.4 * wrong["position_rms_mm"]
     # half a millimetre along the pole is 1.4 % of the radius, about what three seconds of scan err by anyway
     assert max(right["kappa_rms_error_percent"], wrong["kappa_rms_error_percent"]) < 3.0
+
+
+def test_heights_know_that_the_tool_may_be_off():
+    scene = fast(canprobe.load_scene("cylinder", {"cycle.rate_hz": 200.0}), plant={"tool_error_mm": (0.1, 0.1, 0.2)})
+    found = canprobe.run(scene, bus="direct", files=False, duration_s=2.0).summary["shape"]["map"]
+    assert found["rms_error_um"] == pytest.approx(200.0, abs=20.0)
+    assert found["sigma_um"] == pytest.approx(200.0, rel=0.05) and found["sigma_relative_um"] < 20.0
+    assert found["within_2_sigma_fraction"] == 1.0 and found["within_2_sigma_relative_fraction"] > 0.9
+    real = replace(scene, arm=replace(scene.arm, emulated=False))
+    stated = [
+        canprobe.plan(replace(each, arm=replace(each.arm, accuracy_mm=mm))).setup.probe.place_sd
+        for each, mm in ((scene, None), (scene, 0.15), (real, None), (real, 0.0))
+    ]
+    assert stated == pytest.approx([0.2e-3, 0.25e-3, 0.5385e-3, 0.2e-3], rel=1e-3)
 
 
 @pytest.mark.parametrize(

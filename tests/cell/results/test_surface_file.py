@@ -89,7 +89,7 @@ def _rewrite(path, **changes):
     [
         (
             {"format_version": lambda _: 1},
-            r'expected format_version 2, got 1 of another canprobe; .*canprobe\.replay\(".*"\)\.surface_map',
+            r'expected format_version 3, got 1 of another canprobe; .*canprobe\.replay\(".*"\)\.surface_map',
         ),
         ({"format_version": None}, "without 'format_version'"),
         ({"normal": None, "path_m": None}, "missing normal, path_m"),

@@ -176,7 +176,7 @@ def calibrate_array(
         dead=dead if own_gains else (),
     )
     offset, of_object = _offsets(good)
-    forces = np.array([_force(patch, s) for _, s in fitted])
+    forces = np.array([force_of(patch, s) for _, s in fitted])
     return ArrayFit(
         calibration=calibration,
         dwells=[d for d, _ in fitted],
@@ -214,7 +214,8 @@ def _blank(  # noqa: PLR0917
     )
 
 
-def _force(patch: PatchCalibration, s: Shown) -> float:
+def force_of(patch: PatchCalibration, s: Shown) -> float:
+    """Mean force of a touch by the gains of a calibration, N, with its creep."""
     return patch.force_gain * s.total + patch.edge_gain * math.sqrt(s.total)
 
 
@@ -230,7 +231,7 @@ def _checked(
     """Errors (n, 3) of moments, (n, 2) of curvatures and (m,) of reference forces of touches by a calibration."""
     patch = make_patch_calibration(calibration, plain.pad)
     model = make_image_model(calibration, patch, seen=seen)
-    measured = [_force(patch, s) for _, s in touches]
+    measured = [force_of(patch, s) for _, s in touches]
     # a reference load is read over the whole touch, and creep is part of it
     forces = [f * s.crept / d.force - 1.0 for f, (d, s) in zip(measured, touches, strict=True) if d.force is not None]
     return moment_errors(model, touches, measured), curvature_errors(model, touches, measured), np.array(forces)
@@ -269,7 +270,7 @@ def _gains(
     """(16, 16) gains of the taxels by these touches, and dead ones."""
     patch = make_patch_calibration(calibration, plain.pad)
     model = make_image_model(calibration, patch, seen=None)
-    forces = [_force(patch, s) for _, s in touches]
+    forces = [force_of(patch, s) for _, s in touches]
     return taxel_gains(plain.pad, model, touches, forces)
 
 

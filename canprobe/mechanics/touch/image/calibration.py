@@ -185,7 +185,9 @@ class ArrayCalibration:
         force: errors of the force.
         gains: (rows, columns) gains of the taxels over their mean; empty where they were not found or are not used.
         dead: (row, column) of each taxel that reads nothing under a patch.
-        serial_number: serial number of the array (1018h:04); None of a make, and where the array states none.
+        serial_number: serial number of the array (1018h:04), or its name; None of a make, and where nobody named it.
+        verified: date of the last touches that it held for, ISO 8601; None: never.
+        of_make: whether the array that is used is another one of the make.
     """
 
     array: str
@@ -203,7 +205,9 @@ class ArrayCalibration:
     force: ForceErrors = UNSTATED
     gains: tuple[tuple[float, ...], ...] = ()
     dead: tuple[tuple[int, int], ...] = ()
-    serial_number: int | None = None
+    serial_number: int | str | None = None
+    verified: str | None = None
+    of_make: bool = False
 
     @property
     def nominal(self) -> bool:
@@ -220,7 +224,7 @@ class ArrayCalibration:
     def of_another(self) -> ArrayCalibration:
         """What it says about another array of its make: no gains of single taxels, and the spread of a make."""
         force = replace(self.force, spread=max(self.force.spread, MAKE_SPREAD))
-        return replace(self, gains=(), dead=(), force=force)
+        return replace(self, gains=(), dead=(), force=force, of_make=True)
 
     def with_stiffness(self, stiffness: float) -> ArrayCalibration:
         """The same calibration with another stiffness K/h of the layer, N/m³."""

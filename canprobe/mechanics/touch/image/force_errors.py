@@ -112,5 +112,6 @@ class ForceErrors:
 UNSTATED = ForceErrors(creep=0.0, creep_sigma=0.05, creep_decades=2.0, array=0.015, spread=0.05)
 """Errors of an array whose calibration does not state them: creep of 5 % per decade, as data sheets of resistive arrays
 give it, and not corrected."""
-MAKE_SPREAD = 0.05
-"""Stated standard deviation of the force between arrays of one make, which touches of one array do not show."""
+MAKE_SPREAD = 0.1
+"""Stated standard deviation of the force between arrays of one make, which touches of one array do not show: gains
+within 15 % of the make's, and blur, hysteresis and creep of each."""

@@ -35,6 +35,8 @@ class MapNoise:
             as the contact moves over the pad and has `normal_path`.
         common: prior standard deviations of the common errors: lag along the heading (m), relative scale of the pad,
             offsets of the centroid along both axes of the pad (m). All 0: none.
+        place: standard deviation of where the whole surface is along its normals, m: tool and arm displace it in one
+            piece.
     """
 
     lateral: float
@@ -44,6 +46,7 @@ class MapNoise:
     normal_path: float = 0.0
     image_path: float = 0.0
     common: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    place: float = 0.0
 
     @property
     def used(self) -> int:

@@ -3,7 +3,8 @@
 A place asks the cells near it. The cells of its sheet blend with (1 − r²/ρ²)²: height, normal and curvature. The foot
 is found in three steps along the blended normal. σ of the height is that of the quartics, widened where the contacts
 scatter more than their noise explains, with the spread between the cells and the error of the depth by the layer's
-stiffness, which is common to all places. What the contacts did not observe is NaN: the height without points, the
+stiffness, which is common to all places. Tool and arm displace all of the surface: σ has that, `sigma_relative` has
+not. What the contacts did not observe is NaN: the height without points, the
 normal of a single point, the curvature across a straight line.
 """
 
@@ -324,6 +325,7 @@ class SurfaceMap:
             foot + floating[:, None],
             normal + nowhere[:, None],
             above + floating,
+            np.hypot(sigma, self.noise.place) + floating,
             sigma + floating,
             np.where(reached, (weight > 0.0).sum(axis=1), 0),
         )

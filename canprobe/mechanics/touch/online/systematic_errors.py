@@ -43,8 +43,6 @@ PAD_DRAG = 0.03
 """Error of the way of a contact over the pad, over this way (`drag_errors`), by hysteresis and creep. A probe that
 keeps its orientation measures the normal by this way alone; else the rolling share is its part in the turn of the
 normal. The value has the best log score on 15 scenes of a gantry of a development draw."""
-TOOL_SIGMA_M = 0.2e-3
-"""Standard deviation of the probe's centre along its pole, m, as a tool is known after its calibration."""
 
 
 class SystematicErrors(AnswerStage):
@@ -66,14 +64,15 @@ class SystematicErrors(AnswerStage):
         self._travelled = 0.0
 
     @classmethod
-    def of_scan(cls, memory_m: float, rolling_share: float) -> SystematicErrors:
+    def of_scan(cls, memory_m: float, rolling_share: float, position_sd: float) -> SystematicErrors:
         """The errors of a scan: the pad drags as far as the contact rolls, the tool errs as far as the probe turns.
 
         Args:
             memory_m: path that the motion remembers, m.
             rolling_share: 0 where the probe follows the normal, 1 where it keeps its orientation.
+            position_sd: standard deviation of the probe's centre on the flange, per axis, m.
         """
-        drag, offset = PAD_DRAG * rolling_share, TOOL_SIGMA_M * (1.0 - rolling_share)
+        drag, offset = PAD_DRAG * rolling_share, position_sd * (1.0 - rolling_share)
         return cls(memory_m, scale=SCALE_ERROR, drag=drag, offset=offset)
 
     def reset(self) -> None:
