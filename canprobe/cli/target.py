@@ -6,6 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.parser import PATIENT_SYNCS
@@ -138,8 +139,6 @@ def real_target(
 
 def scene_target(args: argparse.Namespace, scene: Scene) -> Target:
     """The real bus of a scene's nodes: a channel without a name is for all of them, else each has that of the scene."""
-    from dataclasses import replace
-
     from canprobe.cell.session.target import Target
 
     name, channel = args.channel[0] if args.channel else ("", None)

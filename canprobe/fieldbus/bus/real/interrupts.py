@@ -28,9 +28,7 @@ def raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def handled_signals(handlers: Mapping[int, Callable[[int, FrameType | None], object]]) -> Iterator[None]:
-    """Within the block signals have these handlers. Outside the main thread, which alone receives signals, nothing
-    changes.
-    """
+    """Within the block signals have these handlers. Outside the main thread, which receives none, nothing changes."""
     before = {number: signal.getsignal(number) for number in handlers}
     in_main_thread = threading.current_thread() is threading.main_thread()
     try:
