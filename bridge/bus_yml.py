@@ -9,7 +9,6 @@ dcfgen.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import operator
 import re
@@ -29,7 +28,7 @@ from canprobe.cell.planning.model import (
 )
 from canprobe.cell.planning.node_configuration import Direction, NodeConfiguration, Write
 from canprobe.cell.scene.toml_files import MAX_BYTES
-from canprobe.errors import UsageError, needed_module, regular_file
+from canprobe.errors import UsageError, did_you_mean, needed_module, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
 from canprobe.fieldbus.eds.device_info import commissioned_node
 from canprobe.fieldbus.eds.findings import EdsFindings
@@ -270,9 +269,7 @@ def _name_unknown(
 ) -> None:
     for key in keys:
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            say(f"{path}: {name}: {key}: not understood, passed over{hint}")
+            say(f"{path}: {name}: {key}: not understood, passed over{did_you_mean(str(key), known, 0.6)}")
 
 
 def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[str, Any]) -> ListedNode:

@@ -20,13 +20,7 @@ from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.session.target import VIRTUAL
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG
-from canprobe.lab.bridge.description import (
-    axis_transforms,
-    flange_transform,
-    link_transforms,
-    quaternion_of,
-    robot_description,
-)
+from canprobe.lab.bridge import description
 from canprobe.lab.bridge.sample import BASE, CONTACT, FLANGE, PROBE, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.types import Floats
@@ -91,10 +85,6 @@ class Encoder:
     def encode(self, type_name: str, message: object) -> bytes:
         """A message as CDR, little-endian, with its four bytes of encapsulation."""
         return bytes(self.store.serialize_cdr(message, type_name))
-
-    def decode(self, type_name: str, data: bytes) -> Any:
-        """The inverse of `encode`."""
-        return self.store.deserialize_cdr(data, type_name)
 
     def definition(self, type_name: str) -> str:
         """The definition for MCAP's `ros2msg` and Foxglove, with all types that it refers to."""
@@ -170,7 +160,7 @@ class Messages:
         arm, probe = plan.setup.arm, plan.scene.probe
         self._chain = arm.model.chain if arm is not None else None
         self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
-        self._description = robot_description(plan)
+        self._description = description.robot_description(plan)
         self._is_virtual = plan.scene.bus.interface in VIRTUAL
         self._wanted = wanted
         self._static_every_ns = static_every_ns
@@ -197,14 +187,16 @@ class Messages:
                     yield CAN_FRAMES, t_ns, encode_can_frame(t_ns, can_id, data)
             elif fd:
                 identifier, extended = _identifier(can_id)
-                message = self._make(
-                    CAN_FD_FRAMES.type_name,
-                    header=self._header(at_ns, ""),
+                payload = np.frombuffer(data, np.uint8)
+                message = self._stamped(
+                    CAN_FD_FRAMES,
+                    at_ns,
+                    "",
                     id=identifier,
                     is_extended=extended,
                     is_error=False,
                     len=len(data),
-                    data=np.frombuffer(data, np.uint8),
+                    data=payload,
                 )
                 yield CAN_FD_FRAMES, t_ns, self.encoder.encode(CAN_FD_FRAMES.type_name, message)
 
@@ -219,7 +211,7 @@ class Messages:
             yield CLOCK, t_ns, lambda: self._make(CLOCK.type_name, clock=self._time(t_ns))
         if q is not None and (chain := self._chain) is not None:
             yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, chain, q)
-            yield TF, t_ns, lambda: self._tf(t_ns, link_transforms(chain, q))
+            yield TF, t_ns, lambda: self._tf(t_ns, description.link_transforms(chain, q))
         if touch is not None:
             if (counts := touch.counts) is not None:
                 yield TAXELS, touch.t_ns, lambda: self._image(touch.t_ns, counts)
@@ -236,43 +228,35 @@ class Messages:
 
     def _joint_state(self, t_ns: int, chain: Chain, q: Floats) -> Any:
         unknown = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
-        header, names = self._header(t_ns, BASE), list(chain.joints)
-        return self._make(
-            "sensor_msgs/msg/JointState", header=header, name=names, position=q, velocity=unknown, effort=unknown
+        return self._stamped(
+            JOINT_STATES, t_ns, BASE, name=list(chain.joints), position=q, velocity=unknown, effort=unknown
         )
 
     def _static(self, t_ns: int) -> Any:
         assert self._chain is not None
-        fixed = [flange_transform(self._chain)]
+        fixed = [description.flange_transform(self._chain)]
         if self._T_flange_probe is not None:
             fixed.append((FLANGE, PROBE, self._T_flange_probe))
-        return self._tf(t_ns, [*fixed, *axis_transforms(self._chain)])
+        return self._tf(t_ns, [*fixed, *description.axis_transforms(self._chain)])
 
     def _wrench(self, touch: TouchFrame) -> Any:
         force, torque = self._vector(touch.force), self._vector(np.zeros(3))
         body = self._make("geometry_msgs/msg/Wrench", force=force, torque=torque)
-        return self._make("geometry_msgs/msg/WrenchStamped", header=self._header(touch.t_ns, PROBE), wrench=body)
+        return self._stamped(WRENCH, touch.t_ns, PROBE, wrench=body)
 
     def _image(self, t_ns: int, counts: NDArray[np.uint8]) -> Any:
         rows, columns = counts.shape
-        return self._make(
-            "sensor_msgs/msg/Image",
-            header=self._header(t_ns, PROBE),
-            height=rows,
-            width=columns,
-            encoding="mono8",
-            is_bigendian=0,
-            step=columns,
-            data=counts.ravel(),
-        )
+        size, data = {"height": rows, "width": columns, "step": columns}, counts.ravel()
+        return self._stamped(TAXELS, t_ns, PROBE, **size, encoding="mono8", is_bigendian=0, data=data)
 
     def _cloud(self, patch: SurfacePatch) -> Any:
         points, sigma = patch.grid()
         rows = np.column_stack([points, sigma]).astype("<f4")
         step = rows.shape[1] * 4
-        return self._make(
-            "sensor_msgs/msg/PointCloud2",
-            header=self._header(patch.t_ns, BASE),
+        return self._stamped(
+            PATCH,
+            patch.t_ns,
+            BASE,
             height=1,
             width=len(rows),
             fields=self._fields,
@@ -287,7 +271,7 @@ class Messages:
         """Principal curvatures κ1, κ2 as x and y, 1/m, for plots; z is their mean."""
         first, second = patch.kappa
         vector = self._vector(np.array([first, second, 0.5 * (first + second)]))
-        return self._make("geometry_msgs/msg/Vector3Stamped", header=self._header(patch.t_ns, CONTACT), vector=vector)
+        return self._stamped(CURVATURE, patch.t_ns, CONTACT, vector=vector)
 
     def _diagnostics(self, sample: Sample) -> Any:
         status = []
@@ -295,7 +279,7 @@ class Messages:
             values = [self._make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in d.values]
             words = {"name": d.name, "message": d.message, "hardware_id": "canprobe"}
             status.append(self._make("diagnostic_msgs/msg/DiagnosticStatus", level=d.level, values=values, **words))
-        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=self._header(sample.t_ns, ""), status=status)
+        return self._stamped(DIAGNOSTICS, sample.t_ns, "", status=status)
 
     # parts of messages
 
@@ -304,6 +288,10 @@ class Messages:
 
     def _make(self, type_name: str, **fields: Any) -> Any:
         return self._types[type_name](**fields)
+
+    def _stamped(self, topic: Topic, t_ns: int, frame_id: str, **fields: Any) -> Any:
+        """A message of a topic's type that begins with a header."""
+        return self._make(topic.type_name, header=self._header(t_ns, frame_id), **fields)
 
     def _header(self, t_ns: int, frame_id: str) -> Any:
         return self._make("std_msgs/msg/Header", stamp=self._time(t_ns), frame_id=frame_id)
@@ -319,13 +307,9 @@ class Messages:
     def _tf(self, t_ns: int, transforms: list[tuple[str, str, Floats]]) -> Any:
         stamped = []
         for parent, child, T in transforms:
-            x, y, z, w = quaternion_of(T[:3, :3])
+            x, y, z, w = description.quaternion_of(T[:3, :3])
             rotation = self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
             transform = self._make("geometry_msgs/msg/Transform", translation=self._vector(T[:3, 3]), rotation=rotation)
-            header = self._header(t_ns, parent)
-            stamped.append(
-                self._make(
-                    "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
-                )
-            )
+            header, name = self._header(t_ns, parent), "geometry_msgs/msg/TransformStamped"
+            stamped.append(self._make(name, header=header, child_frame_id=child, transform=transform))
         return self._make("tf2_msgs/msg/TFMessage", transforms=stamped)

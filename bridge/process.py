@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import marshal
 import os
 import select
 import subprocess
@@ -52,10 +51,6 @@ class BridgeProcess(ChildProcess):
         super().__init__()
         self.name = name
         self.requests: deque[Request] = deque(maxlen=100)
-        self._config = {
-            "scene": str(self.scene_file),
-            "out": str(out.resolve()) if out is not None else None,
-        }
         self._virtual = virtual
         self._takes_requests = name == "ros2" and bool(plan.scene.bridge and plan.scene.bridge.ros2_commands)
         self._epoch: bytes | None = None
@@ -67,7 +62,8 @@ class BridgeProcess(ChildProcess):
         self._text = b""
         self._poll_in = self._batch = max(1, round(LATENCY_S * plan.scene.cycle.rate_hz))
         reader, writer = os.pipe()
-        self.launch(plan, ["canprobe.lab.bridge.worker", name], stdin=reader, stdout=subprocess.PIPE)
+        words = [name, str(self.scene_file), *([] if out is None else [str(out.resolve())])]
+        self.launch(plan, ["canprobe.lab.bridge.worker", *words], stdin=reader, stdout=subprocess.PIPE)
         os.close(reader)
         assert self.process.stdout is not None
         self._back = self.process.stdout.fileno()
@@ -83,9 +79,6 @@ class BridgeProcess(ChildProcess):
         """
         if self._where is not None:
             return self._where
-        self._feed.put(marshal.dumps(self._config))
-        self._feed.flush(READY_TIMEOUT_S)
-        self._feed.taken = 0
         deadline = elapsed_ns() + round(READY_TIMEOUT_S * 1e9)
         while self._where is None and self._error is None:
             left = _left_s(deadline)
@@ -128,7 +121,7 @@ class BridgeProcess(ChildProcess):
         self._error = document.get("error", self._error)
         self._unwritten = document.get("unwritten", self._unwritten)
         if "done" in document:
-            self._received = document["done"]["received"]
+            self._received = document["done"]
             self._ends_by_ns = elapsed_ns() + round(CLOSE_TIMEOUT_S * 1e9)
         if "request" in document and self._takes_requests:
             try:

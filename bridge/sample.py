@@ -194,15 +194,12 @@ class Sink(Protocol):
     @property
     def where(self) -> str:
         """Place of the output, for people: a file, an address."""
-        ...
 
     def start(self, epoch_ns: int) -> None:
         """Take the epoch: time 0 of the samples is `epoch_ns` after the Unix epoch, or 0 in virtual time."""
-        ...
 
     def write(self, sample: Sample) -> None:
         """Take one sample."""
-        ...
 
     def close(self, summary: str | None) -> None:
         """End the output at the end of the run.
@@ -210,4 +207,3 @@ class Sink(Protocol):
         Args:
             summary: content of `summary.json`; None where the cell ended without one.
         """
-        ...

@@ -1,6 +1,6 @@
 """The process of one bridge: it reads records of the cell from stdin, makes samples, and answers with lines of JSON.
 
-The lines are `{"ready": where}`, then requests of the other tool, then `{"done": {"received": n, "where": …}}`, or
+The lines are `{"ready": where}`, then requests of the other tool, then `{"done": n}` with their number, or
 `{"error": text}` at any time. Where stdin ends without a last record the cell is gone, and the sink is closed too.
 A file is done when it is closed. A live view is done before that: a viewer that does not read delays its close.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import marshal
 import os
 import signal
 import sys
@@ -32,12 +31,14 @@ NICE = 10
 """Niceness of the process: the cell and its nodes have priority over a bridge."""
 
 
-def run(name: str, records: Iterator[bytes], fd: int) -> int:
+def run(name: str, scene: str, out: Path | None, records: Iterator[bytes], fd: int) -> int:
     """Serve one bridge to the end of its records.
 
     Args:
         name: name of the bridge.
-        records: the first is the configuration, the others are observations, the last may be the end.
+        scene: path of the scene's file.
+        out: folder of the run; None where no files are written.
+        records: observations; the last record may be the end.
         fd: file descriptor on which lines are written back.
 
     Returns:
@@ -48,13 +49,12 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
         os.write(fd, (json.dumps(document) + "\n").encode())
 
     try:
-        config = marshal.loads(next(records))
-        plan, out = make_plan(resolve(load_scene(config["scene"]))), config["out"]
-        context = Context(plan, plan.scene.bridge or BridgeSettings(), None if out is None else Path(out), send)
+        plan = make_plan(resolve(load_scene(scene)))
+        context = Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
         sink: Sink = importlib.import_module(f"canprobe.lab.bridge.{BRIDGES[name].module}").open_sink(context)
         send({"ready": sink.where})
         received, summary = _serve(sink, SampleSource(context.plan), records)
-        done: dict[str, object] = {"done": {"received": received, "where": sink.where}}
+        done: dict[str, object] = {"done": received}
         if BRIDGES[name].live:
             send(done)
         sink.close(summary)
@@ -87,12 +87,16 @@ def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> tuple[
 
 
 def main() -> int:
-    """The process: Ctrl-C is for the cell, which ends this one by the end of its records."""
+    """The process: Ctrl-C is for the cell, which ends this one by the end of its records.
+
+    Its arguments are those of `run`: name, scene and folder, which may be missing.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(NICE)
     fd = os.dup(1)
     os.dup2(2, 1)  # what a library prints does not mix with the lines back
-    return run(sys.argv[1], read_records(sys.stdin.buffer), fd)
+    name, scene, *out = sys.argv[1:]
+    return run(name, scene, Path(out[0]) if out else None, read_records(sys.stdin.buffer), fd)
 
 
 if __name__ == "__main__":

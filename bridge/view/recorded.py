@@ -13,16 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.results.run_files import (
-    LOG,
-    TACTILE,
-    check_run_folder,
-    is_recorded,
-    read_log,
-    read_scene,
-    read_summary,
-    read_tactile,
-)
+from canprobe.cell.results import run_files
 from canprobe.cell.results.surface_file import SURFACE, load_surface_map
 from canprobe.cell.rows import joint_positions
 from canprobe.cell.scene.load import SAVED_AS
@@ -122,15 +113,15 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
             be; with the file's name.
         SceneError: a scene that cannot be loaded.
     """
-    check_run_folder(folder, SAVED_AS, LOG)
-    read_summary(folder)
+    run_files.check_run_folder(folder, SAVED_AS, run_files.LOG)
+    run_files.read_summary(folder)
     if setup is None:
-        setup = resolve(read_scene(folder))
-    log = read_log(folder / LOG, setup)
+        setup = resolve(run_files.read_scene(folder))
+    log = run_files.read_log(folder / run_files.LOG, setup)
     every = -(-len(log["t_s"]) // ROWS_SHOWN) or 1
     log = {name: np.array(log.pop(name)[::every]) for name in tuple(log)}  # one after the other: each is let go
     if not len(log["t_s"]):
-        raise UsageError(f"{folder / LOG}: expected a row for each cycle, got none")
+        raise UsageError(f"{folder / run_files.LOG}: expected a row for each cycle, got none")
     rows = _new_answers(log)
     rows = rows[:: -(-len(rows) // ANSWERS_SHOWN) or 1]
     shape = setup.truth.object
@@ -139,7 +130,7 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
         log=log,
         answer_rows=rows,
         answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
-        taxels=tuple(_read_taxels(folder / TACTILE, setup)),
+        taxels=tuple(_read_taxels(folder / run_files.TACTILE, setup)),
         surface_map=_surface_map(folder / SURFACE, log, setup),
     )
 
@@ -167,7 +158,7 @@ def contact_rows(log: dict[str, Floats]) -> NDArray[np.intp]:
 
 def _read_taxels(file: Path, setup: Setup) -> Iterator[tuple[float, NDArray[np.uint8]]]:
     """The images that the cell used; none where there is no file, or of an array that sends features."""
-    columns = read_tactile(file, setup) if is_recorded(file) else {}
+    columns = run_files.read_tactile(file, setup) if run_files.is_recorded(file) else {}
     if columns and np.isnan(columns["features"]).all():
         every = -(-len(columns["t_s"]) // ROWS_SHOWN) or 1
         yield from zip(columns["t_s"][::every].tolist(), columns["taxels"][::every], strict=True)

@@ -1,8 +1,9 @@
 # PYTHON_ARGCOMPLETE_OK
 """The command line: parse, call, print. Each command is a module, imported only when it is used.
 
-A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`; its docstring is the description
-in its help. It imports everything besides argparse inside `run`, so that `canprobe --help` stays quick.
+A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args)`, which returns the exit status, or
+nothing for 0; its docstring is the description in its help. It imports everything besides argparse inside `run`, so
+that `canprobe --help` stays quick.
 
 Commands share the arguments of `parser`, `argument_types`, `target` (scene and bus of a command), `output` (stdout),
 `interrupts`, `operator` (questions) and `completion`.
@@ -94,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
         args.arguments, args.report, report.verbosity = arguments, report, getattr(args, "verbosity", 0)
         report.words = partial(with_scene, args=args)
         with termination_interrupts():
-            status = int(args.run(args))
+            status = int(args.run(args) or 0)
         sys.stdout.flush()
         return status
     except SystemExit as leaving:

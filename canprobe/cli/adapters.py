@@ -23,7 +23,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_shared("--json")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print the channels that are here, then the interfaces with what they lack."""
     from dataclasses import asdict
 
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         interfaces = [{"interface": name, **asdict(one), "missing": missing[name]} for name, one in BACKENDS.items()]
         print_json({"found": [asdict(one) for one in found], "interfaces": interfaces})
-        return 0
+        return
     if found:
         rows = [(one.interface, one.channel, one.state, one.type_next) for one in found]
         print_table([("found here", "channel", "state", "type next"), *rows])
@@ -46,4 +46,3 @@ def run(args: argparse.Namespace) -> int:
         for name, one in BACKENDS.items()
     ]
     print_table([("--bus", "for", "has, by python-can", "missing"), *states])
-    return 0

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+N = TypeVar("N", int, float)
 
 
 def word(text: str) -> str:
@@ -31,59 +34,44 @@ def channel(text: str) -> tuple[str | None, str]:
     return (name if equals else None), target
 
 
+def number_type(parse: Callable[[str], N], fits: Callable[[N], bool], expected: str) -> Callable[[str], N]:
+    """An argument type: numbers that fit.
+
+    Args:
+        parse: reads the text; a ValueError says that it is no number.
+        fits: whether a number is allowed.
+        expected: what is allowed, in the message.
+    """
+
+    def read(text: str) -> N:
+        with contextlib.suppress(ValueError):
+            if fits(value := parse(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
+
+    return read
+
+
 def whole(low: int, high: int) -> Callable[[str], int]:
     """An argument type: integers from `low` to `high`."""
-
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"expected an integer from {low} to {high}, got {text!r}")
-        return value
-
-    return parse
+    return number_type(int, lambda value: low <= value <= high, f"an integer from {low} to {high}")
 
 
 seed = whole(0, 2**63 - 1)
 """An argument type: the seed of random numbers."""
+seconds = number_type(float, lambda value: 0.0 < value < math.inf, "seconds above 0")
+"""An argument type: a duration."""
+positive = number_type(float, lambda value: 0.0 < value < 1e6, "a number above 0")
+"""An argument type: a number above 0, below a million."""
+number_of_32_bits = number_type(
+    lambda text: int(text, 0), lambda value: 0 <= value < 1 << 32, "a number of 32 bits such as 4711 or 0x1267"
+)
+"""An argument type: a number of 1018h, decimal or hexadecimal with 0x."""
 
 
 def node_id(text: str) -> int:
     """An argument type: a node id, or 255 for none."""
     return 255 if text == "255" else whole(1, 127)(text)
-
-
-def number_of_32_bits(text: str) -> int:
-    """An argument type: a number of 1018h, decimal or hexadecimal with 0x."""
-    try:
-        value = int(text, 0)
-    except ValueError:
-        value = -1
-    if not 0 <= value <= 0xFFFFFFFF:
-        raise argparse.ArgumentTypeError(f"expected a number of 32 bits such as 4711 or 0x1267, got {text!r}")
-    return value
-
-
-def seconds(text: str) -> float:
-    """An argument type: a duration."""
-    return _above_zero(text, "seconds", math.inf)
-
-
-def positive(text: str) -> float:
-    """An argument type: a number above 0, below a million."""
-    return _above_zero(text, "a number", 1e6)
-
-
-def _above_zero(text: str, what: str, end: float) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < end:
-        raise argparse.ArgumentTypeError(f"expected {what} above 0, got {text!r}")
-    return value
 
 
 def setting(text: str) -> tuple[str, Any]:

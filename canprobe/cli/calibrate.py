@@ -40,47 +40,36 @@ def add_arguments(parser: Parser) -> None:
         help="reference of the force in newtons: a scale or load cell under the object, known weights, the stated"
         " full scale of the array (unit), or nothing [none: nominal newtons]",
     )
-    parser.add_argument(
-        "--sigma", metavar="PERCENT", type=positive, default=1.0, help="standard deviation of that reference [1]"
-    )
+    parser.add_option("--sigma PERCENT", "standard deviation of that reference [1]", positive, default=1.0)
     parser.add_argument(
         "--at", metavar=("X", "Y", "Z"), nargs=3, type=float,
         help="touched point in the base frame, mm [for a cell file: below the probe in its start posture]",
     )  # fmt: skip
-    parser.add_argument("--ball-radius", metavar="MM", type=positive, default=25.0, help="radius of the ball [25]")
-    parser.add_argument("--rod-radius", metavar="MM", type=positive, default=25.0, help="radius of the rod [25]")
-    parser.add_argument(
-        "--make",
-        action="store_true",
-        help="write a calibration for all arrays of this make, without the gains and dead taxels of this one",
+    parser.add_option("--ball-radius MM", "radius of the ball [25]", positive, default=25.0)
+    parser.add_option("--rod-radius MM", "radius of the rod [25]", positive, default=25.0)
+    parser.add_option(
+        "--make", "write a calibration for all arrays of this make, without the gains and dead taxels of this one"
     )
-    parser.add_argument(
-        "--spread", metavar="PERCENT", type=positive, default=10.0,
-        help="with --make: standard deviation of the force from array to array, by its data sheet [10]",
-    )  # fmt: skip
-    parser.add_argument(
-        "--verify",
-        action="store_true",
-        help="touch the ball three times, and say whether the calibration of the cell still holds [status 1: no]",
+    parser.add_option(
+        "--spread PERCENT",
+        "with --make: standard deviation of the force from array to array, by its data sheet [10]",
+        positive,
+        default=10.0,
     )
-    parser.add_argument("--yes", action="store_true", help="do not ask for objects; for an emulated cell only")
+    parser.add_option(
+        "--verify", "touch the ball three times, and say whether the calibration of the cell still holds [status 1: no]"
+    )
+    parser.add_option("--yes", "do not ask for objects; for an emulated cell only")
     parser.add_shared("BUS")
-    parser.add_argument("--seed", metavar="N", type=seed, default=0, help="seed of the emulation [0]")
-    parser.add_argument(
-        "--out", metavar="DIR", type=folder_path, help="folder of the files [runs/calibrate-array-<cell>-<time>]"
-    )
+    parser.add_option("--seed N", "seed of the emulation [0]", seed, default=0)
+    parser.add_option("--out DIR", "folder of the files [runs/calibrate-array-<cell>-<time>]", folder_path)
     parser.add_shared("--force", "--json", "-v")
 
 
 def run(args: argparse.Namespace) -> int:
     """Touch, fit, print, and write calibration.toml, calibration.png and the recorded buses."""
     from canprobe import api
-    from canprobe.cell.results.array_report import (
-        as_document,
-        calibration_text,
-        draw_calibration,
-        verification_text,
-    )
+    from canprobe.cell.results.array_report import as_document, calibration_text, draw_calibration, verification_text
     from canprobe.cell.scene.calibrations import dump_calibration
     from canprobe.cell.scene.load import load_scene, read_cell
     from canprobe.cell.session.array_calibration import CalibrationRequest, calibrate, verify

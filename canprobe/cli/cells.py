@@ -16,7 +16,7 @@ examples:
 add_arguments = scenes.add_arguments
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print name and title of every packaged cell and array, and the folders of their files."""
     advice = {
         "cell": "copy one to change it, or let `canprobe init` write one",

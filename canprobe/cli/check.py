@@ -25,7 +25,7 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
-    parser.add_argument("--seconds", metavar="S", type=seconds, default=10.0, help="length of the measurement [10]")
+    parser.add_option("--seconds S", "length of the measurement [10]", seconds, default=10.0)
     parser.add_shared("--json", "-v")
 
 

@@ -26,12 +26,13 @@ from canprobe.cli.stdin import yes_typed
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.eds.packaged import check_eds, load_eds
+from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.port import Port
     from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.conform import Examination, Point
-    from canprobe.fieldbus.tools.reports import Report
 
 HELP = "examine a device of any maker for conformance"
 EXAMPLE = """\
@@ -53,40 +54,35 @@ _REAL_SLACK_S = 0.05
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument("--node", metavar="N", type=whole(1, 127), help="node id of the device")
-    parser.add_argument(
-        "--eds", metavar="FILE", type=word, help="EDS, DCF, XDD or XDC file of the device, or a packaged name"
-    )
+    parser.add_option("--node N", "node id of the device", whole(1, 127))
+    parser.add_option("--eds FILE", "EDS, DCF, XDD or XDC file of the device, or a packaged name", word)
     parser.add_real_bus(", or lockstep")
-    parser.add_argument(
-        "--data-bitrate",
-        metavar="BIT/S",
-        type=whole(50_000, 8_000_000),
-        help="the bus carries CAN FD: bit rate of the data phase [classical CAN]",
+    parser.add_option(
+        "--data-bitrate BIT/S",
+        "the bus carries CAN FD: bit rate of the data phase [classical CAN]",
+        whole(50_000, 8_000_000),
     )
-    parser.add_argument("--points", metavar="LIST", type=word, help="groups, numbers or points [all]")
-    parser.add_argument(
-        "--write",
-        metavar="LIST",
-        default="",
-        help="objects that may be written, as 2000h-20FFh,6081h,60C2h:01; and the words reset (NMT reset node), history"
+    parser.add_option("--points LIST", "groups, numbers or points [all]", word)
+    parser.add_option(
+        "--write LIST",
+        "objects that may be written, as 2000h-20FFh,6081h,60C2h:01; and the words reset (NMT reset node), history"
         " (clear 1003h)",
+        default="",
     )
-    parser.add_argument("--motion", action="store_true", help="also switch the power stage on and move the axis")
-    parser.add_argument("--yes", action="store_true", help="with --motion: do not ask whether the axis may move")
-    parser.add_argument("--own", metavar="FILE", type=Path, help="a TOML file with points of your own")
-    parser.add_argument("--timeout", metavar="S", type=seconds, default=1.0, help="longest time to an SDO answer [1]")
-    parser.add_argument("--listen", metavar="S", type=seconds, default=1.5, help="time to hear the bus before [1.5]")
-    parser.add_argument(
-        "--snapshot",
-        metavar="FILE",
-        type=Path,
-        help="keep the snapshot in this file [conform-node<N>.snapshot.json, removed when all is put back]",
+    parser.add_option("--motion", "also switch the power stage on and move the axis")
+    parser.add_option("--yes", "with --motion: do not ask whether the axis may move")
+    parser.add_option("--own FILE", "a TOML file with points of your own", Path)
+    parser.add_option("--timeout S", "longest time to an SDO answer [1]", seconds, default=1.0)
+    parser.add_option("--listen S", "time to hear the bus before [1.5]", seconds, default=1.5)
+    parser.add_option(
+        "--snapshot FILE",
+        "keep the snapshot in this file [conform-node<N>.snapshot.json, removed when all is put back]",
+        Path,
     )
-    parser.add_argument("--restore", metavar="FILE", type=Path, help="put back a snapshot, and end")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="record all frames as a candump log")
-    parser.add_argument("--full", action="store_true", help="print all points below the verdict")
-    parser.add_argument("--list", action="store_true", help="list the points, and end")
+    parser.add_option("--restore FILE", "put back a snapshot, and end", Path)
+    parser.add_option("--log FILE", "record all frames as a candump log", Path)
+    parser.add_option("--full", "print all points below the verdict")
+    parser.add_option("--list", "list the points, and end")
     add_report_options(parser)
     parser.add_shared("-v")
 
@@ -98,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     if args.node is None:
         how = "any, such as --node 1" if args.bus == "lockstep" else "`canprobe scan` lists the nodes on a bus"
         raise UsageError(f"conform: --node N names the device; {how}")
-    from canprobe.fieldbus.tools.conform import ExaminationSettings, WriteList, restore_snapshot
+    from canprobe.fieldbus.tools.conform import Examination, ExaminationSettings, WriteList, restore_snapshot
     from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 
     points, description = _points(args), _description(args)
@@ -123,13 +119,11 @@ def run(args: argparse.Namespace) -> int:
             times=BenchTimes() if virtual else times,
             ask=yes_typed if sys.stdin.isatty() else None,
         )
-        from canprobe.fieldbus.tools.conform import Examination
-
         report = _examine(args, Examination(port, args.node, description, settings), points)
     return _finish(args, report, baseline)
 
 
-def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> Report:
+def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> reports.Report:
     """Run the examination, with its progress on stderr."""
     bar = args.report.bar(".0f points") or nothing
     examination.report.facts.update(_bench_facts(args))
@@ -140,29 +134,25 @@ def _examine(args: argparse.Namespace, examination: Examination, points: Sequenc
     return report
 
 
-def _finish(args: argparse.Namespace, report: Report, baseline: Report | None) -> int:
-    from canprobe.fieldbus.tools.reports import closing_text, report_document, row_text, verdict_text
-
+def _finish(args: argparse.Namespace, report: reports.Report, baseline: reports.Report | None) -> int:
     if baseline is not None and args.points:
         asked = {(row.group, row.name) for row in report.rows}
         baseline.rows = [row for row in baseline.rows if (row.group, row.name) in asked]
     change = write_report(args, report, baseline)
     if args.json:
-        print_json(report_document(report))
+        print_json(reports.report_document(report))
         return report.exit_status
-    print(verdict_text(report, change))
+    print(reports.verdict_text(report, change))
     if args.full:
-        print("", *map(row_text, report.rows), closing_text(report), sep="\n")
+        print("", *map(reports.row_text, report.rows), reports.closing_text(report), sep="\n")
     else:
         print(f"all points: type it again with --full, or --html FILE for the frames{_again(report)}")
     return report.exit_status
 
 
-def _again(report: Report) -> str:
+def _again(report: reports.Report) -> str:
     """How to examine again what failed."""
-    from canprobe.fieldbus.tools.reports import Verdict
-
-    groups = dict.fromkeys(row.group for row in report.rows if row.verdict is Verdict.FAIL)
+    groups = dict.fromkeys(row.group for row in report.rows if row.verdict is reports.Verdict.FAIL)
     return f"; after a change --points {','.join(groups)}" if groups else ""
 
 
@@ -178,13 +168,9 @@ def _points(args: argparse.Namespace) -> tuple[Point, ...]:
 
 
 def _description(args: argparse.Namespace) -> Description | None:
-    if args.eds is None:
-        return None
     from canprobe.fieldbus.eds.description import Description
-    from canprobe.fieldbus.eds.packaged import eds_file
-    from canprobe.fieldbus.eds.reading import read_eds
 
-    return Description(read_eds(eds_file(args.eds), args.node, serving=False).usable())
+    return None if args.eds is None else Description(load_eds(args.eds, args.node))
 
 
 @contextlib.contextmanager
@@ -214,7 +200,6 @@ def _emulated(args: argparse.Namespace) -> Port:
     from canprobe.fieldbus.bus.clock import VirtualClock
     from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
     from canprobe.fieldbus.drive.from_eds import make_eds_node
-    from canprobe.fieldbus.eds.packaged import load_eds
 
     bus = LockstepBus(VirtualClock(), "lockstep", fd=True)
     bus.attach(make_eds_node(load_eds(args.eds, args.node), args.node, eds=args.eds))
@@ -232,8 +217,6 @@ def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
         or "nothing beyond the default",
     }
     if args.eds is not None:
-        from canprobe.fieldbus.eds.packaged import check_eds
-
         reading = check_eds(args.eds, args.node)
         facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
         facts["EDS"] = eds_and_hash(args.eds)

@@ -41,10 +41,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--view", action="append_const", dest="bridge", const="view", help="show the arm in a browser; --bridge view"
     )
-    parser.add_argument("--plain", action="store_true", help="commands and answers as lines, without a screen")
-    parser.add_argument(
-        "--json", action="store_true", help="as --plain, with answers and, ten times a second, the state as JSON lines"
-    )
+    parser.add_option("--plain", "commands and answers as lines, without a screen")
+    parser.add_option("--json", "as --plain, with answers and, ten times a second, the state as JSON lines")
     parser.add_shared("-v")
 
 

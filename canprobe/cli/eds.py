@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.argument_types import whole
 from canprobe.cli.output import print_answer
 from canprobe.cli.parser import Parser
+from canprobe.fieldbus.eds.packaged import check_eds, eds_names, eds_path
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.eds.findings import EdsFinding
@@ -57,28 +58,21 @@ def add_arguments(parser: Parser) -> None:
         epilog=_CHECK,
     )
     check.add_argument("file", metavar="FILE", help="path of an EDS, DCF, XDD or XDC file, or name of a packaged file")
-    check.add_argument(
-        "--node-id", metavar="N", type=whole(1, 127), help="node id that replaces $NODEID [that of the DCF, or 1]"
-    )
+    check.add_option("--node-id N", "node id that replaces $NODEID [that of the DCF, or 1]", whole(1, 127))
     check.add_shared("--json")
     check.set_defaults(run=run_check)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print the names of the files, or the path of one."""
-    from canprobe.fieldbus.eds.packaged import eds_names, eds_path
-
     if args.action == "path":
         print(eds_path(args.eds))
     else:
         print_answer(args, list(eds_names()), "\n".join(eds_names()))
-    return 0
 
 
 def run_check(args: argparse.Namespace) -> int:
     """Print the faults and warnings of a file; status 2 when it cannot be served."""
-    from canprobe.fieldbus.eds.packaged import check_eds
-
     reading = check_eds(args.file, args.node_id)
     found = [f"{'fault' if fault.prevents else 'warning'}: {fault}" for fault in reading.found]
     print_answer(args, _document(reading), "\n".join([*found, f"{reading.path}: {_summary(reading)}"]))

@@ -9,19 +9,17 @@ from __future__ import annotations
 import argparse
 import signal
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import node_ids, number_of_32_bits, whole
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
-from canprobe.cli.target import loaded, one_channel, real_target, target_of
+from canprobe.cli.target import loaded, one_channel, real_target, scene_target
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
     from canprobe.cell.scene.model import Scene
-    from canprobe.cell.session.target import Target
 
 HELP = "serve emulated nodes on a bus"
 EXAMPLE = """\
@@ -42,41 +40,23 @@ examples:
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("[SCENE]", "BUS", "--realtime", "--seed")
     parser.add_eds_nodes(more="; 255: no id, the node waits for LSS")
-    parser.add_argument(
-        "--serial",
-        metavar="N",
-        action="append",
-        default=[],
-        type=number_of_32_bits,
-        help="serial number (1018h:04) for the --eds at the same position",
+    parser.add_option(
+        "--serial N", "serial number (1018h:04) for the --eds at the same position", number_of_32_bits, many=True
     )
-    parser.add_argument(
-        "--without-id",
-        metavar="IDS",
-        type=node_ids,
-        default=(),
-        help="nodes that start without an id; `canprobe scan --lss` assigns it",
+    parser.add_option(
+        "--without-id IDS", "nodes that start without an id; `canprobe scan --lss` assigns it", node_ids, default=()
     )
-    parser.add_argument("--bus-yml", metavar="FILE", type=Path, help="serve the slaves of a bus.yml of ros2_canopen")
-    parser.add_argument(
-        "--nodes", metavar="IDS", type=node_ids, help="nodes to serve, such as 1-6,16 [those with emulated = true]"
-    )
-    parser.add_argument(
-        "--truth", metavar="FILE", type=Path, help="write the true values of the model to this npz file at the end"
-    )
-    parser.add_argument(
-        "--store",
-        metavar="DIR",
-        type=Path,
-        help="folder that keeps what a master stores by 1010h or LSS [nothing is kept]",
-    )
+    parser.add_option("--bus-yml FILE", "serve the slaves of a bus.yml of ros2_canopen", Path)
+    parser.add_option("--nodes IDS", "nodes to serve, such as 1-6,16 [those with emulated = true]", node_ids)
+    parser.add_option("--truth FILE", "write the true values of the model to this npz file at the end", Path)
+    parser.add_option("--store DIR", "folder that keeps what a master stores by 1010h or LSS [nothing is kept]", Path)
     parser.add_inject("throw a fault, as 'node 3: mute at 5 s'")
-    parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
-    parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times
+    parser.add_option("--parent PID", argparse.SUPPRESS, whole(1, 2**31 - 1))  # ends with it
+    parser.add_option("--origin NS", argparse.SUPPRESS, whole(0, 2**63 - 1))  # of its times
     parser.add_shared("-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Serve until Ctrl-C, which is the normal way to leave."""
     if [args.scene is not None, bool(args.eds), args.bus_yml is not None].count(True) != 1:
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
@@ -88,7 +68,6 @@ def run(args: argparse.Namespace) -> int:
         if args.parent is not None:
             system.end_with_parent(args.parent, signal.SIGTERM)
         serve()
-    return 0
 
 
 def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
@@ -159,17 +138,6 @@ def eds_files(command: str, args: argparse.Namespace) -> list[tuple[str | Path, 
             f"{command}: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own"
         )
     return list(zip(args.eds, args.node_id, strict=True))
-
-
-def scene_target(args: argparse.Namespace, scene: Scene) -> Target:
-    """The bus of the nodes: a channel without a name is for all of them, else each has that of the scene."""
-    given = args.channel or []
-    real = real_target(args.bus, given[0][1] if given else None, args.bitrate, bitrate_else=scene.bus.bitrate)
-    given = given or [(scene.bus.channel, real.channel)]
-    args = argparse.Namespace(bus=real.interface, channel=given, bitrate=real.bitrate)
-    target = target_of(args, scene)
-    one = given[0][1] if given[0][0] is None else None
-    return replace(target, others={name: one or target.others.get(name, name) for name in scene.channels[1:]})
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:

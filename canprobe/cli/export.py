@@ -22,17 +22,14 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folder of a run, an episode each")
-    parser.add_argument(
-        "--lerobot", metavar="DIR", type=folder_path, required=True, help="folder of the dataset; it must not exist"
-    )
-    parser.add_argument("--fps", metavar="N", type=int, help="rows a second [the rate of the cycle]")
+    parser.add_option("--lerobot DIR", "folder of the dataset; it must not exist", folder_path, required=True)
+    parser.add_option("--fps N", "rows a second [the rate of the cycle]", int)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Write the dataset."""
     from canprobe.cell.results.lerobot import export_lerobot
 
     export_lerobot(args.runs, args.lerobot, fps=args.fps)
     episodes = f"{len(args.runs)} episode{'s' if len(args.runs) > 1 else ''}"
     print(f"wrote {args.lerobot}: {episodes}; the files of each run are in {args.lerobot / 'raw'}")
-    return 0

@@ -22,7 +22,7 @@ from canprobe.cli.listen import array_line
 from canprobe.cli.move import standing
 from canprobe.cli.stdin import LOOK_S
 from canprobe.errors import NodeError, ResultsError, SafetyStop, UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.clock import Pace
 from canprobe.fieldbus.bus.port import nothing
 
 SHOWN_S = 0.1
@@ -56,8 +56,8 @@ class HandSession:
         self.take: Callable[[], None] = nothing
         self.ended = False
         self._cell, self._show = cell, show
-        self._paced, self._clock = paced and cell.session.virtual, MonotonicClock()
-        self._behind_ns = self._shown_ns = 0
+        self._pace = Pace() if paced and cell.session.virtual else None
+        self._shown_ns = 0
         self._shown = ""
 
     def run(self) -> None:
@@ -148,10 +148,8 @@ class HandSession:
 
     def _keep_pace(self) -> None:
         """Wait where virtual time is ahead of real time."""
-        if self._paced:
-            now_ns, t_ns = self._clock.now_ns(), self._cell.cell.port.clock.now_ns()
-            self._behind_ns = max(self._behind_ns, now_ns - t_ns)  # time that computing took is not made up for
-            self._clock.sleep_until_ns(t_ns + self._behind_ns)
+        if self._pace is not None:
+            self._pace.keep(self._cell.cell.port.clock.now_ns())
 
     @property
     def _state(self) -> str:

@@ -22,7 +22,7 @@ ROWS = 4000
 def add_arguments_of_hands(parser: Parser) -> None:
     """Add the options of a command that moves an arm."""
     parser.add_shared("BUS", "--realtime", "--patient")
-    parser.add_argument("--yes", action="store_true", help="do not ask before the motion")
+    parser.add_option("--yes", "do not ask before the motion")
     parser.add_shared("-v")
     parser.set_defaults(asking=parser.prog.removeprefix("canprobe "))
 

@@ -27,11 +27,11 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "joints", metavar="JOINT", nargs="*", type=whole(1, 99), help="numbers of joints, from 1 [all that are homed]"
     )
-    parser.add_argument("--dry-run", action="store_true", help="show how each joint would be homed, and move nothing")
+    parser.add_option("--dry-run", "show how each joint would be homed, and move nothing")
     add_arguments_of_hands(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Home joint by joint."""
     need_terminal(args.yes or args.dry_run, "home asks before each joint")
     scene = scene_of(args)
@@ -41,4 +41,3 @@ def run(args: argparse.Namespace) -> int:
 
     operator = NobodyMoves() if args.dry_run else None if args.yes else TerminalOperator()
     api.home(scene, args.joints or None, operator=operator, say=args.report.say)
-    return 0

@@ -30,20 +30,18 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("folder", metavar="DIR", type=folder_path, help="folder to write into; made if it is missing")
-    parser.add_argument("--urdf", metavar="FILE", type=Path, help="URDF of the arm [rows of a PUMA 560]")
-    parser.add_argument("--base", metavar="LINK", help="link of the URDF that is the base [its root]")
-    parser.add_argument("--tip", metavar="LINK", help="link of the URDF that is the flange [its only end]")
-    parser.add_argument(
-        "--eds",
-        metavar="FILE",
-        action="append",
-        default=[],
-        help="EDS, DCF, XDD or XDC of the drives, or the name of a packaged one: given once for all of them, or once"
+    parser.add_option("--urdf FILE", "URDF of the arm [rows of a PUMA 560]", Path)
+    parser.add_option("--base LINK", "link of the URDF that is the base [its root]")
+    parser.add_option("--tip LINK", "link of the URDF that is the flange [its only end]")
+    parser.add_option(
+        "--eds FILE",
+        "EDS, DCF, XDD or XDC of the drives, or the name of a packaged one: given once for all of them, or once"
         " for each joint from the base",
+        many=True,
     )
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Write cell.toml and first.toml, with the files that they name."""
     from canprobe.cell.scene.schemas import schema_line, schema_name, schema_text
     from canprobe.cell.scene.toml_files import written_by_line
@@ -80,7 +78,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"first.toml moves the arm freely: a scan was refused: {no_scan}")
     print(f"next: canprobe plan {folder / 'first.toml'}")
     print(f"      canprobe run {folder / 'first.toml'}")
-    return 0
 
 
 @contextlib.contextmanager

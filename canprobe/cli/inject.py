@@ -27,13 +27,13 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("faults", metavar="FAULT", nargs="*", type=word, help="fault, such as 'node 3: mute for 2 s'")
-    parser.add_argument("--list", action="store_true", help="list the kinds of faults, and end")
-    parser.add_argument("--clear", action="store_true", help="end the faults that hold, before others are thrown")
-    parser.add_argument("--channel", metavar="CH", type=word, default="vcan0", help="channel of the nodes [vcan0]")
+    parser.add_option("--list", "list the kinds of faults, and end")
+    parser.add_option("--clear", "end the faults that hold, before others are thrown")
+    parser.add_option("--channel CH", "channel of the nodes [vcan0]", word, default="vcan0")
     parser.add_shared("--json", "-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """List the kinds, or throw faults."""
     if args.list:
         return _list(args)
@@ -44,10 +44,9 @@ def run(args: argparse.Namespace) -> int:
     done = request_faults(args.channel, args.faults, clear=args.clear)
     lines = [f"{what}: {fault}" for what, faults in done.items() for fault in faults]
     print_answer(args, done, "\n".join(lines), end="\n" * bool(lines))
-    return 0
 
 
-def _list(args: argparse.Namespace) -> int:
+def _list(args: argparse.Namespace) -> None:
     from canprobe.cell.emulated.array_faults import CELL_FAULTS
     from canprobe.fieldbus.tools.faults.fault import number_text
 
@@ -67,4 +66,3 @@ def _list(args: argparse.Namespace) -> int:
         values = [number_text(name, one.default) for name, one in kind.parameters.items()]
         rows.append((" ".join([kind.name, *values]), kind.what, kind.clause, kind.reaction))
     print_answer(args, document, lambda: print_table(rows))
-    return 0

@@ -6,14 +6,13 @@ import contextlib
 import signal
 from collections.abc import Callable, Iterator
 
-from canprobe.fieldbus.bus.real.interrupts import Terminated, raise_terminated, signal_handlers
+from canprobe.fieldbus.bus.real.interrupts import Terminated, handled_signals, heeded_signals, raise_terminated
 from canprobe.fieldbus.bus.system import system
 
 
 def termination_interrupts() -> contextlib.AbstractContextManager[None]:
     """Within the block SIGTERM and SIGHUP raise `Terminated`, but for one that is ignored, as under nohup."""
-    heeded = [number for number in system.TERMINATION_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
-    return signal_handlers(dict.fromkeys(heeded, raise_terminated))
+    return handled_signals(dict.fromkeys(heeded_signals(*system.TERMINATION_SIGNALS), raise_terminated))
 
 
 @contextlib.contextmanager
@@ -35,4 +34,4 @@ def first_ctrl_c(asked: Callable[[], None]) -> contextlib.AbstractContextManager
         signal.signal(signal.SIGINT, before)
         asked()
 
-    return signal_handlers({signal.SIGINT: ask})
+    return handled_signals({signal.SIGINT: ask})

@@ -19,20 +19,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import seconds
-from canprobe.cli.emulate import eds_files, scene_target
+from canprobe.cli.emulate import eds_files
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
-from canprobe.cli.target import loaded, one_channel, real_target
+from canprobe.cli.target import loaded, one_channel, real_target, scene_target
 from canprobe.errors import UsageError
+from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
     from canprobe.cell.session.target import Target
     from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.judge import Judge
     from canprobe.fieldbus.tools.judge.bench import MasterBench
-    from canprobe.fieldbus.tools.reports import Report, ReportRow
 
 HELP = "judge a CANopen master by what it sends"
 EXAMPLE = """\
@@ -49,6 +50,8 @@ examples:
 """
 _TIMED_OUT = 124
 _SHOWN_FRAMES = 6
+Nodes = Mapping[int, "Description"]
+"""What is known of each node, by its id."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -56,22 +59,19 @@ def add_arguments(parser: Parser) -> None:
     parser.usage = "canprobe judge [SCENE | --eds FILE --node-id N ...] [--record FILE] [options] [-- COMMAND...]"
     parser.add_shared("[SCENE]", "BUS")
     parser.add_eds_nodes()
-    parser.add_argument("--record", metavar="FILE", type=Path, help="judge a log, and serve nothing")
-    parser.add_argument(
-        "--seconds", metavar="S", type=seconds, help="end after S seconds [at the end of COMMAND, or at Ctrl-C]"
-    )
+    parser.add_option("--record FILE", "judge a log, and serve nothing", Path)
+    parser.add_option("--seconds S", "end after S seconds [at the end of COMMAND, or at Ctrl-C]", seconds)
     parser.add_inject("throw this fault in the place of the sequence")
-    parser.add_argument("--passive", action="store_true", help="throw no faults")
-    parser.add_argument(
-        "--without",
-        metavar="RULES",
-        type=rule_numbers,
+    parser.add_option("--passive", "throw no faults")
+    parser.add_option(
+        "--without RULES",
+        "leave out rules, such as 32,33,34,45 on a machine that keeps no time",
+        rule_numbers,
         default=(),
-        help="leave out rules, such as 32,33,34,45 on a machine that keeps no time",
     )
-    parser.add_argument("--output", metavar="FILE", type=Path, help="file for the output of COMMAND [a temporary one]")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="write the frames as a candump log")
-    parser.add_argument("--list", action="store_true", help="list the rules, and end")
+    parser.add_option("--output FILE", "file for the output of COMMAND [a temporary one]", Path)
+    parser.add_option("--log FILE", "write the frames as a candump log", Path)
+    parser.add_option("--list", "list the rules, and end")
     add_report_options(parser)
     parser.add_shared("-v")
 
@@ -161,9 +161,7 @@ def _judge_served(args: argparse.Namespace) -> int:
     return _TIMED_OUT if bench.timed_out else _status_of_command(bench)
 
 
-def _server(
-    args: argparse.Namespace, bench: MasterBench, nodes: Mapping[int, Description]
-) -> tuple[Target, Callable[[], None]]:
+def _server(args: argparse.Namespace, bench: MasterBench, nodes: Nodes) -> tuple[Target, Callable[[], None]]:
     """The bus, and the function that serves the nodes on it; drives stand away from 0, where a jump to 0 is seen."""
     channel = one_channel(args, "judge: the nodes are served on one channel, without a name: --channel CH")
     if args.scene is None:
@@ -194,10 +192,9 @@ def _status_of_command(bench: MasterBench) -> int:
     return 3
 
 
-def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mapping[int, Description]:
+def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Nodes:
     """What is known of each node, by its id; of a scene with several channels, those on one of them."""
     from canprobe.fieldbus.eds.description import Description
-    from canprobe.fieldbus.eds.packaged import load_eds
 
     if args.scene is None:
         files = eds_files("judge", args)
@@ -214,8 +211,8 @@ def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mappi
 
 
 def _report_of(
-    args: argparse.Namespace, bench: MasterBench, judge: Judge, nodes: Mapping[int, Description], target: Target
-) -> Report:
+    args: argparse.Namespace, bench: MasterBench, judge: Judge, nodes: Nodes, target: Target
+) -> reports.Report:
     from canprobe.fieldbus.tools.judge.bench import first_answers
 
     facts = {
@@ -257,27 +254,25 @@ def _facts(args: argparse.Namespace) -> dict[str, str]:
     return facts
 
 
-def _print(args: argparse.Namespace, report: Report) -> None:
+def _print(args: argparse.Namespace, report: reports.Report) -> None:
     """Write the files, and print the findings and the closing table."""
-    from canprobe.fieldbus.tools.reports import Verdict, closing_text, report_document, row_text
-
     change = write_report(args, report, args.older)
     if args.json:
-        print_json(report_document(report))
+        print_json(reports.report_document(report))
         return
     for row in report.rows:
-        if row.verdict is Verdict.FAIL:
-            print(row_text(row))
+        if row.verdict is reports.Verdict.FAIL:
+            print(reports.row_text(row))
             _print_finding(row)
         elif args.report.verbosity > 0:
-            print(row_text(row))
+            print(reports.row_text(row))
     for name, fact in report.facts.items():
         if name.startswith("fault "):
             print(f"{name}: {fact}")
-    print(closing_text(report, change))
+    print(reports.closing_text(report, change))
 
 
-def _print_finding(row: ReportRow) -> None:
+def _print_finding(row: reports.ReportRow) -> None:
     """The lines of a finding below its first."""
     print(f"       severity: {row.severity}")
     print(f"       expected: {row.expected}")

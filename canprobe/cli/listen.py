@@ -16,7 +16,7 @@ from canprobe.cli.argument_types import seconds
 from canprobe.cli.hands import opened
 from canprobe.cli.parser import Parser
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.clock import Pace
 
 if TYPE_CHECKING:
     from canprobe.cell.master.controller import Command, Measurement
@@ -35,9 +35,9 @@ _CLEAR = "\x1b[H\x1b[J"
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
-    parser.add_argument("--duration", metavar="S", type=seconds, default=10.0, help="end after S seconds [10]")
-    parser.add_argument("--every", metavar="S", type=seconds, default=0.1, help="time between two images [0.1]")
-    parser.add_argument("--json", action="store_true", help="print one JSON document a line")
+    parser.add_option("--duration S", "end after S seconds [10]", seconds, default=10.0)
+    parser.add_option("--every S", "time between two images [0.1]", seconds, default=0.1)
+    parser.add_option("--json", "print one JSON document a line")
     parser.add_shared("-v")
 
 
@@ -53,13 +53,13 @@ def array_only(scene: Scene) -> Scene:
     return replace(alone, task=replace(scene.task, kind="listen"))
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print images until the time is over, or Ctrl-C."""
     from canprobe.cell.master.controller import Command
 
     duration_s, args.duration = args.duration, None
     on_terminal = sys.stdout.isatty() and not args.json
-    next_s, clock = 0.0, MonotonicClock()
+    next_s, pace = 0.0, Pace()
     with opened(args, prepared=array_only) as cell:
 
         def step(measurement: Measurement) -> Command:
@@ -73,11 +73,10 @@ def run(args: argparse.Namespace) -> int:
                     text = f"{t_s:7.2f} s  {array_line(cell, measurement)}"
                     print(_CLEAR + text + "\n" + _picture(measurement) if on_terminal else text, flush=True)
                 if cell.session.virtual and on_terminal:
-                    clock.sleep_until_ns(clock.now_ns() + round(1e9 * args.every))
+                    pace.keep(measurement.t_ns)
             return Command(done=t_s >= duration_s)
 
         cell.run(step)
-    return 0
 
 
 def array_values(cell: OpenCell, measurement: Measurement) -> dict[str, Any]:

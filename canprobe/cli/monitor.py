@@ -25,13 +25,11 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS")
-    parser.add_argument(
-        "--duration", metavar="S", type=seconds, help="end after S seconds [at Ctrl-C on a terminal, else 1]"
-    )
+    parser.add_option("--duration S", "end after S seconds [at Ctrl-C on a terminal, else 1]", seconds)
     parser.add_shared("--json", "-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Show the cell ten times a second; with --json print it once, at the end."""
     scene = loaded(args)
     scene = target_of(args, scene).applied_to(scene)
@@ -55,4 +53,3 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join(lines(view)))
     if isinstance(ended, Terminated):
         raise ended
-    return 0

@@ -8,10 +8,10 @@ end of a pipe at stdin brake the motion. A force from `limits.jog_force_n` on en
 from __future__ import annotations
 
 import argparse
-import math
 import re
 from typing import TYPE_CHECKING
 
+from canprobe.cli.argument_types import number_type
 from canprobe.cli.hands import add_arguments_of_hands, agreed, opened
 from canprobe.cli.parser import Parser
 from canprobe.cli.stdin import InputOpen
@@ -47,12 +47,10 @@ def add_arguments(parser: Parser) -> None:
         nargs="?",
         help="name of a posture (`canprobe posture list`), or the positions of all joints, deg or mm, with commas",
     )
-    parser.add_argument("--joint", metavar="N", type=int, help="move this joint alone, by its number from 1")
-    parser.add_argument("--by", metavar="WAY", type=way, help="its way, such as 5deg or -10mm")
-    parser.add_argument(
-        "--speed", metavar="SHARE", type=share, default=0.1, help="share of the speed limits, such as 20%% [10%%]"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="show the way, and move nothing")
+    parser.add_option("--joint N", "move this joint alone, by its number from 1", int)
+    parser.add_option("--by WAY", "its way, such as 5deg or -10mm", way)
+    parser.add_option("--speed SHARE", "share of the speed limits, such as 20%% [10%%]", share, default=0.1)
+    parser.add_option("--dry-run", "show the way, and move nothing")
     add_arguments_of_hands(parser)
 
 
@@ -63,18 +61,15 @@ def way(text: str) -> tuple[float, str | None]:
     return float(match[1]), match[2]
 
 
-def share(text: str) -> float:
-    """An argument type: a share, in percent or as a number up to 1."""
-    try:
-        value = float(text.removesuffix("%")) * (0.01 if text.endswith("%") else 1.0)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value <= 1.0:
-        raise argparse.ArgumentTypeError(f"expected a share such as 20% or 0.2, above 0 and up to 1, got {text!r}")
-    return value
+share = number_type(
+    lambda text: float(text.removesuffix("%")) * (0.01 if text.endswith("%") else 1.0),
+    lambda value: 0.0 < value <= 1.0,
+    "a share such as 20% or 0.2, above 0 and up to 1",
+)
+"""An argument type: a share, in percent or as a number up to 1."""
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Show the way, ask, and go it."""
     if (args.joint is None) != (args.by is None) or (args.to is None) == (args.joint is None):
         raise UsageError("move: expected a posture, or --joint and --by; `canprobe posture list CELL` has the postures")
@@ -90,14 +85,13 @@ def run(args: argparse.Namespace) -> int:
         args.report.say(f"{cell.plan.setup.needed_arm().left_alone}; they are at the end")
         if args.dry_run or not agreed(args, cell, "move?"):
             args.report.say("nothing was moved")
-            return 0
+            return
         if not stdin.watched:
             args.report.say("Ctrl-C brakes the motion")
         ended = cell.move(found, wanted=stdin)
         print(f"the arm stands at {standing(cell.plan, cell.read())}")
     if ended is not None:
         args.report.say("warning: stdin has ended, and the motion was braked")
-    return 0
 
 
 def _goal(args: argparse.Namespace, plan: Plan) -> Callable[[Floats], npt.ArrayLike]:

@@ -5,71 +5,71 @@ from __future__ import annotations
 import argparse
 import re
 import textwrap
-from collections.abc import Container, Mapping, Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Container, Sequence
+from typing import Any, NamedTuple, NoReturn
 
 from canprobe.cli.argument_types import channel, folder_path, node_id, seconds, seed, setting, whole, word
 from canprobe.errors import did_you_mean
 
 PATIENT_SYNCS = 40
 """100 ms at 400 Hz: a virtual machine may stand still as long."""
-OPTIONS: Mapping[str, dict[str, Any]] = {
-    "scene": {
-        "metavar": "SCENE",
-        "help": "a packaged scene (`canprobe scenes` lists them), a cell, or the path of a TOML file",
-    },
-    "--cell": {
-        "metavar": "C",
-        "type": word,
-        "help": "a packaged cell (`canprobe cells` lists them) or a path [the scene's]",
-    },
-    "--bus": {
-        "metavar": "B",
-        "type": word,
-        "help": "lockstep, direct (no bus), socketcan or another python-can interface; config: the one that"
-        " CAN_INTERFACE or python-can's configuration files name [the scene's]",
-    },
-    "--channel": {
-        "metavar": "[NAME=]CH",
-        "action": "append",
-        "type": channel,
-        "help": "channel of the interface; NAME=CH replaces the scene's channel NAME and may be repeated [the scene's]",
-    },
-    "--bitrate": {"metavar": "BIT/S", "type": whole(10_000, 1_000_000), "help": "bit rate [the scene's]"},
-    "--set": {
-        "metavar": "KEY=VALUE",
-        "action": "append",
-        "default": [],
-        "type": setting,
-        "help": "a key of the scene, as `--set task.force_n=3`, checked as in a file; may be repeated",
-    },
-    "--realtime": {
-        "action": "store_true",
-        "help": "request SCHED_FIFO, a processor for the cycle and locked memory; what the system does not permit is"
-        " reported [the scene's cycle.realtime]",
-    },
-    "--patient": {
-        "action": "store_true",
-        "help": f"emulated nodes on a slow machine: drives wait for {PATIENT_SYNCS} SYNCs, and late cycles stop"
-        " nothing",
-    },
-    "--bridge": {
-        "metavar": "NAME",
-        "action": "append",
-        "default": [],
-        "help": "send the data to another tool: mcap, foxglove, ros2 or view; may be repeated",
-    },
-    "--out": {"metavar": "DIR", "type": folder_path, "help": "folder of the results [runs/<scene>-<time>]"},
-    "--force": {"action": "store_true", "help": "replace the results of an earlier run in DIR"},
-    "--seed": {"metavar": "N", "type": seed, "help": "seed of all random numbers [the scene's]"},
-    "--duration": {
-        "metavar": "S",
-        "type": seconds,
-        "help": "length of the scan, press, listen or free phase in seconds [the scene's]",
-    },
-    "--json": {"action": "store_true", "help": "print one JSON document on stdout"},
-}
-"""Arguments that commands share."""
+
+
+class Option(NamedTuple):
+    """An option, as `Parser.add_option` adds it.
+
+    Attributes:
+        form: how it is typed, such as `--every S`; a switch has no word behind it.
+        text: its help.
+        kind: function that reads its value.
+        many: whether it may be repeated; its values are a list then.
+    """
+
+    form: str
+    text: str
+    kind: Callable[[str], Any] | None = None
+    many: bool = False
+
+
+_SHARED = (
+    Option("--cell C", "a packaged cell (`canprobe cells` lists them) or a path [the scene's]", word),
+    Option(
+        "--bus B",
+        "lockstep, direct (no bus), socketcan or another python-can interface; config: the one that CAN_INTERFACE or"
+        " python-can's configuration files name [the scene's]",
+        word,
+    ),
+    Option(
+        "--channel [NAME=]CH",
+        "channel of the interface; NAME=CH replaces the scene's channel NAME and may be repeated [the scene's]",
+        channel,
+        many=True,
+    ),
+    Option("--bitrate BIT/S", "bit rate [the scene's]", whole(10_000, 1_000_000)),
+    Option(
+        "--set KEY=VALUE",
+        "a key of the scene, as `--set task.force_n=3`, checked as in a file; may be repeated",
+        setting,
+        many=True,
+    ),
+    Option(
+        "--realtime",
+        "request SCHED_FIFO, a processor for the cycle and locked memory; what the system does not permit is reported"
+        " [the scene's cycle.realtime]",
+    ),
+    Option(
+        "--patient",
+        f"emulated nodes on a slow machine: drives wait for {PATIENT_SYNCS} SYNCs, and late cycles stop nothing",
+    ),
+    Option("--bridge NAME", "send the data to another tool: mcap, foxglove, ros2 or view; may be repeated", many=True),
+    Option("--out DIR", "folder of the results [runs/<scene>-<time>]", folder_path),
+    Option("--force", "replace the results of an earlier run in DIR"),
+    Option("--seed N", "seed of all random numbers [the scene's]", seed),
+    Option("--duration S", "length of the scan, press, listen or free phase in seconds [the scene's]", seconds),
+    Option("--json", "print one JSON document on stdout"),
+)
+_OPTIONS = {option.form.partition(" ")[0]: option for option in _SHARED}
+"""Options that commands share, by their names."""
 _KEYS = {
     "--bus": "bus.interface",
     "--channel": "bus.channel",
@@ -122,8 +122,34 @@ class Parser(argparse.ArgumentParser):
         settings.setdefault("allow_abbrev", False)
         super().__init__(**settings)  # type: ignore[arg-type]
 
+    def add_option(
+        self,
+        form: str,
+        text: str,
+        kind: Callable[[str], Any] | None = None,
+        many: bool = False,
+        *,
+        to: argparse._ActionsContainer | None = None,
+        **more: Any,
+    ) -> None:
+        """Add an option.
+
+        Args:
+            form, text, kind, many: see `Option`.
+            to: group of the help in which it stands.
+            more: further arguments of `add_argument`.
+        """
+        name, _, metavar = form.partition(" ")
+        if not metavar:
+            more |= {"action": "store_true"}
+        elif many:
+            more |= {"metavar": metavar, "type": kind, "action": "append", "default": []}
+        else:
+            more |= {"metavar": metavar, "type": kind}
+        (to or self).add_argument(name, help=text, **more)
+
     def add_shared(self, *names: str, to: argparse._ActionsContainer | None = None) -> None:
-        """Add arguments of `OPTIONS`, in this order.
+        """Add arguments that commands share, in this order.
 
         Args:
             names: their names; SCENE is the scene with --cell and --set, and [SCENE] one that another argument can
@@ -133,33 +159,33 @@ class Parser(argparse.ArgumentParser):
         for name in names:
             match name:
                 case "SCENE" | "[SCENE]":
-                    self.add_argument("scene", nargs="?" if name == "[SCENE]" else None, **OPTIONS["scene"])
+                    what = "a packaged scene (`canprobe scenes` lists them), a cell, or the path of a TOML file"
+                    self.add_argument("scene", metavar="SCENE", nargs="?" if name == "[SCENE]" else None, help=what)
                     self.add_shared("--cell", "--set")
                 case "BUS":
                     self.add_shared("--bus", "--channel", "--bitrate", to=to)
                 case "-v":
                     self._add_verbosity()
                 case _:
-                    (to or self).add_argument(name, **OPTIONS[name])
+                    self.add_option(*_OPTIONS[name], to=to)
 
     def add_real_bus(self, more: str = "") -> None:
         """Add --bus, --channel and --bitrate of a real bus without a scene; `more` names what else --bus may be."""
         what = f"python-can interface{more} [that of CAN_INTERFACE or python-can's configuration files, else socketcan]"
-        self.add_argument("--bus", **OPTIONS["--bus"] | {"help": what})
-        self.add_argument("--channel", metavar="CH", type=word, help="channel of the interface [can0]")
-        self.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
+        self.add_option("--bus B", what, word)
+        self.add_option("--channel CH", "channel of the interface [can0]", word)
+        self.add_option("--bitrate BIT/S", "bit rate [1000000]", whole(10_000, 1_000_000))
 
     def add_eds_nodes(self, *, more: str = "") -> None:
         """Add --eds and --node-id, which stand in pairs; `more` ends the help of the latter."""
         what = "EDS, DCF, XDD or XDC file of a node; may be repeated, each with its --node-id"
-        self.add_argument("--eds", metavar="FILE", action="append", default=[], help=what)
-        what = f"node id for the --eds at the same position{more}"
-        self.add_argument("--node-id", metavar="N", action="append", default=[], type=node_id, help=what)
+        self.add_option("--eds FILE", what, many=True)
+        self.add_option("--node-id N", f"node id for the --eds at the same position{more}", node_id, many=True)
 
     def add_inject(self, what: str) -> None:
         """Add --inject; `what` begins its help."""
         what += "; may be repeated; `canprobe inject --list` lists them"
-        self.add_argument("--inject", metavar="FAULT", action="append", default=[], type=word, help=what)
+        self.add_option("--inject FAULT", what, word, many=True)
 
     def _add_verbosity(self) -> None:
         """Add -v and -q to a command that reports its steps."""

@@ -18,7 +18,7 @@ from canprobe.cell.session.terminal import columns
 from canprobe.cli.output import print_answer, print_json, say
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, with_scene
-from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
+from canprobe.errors import CanprobeError, PlanError, UsageError, needed_module
 
 if TYPE_CHECKING:
     from canprobe.cell.planning.model import Plan
@@ -47,22 +47,19 @@ EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE")
-    parser.add_argument("--full", action="store_true", help="print the tables of nodes, PDOs, times and choices too")
-    parser.add_argument(
-        "--measured",
-        metavar="LOG",
-        type=Path,
-        help="compare a candump log, the folder of a run, or the --json report of `canprobe conform` with the plan",
+    parser.add_option("--full", "print the tables of nodes, PDOs, times and choices too")
+    parser.add_option(
+        "--measured LOG",
+        "compare a candump log, the folder of a run, or the --json report of `canprobe conform` with the plan",
+        Path,
     )
-    parser.add_argument(
+    parser.add_option(
         "--rehearse",
-        action="store_true",
-        help="bring the cell up in lockstep, all of it emulated, and touch; status 2 with the cause where that fails",
+        "bring the cell up in lockstep, all of it emulated, and touch; status 2 with the cause where that fails",
     )
-    parser.add_argument(
+    parser.add_option(
         "--auto",
-        action="store_true",
-        help="let the plan choose bus.fd, bus.cob_ids, arm.grouped_rpdo and sensor.channel, except those that the"
+        "let the plan choose bus.fd, bus.cob_ids, arm.grouped_rpdo and sensor.channel, except those that the"
         " scene sets",
     )
     parser.add_argument(
@@ -72,22 +69,17 @@ def add_arguments(parser: Parser) -> None:
         default=[],
         help="write the plan as a file for other tools; may be repeated",
     )
-    parser.add_argument(
-        "--figure", metavar="FILE.png", type=Path, help="draw the cycles and the response times (extra `study`)"
-    )
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the exported files [.]")
+    parser.add_option("--figure FILE.png", "draw the cycles and the response times (extra `study`)", Path)
+    parser.add_option("--out DIR", "folder of the exported files [.]", Path, default=Path())
     parser.add_shared("--json")
 
 
 def _draw(plan: Plan, path: Path) -> Path:
-    try:
-        from canprobe.cell.results.plan_figure import draw_plan
-    except ImportError as error:
-        raise UsageError(f"--figure needs matplotlib: {install_line('study')}") from error
+    drawing = needed_module("canprobe.cell.results.plan_figure", "study", "--figure needs matplotlib:")
     if not path.suffix:
         path = path.with_suffix(".png")  # as matplotlib would do without a message
     try:
-        draw_plan(plan, path)
+        drawing.draw_plan(plan, path)
     except ValueError as error:  # matplotlib does not know the format
         raise UsageError(f"--figure {path}: {error}") from error
     return path

@@ -26,20 +26,15 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "log", metavar="LOG", type=Path, help="folder of a run, or a log of candump or, by its suffix, of another tool"
     )
-    parser.add_argument(
-        "--scene", metavar="SCENE", help="packaged scene or path of a TOML file [the scene.toml of the run]"
+    parser.add_option("--scene SCENE", "packaged scene or path of a TOML file [the scene.toml of the run]")
+    parser.add_option(
+        "--method M", "recursive, ml, chord or chen1996; may be repeated [those of the scene]", action="append"
     )
-    parser.add_argument(
-        "--method",
-        metavar="M",
-        action="append",
-        help="recursive, ml, chord or chen1996; may be repeated [those of the scene]",
-    )
-    parser.add_argument("--out", metavar="FILE", type=Path, help="write all estimates to this npz file")
+    parser.add_option("--out FILE", "write all estimates to this npz file", Path)
     parser.add_shared("--bridge", "--json", "-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Replay the log and print the estimates."""
     from canprobe.cell.recorded import reestimate as recorded
 
@@ -49,10 +44,9 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         result.save(args.out)
     print_answer(args, result.summary, result.text())
-    return 0
 
 
-def _run_into(args: argparse.Namespace) -> int:
+def _run_into(args: argparse.Namespace) -> None:
     """Feed the log to bridges; print the estimates and the state of the bridges."""
     from canprobe.cell.recorded.reestimate import replay_into
     from canprobe.cell.results.text import bridge_lines
@@ -66,4 +60,3 @@ def _run_into(args: argparse.Namespace) -> int:
     for name, status in replayed.bridges.items():
         if status["error"] is not None:
             raise ResultsError(f"bridge {name}: {status['error']}")
-    return 0

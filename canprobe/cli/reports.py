@@ -7,56 +7,47 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from canprobe.cli.parser import Parser
 from canprobe.errors import UsageError
-
-if TYPE_CHECKING:
-    from canprobe.cli.parser import Parser
-    from canprobe.fieldbus.tools.reports import Report, ReportChange
+from canprobe.fieldbus.eds.packaged import eds_file
+from canprobe.fieldbus.tools import reports
 
 
 def add_report_options(parser: Parser) -> None:
     """Add --baseline, --fail-on, --junit, --html and --json."""
-    parser.add_argument("--baseline", metavar="FILE", type=Path, help="compare with an older --json report")
-    parser.add_argument(
-        "--fail-on",
-        metavar="WHAT",
+    parser.add_option("--baseline FILE", "compare with an older --json report", Path)
+    parser.add_option(
+        "--fail-on WHAT",
+        "exit with 1 for any deviation, or for a new one: not in the --baseline [deviation]",
         choices=("deviation", "new"),
         default="deviation",
-        help="exit with 1 for any deviation, or for a new one: not in the --baseline [deviation]",
     )
-    parser.add_argument("--junit", metavar="FILE", type=Path, help="write JUnit XML, for CI servers")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write one HTML file, for people")
+    parser.add_option("--junit FILE", "write JUnit XML, for CI servers", Path)
+    parser.add_option("--html FILE", "write one HTML file, for people", Path)
     parser.add_shared("--json")
 
 
-def read_baseline(args: argparse.Namespace) -> Report | None:
+def read_baseline(args: argparse.Namespace) -> reports.Report | None:
     """The older report, read before anything is sent; None where none is named."""
-    from canprobe.fieldbus.tools.reports import read_json
-
     if args.fail_on == "new" and args.baseline is None:
         raise UsageError("--fail-on new compares with an older report: --baseline FILE names it")
-    return read_json(args.baseline) if args.baseline is not None else None
+    return reports.read_json(args.baseline) if args.baseline is not None else None
 
 
-def write_report(args: argparse.Namespace, report: Report, baseline: Report | None) -> ReportChange | None:
+def write_report(
+    args: argparse.Namespace, report: reports.Report, baseline: reports.Report | None
+) -> reports.ReportChange | None:
     """Write the files that are asked for, and the step summary of GitHub; what changed since the baseline."""
-    from canprobe.fieldbus.tools.reports import Verdict, append_step_summary, compare
-
-    change = None if baseline is None else compare(report, baseline)
+    change = None if baseline is None else reports.compare(report, baseline)
     if change is not None and args.fail_on == "new":
-        bad = [row.key for row in report.rows if row.verdict is Verdict.FAIL]
+        bad = [row.key for row in report.rows if row.verdict is reports.Verdict.FAIL]
         report.known = tuple(key for key in bad if key not in (*change.worse, *change.new))
     if args.junit is not None:
-        from canprobe.fieldbus.tools.reports import write_junit
-
-        write_junit(report, args.junit)
+        reports.write_junit(report, args.junit)
     if args.html is not None:
-        from canprobe.fieldbus.tools.reports import write_html
-
-        write_html(report, args.html, change)
-    append_step_summary(report, os.environ, change)
+        reports.write_html(report, args.html, change)
+    reports.append_step_summary(report, os.environ, change)
     return change
 
 
@@ -77,8 +68,6 @@ def versions() -> str:
 def eds_and_hash(name: str) -> str:
     """Name of an EDS file with the hash of its content."""
     import hashlib
-
-    from canprobe.fieldbus.eds.packaged import eds_file
 
     path = eds_file(name)
     return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"

@@ -34,9 +34,7 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS", "--realtime", "--patient", "--bridge", "--out", "--force", "--seed", "--duration")
-    parser.add_argument(
-        "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
-    )
+    parser.add_option("--tool FILE", "centre of the probe, from the tool.toml of a calibration", Path)
     parser.add_argument(
         "--no-figures",
         dest="figures",
@@ -44,11 +42,11 @@ def add_arguments(parser: Parser) -> None:
         default=None,
         help="draw no report.png and surface.png [the scene's scene.figures]",
     )
-    parser.add_argument("--full", action="store_true", help="print the error of the force and every estimator too")
+    parser.add_option("--full", "print the error of the force and every estimator too")
     parser.add_shared("--json", "-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Run the scene; the verdict goes to stdout, the progress to stderr. A run that was stopped raises.
 
     It is printed as soon as it holds the estimator in the loop; with --full the errors of the others follow below it.
@@ -97,7 +95,6 @@ def run(args: argparse.Namespace) -> int:
         print(folder_line(folder))
         view = BRIDGES["view"]
         print(f"next: {f'{view.pip} && ' if view.missing else ''}canprobe view {shlex.quote(str(folder))}")
-    return 0
 
 
 def _expected(args: argparse.Namespace) -> list[str]:

@@ -30,15 +30,13 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("runs", metavar="RUN", type=folder_path, nargs="*", help="folder of a run, or of runs [runs]")
-    parser.add_argument("--prune", action="store_true", help="delete the runs")
-    parser.add_argument(
-        "--keep", metavar="N", type=whole(0, 1_000_000), default=0, help="with --prune: the newest N runs stay [0]"
-    )
-    parser.add_argument("--yes", action="store_true", help="with --prune: do not ask")
+    parser.add_option("--prune", "delete the runs")
+    parser.add_option("--keep N", "with --prune: the newest N runs stay [0]", whole(0, 1_000_000), default=0)
+    parser.add_option("--yes", "with --prune: do not ask")
     parser.add_shared("--json")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print the runs, or what differs between two; or delete them."""
     from canprobe.cell.results.runs import compare_runs, find_runs, remove_run
 
@@ -46,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.prune and len(args.runs) == len(found) == 2:
         differing = compare_runs(*args.runs)
         print_answer(args, differing, lambda: _print_differing(args.runs, differing))
-        return 0
+        return
     if args.prune:
         found = sorted(found, key=lambda entry: entry["started"])[: max(len(found) - args.keep, 0)]
         for entry in found:
@@ -59,7 +57,6 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError("runs: --prune needs a yes at the terminal, or --yes; nothing was deleted")
         for entry in found:
             remove_run(Path(entry["folder"]))
-    return 0
 
 
 def _print_runs(found: Sequence[Mapping[str, Any]]) -> None:

@@ -41,22 +41,19 @@ Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("[SCENE]")
     parser.add_real_bus()
-    parser.add_argument(
-        "--timeout",
-        metavar="S",
-        type=seconds,
-        help="longest time to one SDO answer in seconds [0.5, as bring-up waits; the scene's bring_up.sdo_s]",
+    parser.add_option(
+        "--timeout S",
+        "longest time to one SDO answer in seconds [0.5, as bring-up waits; the scene's bring_up.sdo_s]",
+        seconds,
     )
-    parser.add_argument("--lss", action="store_true", help="also find nodes without an id")
-    parser.add_argument(
-        "--assign",
-        metavar="[SERIAL=]ID",
-        action="append",
-        type=assignment,
-        default=[],
-        help="assign this id to the device with this serial number or VENDOR:PRODUCT:REVISION:SERIAL; may be repeated",
+    parser.add_option("--lss", "also find nodes without an id")
+    parser.add_option(
+        "--assign [SERIAL=]ID",
+        "assign this id to the device with this serial number or VENDOR:PRODUCT:REVISION:SERIAL; may be repeated",
+        assignment,
+        many=True,
     )
-    parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
+    parser.add_option("--no-store", "the devices lose their new ids when they lose power")
     parser.add_shared("--json", "-v")
 
 
@@ -70,7 +67,7 @@ def assignment(text: str) -> Assignment:
     return (vendor, product, revision, serial), whole(1, 127)(node_id)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print one row for each node."""
     from canprobe.cell.session.target import refuse_virtual
 
@@ -83,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.lss:
         nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
         print_answer(args, nodes, lambda: _print_nodes(nodes, target.channel))
-        return 0
+        return
     scene = None if args.scene is None else loaded(args)
     done = api.commission(
         target,
@@ -94,7 +91,6 @@ def run(args: argparse.Namespace) -> int:
         say=args.report.say,
     )
     print_answer(args, done.as_document(), lambda: _print_commissioned(done, target.channel))
-    return 0
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -25,7 +25,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_shared("--json")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print name, title and figures of every packaged scene, and the folder of their files."""
     from canprobe.cell.results.expected import read_expected
 
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
 
 def print_packaged(
     advice: Mapping[str, str], args: argparse.Namespace, expected: Mapping[str, Any] | None = None
-) -> int:
+) -> None:
     """Print name and title of every packaged file of some kinds, their folders, and advice.
 
     Args:
@@ -71,4 +71,3 @@ def print_packaged(
             print_table([(one.name, f"estimator of the package {one.package}") for one in plugins("estimator")])
     if args.json:
         print_json(document)
-    return 0

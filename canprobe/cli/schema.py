@@ -24,7 +24,6 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("kind", metavar="KIND", choices=KINDS, help=f"kind of file: {', '.join(KINDS)}")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print the schema."""
     print(schema_text(args.kind), end="")
-    return 0

@@ -44,48 +44,28 @@ FORM_OPTIONS = ("recover", "link", "soak", "vcan")
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("name", metavar="NAME", nargs="?", help="study to run; --list lists them")
-    parser.add_argument("--list", action="store_true", help="list the studies, and end")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the files [runs/study-NAME]")
-    parser.add_argument("--quick", action="store_true", help="measure fewer cases, with fewer repeats")
-    parser.add_argument(
-        "--seed",
-        metavar="N",
-        type=whole(0, 2**63 - 1),
-        help="faults, regions: run only the case of this seed, and report each step",
+    parser.add_option("--list", "list the studies, and end")
+    parser.add_option("--out DIR", "folder of the files [runs/study-NAME]", Path)
+    parser.add_option("--quick", "measure fewer cases, with fewer repeats")
+    parser.add_option(
+        "--seed N", "faults, regions: run only the case of this seed, and report each step", whole(0, 2**63 - 1)
     )
-    parser.add_argument(
-        "--draw",
-        metavar="N",
-        type=whole(0, 9999),
-        help="calibration, realtime --link, regions, surfaces: number that all cases follow from; others than those of"
+    parser.add_option(
+        "--draw N",
+        "calibration, realtime --link, regions, surfaces: number that all cases follow from; others than those of"
         " the published figures",
+        whole(0, 9999),
     )
-    parser.add_argument(
-        "--against", metavar="FILE", type=Path, help="regions: regions.json of an earlier run, to compare with"
+    parser.add_option("--against FILE", "regions: regions.json of an earlier run, to compare with", Path)
+    parser.add_option(
+        "--recover", "faults: whether a cell comes back from what it loses by chance: power, links, its master's time"
     )
-    parser.add_argument(
-        "--recover",
-        action="store_true",
-        help="faults: whether a cell comes back from what it loses by chance: power, links, its master's time",
-    )
-    parser.add_argument(
-        "--vcan",
-        action="store_true",
-        help="faults: on a real vcan0; processes are killed, and the link is taken down",
-    )
-    parser.add_argument(
-        "--link",
-        action="store_true",
-        help="realtime: whether a check of a link says what the next minute shows, in virtual time",
-    )
-    parser.add_argument(
-        "--soak",
-        action="store_true",
-        help="realtime: hold the cell for half an hour, and watch memory, clocks and counters",
-    )
-    parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="number of processes [one for each core]")
-    parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
-    parser.add_argument("--fresh", action="store_true", help="ignore finished cells in DIR")
+    parser.add_option("--vcan", "faults: on a real vcan0; processes are killed, and the link is taken down")
+    parser.add_option("--link", "realtime: whether a check of a link says what the next minute shows, in virtual time")
+    parser.add_option("--soak", "realtime: hold the cell for half an hour, and watch memory, clocks and counters")
+    parser.add_option("--workers N", "number of processes [one for each core]", whole(1, 1024))
+    parser.add_option("--dask ADDRESS", "compute on the Dask cluster with this scheduler")
+    parser.add_option("--fresh", "ignore finished cells in DIR")
     parser.add_shared("--json", "-v")
     parser.set_defaults(complain=parser.error)
 

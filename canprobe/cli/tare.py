@@ -24,13 +24,12 @@ def add_arguments(parser: Parser) -> None:
     add_arguments_of_hands(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Show the image, ask, tare, and show it again."""
     with opened(args, prepared=array_only) as cell:
         print(f"before: {array_line(cell, cell.read())}")
         if not agreed(args, cell, "is the array free, and may this be zero?"):
             args.report.say("nothing was tared")
-            return 0
+            return
         cell.tare()
         print(f"after:  {array_line(cell, cell.read())}")
-    return 0

@@ -6,6 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.parser import PATIENT_SYNCS
@@ -86,7 +87,7 @@ def target_of(args: argparse.Namespace, scene: Scene) -> Target:
     from canprobe.cell.session.target import LOCKSTEP, Target
 
     (main, *_), bitrate = scene.channels, args.bitrate
-    channels = _channels(args.channel or [], scene.channels)
+    channels = _channels(args.channel, scene.channels)
     interface, channel = args.bus, channels.pop(main, None)
     open_to_configuration = args.bus is None and scene.bus.interface == LOCKSTEP and _has_real_nodes(scene)
     if (args.bus == CONFIG or open_to_configuration) and (found := _configured(args.bus)) is not None:
@@ -134,6 +135,18 @@ def real_target(
     if (channel := channel or channel_else) is None:
         raise UsageError("--channel is missing: name the bus, such as --channel vcan0")
     return Target(interface, channel, bitrate or bitrate_else)
+
+
+def scene_target(args: argparse.Namespace, scene: Scene) -> Target:
+    """The real bus of a scene's nodes: a channel without a name is for all of them, else each has that of the scene."""
+    from canprobe.cell.session.target import Target
+
+    name, channel = args.channel[0] if args.channel else ("", None)
+    real = real_target(args.bus, channel, args.bitrate, bitrate_else=scene.bus.bitrate)
+    channels = _channels(args.channel, scene.channels) or {scene.bus.channel: real.channel}
+    target = Target.over(scene, real.interface, channels, real.bitrate)
+    one = channel if name is None else None
+    return replace(target, others={each: one or target.others.get(each, each) for each in scene.channels[1:]})
 
 
 def _configured(bus: str | None) -> ConfiguredBus | None:

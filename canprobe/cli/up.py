@@ -24,25 +24,21 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS", "--realtime", "--patient", "--bridge")
-    parser.add_argument(
+    parser.add_option(
         "--check-joints",
-        action="store_true",
-        help="move one joint after the other by 1 deg and by 10 deg (3.5 and 35 mm for a sliding joint) and back,"
+        "move one joint after the other by 1 deg and by 10 deg (3.5 and 35 mm for a sliding joint) and back,"
         " compare the encoders and what you see, record it, and end; asks before each motion",
     )
-    parser.add_argument(
+    parser.add_option(
         "--recover",
-        action="store_true",
-        help="come back after a node was switched off or reset, or the interface was down: stop, wait, bring up again"
+        "come back after a node was switched off or reset, or the interface was down: stop, wait, bring up again"
         " and hold; `r` and Enter let requested motion go on",
     )
-    parser.add_argument(
-        "--yes", action="store_true", help="with --check-joints: do not ask; by 10 deg nothing moves then"
-    )
+    parser.add_option("--yes", "with --check-joints: do not ask; by 10 deg nothing moves then")
     parser.add_shared("-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Hold the cell until Ctrl-C, which is the normal way to leave."""
     if args.yes and not args.check_joints:
         raise UsageError("up: --yes goes with --check-joints")
@@ -60,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         from canprobe.cli.operator import TerminalOperator
 
         api.check_joints(scene, operator=None if args.yes else TerminalOperator(), say=args.report.say)
-        return 0
+        return
     with left_by_ctrl_c():
         if args.recover:
             from canprobe.cli.operator import LetterKey
@@ -68,4 +64,3 @@ def run(args: argparse.Namespace) -> int:
             api.up(scene, bridge=args.bridge, say=args.report.say, recover=True, asked=LetterKey("r").pressed)
         else:
             api.up(scene, bridge=args.bridge, say=args.report.say)
-    return 0

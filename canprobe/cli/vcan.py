@@ -29,15 +29,11 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.usage = "canprobe vcan [--install] [--timeout S] [--realtime] [-- COMMAND...]"
-    parser.add_argument(
-        "--install",
-        action="store_true",
-        help="install the Debian packages user-mode-linux and iproute2 if they are needed (as root)",
+    parser.add_option(
+        "--install", "install the Debian packages user-mode-linux and iproute2 if they are needed (as root)"
     )
-    parser.add_argument("--timeout", metavar="S", type=seconds, help="stop the command after S seconds")
-    parser.add_argument(
-        "--realtime", action="store_true", help="pin the virtual machine to one processor under SCHED_FIFO"
-    )
+    parser.add_option("--timeout S", "stop the command after S seconds", seconds)
+    parser.add_option("--realtime", "pin the virtual machine to one processor under SCHED_FIFO")
     parser.add_argument(
         "command", metavar="COMMAND", nargs=argparse.REMAINDER, help="command to run, with its arguments [a shell]"
     )

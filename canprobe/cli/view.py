@@ -12,16 +12,13 @@ import os
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import whole
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import target_of
+from canprobe.fieldbus.bus.clock import Pace
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
-
-if TYPE_CHECKING:
-    from canprobe.cell.master.observers import AnyObserver
 
 HELP = "show a scene or a run in a browser"
 EXAMPLE = """\
@@ -34,23 +31,18 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     parser.add_argument("what", metavar="SCENE|RUN_DIR", help="scene to run, or folder of a recorded run")
-    parser.add_argument(
-        "--host",
-        metavar="H",
-        default="127.0.0.1",
-        help="address of the server; 0.0.0.0 serves other machines [127.0.0.1]",
+    parser.add_option(
+        "--host H", "address of the server; 0.0.0.0 serves other machines [127.0.0.1]", default="127.0.0.1"
     )
-    parser.add_argument(
-        "--port", metavar="N", type=whole(0, 65_535), default=8080, help="port of the server; 0: any free port [8080]"
-    )
-    parser.add_argument("--no-open", action="store_true", help="print the address and open no browser")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
+    parser.add_option("--port N", "port of the server; 0: any free port [8080]", whole(0, 65_535), default=8080)
+    parser.add_option("--no-open", "print the address and open no browser")
+    parser.add_option("--html FILE", "write the replay to one HTML file, and end", Path)
     of_scene = parser.add_argument_group("options of a SCENE")
     parser.add_shared("--set", "BUS", "--out", "--force", "--seed", "--duration", to=of_scene)
     parser.add_shared("-v")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Show it until Ctrl-C, or write the file."""
     from canprobe.cell.planning.bridges import check_view
 
@@ -78,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
                 say=args.report.say,
                 whole=interrupts_held,
             )
-    return 0
 
 
 def _is_scene(what: str) -> bool:
@@ -107,6 +98,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         raise
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
     scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
+    pace = Pace()
     live = args.html is None and not BRIDGES["view"].lacks
     folder = api.results_folder(scene, args.out)
     api.run(
@@ -116,7 +108,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         duration_s=args.duration,
         force=args.force,
         bridge=("view",) if live else (),
-        observers=[_paced()] if live and scene.bus.interface in VIRTUAL else [],
+        observers=[lambda seen: pace.keep(seen.t_ns)] if live and scene.bus.interface in VIRTUAL else [],
         say=browser.say,
     )
     return folder
@@ -155,21 +147,3 @@ class _Browser:
             self.show(where)
         else:
             self._say(line)
-
-
-def _paced() -> AnyObserver:
-    """An observer that lets virtual time pass no faster than the clock on the wall."""
-    from canprobe.cell.master.observers import Observation
-    from canprobe.fieldbus.bus.clock import MonotonicClock
-
-    clock = MonotonicClock()
-    offset_ns: int | None = None
-
-    def wait(observation: Observation) -> None:
-        nonlocal offset_ns
-        now_ns = clock.now_ns()
-        if offset_ns is None or now_ns > offset_ns + observation.t_ns:  # behind: lost time is not caught up
-            offset_ns = now_ns - observation.t_ns
-        clock.sleep_until_ns(offset_ns + observation.t_ns)
-
-    return wait

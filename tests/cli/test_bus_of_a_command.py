@@ -48,7 +48,7 @@ def test_the_command_line_and_the_scene_come_before_the_configuration(bare, monk
     monkeypatch.setenv("CAN_INTERFACE", "pcan")
     monkeypatch.setenv("CAN_CHANNEL", "PCAN_USBBUS1")
     monkeypatch.setenv("CAN_BITRATE", "500000")
-    silent = Namespace(bus=None, channel=None, bitrate=None)
+    silent = Namespace(bus=None, channel=[], bitrate=None)
     scene = load_scene("free")
     real = replace(scene, arm=replace(scene.arm, emulated=False))
     named = replace(real, bus=replace(real.bus, interface="kvaser"))
@@ -56,11 +56,11 @@ def test_the_command_line_and_the_scene_come_before_the_configuration(bare, monk
     assert target_of(silent, scene) == Target("lockstep", "can0", 1_000_000)
     assert target_of(silent, real) == configured
     assert target_of(silent, named) == Target("kvaser", "can0", 1_000_000)
-    assert target_of(Namespace(bus="config", channel=None, bitrate=None), scene) == configured
+    assert target_of(Namespace(bus="config", channel=[], bitrate=None), scene) == configured
     assert target_of(Namespace(bus="config", channel=[(None, "X")], bitrate=250_000), scene) == Target(
         "pcan", "X", 250_000
     )
-    assert target_of(Namespace(bus="slcan", channel=None, bitrate=None), real) == Target("slcan", "can0", 1_000_000)
+    assert target_of(Namespace(bus="slcan", channel=[], bitrate=None), real) == Target("slcan", "can0", 1_000_000)
 
 
 def test_channels_of_a_scene_with_two_buses(bare):

@@ -108,7 +108,7 @@ class CandumpWriter:
             channel: name in its lines.
             also: function that takes the same frames.
         """
-        form = _ChannelLines(channel, self._t0_ns).line
+        form = _line_maker(channel, self._t0_ns)
 
         def take(frames: Sequence[TimedFrame]) -> None:
             self._lines += starmap(form, frames)
@@ -161,30 +161,26 @@ class CandumpWriter:
         self.close()
 
 
-class _ChannelLines:
-    """Lines of one channel."""
+def _line_maker(channel: str, t0_ns: int) -> Callable[[int, bytes, int], str]:
+    """A function that makes the line of one frame, newline included; ns below the microsecond are cut off."""
+    names: dict[int, str] = {}
+    prefix, prefix_s = "", -1
 
-    __slots__ = ("_channel", "_names", "_prefix", "_second", "_t0_ns")
-
-    def __init__(self, channel: str, t0_ns: int) -> None:
-        self._channel, self._t0_ns = channel, t0_ns
-        self._second = -1
-        self._prefix = ""
-        self._names: dict[int, str] = {}
-
-    def line(self, can_id: int, data: bytes, t_ns: int) -> str:
-        """The line of one frame, newline included; ns below the microsecond are cut off."""
-        second, us = divmod((t_ns - self._t0_ns) // 1000, 1_000_000)
-        if second != self._second:
-            self._second, self._prefix = second, f"({second:010d}."
-        name = self._names.get(can_id)
+    def line(can_id: int, data: bytes, t_ns: int) -> str:
+        nonlocal prefix, prefix_s
+        second, us = divmod((t_ns - t0_ns) // 1000, 1_000_000)
+        if second != prefix_s:
+            prefix, prefix_s = f"({second:010d}.", second
+        name = names.get(can_id)
         if name is None:
-            name = self._names[can_id] = f") {self._channel} {_format_id(can_id)}#"
+            name = names[can_id] = f") {channel} {_format_id(can_id)}#"
         if len(data) > CLASSIC_BYTES:
             payload = f"#{BRS_FLAG}{data.hex().upper()}"
         else:
             payload = "R" if can_id & RTR_FLAG else data.hex().upper()
-        return f"{self._prefix}{us:06d}{name}{payload}\n"
+        return f"{prefix}{us:06d}{name}{payload}\n"
+
+    return line
 
 
 def _format_id(can_id: int) -> str:

@@ -154,6 +154,18 @@ class MonotonicClock:
                 raise OSError(status, os.strerror(status))
 
 
+class Pace:
+    """Lets virtual time pass no faster than real time; time that computing took is not made up for."""
+
+    def __init__(self) -> None:
+        self._clock, self._ahead_ns = MonotonicClock(), -(1 << 62)
+
+    def keep(self, t_ns: int) -> None:
+        """Wait where `t_ns` of virtual time would come too early; the first call waits for nothing."""
+        self._ahead_ns = max(self._ahead_ns, self._clock.now_ns() - t_ns)
+        self._clock.sleep_until_ns(t_ns + self._ahead_ns)
+
+
 def epoch_now_ns() -> int:
     """Time of day in ns since the Unix epoch, for data that leave this machine; no decision uses it."""
     return time.time_ns()

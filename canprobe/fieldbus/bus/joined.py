@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import select
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from operator import itemgetter
 
 from canprobe.errors import InterfaceError
@@ -62,7 +61,9 @@ class JoinedPort(PlainPort):
     def counters(self) -> PortCounters:
         """Sum of the counters of all ports; a step of the wall clock, which each port notices, counts once."""
         every = [port.counters for port in self._ports.values()]
-        total = PortCounters(*(sum(getattr(one, field.name) for one in every) for field in fields(PortCounters)))
+        total = PortCounters()
+        for one in every:
+            total.add(one)
         total.clock_steps = max(one.clock_steps for one in every)
         return total
 

@@ -7,19 +7,8 @@ from __future__ import annotations
 
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.protocol.lss import (
-    LSS_ANSWER_ID,
-    LSS_BYTES,
-    LSS_REQUEST_ID,
-    PRESENCE_CHECK,
-    LssAddress,
-    LssCommand,
-    LssError,
-    LssState,
-    pack_fastscan,
-    pack_lss,
-    pack_number,
-)
+from canprobe.fieldbus.protocol import lss
+from canprobe.fieldbus.protocol.lss import LssAddress, LssCommand, LssError, LssState
 
 SETTLING_S = 0.005
 """Time that is waited after the first answer, as several nodes may answer one question one after another."""
@@ -40,12 +29,13 @@ class Lss:
 
     def release(self) -> None:
         """Put all nodes into the waiting state; a node that got an id boots with it."""
-        self._send(pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
+        self._send(lss.pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
 
     def select(self, address: LssAddress) -> bool:
         """Put the node of this address into configuration; return whether it answered."""
         *first, last = [
-            pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), number) for i, number in enumerate(address.numbers)
+            lss.pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), number)
+            for i, number in enumerate(address.numbers)
         ]
         for message in first:
             self._send(message)
@@ -54,7 +44,7 @@ class Lss:
     def inquire_node_ids(self) -> list[int]:
         """Node ids of all nodes in configuration: one, unless several devices have one address."""
         command = LssCommand.INQUIRE_NODE_ID
-        return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_TIMEOUT_S, command)]
+        return [answer[1] for answer in self._ask(lss.pack_lss(command), ANSWER_TIMEOUT_S, command)]
 
     def configure_node_id(self, node_id: int) -> None:
         """Give the node in configuration its id.
@@ -85,7 +75,7 @@ class Lss:
             LssAnswerError: nodes answer, but no address is found: answers were lost or came late.
         """
         for timeout_s in (SEARCH_TIMEOUT_S, 5 * SEARCH_TIMEOUT_S):
-            if not self._identified(0, PRESENCE_CHECK, 0, 0, ANSWER_TIMEOUT_S):
+            if not self._identified(0, lss.PRESENCE_CHECK, 0, 0, ANSWER_TIMEOUT_S):
                 return None
             if (address := self._search(timeout_s)) is not None:
                 return address
@@ -107,16 +97,16 @@ class Lss:
         return LssAddress(*found)
 
     def _identified(self, number: int, bit: int, position: int, following: int, timeout_s: float) -> bool:
-        return bool(self._ask(pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED))
+        return bool(self._ask(lss.pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED))
 
     def _configure(self, command: LssCommand, value: int = 0) -> int:
-        answers = self._ask(pack_lss(command, bytes((value,))), ANSWER_TIMEOUT_S, command)
+        answers = self._ask(lss.pack_lss(command, bytes((value,))), ANSWER_TIMEOUT_S, command)
         if not answers:
             raise LssAnswerError(f"no answer to {command.name.lower().replace('_', ' ')}")
         return answers[0][1]
 
     def _send(self, message: bytes) -> None:
-        self._network.send_message(LSS_REQUEST_ID, message)
+        self._network.send_message(lss.LSS_REQUEST_ID, message)
 
     def _ask(self, message: bytes, timeout_s: float, command: LssCommand) -> list[bytes]:
         """Send a question; return the answers with this command."""
@@ -124,15 +114,15 @@ class Lss:
         answers: list[bytes] = []
 
         def take(_id: int, data: bytes, _t_ns: int) -> None:
-            if len(data) == LSS_BYTES:
+            if len(data) == lss.LSS_BYTES:
                 answers.append(data)
 
         network.pump_until(lambda: True, 0.0)  # late answers to earlier questions
-        network.subscribe(LSS_ANSWER_ID, take)
+        network.subscribe(lss.LSS_ANSWER_ID, take)
         try:
             self._send(message)
             if network.pump_until(lambda: bool(answers), timeout_s):
                 network.pump_until(lambda: False, SETTLING_S)
         finally:
-            network.unsubscribe(LSS_ANSWER_ID, take)
+            network.unsubscribe(lss.LSS_ANSWER_ID, take)
         return [answer for answer in answers if answer[0] == command]

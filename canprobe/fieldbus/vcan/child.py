@@ -10,11 +10,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
-from canprobe.fieldbus.bus.real.interrupts import signal_handlers
+from canprobe.fieldbus.bus.real.interrupts import handled_signals, heeded_signals
 
 TIMED_OUT_STATUS = 124
 _GRACE_S = 5.0
-_POLL_PERIOD_S = 0.02
+POLL_PERIOD_S = 0.02
 _MAX_SIGNALS = 3
 _FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
@@ -27,13 +27,13 @@ def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
         keyboard: False drops SIGINT and SIGQUIT, which the terminal sends to a shell in this group as well.
     """
     signals: list[int] = []
+    dropped = () if keyboard else (signal.SIGINT, signal.SIGQUIT)
 
-    def catch(number: int, _frame: object) -> None:
-        if keyboard or number not in (signal.SIGINT, signal.SIGQUIT):
+    def take(number: int, _: object) -> None:
+        if number not in dropped:
             signals.append(number)
 
-    heeded = [number for number in _FORWARDED_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
-    with signal_handlers(dict.fromkeys(heeded, catch)):
+    with handled_signals(dict.fromkeys(heeded_signals(*_FORWARDED_SIGNALS), take)):
         yield signals
 
 
@@ -81,7 +81,7 @@ def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[in
             timed_out = True
             job.send_signal(signal.SIGTERM)
             deadline += _GRACE_S
-        time.sleep(_POLL_PERIOD_S)
+        time.sleep(POLL_PERIOD_S)
     return (TIMED_OUT_STATUS if timed_out or status is None else status), timed_out
 
 

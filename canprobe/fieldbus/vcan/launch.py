@@ -14,13 +14,14 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.real.link import missing_ip, sudo
 from canprobe.fieldbus.bus.real.socketcan import check_interface, has_socketcan
-from canprobe.fieldbus.vcan.child import Job, LocalJob, caught_signals, supervise
+from canprobe.fieldbus.vcan.child import POLL_PERIOD_S, Job, LocalJob, caught_signals, supervise
 from canprobe.fieldbus.vcan.guest import GuestError, GuestJob, missing_packages
 
 CHANNEL, SECOND_CHANNEL = "vcan0", "vcan1"
@@ -98,35 +99,16 @@ def _run_in_guest(boot: Callable[[], GuestJob], signals: list[int], timeout_s: f
 
 def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None) -> int:
     """Wait for the boot, which may be interrupted but does not count as running time, then for the command."""
-    interrupted, _ = supervise(_Boot(job), signals, None)
-    if interrupted:
-        return interrupted
+    while job.poll() is None and not job.started:
+        if signals:
+            job.kill()
+            return 128 + signals[0]
+        time.sleep(POLL_PERIOD_S)
     status = _supervise(job, signals, timeout_s)
     if status == 128 + signal.SIGKILL:
         _report_killed()
     job.halt()
     return status
-
-
-class _Boot:
-    """The boot of a guest as a job: it ends with 0 when the command starts, with 128 + n at a signal."""
-
-    def __init__(self, job: GuestJob) -> None:
-        self._job = job
-        self._signal = 0
-
-    def poll(self) -> int | None:
-        if self._signal:
-            return 128 + self._signal
-        self._job.poll()
-        return 0 if self._job.started else None
-
-    def send_signal(self, number: int) -> None:
-        self._signal = number
-        self._job.kill()
-
-    def kill(self) -> None:
-        self._job.kill()
 
 
 @contextlib.contextmanager
@@ -193,7 +175,7 @@ def _report_killed() -> None:
     if mappings < _MIN_MAPPINGS:
         _say(
             f"the command was killed; a process that holds more than about {mappings // 256} MiB is, as "
-            f"vm.max_map_count is {mappings} on this machine; type:  {'' if os.geteuid() == 0 else 'sudo '}"
+            f"vm.max_map_count is {mappings} on this machine; type:  {sudo()}"
             f"sysctl vm.max_map_count={_MIN_MAPPINGS}"
         )
 

@@ -203,7 +203,7 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
     sample = Sample(7, frames=((0x181, data, 5), (0x182, data[:8], 6)))
     messages = list(Messages(recorded.result.plan, encoder).of(sample))
     assert [topic.name for topic, _, _ in messages][:2] == ["/can_fd_frames", "/can_frames"]
-    frame = encoder.decode("ros2_socketcan_msgs/msg/FdFrame", messages[0][2])
+    frame = encoder.store.deserialize_cdr(messages[0][2], "ros2_socketcan_msgs/msg/FdFrame")
     assert (frame.id, frame.len, bytes(frame.data)) == (0x181, 64, data)
 
 

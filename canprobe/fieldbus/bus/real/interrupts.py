@@ -13,8 +13,6 @@ from typing import Any
 
 from canprobe.fieldbus.bus.system import system
 
-INTERRUPTS = (signal.SIGINT, *system.TERMINATION_SIGNALS)
-"""Signals that end a program from outside, of which Ctrl-C is one."""
 REPEAT_PERIOD_S = 0.1
 """Time between two repetitions of an interrupt."""
 
@@ -29,29 +27,36 @@ def raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
-def signal_handlers(handlers: Mapping[int, Callable[[int, FrameType | None], object]]) -> Iterator[None]:
-    """Within the block signals have these handlers. In another thread than the main one nothing changes."""
-    before: dict[int, Any] = {}
+def handled_signals(handlers: Mapping[int, Callable[[int, FrameType | None], object]]) -> Iterator[None]:
+    """Within the block signals have these handlers. Outside the main thread, which receives none, nothing changes."""
+    before = {number: signal.getsignal(number) for number in handlers}
+    in_main_thread = threading.current_thread() is threading.main_thread()
     try:
-        with contextlib.suppress(ValueError):  # not the main thread
+        if in_main_thread:
             for number, handler in handlers.items():
-                before[number] = signal.signal(number, handler)
+                signal.signal(number, handler)
         yield
     finally:
-        for number, former in before.items():
-            signal.signal(number, former)
+        if in_main_thread:
+            for number, former in before.items():
+                signal.signal(number, former)
+
+
+def heeded_signals(*numbers: int) -> list[int]:
+    """Those of some signals that are not ignored: SIGHUP is under `nohup`, SIGINT in the background of some shells."""
+    return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
     """Hold an interrupt until the end of the block, so that the block is done whole. It works in the main thread only.
 
-    Ignored signals stay ignored: SIGHUP under `nohup`, and SIGINT in the background of a shell without job control.
+    Ignored signals stay ignored.
     """
     came: list[int] = []
-    heeded = [number for number in INTERRUPTS if signal.getsignal(number) is not signal.SIG_IGN]
+    heeded = heeded_signals(signal.SIGINT, *system.TERMINATION_SIGNALS)
     try:
-        with signal_handlers(dict.fromkeys(heeded, lambda number, _: came.append(number))):
+        with handled_signals(dict.fromkeys(heeded, lambda number, _: came.append(number))):
             yield
     finally:
         if came:
@@ -70,7 +75,8 @@ def interrupts_repeated() -> Iterator[None]:
         return
     came: list[signal.Signals] = []
     left = threading.Event()
-    handlers = {number: handler for number in INTERRUPTS if callable(handler := signal.getsignal(number))}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *system.TERMINATION_SIGNALS)}
+    handlers = {number: handler for number, handler in before.items() if callable(handler)}
     hook = sys.unraisablehook
 
     def raise_it(number: int, frame: FrameType | None) -> None:
@@ -88,17 +94,15 @@ def interrupts_repeated() -> Iterator[None]:
             hook(dropped)
 
     repeater = threading.Thread(target=repeat, daemon=True)
-    sys.unraisablehook = unraisable
-    try:
-        with signal_handlers(dict.fromkeys(handlers, raise_it)):
-            try:
-                repeater.start()
-                yield
-            finally:
-                left.set()
-                repeater.join()
-    finally:
-        sys.unraisablehook = hook
+    with handled_signals(dict.fromkeys(handlers, raise_it)):
+        try:
+            sys.unraisablehook = unraisable
+            repeater.start()
+            yield
+        finally:
+            left.set()
+            repeater.join()
+            sys.unraisablehook = hook
     if came:
         signal.raise_signal(came[0])
 
@@ -121,20 +125,19 @@ class Interrupts:
         self._waiting: int | None = None
 
     def __enter__(self) -> Interrupts:
-        for number in INTERRUPTS:
-            handler = signal.getsignal(number)
-            if handler is signal.SIG_DFL and number in system.TERMINATION_SIGNALS:
-                handler = raise_terminated
+        for number in (signal.SIGINT, *system.TERMINATION_SIGNALS):
+            before = signal.getsignal(number)
+            handler = raise_terminated if before is signal.SIG_DFL and number in system.TERMINATION_SIGNALS else before
             if callable(handler):
                 self._before[number] = handler
-        self._handlers = signal_handlers(dict.fromkeys(self._before, self._note))
-        self._handlers.__enter__()
+        self._handled = handled_signals(dict.fromkeys(self._before, self._note))
+        self._handled.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._handlers.__exit__(kind, error, trace)
+        self._handled.__exit__(kind, error, trace)
         if error is None:
             self.take()
 

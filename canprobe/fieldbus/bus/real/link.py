@@ -13,10 +13,11 @@ import os
 import shutil
 import subprocess
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from canprobe.fieldbus.bus.system import system
 
+T = TypeVar("T", dict[str, Any], list[Any], str)
 VIRTUAL_KINDS = ("vcan", "vxcan")
 MAX_SLOW_BITRATE = 500_000
 SLOW_SAMPLE_POINTS, FAST_SAMPLE_POINTS = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
@@ -71,23 +72,22 @@ def parse_link(text: str) -> LinkState:
     if len(found) != 1:
         raise ValueError(f"expected the JSON of one link, got {len(found)}")
     link = found[0]
-    info = _table(link, "linkinfo")
-    data, counted = _table(info, "info_data"), _table(info, "info_xstats")
-    nominal, fast, errors = (_table(data, key) for key in ("bittiming", "data_bittiming", "berr_counter"))
-    kind, state = info.get("info_kind"), data.get("state")
+    info: dict[str, Any] = _of_form(link, "linkinfo", {})
+    data, counted = (_of_form(info, key, {}) for key in ("info_data", "info_xstats"))
+    nominal, fast, errors = (_of_form(data, key, {}) for key in ("bittiming", "data_bittiming", "berr_counter"))
     return LinkState(
         name=str(link["ifname"]),
-        kind=kind if isinstance(kind, str) else None,
-        is_up="UP" in _list(link, "flags"),
+        kind=_of_form(info, "info_kind", "") or None,
+        is_up="UP" in _of_form(link, "flags", []),
         tx_queue=_whole(link, "txqlen"),
         bitrate=_whole(nominal, "bitrate") or _whole(data, "bittiming_bitrate") or None,
         data_bitrate=_whole(fast, "bitrate") or None,
         sample_point=_number(nominal, "sample_point") or None,
         restart_ms=_whole(data, "restart_ms"),
-        state=state if isinstance(state, str) else None,
+        state=_of_form(data, "state", "") or None,
         tx_errors=_whole(errors, "tx"),
         rx_errors=_whole(errors, "rx"),
-        modes=tuple(str(mode) for mode in _list(data, "ctrlmode")),
+        modes=tuple(str(mode) for mode in _of_form(data, "ctrlmode", [])),
         bus_offs=_whole(counted, "bus_off"),
     )
 
@@ -165,14 +165,10 @@ def sudo() -> str:
     return "" if system.is_root() else "sudo "
 
 
-def _table(parent: dict[str, Any], key: str) -> dict[str, Any]:
+def _of_form(parent: dict[str, Any], key: str, empty: T) -> T:
+    """A value that has the type of an empty one; that one where it is missing or of another type."""
     value = parent.get(key)
-    return value if isinstance(value, dict) else {}
-
-
-def _list(parent: dict[str, Any], key: str) -> list[Any]:
-    value = parent.get(key)
-    return value if isinstance(value, list) else []
+    return value if isinstance(value, type(empty)) else empty
 
 
 def _number(parent: dict[str, Any], key: str) -> float | None:

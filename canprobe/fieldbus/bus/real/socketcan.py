@@ -28,15 +28,7 @@ from operator import itemgetter
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import Clock, Timespec
 from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, PortCounters, Reports, TimedFrame, state_after
-from canprobe.fieldbus.bus.real.link import (
-    FD_MTU_BYTES,
-    TX_QUEUE_FRAMES,
-    drop_queued,
-    emptying_line,
-    ip_line,
-    setting_line,
-    sudo,
-)
+from canprobe.fieldbus.bus.real import link
 from canprobe.fieldbus.bus.real.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.fieldbus.bus.system import system
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
@@ -166,7 +158,7 @@ class SocketCanPort:
         reports: Reports | None = None,
     ) -> None:
         self._fd = fd = data_bitrate is not None
-        self._setting = setting_line(channel, bitrate, data_bitrate)
+        self._setting = link.setting_line(channel, bitrate, data_bitrate)
         self._waits = waits
         self._reports = reports or Reports()
         check_interface(channel, self._setting, fd)
@@ -301,14 +293,14 @@ class SocketCanPort:
         try:
             if self._await_empty():
                 return
-            if drop_queued(self.channel):
+            if link.drop_queued(self.channel):
                 self._reports.say(
                     f"{self.channel}: frames that nobody acknowledged were dropped from its transmit queue"
                 )
             else:
                 self._reports.say(
                     f"{self.channel}: frames wait in its transmit queue that nobody acknowledges, and are sent when"
-                    f" somebody does; to drop them type: {emptying_line(self.channel)}"
+                    f" somebody does; to drop them type: {link.emptying_line(self.channel)}"
                 )
         finally:
             self._socket.close()
@@ -360,9 +352,9 @@ class SocketCanPort:
             length = struct.unpack("=16si12x", system.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
         except OSError:  # the interface has gone meanwhile
             return ""
-        if length >= TX_QUEUE_FRAMES:
+        if length >= link.TX_QUEUE_FRAMES:
             return ""
-        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE_FRAMES}')}"
+        return f"; it holds {length} frames; type: {link.ip_line(f'{self.channel} txqueuelen {link.TX_QUEUE_FRAMES}')}"
 
     def _failed(self, error: OSError) -> InterfaceError:
         if error.errno == errno.ENETDOWN:
@@ -448,8 +440,8 @@ def check_interface(channel: str, setting: str | None = None, fd: bool = False) 
         except OSError as error:
             raise InterfaceError(f"{channel}: not a CAN interface: {error.strerror}") from error
         if not flags & _IFF_UP:
-            raise _down(channel, setting or ip_line(f"{channel} up"))
-    if fd and mtu < FD_MTU_BYTES:
+            raise _down(channel, setting or link.ip_line(f"{channel} up"))
+    if fd and mtu < link.FD_MTU_BYTES:
         raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
 
 
@@ -467,7 +459,7 @@ def _down(channel: str, setting: str) -> InterfaceError:
 def how_to_make(channel: str) -> str:
     """What to type where an interface is missing."""
     if channel.startswith("vcan"):
-        return f"type: {sudo()}ip link add dev {channel} type vcan && {setting_line(channel, 1_000_000)}"
+        return f"type: {link.sudo()}ip link add dev {channel} type vcan && {link.setting_line(channel, 1_000_000)}"
     return "is the adapter plugged in? `canprobe adapters` lists the interfaces that there are"
 
 

@@ -291,19 +291,10 @@ class LockstepPort(Participant, PlainPort):
     def __init__(self, bus: LockstepBus) -> None:
         self._bus = bus
         self._open = True
+        self.clock, self.channel = bus.clock, bus.channel
         self.inbox: list[TimedFrame] = []
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
-
-    @property
-    def clock(self) -> VirtualClock:
-        """Virtual clock of the bus."""
-        return self._bus.clock
-
-    @property
-    def channel(self) -> str:
-        """Name of the bus."""
-        return self._bus.channel
 
     stamps_arrival = True
 
@@ -329,7 +320,7 @@ class LockstepPort(Participant, PlainPort):
     def wait(self, until_ns: int) -> None:
         """Move virtual time on until a frame is here, or to `until_ns` with everything due by then done."""
         self._check_open()
-        clock, inbox = self._bus.clock, self.inbox
+        clock, inbox = self.clock, self.inbox
         until_ns = max(until_ns, clock.now_ns())
         while not inbox and clock.step(until_ns):
             pass

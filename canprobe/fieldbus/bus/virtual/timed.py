@@ -121,21 +121,14 @@ class TimedBus(LockstepBus):
         self._settling = True
         if self._stale:
             self.next_deadline_ns()
-        rounds_left = self._max_frames
         try:
             while True:
                 if self._flying is not None and self._end_ns <= t_ns:
                     self._finish()
-                    continue
-                due = self._first_due is not None and self._first_due <= t_ns
-                if not due and self._flying is None and self._ready and self._free_ns <= t_ns and self._start(t_ns):
-                    continue
-                if not due or not self._advance_due(t_ns):
+                elif self._first_due is not None and self._first_due <= t_ns:
+                    self._serve(t_ns)
+                elif self._flying is not None or not self._ready or self._free_ns > t_ns or not self._start(t_ns):
                     break
-                self._first_due = self._earliest()
-                rounds_left -= 1
-                if rounds_left < 0:
-                    raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
             if self._controllers.troubled and self._flying is None:
                 self._controllers.hear_silence(t_ns)
         finally:
