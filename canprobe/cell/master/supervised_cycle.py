@@ -21,7 +21,7 @@ from canprobe.cell.master.supervision import CycleState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.rows import joint_columns
+from canprobe.cell.rows import BLOCK_ROWS, TACTILE_PHASE, joint_columns
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import Port
 
@@ -158,6 +158,8 @@ class SupervisedCycle:
             if measurement.tactile is not None:
                 self.tactile_log.add(t_s, self.log.start_s, measurement.tactile)
         self.log.add(row)
+        if len(self.log) % BLOCK_ROWS == TACTILE_PHASE:
+            self.tactile_log.flush()
         if self._observers is not None:
             self._observers.cycle(self.start_ns, measurement, command)
 
