@@ -287,7 +287,7 @@ class _ServedRun:
     def _start_master(self) -> subprocess.Popen[bytes]:
         scene = with_real_nodes(served_scene())
         path = self.folder / "scene.toml"
-        path.write_text(dump_scene(replace(scene, scene=replace(scene.scene, figures=False))), encoding="utf-8")
+        path.write_text(dump_scene(replace(scene, outputs=replace(scene.outputs, figures=False))), encoding="utf-8")
         command = [sys.executable, "-P", "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
         with (self.folder / "stderr").open("wb") as errors:
             return subprocess.Popen(

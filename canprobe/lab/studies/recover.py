@@ -131,7 +131,7 @@ class RecoverRun:
 
     def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path) -> None:
         self._case = case
-        changes = {"bus.timed": False, "scene.figures": False, "task.duration_s": END_S + 2.0}
+        changes = {"bus.timed": False, "outputs.figures": False, "task.duration_s": END_S + 2.0}
         plan = canprobe.plan(SCENES[case.work], changes)
         self._score = RecoverScore(case, plan, say)
         self._session = session = Session(plan, RunOptions(out, self._say, recover=True))

@@ -60,7 +60,7 @@ class ServedRun:
     """
 
     def __init__(self, case: RecoverCase, say: Callable[[str], None], out: Path) -> None:
-        changes = {**ON_VCAN, "scene.figures": False, "task.duration_s": END_S + 2.0}
+        changes = {**ON_VCAN, "outputs.figures": False, "task.duration_s": END_S + 2.0}
         plan = make_plan(resolve(patient(load_scene(SCENES[case.work], changes), MISSED_SYNCS)))
         self._case, self._score = case, RecoverScore(case, plan, say)
         self._session = Session(plan, RunOptions(out, lambda text: self._score.say(self._now_s(), text), recover=True))
