@@ -431,10 +431,10 @@ PRINTED: Mapping[str, Sequence[Sequence[str]]] = {
 
 def pictures() -> Entry:
     """The pictures of the default scan, with the figures of `first_day`, and those of the gallery, drawn anew."""
-    result = canprobe.run("cylinder", {"scene.figures": False})
+    result = canprobe.run("cylinder", {"outputs.figures": False})
     draw_run(result, IMAGES / "cylinder.png")
     draw_surface(result, IMAGES / "surface.png")
-    draw_moving(canprobe.run("cylinder", {"scene.figures": False}, duration_s=5.0), IMAGES / "scan.webp")
+    draw_moving(canprobe.run("cylinder", {"outputs.figures": False}, duration_s=5.0), IMAGES / "scan.webp")
     for name in ("cylinder", "surface"):
         path = IMAGES / f"{name}.png"
         Image.open(path).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(path, optimize=True)

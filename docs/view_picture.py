@@ -21,7 +21,7 @@ def draw_view(path: Path) -> None:
     """Run the scan, write its page, and let chromium play it until then."""
     with tempfile.TemporaryDirectory() as made:
         run, page = Path(made) / "run", Path(made) / "view.html"
-        canprobe.run("cylinder", {"scene.figures": False}, bus="direct", out=run)
+        canprobe.run("cylinder", {"outputs.figures": False}, bus="direct", out=run)
         main(["view", str(run), "--html", str(page), "--quiet"])
         page.write_text(page.read_text(encoding="utf-8").replace("</head>", NO_NOTES, 1), encoding="utf-8")
         drawn = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -77,7 +77,7 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize("block", blocks("python"))
 def test_python_block_runs(block, tmp_path, monkeypatch, capsys):
     def load_quick(scene, overrides=None):
-        return load_scene(scene, {"scene.figures": False, "cycle.rate_hz": 200.0, **(overrides or {})})
+        return load_scene(scene, {"outputs.figures": False, "cycle.rate_hz": 200.0, **(overrides or {})})
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("canprobe.api.load_scene", load_quick)

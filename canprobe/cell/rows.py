@@ -30,6 +30,8 @@ ROWS_FOLDER = "rows"
 ROWS_SUFFIX = ".npy.gz"
 BLOCK_ROWS = 200
 """Rows between two writes: a process that is killed loses half a second of a cell at 400 Hz."""
+TACTILE_PHASE, TRUTH_PHASE = 70, 140
+"""Cycles from a write of the log's rows to that of the tactile frames and that of the truth: a cycle carries one."""
 NUMBER = "#"
 """Field of a row: its number, where rows of one table are in several files."""
 _COLUMNS_MADE = 8

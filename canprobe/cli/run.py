@@ -27,6 +27,7 @@ examples:
   canprobe run cylinder --set task.force_n=3 --set object.radius_mm=50
   canprobe run cylinder --full
   canprobe run cylinder --no-figures
+  canprobe run cylinder --only log,bus_log
   canprobe run cylinder --tool runs/calibrate/tool.toml
   canprobe run cylinder --bus socketcan --channel vcan0 --patient
 """
@@ -40,7 +41,12 @@ def add_arguments(parser: Parser) -> None:
         dest="figures",
         action="store_false",
         default=None,
-        help="draw no report.png and surface.png [the scene's scene.figures]",
+        help="draw no report.png and surface.png [the scene's outputs.figures]",
+    )
+    parser.add_argument(
+        "--only",
+        metavar="LIST",
+        help="outputs to make, of log,truth,surface_map,bus_log,figures; the others are off [the scene's outputs]",
     )
     parser.add_option("--full", "print the error of the force and every estimator too")
     parser.add_shared("--json", "-v")

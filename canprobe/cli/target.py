@@ -6,7 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.parser import PATIENT_SYNCS
@@ -35,8 +35,10 @@ def scene_of(args: argparse.Namespace) -> Scene:
         "bus.bitrate": args.bitrate,
         "scene.seed": getattr(args, "seed", None),
         "task.duration_s": getattr(args, "duration", None),
-        "scene.figures": getattr(args, "figures", None),
+        **({} if getattr(args, "only", None) is None else _kept_outputs(args.only)),
     }
+    if getattr(args, "figures", None) is not None:
+        given["outputs.figures"] = False
     scene = loaded(args, {key: value for key, value in given.items() if value is not None})
     if args.patient:
         if _has_real_nodes(scene):
@@ -50,6 +52,17 @@ def scene_of(args: argparse.Namespace) -> Scene:
     if args.realtime and scene.bus.interface in VIRTUAL:
         args.report.say(f"warning: --realtime has no effect on bus {scene.bus.interface}, whose time is virtual")
     return scene
+
+
+def _kept_outputs(names: str) -> dict[str, bool]:
+    """The keys of `[outputs]` by the names that --only keeps; the log is always written."""
+    from canprobe.cell.scene.model import OutputSettings
+
+    kept, known = names.split(","), [key.name for key in fields(OutputSettings)]
+    for name in kept:
+        if name not in ("log", *known):
+            raise UsageError(f"--only: expected some of log,{','.join(known)}, got {name}{did_you_mean(name, known)}")
+    return {f"outputs.{name}": name in kept for name in known}
 
 
 def loaded(args: argparse.Namespace, more: Mapping[str, Any] | None = None) -> Scene:

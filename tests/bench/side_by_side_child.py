@@ -30,7 +30,7 @@ def cell(bus: str) -> float:
     marks: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
         canprobe.run(
-            "cylinder", {"scene.figures": False, "shape.also": []}, bus=bus, duration_s=CYCLES / 400,
+            "cylinder", {"outputs.figures": False, "shape.also": []}, bus=bus, duration_s=CYCLES / 400,
             out=f"{folder}/run", progress=lambda *_: marks.append(process_time()),
         )  # fmt: skip
     return (marks[-1] - marks[WARM_UP]) / (len(marks) - 1 - WARM_UP)

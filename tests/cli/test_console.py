@@ -27,7 +27,7 @@ from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 READY = [70.0, 65.0, 10.0, 0.0, 100.0, 0.0]
-QUIET = {"bus.timed": False, "scene.figures": False}
+QUIET = {"bus.timed": False, "outputs.figures": False}
 
 
 class Typist:

@@ -163,7 +163,7 @@ def test_a_run_of_a_packaged_scene_as_it_is_shows_what_to_expect(capsys, tmp_pat
     assert err == ""
     summary = json.loads((tmp_path / "a b" / "summary.json").read_text())
     assert figures_of(summary).keys() == read_expected()["scenes"]["press"].keys()
-    changed = ["--duration", "0.5", "--set", "scene.figures=false"]
+    changed = ["--duration", "0.5", "--set", "outputs.figures=false"]
     assert main(["run", "press", "--bus", "direct", *changed, "--out", str(tmp_path / "c")]) == 0
     assert "expected" not in capsys.readouterr().out
 

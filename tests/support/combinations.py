@@ -312,7 +312,7 @@ def draw(seed: int, folder: Path) -> Combination:
     rate = rng.choice((333.333, 250, 250, 200, 200, 200, 100, 100)) if rng.random() < 0.95 else 400
     head = f"[cycle]\nrate_hz = {rate}\n\n[bus]\nbitrate = {rng.choice((1_000_000,) * 9 + (500_000,))}\n"
     head += rng.choice(("", "timed = false\n", 'interface = "direct"\n'))
-    named = f'[scene]\nname = "drawn"\nseed = {seed}\nfigures = false\n\n'
+    named = f'[scene]\nname = "drawn"\nseed = {seed}\n\n[outputs]\nfigures = false\n\n'
     radius = rng.choice((10, 20, 40, 40))
     probe = f"\n[probe]\nradius_mm = {radius}\ncentre_offset_mm = {rng.choice((40, 80, 120))}\n"
     array, array_what = draw_array(rng, folder, kind, rate)

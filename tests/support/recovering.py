@@ -78,7 +78,7 @@ class Returning:
 
     def __init__(self, action, scene="free", *, controller=Way, again=False, **options):
         self.said, self.errors, self.controllers = [], [], []
-        scene = canprobe.load_scene(scene, {"bus.timed": False, "scene.figures": False})
+        scene = canprobe.load_scene(scene, {"bus.timed": False, "outputs.figures": False})
         self.opened = canprobe.open_cell(scene, say=self.say, recover=True, **options)
         self.session = self.opened.session
         self.faulty = self.session.buses.world.make_faulty()

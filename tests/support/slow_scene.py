@@ -22,6 +22,6 @@ def write_slow_scene(
         .replace("[arm]\n", f"[arm]\nmissed_syncs = {missed_syncs}\n{extra}" + (f'eds = "{eds}"\n' if eds else ""))
     )
     text = text.replace("[sensor]\n", f"[sensor]\n{extra}rate_hz = {rate_hz // 2}\n")
-    text = text.replace("[scene]\n", "[scene]\nfigures = false\n")
+    text = text.replace("[scene]\n", "[outputs]\nfigures = false\n[scene]\n")
     path.write_text(f"{text}\n[cycle]\nrate_hz = {rate_hz}\n[limits]\nlate_cycles_max_percent = 100\n")
     return path

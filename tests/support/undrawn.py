@@ -12,7 +12,7 @@ from canprobe.cell.scene.model import Scene
 
 def undrawn(scene: Scene) -> Scene:
     """The scene, whose runs leave all their files but the figures."""
-    return replace(scene, scene=replace(scene.scene, figures=False))
+    return replace(scene, outputs=replace(scene.outputs, figures=False))
 
 
 def undrawn_run(scene: Scene, **options: Any) -> RunResult:

@@ -100,6 +100,7 @@ SCENE = """
 cell = "{cell}"
 [scene]
 name = "foreign"
+[outputs]
 figures = false
 [arm]
 missed_syncs = 20

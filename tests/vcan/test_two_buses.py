@@ -79,6 +79,7 @@ def test_an_arm_of_another_process_and_an_emulated_sensor_on_its_own_bus(bench: 
 SPREAD = """\
 [scene]
 name = "spread"
+[outputs]
 figures = false
 [cycle]
 rate_hz = 100

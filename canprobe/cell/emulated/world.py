@@ -19,7 +19,7 @@ from canprobe.cell.plant.config import PlantConfig, PressMotion
 from canprobe.cell.plant.contact import PlantState, TruthRow
 from canprobe.cell.plant.plant import Plant, truth_columns
 from canprobe.cell.plant.taxels import TaxelConfig
-from canprobe.cell.rows import BLOCK_ROWS, ROWS_SUFFIX, LazyColumns, Rows, joint_columns
+from canprobe.cell.rows import BLOCK_ROWS, ROWS_SUFFIX, TRUTH_PHASE, LazyColumns, Rows, joint_columns
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_known, load_eds
@@ -55,6 +55,10 @@ def with_units(columns: Mapping[str, NDArray[Any]], prismatic: Sequence[bool]) -
     for name, column in columns.items():
         named |= joint_columns("q", column, slides) if name == "q" else {NAMES.get(name, name): column}
     return named
+
+
+TRUTH_BLOCK = 20
+"""SYNCs whose truth becomes rows together: a row alone costs twice as much, those of half a second hold a cycle up."""
 
 
 class TruthRecorder(Participant):
@@ -93,8 +97,10 @@ class TruthRecorder(Participant):
                 self._states.append(self._plant.state())
                 return []
             self._truths.append(self._plant.truth_row())
-            if len(self._truths) >= BLOCK_ROWS:
-                self._compute()
+            if len(self._truths) >= TRUTH_BLOCK:
+                rows = self._compute()
+                if len(rows) % BLOCK_ROWS == TRUTH_PHASE:
+                    rows.flush()
         return []
 
     def columns(self) -> LazyColumns:
@@ -128,7 +134,6 @@ class TruthRecorder(Participant):
         for name in self.rows.dtype.names or ():
             table[name] = named[name]
         self.rows.add(table.tobytes())
-        self.rows.flush()
         return self.rows
 
 

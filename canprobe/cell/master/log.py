@@ -181,7 +181,6 @@ class TactileLog:
         self.rows: Rows | None = None
         self._kept = kept
         self._file = folder / f"tactile{ROWS_SUFFIX}" if folder is not None else None
-        self._added = 0
 
     def add(self, t_s: float, start_s: float, sample: TactileSample) -> None:
         """Append the sample that became usable in the cycle at ``t_s``, on the run's clock; 0 of its own is `start_s`.
@@ -198,8 +197,10 @@ class TactileLog:
             of_frame = [("taxels", np.uint8, frame.taxels.shape), ("window", np.int64, 4), ("features", np.float64, 7)]
             self.rows = Rows([*of_raw, *of_times, *of_frame], self._file, self._kept)
         self.rows.add(np.array((*raw, *times, frame.taxels, frame.window, features), self.rows.dtype).tobytes())
-        self._added += 1
-        if self._file is not None and self._added % BLOCK_ROWS == 0:
+
+    def flush(self) -> None:
+        """Write the frames that wait."""
+        if self.rows is not None:
             self.rows.flush()
 
     def columns(self) -> LazyColumns:

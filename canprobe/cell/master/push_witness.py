@@ -6,6 +6,7 @@ as standard deviation (`canprobe.mechanics.robot.tool_push`).
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -91,10 +92,10 @@ class PushWitness:
 
     def _compare(self) -> None:
         means = list(self._means)
-        now, before = means[-1], [one for one in means[:-LATEST] if np.isfinite(one.way[0])]
-        like = [
-            one for one in before if np.all(np.abs(one.way - now.way) <= LIKE_SHARE * np.abs(now.way) + self._least_way)
-        ]
+        now, before = means[-1], [one for one in means[:-LATEST] if math.isfinite(one.way[0])]
+        differs = np.abs(np.array([one.way for one in before]) - now.way)
+        alike = np.all(differs <= LIKE_SHARE * np.abs(now.way) + self._least_way, axis=1)
+        like = [one for one, is_alike in zip(before, alike.tolist(), strict=True) if is_alike]
         before = like[-MOST_LIKE:] if len(like) >= LEAST_LIKE else before
         push, self.sigma = push_since(self._geometry, now, before)
         unfelt = push - (now.force - float(np.mean([one.force for one in before])))

@@ -20,7 +20,7 @@ from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.master.supervision import CycleState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.rows import joint_columns
+from canprobe.cell.rows import BLOCK_ROWS, TACTILE_PHASE, joint_columns
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import Port
 
@@ -146,6 +146,8 @@ class SupervisedCycle:
             if measurement.tactile is not None:
                 self.tactile_log.add(t_s, self.log.start_s, measurement.tactile)
         self.log.add(row)
+        if len(self.log) % BLOCK_ROWS == TACTILE_PHASE:
+            self.tactile_log.flush()
         if self._observers is not None:
             self._observers.cycle(self.start_ns, measurement, command)
 

@@ -46,8 +46,8 @@ _EFFECTS = {
 _BY_ARRAY = f'sensor.mode = "features": {MODES["features"]}'
 IMAGE, OWN_WINDOW = "full image (32 PDOs)", "window (8 PDOs)"
 ARRAY_NODE_PARTS = "node of the array, its PDOs and its supervision by heartbeat"
-ESTIMATOR, FIGURE = "surface estimator", "figure"
-BUS_PARTS = "bus, bring-up by SDO and their log (bus.log)"
+ESTIMATOR, SURFACE_MAP, FIGURE = "surface estimator", "surface map", "figure"
+BUS_PARTS, BUS_LOG = "bus, bring-up by SDO and their log (bus.log)", "log of the bus (bus.log)"
 TRUTH_PARTS = "truth and scores against it"
 
 
@@ -60,6 +60,8 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     array, kind = setup.array, setup.kind
     if setup.bus.direct:
         yield BUS_PARTS, 'bus.interface = "direct": counts and images pass in the place of frames'
+    elif not setup.outputs.bus_log:
+        yield BUS_LOG, "outputs.bus_log = false"
     if setup.arm is None:
         yield "drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
     elif not setup.arm.torque:
@@ -85,6 +87,8 @@ def _not_computed(setup: Setup) -> Iterator[tuple[str, str]]:
         lacking = support is not None and not support.curvature
         off = f"the array: {support}" if lacking else "shape.patch = false"
         yield "curvature from the patch", _BY_ARRAY if shape.patch else off
+    if shape is not None and not setup.outputs.surface_map:
+        yield SURFACE_MAP, "outputs.surface_map = false"
     if kind in _NO_STRATEGY:
         yield "exploration strategy", _NO_STRATEGY[kind]
     if not isinstance(setup.task, Touch):
@@ -98,6 +102,8 @@ def _not_emulated(setup: Setup) -> Iterator[tuple[str, str]]:
         yield TRUTH_PARTS, "no emulated node"
     elif setup.truth.object is None and kind != "free":
         yield TRUTH_PARTS, "no [object]: nothing to compare with"
+    elif not setup.outputs.truth:
+        yield TRUTH_PARTS, "outputs.truth = false: true values, errors and the map's coverage are null in summary.json"
     if setup.truth.fidelity == "ideal" and any(drive.emulated for drive in setup.drives):
         yield "arm dynamics", 'plant.fidelity = "ideal": each drive tracks as a second-order system'
     for effect, what in _EFFECTS.items():
@@ -106,8 +112,8 @@ def _not_emulated(setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _not_shown(setup: Setup) -> Iterator[tuple[str, str]]:
-    if not setup.figures:
-        yield FIGURE, "scene.figures = false"
+    if not setup.outputs.figures:
+        yield FIGURE, "outputs.figures = false"
     elif importlib.util.find_spec("matplotlib") is None:
         yield FIGURE, f"the study extra is not installed: {install_line('study')}"
     if not setup.bridge.use:
@@ -132,17 +138,18 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
         setup: closed setup of the scene.
         absent: names of the parts that the plan leaves out.
     """
+    mapped = ESTIMATOR not in absent and SURFACE_MAP not in absent
     written = {
         "summary.json": True,
         "log.npz": True,
         "tactile.npz": setup.array is not None,
-        "bus.log": BUS_PARTS not in absent,
+        "bus.log": BUS_PARTS not in absent and BUS_LOG not in absent,
         "scene.toml": True,
         "truth.npz": TRUTH_PARTS not in absent,
         "tool.toml": setup.kind == "calibrate",
-        "surface.npz": ESTIMATOR not in absent,
+        "surface.npz": mapped,
         "report.png": FIGURE not in absent,
-        "surface.png": FIGURE not in absent and ESTIMATOR not in absent,
+        "surface.png": mapped and FIGURE not in absent,
     }
     return (*(file for file, is_written in written.items() if is_written), *bridge_outputs(setup))
 

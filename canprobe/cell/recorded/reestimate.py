@@ -30,7 +30,7 @@ from canprobe.cell.results.scores import estimate_columns, summarise_map
 from canprobe.cell.results.summary import finite_or_none, summarise_shape
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import SAVED_AS, load_scene
-from canprobe.cell.scene.model import BridgeSettings, Scene
+from canprobe.cell.scene.model import BridgeSettings, OutputSettings, Scene
 from canprobe.cell.scene.plugins import find_plugin
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
@@ -279,7 +279,8 @@ def replay(
             or a node sent no TPDO.
     """
     path, folder = find_log(Path(log))
-    plan = make_plan(resolve(scene_of(path, folder, scene)))
+    described = replace(scene_of(path, folder, scene), outputs=OutputSettings())  # the map, too, if the run had none
+    plan = make_plan(resolve(described))
     methods = _methods(plan.scene, method)
     run = read_run(folder, plan.setup) if folder is not None else None
     contacts = _from_run(plan, run) if run is not None else _from_log(plan, path)
@@ -301,7 +302,10 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
         return log, None
     path = log / "bus.log"
     if not path.exists() and not is_recorded(log / TACTILE):
-        raise UsageError(f"{log}: no bus.log in this folder; expected the folder of a run, or a candump file")
+        raise UsageError(
+            f"{log}: no bus.log in this folder; expected a candump file, or the folder of a run with an array, or one"
+            " on a bus with outputs.bus_log = true"
+        )
     return path, log
 
 

@@ -40,7 +40,7 @@ class LockstepCell:
 
     def plan(self, overrides: Mapping[str, Any] | None = None) -> Plan:
         """The plan of a run, without running it; arguments and errors are those of `canprobe.plan`."""
-        own = {"scene.seed": self._seed, "scene.figures": False, "bus.interface": LOCKSTEP}
+        own = {"scene.seed": self._seed, "outputs.figures": False, "bus.interface": LOCKSTEP}
         return make_plan(resolve(load_scene(self._scene, {**own, **(overrides or {})})))
 
     def run(

@@ -78,7 +78,7 @@ FILE_ONLY = Only("kind", ("heights", "mesh"))
 
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
-    """`[scene]`: the name of the scene, its seed, and whether its runs are drawn."""
+    """`[scene]`: the name of the scene and its seed."""
 
     name: Annotated[str, Pattern(r"[A-Za-z0-9][A-Za-z0-9_.-]*", "of letters, digits, '_', '.' and '-'")]
     """Name of the scene. It is part of the name of the results folder."""
@@ -86,6 +86,21 @@ class SceneInfo:
     """One line about the scene, which `canprobe scenes` and `canprobe plan` print."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random numbers. In lockstep the same seed gives the same `bus.log`."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutputSettings:
+    """`[outputs]`: what a run makes besides its log and summary; false leaves it out, with its part of each cycle.
+
+    `canprobe plan` says what each of them costs. Nothing here changes what moves, or when the supervision stops it.
+    """
+
+    truth: bool = True
+    """Record what is true at every SYNC in `truth.npz`, and score the run against it."""
+    surface_map: bool = True
+    """Fuse all contacts of a scan into one surface, `surface.npz`. An exploration needs it."""
+    bus_log: bool = True
+    """Write every frame into `bus.log`, which `canprobe replay` and `canprobe plan --measured` read."""
     figures: bool = True
     """Draw `report.png` and `surface.png` after a run. false saves a second."""
 
@@ -519,6 +534,7 @@ class Scene:
     task: TaskSettings
     bus: BusSettings = BusSettings()  # noqa: RUF009 - frozen
     cycle: CycleSettings = CycleSettings()
+    outputs: OutputSettings = OutputSettings()
     limits: LimitSettings = LimitSettings()
     bring_up: BringUpSettings = BringUpSettings()  # noqa: RUF009 - frozen
     cell: CellInfo = CellInfo()  # noqa: RUF009 - frozen

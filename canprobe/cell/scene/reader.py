@@ -45,6 +45,7 @@ class Reader:
         self.bad: set[str] = set()
         self.paths: dict[str, str] = {}
         self._folder = folder
+        self._sections: Mapping[str, Any] = {}
 
     def complain(self, path: str, message: str) -> None:
         """Add a problem."""
@@ -69,9 +70,10 @@ class Reader:
             needed: sections that are read as empty ones where they are missing.
         """
         sections, needed = annotations_of(file), set(needed)
+        self._sections = sections
         for name in document:
             if name not in sections:
-                self.complain(name, f"unknown section{_did_you_mean_key(name, sections)}")
+                self.complain(name, f"unknown section{_other_section(name, sections) or did_you_mean(name, sections)}")
         return {
             name: self._named(hint, document.get(name, {}), name)
             if typing.get_origin(hint) is Mapping
@@ -114,7 +116,7 @@ class Reader:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
                 given = {field.name: field.default for field in dataclasses.fields(cls)} | table
-                hint = above or did_you_mean(key, keys_that_belong(cls, given))
+                hint = above or did_you_mean(key, keys_that_belong(cls, given)) or _other_section(key, self._sections)
                 self.complain(f"{name}.{key}", f"unknown key{hint}")
         values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
@@ -164,8 +166,8 @@ def _other_unit(path: str, raw: object, annotation: Any) -> str:
     return ""
 
 
-def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:
-    """A hint for an unknown section: the section that has a key of that name, or the nearest section."""
+def _other_section(got: str, sections: Mapping[str, Any]) -> str:
+    """A hint for an unknown section or key: the sections that have a key of that name; empty without one."""
     classes = {name: next(iter(typing.get_args(hint)), hint) for name, hint in sections.items()}
     keys = [f"{name}.{got}" for name, cls in classes.items() if got in getattr(cls, "__dataclass_fields__", {})]
-    return f"; did you mean {' or '.join(keys)}?" if keys else did_you_mean(got, sections)
+    return f"; did you mean {' or '.join(keys)}?" if keys else ""

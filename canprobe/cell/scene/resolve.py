@@ -106,7 +106,7 @@ def resolve(scene: Scene) -> Setup:
         name=scene.name,
         title=scene.title,
         seed=scene.seed,
-        figures=scene.scene.figures,
+        outputs=scene.outputs,
         bus=scene.bus,
         rate_hz=scene.cycle.rate_hz,
         realtime=scene.cycle.realtime,

@@ -133,6 +133,12 @@ def _duplicate_node(joints: Mapping[str, JointSettings], sensor: int | None, wir
             yield f"joints.{name}.node_id", f"expected node ids all different, got {node_id}, as joints.{other} has"
 
 
+@_across("task.strategy", "outputs.surface_map")
+def _explores_without_map(strategy: str, surface_map: bool) -> _Complaint:
+    if strategy == "explore" and not surface_map:
+        yield "outputs.surface_map", 'expected true with task.strategy = "explore", which goes by the map, got false'
+
+
 @_across("task.kind", "sensor.emulated", "object?")
 def _object_missing(kind: str, sensor: bool, obj: object) -> _Complaint:
     if kind in TOUCH_KINDS and sensor and obj is None:

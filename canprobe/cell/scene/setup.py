@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName, WhenDisabled
-from canprobe.cell.scene.model import BridgeSettings, Scene, ShapeMethod, TaskKind
+from canprobe.cell.scene.model import BridgeSettings, OutputSettings, Scene, ShapeMethod, TaskKind
 from canprobe.errors import UsageError
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
@@ -469,7 +469,7 @@ class Setup:
         saved, files: the scene as it names its files beside it, and their contents by name, as they were read for this
             setup. Who writes the scene, or hands it to another process, takes them, whatever became of the originals.
         name, title, seed: name, title and seed of the scene.
-        figures: whether figures of the run are drawn.
+        outputs: what a run makes besides its log and summary.
         bus: interface, channel, bit rates and what a lockstep bus is like.
         rate_hz: rate of SYNC and servo.
         realtime: SCHED_FIFO, a reserved processor, locked memory, on a real interface.
@@ -484,7 +484,7 @@ class Setup:
     name: str
     title: str
     seed: int
-    figures: bool
+    outputs: OutputSettings
     bus: BusSettings
     rate_hz: float
     realtime: bool

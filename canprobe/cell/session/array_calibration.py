@@ -317,7 +317,7 @@ def _scene(request: CalibrationRequest) -> Scene:
     if request.target is not None:
         scene = request.target.applied_to(scene)
     bus = replace(scene.bus, timed=False) if scene.bus.interface == LOCKSTEP else scene.bus
-    info = replace(scene.scene, name="calibrate-array", seed=request.seed, figures=False)
+    info = replace(scene.scene, name="calibrate-array", seed=request.seed)
     at = request.at or (PACKAGED_POINT_MM if str(request.cell) in packaged_files("cells") else _under_probe(scene))
     task = replace(scene.task, start_mm=at, approach_normal=(0.0, 0.0, 1.0), force_n=max(PLANE_FORCES_N))
     scene = replace(scene, scene=info, bus=bus, task=task, object=ObjectSettings("plane", position_mm=at))

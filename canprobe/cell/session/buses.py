@@ -21,13 +21,13 @@ from canprobe.cell.planning.wire_time import exact_frame_bits, unstuffed_frame_b
 from canprobe.cell.scene.hardware import BusSettings
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.child_process import EmulatorChild
-from canprobe.cell.session.folder import KeptFiles, prepare_folder
+from canprobe.cell.session.folder import BUS_LOG, KeptFiles, prepare_folder
 from canprobe.cell.session.links import check_links, data_bitrate, expected_of
 from canprobe.cell.session.target import DIRECT, LOCKSTEP
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
 from canprobe.fieldbus.bus.clock import Clock, MonotonicClock, VirtualClock
-from canprobe.fieldbus.bus.files import make_folder, writing
+from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.port import Port, Reports, TimedFrame, is_bus_error
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
@@ -83,7 +83,7 @@ class BusRecord:
 
     Args:
         plan: plan of the run.
-        out: folder for ``bus.log``, which the first `writer` prepares; None writes nothing.
+        out: folder for ``bus.log``, which the first `writer` prepares, where the scene wants it; None writes nothing.
         observers: observers that get the frames; None where there are none.
 
     Attributes:
@@ -124,12 +124,13 @@ class BusRecord:
         else:
             self.traffic[channel] = TrafficCounter(bus)
         write: Write = self.traffic[channel].write
-        if self._out is not None:
-            if self._candump is None:
+        if self._out is not None and not self._writers:
+            if BUS_LOG in self._plan.outputs:
                 make_folder(self._out)
-                log = CandumpWriter(self._out / "bus.log", channel, self.origin_ns)
+                log = CandumpWriter(self._out / BUS_LOG, channel, self.origin_ns)
                 self._candump = self._stack.enter_context(log)
-                prepare_folder(self._plan, self._out)
+            prepare_folder(self._plan, self._out)
+        if self._candump is not None:
             write = self._candump.on(channel, self.traffic[channel].take)
         if self._observers is not None:
             self._observers.origin_ns = self.origin_ns
@@ -195,8 +196,13 @@ class SessionBuses(ABC):
         """The emulated nodes and their plant in this process; participants may be replaced until the buses open."""
         from canprobe.cell.emulated.world import make_world
 
-        nodes, truth = self._plan.scene.emulated_node_ids, self._options.rows_kept is None
-        return make_world(self._plan, nodes, truth=truth, at_once=True, folder=self._options.rows_folder)
+        nodes, folder = self._plan.scene.emulated_node_ids, self._options.rows_folder
+        return make_world(self._plan, nodes, truth=self._wants_truth, at_once=True, folder=folder)
+
+    @property
+    def _wants_truth(self) -> bool:
+        """Whether the truth is recorded, which grows with time."""
+        return self._options.rows_kept is None and self._plan.setup.outputs.truth
 
     @abstractmethod
     def open(self, record: BusRecord) -> Port:
@@ -252,8 +258,6 @@ class NoBus(SessionBuses):
         self._need_emulated("without a bus there are")
         if (out := self._options.out) is not None:
             prepare_folder(self._plan, out)
-            with writing(out / "bus.log"):
-                (out / "bus.log").unlink(missing_ok=True)
         self._stack.callback(self._keep_truth)
         self.make_cycle = partial(DirectCycle, world=self.world)
         clock = VirtualClock()
@@ -329,8 +333,8 @@ class RealBuses(SessionBuses):
         if not self._plan.setup.emulates:
             return
         self._options.say("start the emulated nodes")
-        channels, truth = list(self._plan.emulated_channels), self._options.rows_kept is None
-        child = EmulatorChild(self._plan, self._options.out, channels, truth=truth, origin_ns=self._record.origin_ns)
+        channels, origin_ns = list(self._plan.emulated_channels), self._record.origin_ns
+        child = EmulatorChild(self._plan, self._options.out, channels, truth=self._wants_truth, origin_ns=origin_ns)
         self._stack.callback(self._end_nodes, child)
         child.start()
         self._child = child

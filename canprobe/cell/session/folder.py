@@ -19,8 +19,8 @@ from canprobe.errors import ResultsError
 from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 
-STEPS = "steps.log"
-"""File of the steps of a run that comes back from losses."""
+BUS_LOG, STEPS = "bus.log", "steps.log"
+"""Files of the frames on the bus, and of the steps of a run that comes back from losses."""
 LEFT_BY_RUNS = (
     STEPS,
     *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
@@ -78,7 +78,7 @@ def prepare_folder(plan: Plan, out: Path) -> None:
     """
     make_folder(out)
     shutil.rmtree(out / ROWS_FOLDER, ignore_errors=True)
-    for name in LEFT_BY_RUNS:
+    for name in LEFT_BY_RUNS if BUS_LOG in plan.outputs else (*LEFT_BY_RUNS, BUS_LOG):
         with writing(out / name):
             (out / name).unlink(missing_ok=True)
     write_scene(plan, out)

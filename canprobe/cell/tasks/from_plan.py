@@ -128,7 +128,7 @@ def make_shape_tracker(setup: Setup, *, with_map: bool = True) -> ShapeTracker |
     if not isinstance(task, Touch) or task.shape is None:
         return None
     samples = max(1, round(task.shape.every_s * task.array.rate_hz))
-    surface_map = make_surface_map(task) if with_map else None
+    surface_map = make_surface_map(task) if with_map and setup.outputs.surface_map else None
     beyond = task.array.calibration.force.beyond(task.force)
     return ShapeTracker(make_shape_estimator(task, task.shape.method), samples, surface_map, beyond)
 

@@ -42,7 +42,7 @@ DEFAULT_SCENE: Mapping[str, Any] = {
 `OBJECTS`, and a short scan of a wide region at up to 60 mm/s, which ends where contact is lost. Torques of the drives
 are a second witness of the force beside the array: without them a step takes a fifth less time, and an approach has to
 be told how far it may search."""
-VIRTUAL_BUS: Mapping[str, Any] = {"bus.interface": "direct", "scene.figures": False, "shape.also": ()}
+VIRTUAL_BUS: Mapping[str, Any] = {"bus.interface": "direct", "outputs.figures": False, "shape.also": ()}
 """Changes of an environment to every scene."""
 
 

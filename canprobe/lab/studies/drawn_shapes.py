@@ -73,7 +73,7 @@ def scene_of(shape: DrawnShape, folder: Path, seconds: float) -> Scene:
     heading = float(rng.integers(0, 360))
     softer = float(np.exp(rng.uniform(-0.4, 0.4))) if shape.number % 2 else 1.0
     return load_scene("cylinder", {
-        "scene.name": shape.name, "scene.seed": FIRST_SEED + shape.number, "scene.figures": False,
+        "scene.name": shape.name, "scene.seed": FIRST_SEED + shape.number, "outputs.figures": False,
         "bus.interface": "direct", "object": object_of(shape, folder), "shape.also": (),
         "task.strategy": "explore", "task.length_mm": LENGTH_MM, "task.width_mm": WIDTH_MM,
         "task.target_sigma_um": TARGET_UM, "task.duration_s": seconds, "task.start_mm": PLACE_MM,

@@ -239,7 +239,7 @@ def row_of(case: ProcessCase) -> Row:
 @contextmanager
 def running_master() -> Iterator[ChildProcess]:
     """`canprobe run` of the served scene in its own process, which is killed where it outlives the block."""
-    plan = make_plan(resolve(load_scene(vcan_cells.with_real_nodes(served_scene()), {"scene.figures": False})))
+    plan = make_plan(resolve(load_scene(vcan_cells.with_real_nodes(served_scene()), {"outputs.figures": False})))
     master = ChildProcess()
     master.launch(plan, ["canprobe", "run", str(master.scene_file), "--out", str(master.folder / "run")])
     try:

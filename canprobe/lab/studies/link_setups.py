@@ -88,7 +88,7 @@ def draw_machine(seed: int) -> SetUp:
 
 def scene_of(setup: SetUp) -> Scene:
     """The scene `free` at the rate of a set-up, on a bus with its bit rate."""
-    return load_scene("free", {"cycle.rate_hz": setup.rate_hz, "bus.timed": True, "scene.figures": False})
+    return load_scene("free", {"cycle.rate_hz": setup.rate_hz, "bus.timed": True, "outputs.figures": False})
 
 
 def construct(session: Session, setup: SetUp, part: int) -> None:

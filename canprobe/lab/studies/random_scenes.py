@@ -159,7 +159,8 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
         sensor = replace(sensor, calibration=str(file))
     scene = replace(
         base,
-        scene=replace(base.scene, name=f"random-{seed}", seed=seed, figures=False),
+        scene=replace(base.scene, name=f"random-{seed}", seed=seed),
+        outputs=replace(base.outputs, figures=False),
         bus=replace(base.bus, interface="direct"),
         object=ObjectSettings(position_mm=place, rotation_deg=(0.0, 0.0, _within(rng, 0.0, 180.0)), **keys),
         task=task,

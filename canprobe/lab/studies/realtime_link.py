@@ -160,7 +160,7 @@ def measure_machine(case: tuple[int, float]) -> list[Row]:
 
 
 def _patient_scene(rate_hz: float) -> Scene:
-    changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "scene.figures": False}
+    changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "outputs.figures": False}
     return on_any_bitrate(patient(load_scene("free", changes)))
 
 

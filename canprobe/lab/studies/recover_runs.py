@@ -118,7 +118,7 @@ class RecoverCase:
 
 def work_scene(work: str, changes: Mapping[str, Any]) -> Scene:
     """The scene of a kind of work, which goes on for longer than anything is lost."""
-    return load_scene(SCENES[work], {"scene.figures": False, "task.duration_s": END_S + 2.0, **changes})
+    return load_scene(SCENES[work], {"outputs.figures": False, "task.duration_s": END_S + 2.0, **changes})
 
 
 def draw_case(seed: int) -> RecoverCase:

@@ -72,7 +72,7 @@ class TorqueMean:
         q: (n,) joints at its end, rad or m.
         x: (n,) motor coordinates at its end.
         way: (n,) way of the motor coordinates in the time `over_s` up to its end.
-        over_s: that time, s: longer than the mean, as encoders come in counts.
+        over_s: that time, s: longer than the mean, as encoders come in counts; the same in means that are compared.
         last: (n,) way of the motor coordinates in the mean itself.
         force: mean force that the array measured, N.
         seconds: its length, s.
@@ -94,13 +94,6 @@ class TorqueMean:
         """(2, n) rates of the motor coordinates, per second: over the longer time, and over the mean itself."""
         return np.array([self.way / self.over_s, self.last / self.seconds])
 
-    @property
-    def acceleration(self) -> Floats:
-        """(n,) size of the acceleration by the difference of the two rates, per second squared."""
-        longer, own = self.rates
-        size: Floats = np.abs(own - longer) / (0.5 * self.over_s)
-        return size
-
 
 def push_sigma(geometry: PushGeometry, noise: Floats, now: TorqueMean, before: Sequence[TorqueMean]) -> Floats:
     """Standard deviation (n,) of the change of each motor's torque that no push has made.
@@ -110,12 +103,13 @@ def push_sigma(geometry: PushGeometry, noise: Floats, now: TorqueMean, before: S
         noise: (n,) standard deviation of the two means' difference by the reports' own scatter.
         now, before: the two moments, the earlier one in pieces.
     """
-    rates = np.concatenate([now.rates, *(one.rates for one in before)])
+    rates = np.array([one.rates for one in (now, *before)])
     turning = np.tanh(rates / STICTION_RATE)
-    friction = geometry.coulomb * (np.ptp(turning, axis=0) + 1.0 - np.abs(turning[:2]).min(axis=0))
-    friction += geometry.viscous * np.ptp(rates, axis=0)
+    friction = geometry.coulomb * (np.ptp(turning, axis=(0, 1)) + 1.0 - np.abs(turning[0]).min(axis=0))
+    friction += geometry.viscous * np.ptp(rates, axis=(0, 1))
     gravity = GRAVITY_SHARE * geometry.rated * float(np.linalg.norm(now.x - before[-1].x))
-    inertia = geometry.inertia * (now.acceleration + np.mean([one.acceleration for one in before], axis=0))
+    accelerations = np.abs(rates[:, 1] - rates[:, 0]) / (0.5 * now.over_s)  # by the difference of the two rates
+    inertia = geometry.inertia * (accelerations[0] + accelerations[1:].mean(axis=0))
     sigma: Floats = np.sqrt(noise**2 + friction**2 + gravity**2 + inertia**2 + (RESOLUTION * geometry.rated) ** 2)
     return sigma
 

@@ -20,6 +20,7 @@ from canprobe.fieldbus.protocol.raw_image import ImageAssembler
 LISTEN = """
 [scene]
 name = "listen"
+[outputs]
 figures = false
 [sensor]
 array = "{array}"
@@ -34,6 +35,7 @@ duration_s = {duration}
 TOUCH = """
 [scene]
 name = "touch"
+[outputs]
 figures = false
 [sensor]
 {sensor}

@@ -13,7 +13,7 @@ SCAN = {
     "task.clearance_mm": 0.3,
     "bus.interface": "direct",
     "shape.also": [],
-    "scene.figures": False,
+    "outputs.figures": False,
 }
 
 

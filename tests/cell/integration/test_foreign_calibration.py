@@ -20,7 +20,7 @@ SCAN = {
     "task.duration_s": 4.0,
     "task.clearance_mm": 0.3,
     "shape.also": [],
-    "scene.figures": False,
+    "outputs.figures": False,
     "bus.interface": "direct",
     "cycle.rate_hz": 200.0,
 }

@@ -22,6 +22,7 @@ from canprobe.mechanics.robot.urdf import from_urdf
 HEAD = """
 [scene]
 name = "stops"
+[outputs]
 figures = false
 [cell]
 name = "arm"

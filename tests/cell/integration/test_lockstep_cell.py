@@ -52,7 +52,7 @@ def statusword_of(slave):
 
 @pytest.mark.parametrize("name", SHORT)
 def test_a_scene_runs_as_planned_to_its_end_and_leaves_the_cell_safe(name, tmp_path):
-    keys = {"task.duration_s": SHORT[name], "scene.figures": name == "listen"}
+    keys = {"task.duration_s": SHORT[name], "outputs.figures": name == "listen"}
     cell = canprobe.open_cell(name, keys | (QUICK if name == "press" else {}), out=tmp_path)
     with cell:
         result = cell.run(make_task(cell.plan))
@@ -83,7 +83,7 @@ def test_same_seed_same_log_other_seed_other_log(tmp_path):
 
 
 def test_a_controller_behind_an_error_keeps_the_period_and_the_log_has_every_cycle(tmp_path):
-    scene = canprobe.load_scene("free", {"bus.timed": False, "scene.figures": False})
+    scene = canprobe.load_scene("free", {"bus.timed": False, "outputs.figures": False})
 
     def fails(measurement):
         raise ArithmeticError("a bug")

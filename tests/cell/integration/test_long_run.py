@@ -86,7 +86,7 @@ MEMORY = """
 import re, sys
 import canprobe
 scene, seconds, out = sys.argv[1], float(sys.argv[2]), sys.argv[3]
-canprobe.run(scene, {"scene.figures": False}, bus="direct", duration_s=seconds, out=out)
+canprobe.run(scene, {"outputs.figures": False}, bus="direct", duration_s=seconds, out=out)
 print(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])  # ru_maxrss is of who started this, too
 """
 

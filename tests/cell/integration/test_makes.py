@@ -32,7 +32,7 @@ MOVING = {name: CSP for name in MAKES} | {"interpolated": IP, "no_cyclic_mode": 
 
 def scene_of(make, folder):
     eds = {"eds": str(write_eds(make, folder))}
-    return change(canprobe.load_scene("free"), arm=eds, cycle={"rate_hz": RATE_HZ}, scene={"figures": False})
+    return change(canprobe.load_scene("free"), arm=eds, cycle={"rate_hz": RATE_HZ}, outputs={"figures": False})
 
 
 def mixed_plan(makes, folder):
@@ -324,7 +324,7 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
     ],
 )
 def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
-    scene = change(canprobe.load_scene("press", {"cell": cell}), emulate=quirk, scene={"figures": False})
+    scene = change(canprobe.load_scene("press", {"cell": cell}), emulate=quirk, outputs={"figures": False})
     with pytest.raises(NodeError, match=told), Session(scene, RunOptions(tmp_path)) as session:
         session.run(lambda _: Command(done=True))
 

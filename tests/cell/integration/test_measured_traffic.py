@@ -149,7 +149,7 @@ def real_bus(monkeypatch):
     scene = canprobe.load_scene("free")
     arm = dataclasses.replace(scene.arm, emulated=False)
     scene = dataclasses.replace(scene, arm=arm, bus=dataclasses.replace(scene.bus, interface="socketcan"))
-    scene = canprobe.load_scene(scene, {"task.duration_s": 0.1, "scene.figures": False})
+    scene = canprobe.load_scene(scene, {"task.duration_s": 0.1, "outputs.figures": False})
     bus, reports = LockstepBus(VirtualClock()), []
     for node in make_world(canprobe.plan(scene), scene.drives).nodes:
         bus.attach(node)

@@ -138,7 +138,7 @@ class CellUnderFaults(RuleBasedStateMachine):
     @initialize(seed=st.integers(0, 3))
     def bring_up(self, seed):
         self.folder, self.swing, self.ended, self.start, self.angle = Path(mkdtemp()), 0.0, False, None, 0.0
-        scene = canprobe.load_scene("free", {"scene.seed": seed, "scene.figures": False})
+        scene = canprobe.load_scene("free", {"scene.seed": seed, "outputs.figures": False})
         self.session = Session(scene, RunOptions(out=self.folder))
         self.faulty = self.session.buses.world.make_faulty()
         self.nodes = {node.node_id: node.node for node in self.faulty.nodes}

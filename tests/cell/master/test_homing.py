@@ -48,7 +48,7 @@ def scene_of(methods, *, emulated=False, **keys):
         if method:
             home = joint.start_deg if method in (35, 37) else switch(joint, method)
             joints[name] = replace(joint, homing_method=method, home_deg=home, **{**HOMED, **keys})
-    return change(replace(scene, joints=joints), arm={"emulated": emulated}, scene={"figures": False})
+    return change(replace(scene, joints=joints), arm={"emulated": emulated}, outputs={"figures": False})
 
 
 class Bench:
@@ -178,7 +178,7 @@ def test_a_slide_whose_drive_counts_backwards_finds_its_negative_switch_at_its_u
     scene = canprobe.load_scene("free", {"cell": "gantry"})
     x = replace(scene.joints["x"], sign=-1, zero="homing", homing_method=17, home_mm=404.0, homing_speed_mm_s=100.0)
     scene = replace(scene, joints={**scene.joints, "x": x})
-    bench = Bench(change(scene, arm={"emulated": False}, scene={"figures": False}), tmp_path)
+    bench = Bench(change(scene, arm={"emulated": False}, outputs={"figures": False}), tmp_path)
     with bench.cell(to_home=True) as cell:
         assert "move in positive direction to the negative limit switch, at 100 and 2 mm/s" in cell.homing.question(0)
         told = cell.homing.home(0)

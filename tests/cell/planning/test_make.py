@@ -72,13 +72,13 @@ def test_switches_of_the_plant_are_listed():
 
 def test_figures_are_left_out_where_they_are_switched_off():
     cylinder = load_scene("cylinder")
-    plan = canprobe.plan(change(cylinder, scene={"figures": False}))
+    plan = canprobe.plan(change(cylinder, outputs={"figures": False}))
     assert {name for name in canprobe.plan(cylinder).outputs if name.startswith(("report", "surface."))} == {
         *("report.png", "surface.png", "surface.npz")
     }
     assert {name for name in plan.outputs if name.startswith(("report", "surface."))} == {"surface.npz"}
     left = dict(plan.left_out)
-    assert left["figure"] == "scene.figures = false"
+    assert left["figure"] == "outputs.figures = false"
 
 
 def test_outputs_without_truth():

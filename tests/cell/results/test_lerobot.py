@@ -14,7 +14,7 @@ from pyarrow import parquet
 import canprobe
 from canprobe.cli import main
 
-SHORT = {"task.duration_s": 0.4, "scene.figures": False}
+SHORT = {"task.duration_s": 0.4, "outputs.figures": False}
 ROW = "data/chunk-000/file-000.parquet"
 
 

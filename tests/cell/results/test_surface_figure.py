@@ -74,7 +74,7 @@ def test_contacts_are_said_to_disagree_only_where_some_do(apart_m, contacts, dra
 def test_the_report_has_the_figures_of_the_run_in_its_title_and_the_scan_fills_its_panel(drawn):
     result = canprobe.run(
         "cylinder",
-        {"scene.figures": False, "shape.also": [], "task.clearance_mm": 0.3},
+        {"outputs.figures": False, "shape.also": [], "task.clearance_mm": 0.3},
         bus="direct",
         duration_s=2.0,
         files=False,

@@ -67,7 +67,11 @@ def test_the_package_of_the_page_is_built_and_used_by_name(tmp_path, monkeypatch
     assert "lab_canprobe" not in sys.modules, "read lazily"
 
     assert load_scene("listen", {"cell": "lab-bench"}).cell.title == "The array of the lab on its bench"
-    overrides = {"shape.method": "lab-fit", "shape.also": ["recursive", "lab-canprobe:lab-fit"], "scene.figures": False}
+    overrides = {
+        "shape.method": "lab-fit",
+        "shape.also": ["recursive", "lab-canprobe:lab-fit"],
+        "outputs.figures": False,
+    }
     result = canprobe.run("sphere", overrides, bus="direct", duration_s=1.0, out=tmp_path / "run")
     shape = result.summary["shape"]
     assert shape["method"] == "lab-fit"

@@ -341,7 +341,7 @@ def test_a_probe_that_leaves_a_mesh_is_stopped_and_touches_nothing_beyond(tmp_pa
         packaged_files("cells")["puma260"].read_text(),
     )
     (tmp_path / "longer.toml").write_text(longer)
-    changes = {"object.origin_mm": "[0, 18.4]", "plant.true_cell": '"longer.toml"', "scene.figures": "false"}
+    changes = {"object.origin_mm": "[0, 18.4]", "plant.true_cell": '"longer.toml"', "outputs.figures": "false"}
     changes |= {"task.heading_deg": 90, "task.length_mm": 10, "object.rotation_deg": "[0, 0, 0]"}
     changes |= {"shape.also": "[]", "cycle.rate_hz": 200}
     words = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]

@@ -109,7 +109,7 @@ def test_spheres_of_a_box_a_cylinder_and_a_sphere_contain_them_and_not_much_more
 
 def way(urdf, goal_deg, **keep_out):
     keys = {f"keep_out.{key}": value for key, value in keep_out.items()}
-    plan = canprobe.plan(canprobe.load_scene("prbt", {"arm.urdf": str(urdf), "scene.figures": False, **keys}))
+    plan = canprobe.plan(canprobe.load_scene("prbt", {"arm.urdf": str(urdf), "outputs.figures": False, **keys}))
     return plan, joint_way(plan, plan.setup.arm.q_start, np.radians(goal_deg))
 
 

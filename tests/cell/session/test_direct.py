@@ -99,7 +99,7 @@ def test_a_drive_that_fails_stops_the_cell_with_the_words_of_a_bus():
 
 
 def test_a_run_says_what_is_left_out_with_the_bus(tmp_path):
-    scene = loaded("listen", scene={"figures": False})
+    scene = loaded("listen", outputs={"figures": False})
     result = canprobe.run(scene, bus="direct", out=tmp_path)
     assert (result.summary["bus"], result.summary["bus_load"], result.summary["traffic"]) == ("direct", None, None)
     assert any(line.startswith("bus, ") for line in result.summary["left_out"])

@@ -23,7 +23,7 @@ READY = [80.0, 70.0, 10.0, 5.0, 90.0, 20.0]
 
 
 def cell(scene="puma260", out=None, **changes):
-    keys = {"bus.timed": False, "scene.figures": False, "cycle.rate_hz": 200.0} | (
+    keys = {"bus.timed": False, "outputs.figures": False, "cycle.rate_hz": 200.0} | (
         {"postures.ready": READY} if scene == "puma260" else {}
     )
     return canprobe.open_cell(

@@ -29,7 +29,7 @@ def scene_with(keys, **changes):
     return replace(
         scene,
         bus=replace(scene.bus, interface="direct"),
-        scene=replace(scene.scene, figures=False),
+        outputs=replace(scene.outputs, figures=False),
         shape=replace(scene.shape, also=()),
         **changes,
     )

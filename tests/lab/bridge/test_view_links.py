@@ -101,7 +101,7 @@ def test_meshes_that_vanish_or_change_during_a_run_cost_only_their_picture(lab, 
             for mesh in (tmp_path / "lab" / "meshes").iterdir():
                 mesh.unlink() if left is None else mesh.write_bytes(left)
 
-    scene = load_scene(lab / "free.toml", {"task.duration_s": 0.2, "scene.figures": False})
+    scene = load_scene(lab / "free.toml", {"task.duration_s": 0.2, "outputs.figures": False})
     with canprobe.open_cell(scene, out=out, bridge=["mcap"], observers=[change_amid]) as cell:
         cell.run(make_task(cell.plan))
     assert len(seen) > 40

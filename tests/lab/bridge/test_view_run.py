@@ -315,7 +315,7 @@ def test_taxels_are_never_built_anew(page):
 
 
 def test_a_scene_without_a_shape_has_a_page_too(tmp_path):
-    result = canprobe.run(canprobe.load_scene("press", {"scene.figures": False}), out=tmp_path, duration_s=0.1)
+    result = canprobe.run(canprobe.load_scene("press", {"outputs.figures": False}), out=tmp_path, duration_s=0.1)
     assert not (tmp_path / "report.html").exists()
     data = panel_data(page_of_run(tmp_path, result.plan))
     assert data["shape"] is False and data["sensor"] is True
@@ -324,7 +324,7 @@ def test_a_scene_without_a_shape_has_a_page_too(tmp_path):
 
 @pytest.mark.slow(reason="a page of one more scene")
 def test_an_exploration_is_coloured_by_the_height_in_its_page_too(tmp_path):
-    result = canprobe.run(canprobe.load_scene("explore", {"scene.figures": False}), out=tmp_path, duration_s=0.1)
+    result = canprobe.run(canprobe.load_scene("explore", {"outputs.figures": False}), out=tmp_path, duration_s=0.1)
     scale = panel_data(page_of_run(tmp_path, result.plan))["scale"]
     assert scale["text"] == "deviation of the height, without tool and arm (µm)"
 
