@@ -6,18 +6,20 @@ mode", "Interpolated position mode".
 
 from __future__ import annotations
 
+from functools import partial
+
 from canprobe.fieldbus.drive.mode import REACHED_FLAG, CyclicMode
-from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
+from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, check_among
 from canprobe.fieldbus.drive.parts import DriveParts
 from canprobe.fieldbus.drive.profile import torque_run, uniform
-from canprobe.fieldbus.node.dictionary import Value, key_of
+from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.protocol.cia402 import ENABLE_INTERPOLATION_BIT, INTERPOLATION_ACTIVE_BIT, OperationMode
 from canprobe.fieldbus.protocol.emcy import REFERENCE_LIMIT_CODE
-from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 
 MAX_ROUNDING_COUNTS = 2
 POSITION_TARGET_KEY, _POSITION_OFFSET_KEY = key_of(0x607A), key_of(0x60B0)
 _RECORD_KEY = key_of(0x60C1, 1)
+_SUBMODES = range(-(1 << 15), 1)  # of 60C0h
 _VELOCITY_TARGET_KEY, _VELOCITY_OFFSET_KEY = key_of(0x60FF), key_of(0x60B1)
 _TORQUE_TARGET_KEY, _TORQUE_OFFSET_KEY = key_of(0x6071), key_of(0x60B2)
 
@@ -85,7 +87,7 @@ class InterpolatedPosition(CyclicPosition):
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
         self._active = False
-        parts.node.dictionary.on_check(0x60C0, _check_submode)
+        parts.node.dictionary.on_check(0x60C0, partial(check_among, _SUBMODES))
 
     def start(self, word: int, t_ns: int) -> None:
         """Start; the interpolation is active at once if bit 4 is already set."""
@@ -110,11 +112,6 @@ class InterpolatedPosition(CyclicPosition):
         """Follow the target, where the interpolation is active."""
         if self._active:
             super().latch(t_ns)
-
-
-def _check_submode(subindex: int, value: Value) -> None:
-    if int(value) > 0:
-        raise SdoAbort(Abort.VALUE)
 
 
 class CyclicVelocity(CyclicMode):

@@ -67,8 +67,4 @@ class PointGroup:
         text = expected if isinstance(expected, str) else accepted.text(expected)
         source = f"{self.standard}, {clause}" if self.standard else clause
         all_needs, hint = frozenset(f"{self.needs} {needs}".split()), HINTS[str(number)]
-
-        def make(run: Callable[[PdoBench], None]) -> Point:
-            return Point(number, self.name, name, source, text, run, all_needs, hint)
-
-        return make
+        return lambda run: Point(number, self.name, name, source, text, run, all_needs, hint)

@@ -56,7 +56,6 @@ class Judge:
     ) -> None:
         self.bus = BusState(nodes, served=served, bitrate=bitrate)
         self.cases = {rule.number: Case(rule, self.bus, charges_ns) for rule in RULES if rule.number not in without}
-        self._left_out = [(f"{r.number:02} {r.name}", "left out on request") for r in RULES if r.number in without]
         self.frame_count = 0
         self._watches: list[Watch[Any]] = []
         self._ears: dict[_Key, list[Watch[Any]]] = {}
@@ -95,7 +94,8 @@ class Judge:
             log: path of the recorded frames; None where they were not kept.
         """
         report = Report("judge", title, dict(facts), [_row(case) for case in self.cases.values()], log=log)
-        report.left_out += [*NO_RULES, *self._left_out]
+        without = [rule for rule in RULES if rule.number not in self.cases]
+        report.left_out += [*NO_RULES, *((f"{rule.number:02} {rule.name}", "left out on request") for rule in without)]
         for case in self.cases.values():
             if case.intervals_ns:
                 report.distributions["SYNC interval"] = tuple(ns * 1e-6 for ns in case.intervals_ns)
