@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_answer, print_table
 from canprobe.cli.parser import Parser
 
 HELP = "list the packaged scenes"
@@ -49,25 +49,21 @@ def print_packaged(
     document: list[dict[str, Any]] = []
     for kind, then in advice.items():
         found, paths, others = packaged(kind), packaged_files(f"{kind}s"), offered(kind, args.report.say)
+        for name, title in found:
+            figures = {} if expected is None else {"expected": expected["scenes"].get(name, {})}
+            row = {"kind": kind, "name": name, "title": title, "path": str(paths[name]), "package": "canprobe"}
+            document.append({**row, **figures})
+        document += [{"kind": kind, **row} for row in others]
         if args.json:
-            for name, title in found:
-                figures = {} if expected is None else {"expected": expected["scenes"].get(name, {})}
-                row = {"kind": kind, "name": name, "title": title, "path": str(paths[name]), "package": "canprobe"}
-                document.append({**row, **figures})
-            document += [{"kind": kind, **row} for row in others]
+            continue
+        if expected is None:
+            print_table(found)
         else:
-            if expected is None:
-                print_table(found)
-            else:
-                print_table(
-                    [(*row, expected_text(expected["scenes"].get(row[0], {}), LISTED_FIGURES)) for row in found]
-                )
-                print(f"figures: RMS errors to expect, lowest–highest of the seeds {seeds_text(expected)}")
-            print(f"in {next(iter(paths.values())).parent}; {then}")
-            print_table([(row["name"], row["title"], f"of the package {row['package']}") for row in others])
-    if "scene" in advice:
-        document += [{"kind": "estimator", "name": one.name, "package": one.package} for one in plugins("estimator")]
-        if not args.json:
-            print_table([(one.name, f"estimator of the package {one.package}") for one in plugins("estimator")])
-    if args.json:
-        print_json(document)
+            print_table([(*row, expected_text(expected["scenes"].get(row[0], {}), LISTED_FIGURES)) for row in found])
+            print(f"figures: RMS errors to expect, lowest–highest of the seeds {seeds_text(expected)}")
+        print(f"in {next(iter(paths.values())).parent}; {then}")
+        print_table([(row["name"], row["title"], f"of the package {row['package']}") for row in others])
+    estimators = list(plugins("estimator")) if "scene" in advice else []
+    document += [{"kind": "estimator", "name": one.name, "package": one.package} for one in estimators]
+    rows = [(one.name, f"estimator of the package {one.package}") for one in estimators]
+    print_answer(args, document, lambda: print_table(rows))
