@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+
 import pytest
 
 from canprobe.fieldbus import VirtualClock, load_eds, make_eds_node
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
+from canprobe.fieldbus.tools import faults
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
 
 MS = 1_000_000
@@ -148,3 +152,15 @@ def test_the_same_seed_does_the_same():
     runs = [played(fault(BUS_FAULTS["drop"], 0, 10, share=0.5, seed=9))[0] for _ in range(2)]
     assert runs[0] == runs[1]
     assert runs[0] != played(fault(BUS_FAULTS["drop"], 0, 10, share=0.5, seed=10))[0]
+
+
+SERVICES = ("PDO", "SYNC", "heartbeat", "boot-up", "SDO request", "SDO answer")
+FACTS = {"what", "clause", "reaction", "trips", "fails", "frames", "direction", "parameters", "lasts_ms"}
+
+
+def test_the_table_of_kinds_has_only_words_that_are_known():
+    kinds = tomllib.loads(Path(faults.__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
+    for name, facts in kinds.items():
+        assert set(facts) <= FACTS, name
+        assert facts.get("frames", "PDO") in SERVICES and facts.get("direction", "in") in ("in", "either"), name
+        assert all(one["low"] <= one["default"] <= one["high"] for one in facts.get("parameters", {}).values()), name

@@ -86,9 +86,10 @@ def mapping_too_long(bench: PdoBench) -> None:
     word = bench.device.mapping(pdo)[0]
     places = sum(bench.device.has(pdo + TO_MAPPING, n) for n in range(1, 65))
     count = min(64 // max(word & 0xFF, 1) + 1, _LONG_ENTRIES)
-    too_few = count > max(places, bench.device.number(pdo + TO_MAPPING))
-    codes = (*accepted.MAPPING_LENGTH, *(accepted.NO_ENTRY if too_few else ()))
-    what = "more than the places" if too_few else f"{count} entries of {word & 0xFF} bits"
+    codes: accepted.AbortSet = accepted.MAPPING_LENGTH
+    what = f"{count} entries of {word & 0xFF} bits"
+    if count > max(places, bench.device.number(pdo + TO_MAPPING)):
+        codes, what = (*codes, *accepted.NO_ENTRY), "more than the places"
     _refused_at_last(bench, pdo, [word] * count, codes, what)
 
 
