@@ -174,7 +174,6 @@ def _row(  # noqa: PLR0917 - one row of a table
         ground.points[last], ground.normals[last], ground.surface, sigma_point=noise[0], sigma_normal=noise[1]
     )
     squares = np.array([np.square(e) @ FROBENIUS for e in errors if e is not None])
-    error = {key: 100.0 * math.sqrt(value) / size for key, value in mean_and_interval("error", squares).items()}
     add, answer = (median(column) for column in zip(*times, strict=True))
     per_sample = [t[0] + t[1] / SHARE for t in times]
     return {
@@ -183,7 +182,7 @@ def _row(  # noqa: PLR0917 - one row of a table
         "window_samples": setting.window,
         "lag_samples": setting.lag,
         **sigma_values(*noise),
-        **{f"{key}_percent": value for key, value in error.items()},
+        **{f"{key}_percent": 100.0 * math.sqrt(v) / size for key, v in mean_and_interval("error", squares).items()},
         "bound_percent": 100.0 * math.sqrt(float(FROBENIUS @ np.diag(C))) / size,
         "observed": len(squares) / len(errors),
         "add_us": add,

@@ -29,7 +29,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.child_process import ERRORS, ChildProcess, EmulatorChild
+from canprobe.cell.session.child_process import ERRORS, ChildProcess
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.task import Phase
@@ -43,13 +43,13 @@ from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.bus.sdo import Dialogue, hold_dialogues, upload
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.fieldbus.tools.faults.control import request_faults
-from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies import vcan_cells
 from canprobe.lab.studies.fault_cases import task_scene
 from canprobe.lab.studies.fault_runs import FORCE_SHARE
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
 from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.vcan_cells import CHANNEL
 from canprobe.lab.studies.witnessed_run import forces_of, longest_above, run_to_end
 
 RUNS, QUICK_THROWN = 40, 1
@@ -95,19 +95,13 @@ def stall(process: subprocess.Popen[bytes]) -> None:
     process.send_signal(signal.SIGCONT)
 
 
-def replug() -> None:
-    """Take the interface down, and up at once."""
-    vcan_cells.link("down")
-    vcan_cells.link("up")
-
-
 MASTER_KILLED, MASTER_STALLED = "master killed", "master stalled"
 PROCESS_FAULTS: Mapping[str, Callable[[ChildProcess, ChildProcess], None]] = {
     MASTER_KILLED: lambda master, nodes: master.process.kill(),
     MASTER_STALLED: lambda master, nodes: stall(master.process),
     "nodes killed": lambda master, nodes: nodes.process.kill(),
     "link down": lambda master, nodes: vcan_cells.link("down"),
-    "link down and up": lambda master, nodes: replug(),
+    "link down and up": lambda master, nodes: vcan_cells.replug(),
 }
 """Kind of a fault → what it does to the process of the master and that of the nodes."""
 
@@ -225,8 +219,7 @@ def throw(text: str, task: str, phase: Phase, *, is_patient: bool) -> Row:
 
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and score the end: the row of the case."""
-    nodes = EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,))
-    with vcan_cells.served(nodes), running_master() as master:
+    with vcan_cells.served(served_scene()) as nodes, running_master() as master:
         run = _ServedRun(case, master, nodes)
         try:
             status, ended_s, drives = run.carry_out()
@@ -253,7 +246,7 @@ def running_master() -> Iterator[ChildProcess]:
 class _ServedRun:
     """One case that is carried out."""
 
-    def __init__(self, case: ProcessCase, master: ChildProcess, nodes: EmulatorChild) -> None:
+    def __init__(self, case: ProcessCase, master: ChildProcess, nodes: ChildProcess) -> None:
         self.case, self.master, self.nodes = case, master, nodes
         self.clock = MonotonicClock()
         self.failures: list[str] = []

@@ -86,9 +86,9 @@ def draw_machine(seed: int) -> SetUp:
     return SetUp(seed, kind, MACHINE_HZ, size, per_s if kind == "still" else share, 1, 0)
 
 
-def scene_of(setup: SetUp) -> Scene:
-    """The scene `free` at the rate of a set-up, on a bus with its bit rate."""
-    return load_scene("free", {"cycle.rate_hz": setup.rate_hz, "bus.timed": True, "outputs.figures": False})
+def scene_at(rate_hz: float) -> Scene:
+    """The scene `free` at a rate, on a bus whose frames take time."""
+    return load_scene("free", {"cycle.rate_hz": rate_hz, "bus.timed": True, "outputs.figures": False})
 
 
 def construct(session: Session, setup: SetUp, part: int) -> None:

@@ -23,7 +23,6 @@ from matplotlib.figure import SubFigure
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.traffic import LAST_LOOK
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
@@ -31,8 +30,6 @@ from canprobe.cell.results.summary import percentiles
 from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
@@ -40,10 +37,9 @@ from canprobe.fieldbus.bus.clock import MonotonicClock, wake_lateness
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.link import AnswerFigures, LinkFigures, LinkLimits, LinkVerdict, judge_link
-from canprobe.fieldbus.vcan.launch import CHANNEL
+from canprobe.lab.studies import vcan_cells
 from canprobe.lab.studies.result import Row, Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.vcan_cells import ON_VCAN, on_any_bitrate, patient, served, vcan_facts, with_real_nodes
 
 RATE_HZ = 400.0
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
@@ -59,7 +55,7 @@ COLUMNS = (
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Measure; minutes of real time, or half a minute with `quick`."""
-    check_interface(CHANNEL)
+    check_interface(vcan_cells.CHANNEL)
     say = sweep.say
     measured = []
     scan_s, bare_s, hold_s = (4.0, 1.0, 1.0) if quick else (300.0, 100.0, 10.0)
@@ -69,7 +65,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     measured.append(measure_bare(bare_s))
     for mode in MODES:
         measured += _climb(mode, hold_s, (400,) if quick else RATES_HZ, say)
-    facts = vcan_facts(quick, 1) | {"controller": "scan of cylinder; hold elsewhere"}
+    facts = vcan_cells.vcan_facts(quick, 1) | {"controller": "scan of cylinder; hold elsewhere"}
     draw = partial(draw_realtime, measured)
     return StudyResult("realtime", [_row(m) for m in measured], findings(measured), facts, draw, COLUMNS)
 
@@ -157,13 +153,13 @@ def measure_bare(seconds: float) -> Measured:
 
 def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:
     """The joints hold their position, at any rate."""
-    with served(EmulatorChild(make_plan(resolve(_scene())), None, (CHANNEL,))):  # they take rates from the master
+    with vcan_cells.served(_scene()):  # its nodes take their rates from the master
         return _measured("hold", holding_scene(mode, rate_hz), lambda _: Hold(int(seconds * rate_hz)))
 
 
 def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
     """Six drives and the sensor at half their rate; the session starts none of them."""
-    scene = on_any_bitrate(with_real_nodes(_scene()))
+    scene = vcan_cells.on_any_bitrate(vcan_cells.with_real_nodes(_scene()))
     assert scene.sensor is not None
     sensor = replace(scene.sensor, mode=mode, rate_hz=rate_hz / 2)
     return replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz), sensor=sensor)
@@ -171,7 +167,7 @@ def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
 
 def _scene(changes: Mapping[str, Any] = MappingProxyType({})) -> Scene:
     """The scene `cylinder`, patient; with real-time priority and locked memory where they are permitted."""
-    return patient(load_scene("cylinder", {**ON_VCAN, "cycle.realtime": True, **changes}))
+    return vcan_cells.patient(load_scene("cylinder", {**vcan_cells.ON_VCAN, "cycle.realtime": True, **changes}))
 
 
 class Hold(Controller):

@@ -19,14 +19,13 @@ from typing import Any, NamedTuple
 
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.check import measure_link, options_of_check
 from canprobe.cell.session.session import Session
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.tools.link.verdict import FIT_SHARE, UNFIT_SHARE, Fitness
 from canprobe.lab.studies.figure import draw_points
-from canprobe.lab.studies.link_setups import MACHINE_HZ, construct, draw_machine, draw_setup, scene_of
+from canprobe.lab.studies.link_setups import MACHINE_HZ, construct, draw_machine, draw_setup, scene_at
 from canprobe.lab.studies.result import Row, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.vcan_cells import on_any_bitrate, patient
@@ -107,7 +106,7 @@ def hold(session: Session, seconds: float) -> Held:
 def measure(seed: int) -> dict[str, Any]:
     """Check one set-up, and hold it for a minute."""
     setup = draw_setup(seed)
-    session = Session(scene_of(setup), options_of_check())
+    session = Session(scene_at(setup.rate_hz), options_of_check())
     construct(session, setup, 0)
     try:
         report = measure_link(session, CHECK_S)
@@ -160,8 +159,7 @@ def measure_machine(case: tuple[int, float]) -> list[Row]:
 
 
 def _patient_scene(rate_hz: float) -> Scene:
-    changes = {"cycle.rate_hz": rate_hz, "bus.timed": True, "outputs.figures": False}
-    return on_any_bitrate(patient(load_scene("free", changes)))
+    return on_any_bitrate(patient(scene_at(rate_hz)))
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

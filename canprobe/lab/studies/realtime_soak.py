@@ -19,20 +19,16 @@ import numpy as np
 
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.picture import BLUE, GREEN, ORANGE, legend, parts, picture
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.result import Row, StudyResult
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.vcan_cells import patient, served, vcan_facts, with_real_nodes
+from canprobe.lab.studies.vcan_cells import CHANNEL, patient, served, vcan_facts, with_real_nodes
 
 SOAK_S = 1800.0
 SAMPLES = 60
@@ -58,9 +54,8 @@ def soak(seconds: float) -> tuple[list[Row], str]:
     """
     scene = load_scene("cylinder", {"cycle.realtime": True})
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
-    nodes = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
     samples: list[Row] = []
-    with watched() as monitor_pid, served(nodes):
+    with watched() as monitor_pid, served(scene, truth=False) as nodes:
         session = Session(with_real_nodes(patient(scene)), RunOptions(rows_kept=ROWS_OF_UP))
         pids = {"master_mib": os.getpid(), "nodes_mib": nodes.pid, "monitor_mib": monitor_pid}
 

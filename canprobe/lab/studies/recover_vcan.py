@@ -16,12 +16,11 @@ from typing import Any
 from canprobe.cell.master.controller import Measurement
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.faults.control import request_faults
-from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
 from canprobe.lab.studies.recover_runs import REPLUG, STALL, RecoverCase, RecoverRun, draw_case, work_scene
 from canprobe.lab.studies.result import Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.vcan_cells import ON_VCAN, link, patient, sleep, vcan_facts
+from canprobe.lab.studies.vcan_cells import CHANNEL, ON_VCAN, link, patient, replug, sleep, vcan_facts
 
 RUNS, QUICK_RUNS = 50, 2
 MISSED_SYNCS = 40
@@ -74,12 +73,4 @@ class ServedRun(RecoverRun):
             self._others.submit(request_faults, CHANNEL, faults)
         for outage in self.case.outages:
             if outage.name == REPLUG:
-                self._others.submit(_replug, outage.after_s, outage.lasts_ms * 1e-3)
-
-
-def _replug(after_s: float, lasts_s: float) -> None:
-    """Take the interface down for a time."""
-    sleep(after_s)
-    link("down")
-    sleep(lasts_s)
-    link("up")
+                self._others.submit(replug, outage.after_s, outage.lasts_ms * 1e-3)

@@ -12,24 +12,26 @@ import re
 import shutil
 import subprocess
 import tempfile
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.child_process import EmulatorChild
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.eds.packaged import eds_file
-from canprobe.fieldbus.vcan.launch import CHANNEL
 from canprobe.lab.studies.result import measuring_facts
 
+CHANNEL = "vcan0"
+"""The interface of studies in real time."""
 MISSED_SYNCS, LATE_PERCENT = 250, 100
 """Limits of a patient cell: neither a drop-out nor late cycles end a run at a rate that cannot be held."""
 ON_VCAN: Mapping[str, Any] = {"bus.interface": "socketcan", "bus.channel": CHANNEL}
@@ -76,13 +78,19 @@ def open_vcan() -> Port:
 
 
 @contextmanager
-def served(nodes: EmulatorChild) -> Iterator[None]:
-    """Emulated nodes serve within the block, in their own process."""
+def served(scene: Scene, *, truth: bool = True) -> Iterator[EmulatorChild]:
+    """The nodes of a scene serve within the block, in their own process.
+
+    Args:
+        scene: the scene.
+        truth: whether they record the true values, which grow with time.
+    """
+    nodes = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=truth)
     try:
         with closing(open_vcan()) as port:
             nodes.start()
             nodes.await_boot_ups(port)
-        yield
+        yield nodes
     finally:
         nodes.end()
 
@@ -100,6 +108,15 @@ def link(state: str) -> None:
         )
 
 
+def replug(after_s: float = 0.0, lasts_s: float = 0.0) -> None:
+    """Take the interface down for a time, s, after another one."""
+    sleep(after_s)
+    link("down")
+    sleep(lasts_s)
+    link("up")
+
+
 def sleep(seconds: float) -> None:
     """Sleep for some time, s; not at all for a negative one."""
-    time.sleep(max(0.0, seconds))
+    clock = MonotonicClock()
+    clock.sleep_until_ns(clock.now_ns() + round(max(0.0, seconds) * 1e9))

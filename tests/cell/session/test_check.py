@@ -18,7 +18,7 @@ from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState, pack_nmt
 from canprobe.fieldbus.tools.link import Fitness
-from canprobe.lab.studies.link_setups import SetUp, construct, scene_of
+from canprobe.lab.studies.link_setups import SetUp, construct, scene_at
 
 
 def session_of(scene="free", say=lambda _: None, **overrides):
@@ -179,7 +179,7 @@ def silent(session):
 )
 def test_a_bad_link_is_named_with_its_cause(kind, size, fitness):
     setup = SetUp(1, kind, 100, size, share=0.2, room=1, node_id=4)
-    session = Session(make_plan(resolve(scene_of(setup))), options_of_check())
+    session = Session(make_plan(resolve(scene_at(setup.rate_hz))), options_of_check())
     construct(session, setup, 0)
     verdict = measure_link(session, 3.0).verdict
     assert (verdict.fitness, verdict.cause) == (fitness, kind), verdict
@@ -187,7 +187,7 @@ def test_a_bad_link_is_named_with_its_cause(kind, size, fitness):
 
 def test_losses_as_long_as_the_drives_wait_are_unfit():
     setup = SetUp(2, "loss", 100, 5e-4, share=0.2, room=9, node_id=4)
-    session = Session(make_plan(resolve(scene_of(setup))), options_of_check())
+    session = Session(make_plan(resolve(scene_at(setup.rate_hz))), options_of_check())
     construct(session, setup, 0)
     verdict = measure_link(session, 10.0).verdict
     assert (verdict.fitness, verdict.cause) == (Fitness.UNFIT, "loss"), verdict
@@ -195,7 +195,7 @@ def test_losses_as_long_as_the_drives_wait_are_unfit():
 
 def test_the_first_second_of_a_run_says_that_the_link_is_not_fit():
     setup, said = SetUp(1, "machine", 100, 0.8, share=0.06, room=1, node_id=4), []
-    session = Session(make_plan(resolve(scene_of(setup))))
+    session = Session(make_plan(resolve(scene_at(setup.rate_hz))))
     construct(session, setup, 0)
     with session:
         first = FirstSecond(session.cell, session.plan, said.append)
