@@ -105,8 +105,8 @@ def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpee
 
         speeds, unreachable = check_motion(setup, setup.arm)
     problems = [*unsuited, *speed_over_array_problems(setup)]
-    if (cut := cut_patch(setup)) is not None and not cut.safe:
-        problems.append(f"{cut.text}; take {' or '.join(cut.ways)}")
+    cut, safe = cut_patch(setup) or ("", True)
+    problems += [cut] if not safe else []
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
         problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
     if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
