@@ -142,7 +142,6 @@ class BusPlan:
                 event_timer_ms=LOST_MS if on_event else 0,
                 kind=kind,
                 fixed_id=fixed is not None,
-                own_bits=device.own_bits(direction, number),
                 constants=constants,
             )
         )
