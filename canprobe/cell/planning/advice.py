@@ -5,12 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Container, Iterator, Sequence
 
-from canprobe.cell.planning.array import (
-    cut_patch,
-    measured_share,
-    patch_across_taxels,
-    support_of,
-)
+from canprobe.cell.planning.array import cut_patch, measured_share, patch_across_taxels, support_of
 from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
