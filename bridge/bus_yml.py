@@ -19,13 +19,7 @@ from typing import Any
 
 from canprobe.cell.planning.configuration import SYNC_START_VALUE
 from canprobe.cell.planning.device_capabilities import INVALID, MAPPING
-from canprobe.cell.planning.model import (
-    HEARTBEAT_CONSUMED_MS,
-    HEARTBEAT_PRODUCED_MS,
-    MASTER_NODE_ID,
-    Plan,
-    PlannedPdo,
-)
+from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
 from canprobe.cell.planning.node_configuration import Direction, NodeConfiguration, Write
 from canprobe.cell.scene.toml_files import MAX_BYTES
 from canprobe.errors import UsageError, did_you_mean, needed_module, regular_file

@@ -5,13 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Container, Iterator, Sequence
 
-from canprobe.cell.planning.array import (
-    TOLERATED_LOSS_SHARE,
-    cut_patch,
-    measured_share,
-    patch_across_taxels,
-    support_of,
-)
+from canprobe.cell.planning.array import cut_patch, measured_share, patch_across_taxels, support_of
 from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
@@ -207,7 +201,7 @@ def _calibration_warnings(array: Array) -> Iterator[str]:
 
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     """Warnings that a user must know before trusting the plan, most important first."""
-    cut, bus = cut_patch(setup), setup.bus
+    bus = setup.bus
     yield from _open_to_others(setup)
     if setup.arm is not None:
         yield from setup.arm.warnings
@@ -228,8 +222,8 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
         yield from _calibration_warnings(setup.array)
     if setup.touch is not None:
         yield from _beyond_the_calibration(setup.touch)
-    if cut is not None:
-        yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
+    if (cut := cut_patch(setup)) is not None:
+        yield cut[0]
     if setup.arm is not None and setup.touch is not None:
         yield from _held_rows(setup.arm)
     if bus.bit_error_rate > 0 and pdos:

@@ -103,23 +103,12 @@ def true_force_n(force_n: float, probe: Probe, side: int, pitch_m: float, most_n
     return high
 
 
-@dataclass(frozen=True, slots=True)
-class CutPatch:
-    """A window that measures too little of the force.
+def cut_patch(setup: Setup) -> tuple[str, bool] | None:
+    """How the window of a scene cuts the contact patch, with what to change, and whether the force stays safe.
 
-    Attributes:
-        text: text for people, with the numbers.
-        safe: whether the true force stays below `limits.force_max_n`, which the cell compares with the measured one.
-        ways: changes after which the window measures the force.
+    It is safe where the true force stays below `limits.force_max_n`, which the cell compares with the measured one.
+    None where the window measures nearly all of the force, or the task presses nothing.
     """
-
-    text: str
-    safe: bool
-    ways: tuple[str, ...]
-
-
-def cut_patch(setup: Setup) -> CutPatch | None:
-    """The cut patch of a scene; None where its window measures nearly all of the force, or the task presses nothing."""
     touch = setup.touch
     if touch is None or touch.array.mode != "window":
         return None
@@ -130,7 +119,9 @@ def cut_patch(setup: Setup) -> CutPatch | None:
         return None
     windows = windows_of(touch.array)
     enough = [wider for wider in windows if measured_share(force, probe, wider, pitch) >= 1.0 - TOLERATED_LOSS_SHARE]
-    ways = (f"sensor.window = {enough[0]}" if enough else 'sensor.mode = "image"', "a smaller task.force_n")
+    larger = f"sensor.window = {enough[0]}" if enough else 'sensor.mode = "image"'
+    ways = f"{larger} or a smaller task.force_n"
+    wider = f"{ways} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
     across = patch_across_taxels(force, probe, pitch)
     cuts = (
         f"sensor.window = {side} cuts the contact patch, which is {across:.1f} taxels across on a plane at "
@@ -138,11 +129,11 @@ def cut_patch(setup: Setup) -> CutPatch | None:
     )
     if side >= CARRIED_SIDE and share >= CARRIED_SHARE:
         carried = f"the rest is carried on from there, and the force errs by up to {100 * CARRIED_ERROR:.0f} %"
-        return CutPatch(f"{cuts}; {carried}", True, ways)
-    true_n = true_force_n(force, probe, side, pitch, most)
-    presses = f"more than limits.force_max_n = {most:g} N" if true_n is None else f"up to {true_n:.2g} N"
-    text = f"{cuts}, and where the window measures {force:g} N, {presses} can press"
-    return CutPatch(text, true_n is not None, ways)
+        return f"{cuts}; {carried}; {wider}", True
+    cuts += f", and where the window measures {force:g} N, "
+    if (true_n := true_force_n(force, probe, side, pitch, most)) is None:
+        return f"{cuts}more than limits.force_max_n = {most:g} N can press; take {ways}", False
+    return f"{cuts}up to {true_n:.2g} N can press; {wider}", True
 
 
 PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16

@@ -196,7 +196,7 @@ def _pdo_writes(
 def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> Iterator[Write]:
     communication = COMMUNICATION[pdo.direction] + pdo.number - 1
     mapping = MAPPING[pdo.direction] + pdo.number - 1
-    name, cob_id = f"{pdo.direction.upper()} {pdo.number}", pdo.cob_id | pdo.own_bits
+    name, cob_id = f"{pdo.direction.upper()} {pdo.number}", pdo.cob_id | device.own_bits(pdo.direction, pdo.number)
     if not pdo.fixed_id:
         off = f"{name} off while it is changed"
         yield Write(communication, 1, cob_id | INVALID, off, "it stays on", own_bits=OWN_BITS)

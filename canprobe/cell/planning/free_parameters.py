@@ -86,9 +86,11 @@ _COB_IDS = (
     ("default", "the cell's own identifiers do"),
     ("by_deadline", "priorities follow the deadlines"),
 )
+_TORQUE = _FreeParameter("arm.torque", "arm", "torque", lambda _: ((True, "recorded"), (False, "only recorded")))
 KEYS = (  # the last is varied first
     _FreeParameter("sensor.mode", "array", "mode", _modes),
     _FreeParameter("sensor.window", "array", "window", window_choices),
+    _TORQUE,
     _FreeParameter("sensor.channel", "array", "channel", _channels),
     _FreeParameter("bus.fd", "bus", "fd", lambda _: _FD),
     _FreeParameter("arm.grouped_rpdo", "arm", "grouped", lambda _: _GROUPED),
@@ -101,30 +103,25 @@ def candidates(setup: Setup) -> Iterator[tuple[Setup, tuple[Choice, ...]]]:
 
     Whatever is open, the motor torque is given up before anything that the task works with: it is only recorded.
     """
-    keys = [key for key in KEYS if key.value(setup) == AUTO]
+    keys = [key for key in KEYS if key.value(setup) == AUTO or (key is _TORQUE and wants_torque(setup))]
     window_open = any(key.field == "window" for key in keys)
-    sensing = [key for key in keys if key.part == "array" and key.field != "channel"]
-    wiring = [key for key in keys if key not in sensing]
-    for chosen in itertools.product(*(key.options(setup) for key in sensing)):
-        for torque in (True, False) if wants_torque(setup) else (True,):
-            for others in itertools.product(*(key.options(setup) for key in wiring)):
-                candidate, choices = setup, []
-                for key, (value, why) in zip((*sensing, *wiring), (*chosen, *others), strict=True):
-                    candidate = candidate.changed(key.part, **{key.field: value})
-                    choices.append(Choice(key.key, value, why))
-                if not torque:
-                    candidate = candidate.changed("arm", torque=False)
-                array = candidate.array
-                if not window_open or array is None or array.mode == "window":
-                    yield candidate, tuple(choices)
-                elif array.window == window_choices(setup)[0][0]:  # a frame without a window is tried once
-                    yield candidate, tuple(choice for choice in choices if choice.key != "sensor.window")
+    for chosen in itertools.product(*(key.options(setup) for key in keys)):
+        candidate, choices = setup, []
+        for key, (value, why) in zip(keys, chosen, strict=True):
+            candidate = candidate.changed(key.part, **{key.field: value})
+            choices += [Choice(key.key, value, why)] if key is not _TORQUE else []
+        array = candidate.array
+        if not window_open or array is None or array.mode == "window":
+            yield candidate, tuple(choices)
+        elif array.window == window_choices(setup)[0][0]:  # a frame without a window is tried once
+            yield candidate, tuple(choice for choice in choices if choice.key != "sensor.window")
 
 
 def opened(setup: Setup) -> Setup:
     """The setup with every key left to the plan that stands at its default; what the array sends stays."""
     for key in KEYS:
-        if getattr(setup, key.part) is not None and key.value(setup) in (setup.bus.channel, False, "default"):
+        default = key is not _TORQUE and key.value(setup) in (setup.bus.channel, False, "default")
+        if default and getattr(setup, key.part) is not None:
             setup = setup.changed(key.part, **{key.field: AUTO})
     return setup
 

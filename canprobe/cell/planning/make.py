@@ -11,7 +11,7 @@ from canprobe.cell.planning.array import array_problems, as_supported, cut_patch
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import configure
 from canprobe.cell.planning.device_capabilities import SECTIONS, DeviceCapabilities, lacks
-from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes
+from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes, wants_torque
 from canprobe.cell.planning.identifiers import (
     identifier_problems,
     order_by_deadline,
@@ -105,8 +105,8 @@ def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpee
 
         speeds, unreachable = check_motion(setup, setup.arm)
     problems = [*unsuited, *speed_over_array_problems(setup)]
-    if (cut := cut_patch(setup)) is not None and not cut.safe:
-        problems.append(f"{cut.text}; take {' or '.join(cut.ways)}")
+    cut, safe = cut_patch(setup) or ("", True)
+    problems += [cut] if not safe else []
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
         problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
     if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
@@ -167,8 +167,7 @@ def _choose(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> BusPlan:
         if not bus.overload and not bus.problems:
             return bus
         found.append(bus)
-    wanted = setup.arm is None or setup.arm.torque
-    found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque == wanted]
+    found = [bus for bus in found if wants_torque(bus.setup) == wants_torque(setup)]
     nearest = min(found, key=_rank)
     if len(found) > 1:
         chosen = ", ".join(f"{choice.key} = {choice.written}" for choice in nearest.choices)

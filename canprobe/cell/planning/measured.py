@@ -13,14 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.planning.model import (
-    HEARTBEAT_PRODUCED_MS,
-    MASTER_NODE_ID,
-    Part,
-    Plan,
-    PlannedBus,
-    PlannedFrames,
-)
+from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Part, Plan, PlannedBus, PlannedFrames
 from canprobe.cell.planning.traffic import SYNC_BITS, SYNC_BITS_LEAST, on_the_wire
 from canprobe.cell.planning.wire_time import exact_frame_bits, unstuffed_frame_bits
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS, worst_case_bits

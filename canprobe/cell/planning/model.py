@@ -46,7 +46,6 @@ class PlannedPdo:
         kind: kind of the node.
         used: False for a TPDO that the scene does not need and that cannot be switched off.
         fixed_id: whether its COB-ID cannot be changed.
-        own_bits: bits 29 and 30 of its COB-ID, which the device sets.
         constants: values of entries that the cycle does not command, by (index, sub-index).
     """
 
@@ -63,7 +62,6 @@ class PlannedPdo:
     kind: NodeKind = "drive"
     used: bool = True
     fixed_id: bool = False
-    own_bits: int = 0
     constants: tuple[tuple[tuple[int, int], int], ...] = ()
 
     @property

@@ -194,7 +194,7 @@ class _Stops:
         )
 
 
-def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
+def _too_fast(speeds: JointSpeeds, way_out: str) -> list[str]:
     """One line for every joint that would have to be too fast."""
     each = zip(speeds.needed, speeds.limit, speeds.units, strict=True)
     return [
@@ -236,7 +236,7 @@ def _check_touch(
     approach = task.approach
     down = stops.speeds(np.abs(joints[_POSES_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
     slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
-    problems += _too_fast(task.arm, down, f"lower task.approach_mm_s to {at_most(slowly)}")
+    problems += _too_fast(down, f"lower task.approach_mm_s to {at_most(slowly)}")
     if task.scan is None:
         return stops.speeds(np.zeros_like(task.arm.q_start)), problems
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
@@ -247,7 +247,7 @@ def _check_touch(
         speeds = stops.speeds(np.hypot(rates[along >= across].max(axis=0), rates[along < across].max(axis=0)))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {at_most(possible)}, turn task.heading_deg, or raise task.rolling_share"
-    return speeds, problems + _too_fast(task.arm, speeds, way_out)
+    return speeds, problems + _too_fast(speeds, way_out)
 
 
 def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> str | None:
@@ -296,7 +296,7 @@ def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeed
     slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
     keys = " and ".join(dict.fromkeys(f"swing_{joint.unit}" for joint in task.arm.model.joints))
     way_out = f"swing slower (task.swing_period_s = {at_least(slower)}) or less ({keys} of the joints)"
-    return speeds, problems + _too_fast(task.arm, speeds, way_out)
+    return speeds, problems + _too_fast(speeds, way_out)
 
 
 @dataclass(frozen=True, slots=True)

@@ -97,10 +97,6 @@ class BusPlan:
         """A drive with its device."""
         return DriveAxis(self.setup, self.setup.needed_arm().node_ids.index(node_id), self.devices[node_id])
 
-    def channel_of(self, node_id: int) -> str:
-        """Channel of a node's bus."""
-        return next(channel for channel, node_ids in self.channels.items() if node_id in node_ids)
-
     def entries(self, node_id: int, direction: Direction, *objects: tuple[int, int]) -> list[PdoEntry]:
         """The objects as entries; what the device cannot map becomes a problem."""
         device = self.devices[node_id]
@@ -138,7 +134,7 @@ class BusPlan:
                 node_id=node_id,
                 direction=direction,
                 number=number,
-                channel=self.channel_of(node_id),
+                channel=next(channel for channel, node_ids in self.channels.items() if node_id in node_ids),
                 layout=layout,
                 rate_hz=1000 / RESENT_MS if on_event else self.sync.rate_hz / layout.transmission_type,
                 bits_worst=frame_bits(layout.length, self.setup.bus),
@@ -146,7 +142,6 @@ class BusPlan:
                 event_timer_ms=LOST_MS if on_event else 0,
                 kind=kind,
                 fixed_id=fixed is not None,
-                own_bits=device.own_bits(direction, number),
                 constants=constants,
             )
         )
@@ -225,13 +220,13 @@ def plan_drive_pdos(bus: BusPlan) -> None:
         text = f"{bus.devices[node_id].eds}: {why}, so each drive keeps its own target RPDO"
         bus.not_available.append(("two targets in one RPDO", text))
     beside: dict[str, list[int]] = {}  # two drives share an RPDO on one bus only
-    for node_id in arm.node_ids:
-        mine = beside.setdefault(bus.channel_of(node_id), [])
-        mine.append(node_id)
+    for drive in arm.drives:
+        mine = beside.setdefault(drive.channel, [])
+        mine.append(drive.node_id)
         if not arm.grouped or without:
-            _plan_commands(bus, node_id)
+            _plan_commands(bus, drive.node_id)
         else:
-            _plan_grouped(bus, node_id, mine[(len(mine) - 1) // 2 * 2])
+            _plan_grouped(bus, drive.node_id, mine[(len(mine) - 1) // 2 * 2])
     for node_id in arm.node_ids:
         _plan_tolerated(bus, node_id)
 

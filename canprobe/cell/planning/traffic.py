@@ -13,7 +13,8 @@ bound for FIFO queues, which knows no offsets, takes the place of the one for pr
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from canprobe.cell.planning.model import (
     HEARTBEAT_PRODUCED_MS,
@@ -28,6 +29,7 @@ from canprobe.cell.planning.model import (
     SyncPlan,
 )
 from canprobe.cell.planning.pdos import BusPlan
+from canprobe.cell.scene.hardware import BusSettings
 from canprobe.fieldbus.protocol.frame_bits import NS_PER_S, best_case_bits, worst_case_bits
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.response_times import (
@@ -47,21 +49,18 @@ SYNC_BITS = worst_case_bits(_SYNC_BYTES)
 SYNC_BITS_LEAST = best_case_bits(_SYNC_BYTES)
 
 
-@dataclass(frozen=True, slots=True)
-class _Messages:
-    """All messages of a bus.
+class _Sent(NamedTuple):
+    """A message of a bus.
 
     Attributes:
-        all: the messages.
-        parts: part in the cycle of each, by identifier.
-        best_feedback_ns: shortest time of the SYNC and the feedback on the wire; None without feedback.
-        fifo_nodes: node of every message in a FIFO transmit queue, by the message's name; empty: priority queues.
+        message: the message.
+        part: its part in the cycle.
+        node: id of the node whose transmit queue it is in.
     """
 
-    all: tuple[Message, ...]
-    parts: Mapping[int, Part]
-    best_feedback_ns: int | None
-    fifo_nodes: Mapping[str, int]
+    message: Message
+    part: Part
+    node: int
 
 
 def on_the_wire(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
@@ -82,8 +81,8 @@ def plan_traffic(plan: BusPlan) -> None:
     """Fill in the buses with their traffic, the response times of PDOs and raw frames, and what does not fit."""
     bitrate, sync = plan.setup.bus.bitrate, plan.sync
     wires = {channel: on_the_wire([pdo for pdo in plan.pdos if pdo.channel == channel]) for channel in plan.channels}
-    messages = [_messages(plan, channel, wire) for channel, wire in wires.items()]
-    analyses, plan.budget = _analyse(messages, sync.period_ns, plan.setup.compute_ns, bitrate)
+    sent = [[*_messages(plan, channel, wire)] for channel, wire in wires.items()]
+    analyses, plan.budget = _analyse(sent, plan)
     response_ns: dict[tuple[str, int], int | None] = {}
     for (channel, wire), analysis in zip(wires.items(), analyses, strict=True):
         response_ns |= {(channel, one.message.cob_id): one.response_ns for one in analysis.responses}
@@ -125,12 +124,10 @@ def _raw_messages(raw: Sequence[PlannedFrames], bitrate: int) -> Iterator[Messag
         yield Message(f"raw frames {can_id:03X}h", can_id, length, period, frame_ns=wire_ns(bits, bitrate))
 
 
-def _messages(plan: BusPlan, channel: str, wire: Sequence[PlannedPdo]) -> _Messages:
+def _messages(plan: BusPlan, channel: str, wire: Sequence[PlannedPdo]) -> Iterator[_Sent]:
     """The messages of one bus: its SYNC, its PDOs, raw frames and heartbeats."""
-    settings, sync = plan.setup.bus, plan.sync
-    found: list[tuple[Message, Part, int]] = [
-        (Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns), "SYNC", MASTER_NODE_ID)
-    ]
+    bitrate, sync = plan.setup.bus.bitrate, plan.sync
+    yield _Sent(Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns), "SYNC", MASTER_NODE_ID)
     for pdo in wire:
         message = Message(
             f"{pdo.direction.upper()} {pdo.cob_id:03X}h",
@@ -138,33 +135,27 @@ def _messages(plan: BusPlan, channel: str, wire: Sequence[PlannedPdo]) -> _Messa
             pdo.layout.length,
             sync.period_ns * pdo.transmission_type if pdo.layout.synchronous else round(1e9 / pdo.rate_hz),
             deadline_ns=pdo.deadline_ns,
-            frame_ns=wire_ns(pdo.bits_worst, settings.bitrate),
+            frame_ns=wire_ns(pdo.bits_worst, bitrate),
         )
-        found.append((message, pdo.part, pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID))
-    raw = [one for one in plan.raw if one.channel == channel]
-    found += [(message, "event", RAW_DEVICE) for message in _raw_messages(raw, settings.bitrate)]
+        yield _Sent(message, pdo.part, pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID)
+    for message in _raw_messages([one for one in plan.raw if one.channel == channel], bitrate):
+        yield _Sent(message, "event", RAW_DEVICE)
     for node in (*plan.channels[channel], MASTER_NODE_ID):
         beat = Message(f"heartbeat of node {node}", HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
-        found.append((beat, "event", node))
-    feedback = [best_case_bits(message.n_data) for message, part, _ in found if part == "feedback"]
-    fifo = settings.transmit_queue == "fifo"
-    return _Messages(
-        all=tuple(message for message, _, _ in found),
-        parts={message.cob_id: part for message, part, _ in found},
-        best_feedback_ns=(SYNC_BITS_LEAST + sum(feedback)) * NS_PER_S // settings.bitrate if feedback else None,
-        fifo_nodes={message.name: node for message, _, node in found} if fifo else {},
-    )
+        yield _Sent(beat, "event", node)
 
 
-def _analyse(
-    buses: Sequence[_Messages], period_ns: int, compute_ns: int, bitrate: int
-) -> tuple[list[BusAnalysis], CycleBudget]:
+def _analyse(buses: Sequence[Sequence[_Sent]], plan: BusPlan) -> tuple[list[BusAnalysis], CycleBudget]:
     """Response times of each bus behind SYNC (of an event behind itself), and the budget of one cycle.
 
     The controller couples the buses: it starts when the feedback of all of them is in.
     """
-    best_sync_ns = SYNC_BITS_LEAST * NS_PER_S // bitrate
-    best_ns = max((one.best_feedback_ns for one in buses if one.best_feedback_ns is not None), default=None)
+    period_ns, compute_ns = plan.sync.period_ns, plan.setup.compute_ns
+    feedback_bits = [sum(best_case_bits(one.message.n_data) for one in bus if one.part == "feedback") for bus in buses]
+    best_sync_ns, best_all_ns = (
+        (SYNC_BITS_LEAST + bits) * NS_PER_S // plan.setup.bus.bitrate for bits in (0, max(feedback_bits))
+    )
+    best_ns = best_all_ns if any(feedback_bits) else None
     awaited: Part = "SYNC" if best_ns is None else "feedback"
     syncs_ns, feedback_ns = [best_sync_ns] * len(buses), best_ns or best_sync_ns
     for _ in range(MAX_ROUNDS):
@@ -177,7 +168,7 @@ def _analyse(
             queued: dict[Part, tuple[int, int]] = {
                 "SYNC": (0, 0), "feedback": answers, "tactile": answers, "other": answers, "command": commands,
             }  # fmt: skip
-            analyses.append(_placed(one, queued, bitrate))
+            analyses.append(_placed(one, queued, plan.setup.bus))
         late_syncs = [_last([one], [analysis], "SYNC") for one, analysis in zip(buses, analyses, strict=True)]
         late_feedback = _last(buses, analyses, awaited)
         moved = (late_syncs, late_feedback) != (syncs_ns, feedback_ns)
@@ -193,7 +184,7 @@ def _analyse(
     feedback, commands_ns = _last(buses, analyses, "feedback"), _last(buses, analyses, "command")
     _, start = controller_starts(best_ns, looks, feedback_ns)
     known = best_ns is None or feedback is not None
-    commanded = any("command" in one.parts.values() for one in buses)
+    commanded = any(one.part == "command" for bus in buses for one in bus)
     out = commands_ns if commanded else start + compute_ns if known else None
     return analyses, CycleBudget(
         period_ns=period_ns,
@@ -208,23 +199,23 @@ def _analyse(
     )
 
 
-def _placed(messages: _Messages, queued: Mapping[Part, tuple[int, int]], bitrate: int) -> BusAnalysis:
+def _placed(sent: Sequence[_Sent], queued: Mapping[Part, tuple[int, int]], settings: BusSettings) -> BusAnalysis:
     """Response times of one bus.
 
     Args:
-        messages: messages of the bus.
+        sent: messages of the bus.
         queued: earliest queueing after SYNC and its jitter, ns, by part; a part that is missing hangs on no SYNC.
-        bitrate: bit/s.
+        settings: bit rate and transmit queues.
     """
     placed = [
-        replace(message, offset_ns=at[0], jitter_ns=at[1])
-        if (at := queued.get(messages.parts[message.cob_id])) is not None
-        else message
-        for message in messages.all
+        replace(one.message, offset_ns=queued[one.part][0], jitter_ns=queued[one.part][1])
+        if one.part in queued
+        else one.message
+        for one in sent
     ]
-    if messages.fifo_nodes:
-        return worst_case_response_fifo(placed, messages.fifo_nodes, bitrate)
-    return worst_case_response(placed, bitrate)
+    if settings.transmit_queue == "fifo":
+        return worst_case_response_fifo(placed, {one.message.name: one.node for one in sent}, settings.bitrate)
+    return worst_case_response(placed, settings.bitrate)
 
 
 def look_times(period_ns: int, feedback_ns: int) -> tuple[int, ...]:
@@ -252,14 +243,12 @@ def controller_starts(best_ns: int | None, looks: Sequence[int], feedback_ns: in
     return earliest, next((look for look in looks if look >= feedback_ns), looks[-1])
 
 
-def _last(buses: Sequence[_Messages], analyses: Sequence[BusAnalysis], *parts: Part) -> int | None:
+def _last(buses: Sequence[Sequence[_Sent]], analyses: Sequence[BusAnalysis], *parts: Part) -> int | None:
     """The latest end of the messages of some parts after the SYNC, on any bus; None without a bound."""
-    found = [
-        one.response_ns
-        for bus, analysis in zip(buses, analyses, strict=True)
-        for one in analysis.responses
-        if bus.parts[one.message.cob_id] in parts
-    ]
+    found: list[int | None] = []
+    for bus, analysis in zip(buses, analyses, strict=True):
+        ids = {one.message.cob_id for one in bus if one.part in parts}
+        found += [one.response_ns for one in analysis.responses if one.message.cob_id in ids]
     return None if None in found or not found else max(ns for ns in found if ns is not None)
 
 
