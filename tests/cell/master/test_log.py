@@ -61,6 +61,19 @@ def test_rows_of_other_names_have_no_other_shape():
     np.testing.assert_array_equal(columns["b"], [np.nan, 2.0, 3.0, np.nan, np.nan])
 
 
+def test_a_column_has_the_shape_of_its_first_number_and_rows_before_it_are_nan():
+    log = RunLog(3)
+    for a, b in ((None, "x"), (None, 1.0), (np.ones(2), 2.0), (np.full(2, 3.0), None)):
+        log.add({"a": a, "b": b, "c": None} if a is None else {"a": a, "b": b})
+    with pytest.warns(UserWarning, match=r"1 values of column 'b' are no numbers of shape \(\)"):
+        columns = log.arrays()
+    np.testing.assert_array_equal(columns["a"], [[np.nan] * 2, [1.0] * 2, [3.0] * 2])
+    np.testing.assert_array_equal(columns["b"], [1.0, 2.0, np.nan])
+    assert np.isnan(columns["c"]).all() and len(columns["c"]) == 3
+    log.add({"a": np.ones(2), "b": 4.0})
+    assert "c" not in log.columns(), "none of the rows that are kept has it"
+
+
 def test_a_controller_may_write_into_what_it_gave():
     log, value = RunLog(), np.zeros(2)
     for k in range(3):
