@@ -72,3 +72,57 @@ def test_listening_says_how_many_images_came_and_their_force(
         assert images == len(tactile["taxels"]) and rate == pytest.approx(200.0, rel=0.02)
     assert (mean, highest) == pytest.approx((np.nanmean(force), np.nanmax(force)), abs=0.006)
     assert 0.0 < mean < highest
+
+
+SHORT = ["run", "cylinder", "--duration", "0.3", "--set", "cycle.rate_hz=200", "--set", "bus.timed=false"]
+SHORT += ["--set", "task.clearance_mm=0.3", "--set", "shape.also=[]", "--no-figures", "--out"]
+FILES = {"truth": "truth.npz", "surface_map": "surface.npz", "bus_log": "bus.log", "figures": "report.png"}
+"""File of each output."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run with all outputs."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert main([*SHORT, str(out)]) == 0
+    return out
+
+
+@pytest.mark.parametrize("off", [("truth",), ("surface_map",), ("bus_log",), tuple(FILES)], ids="+".join)
+def test_outputs_that_are_off_are_not_written_and_said(
+    off: tuple[str, ...], whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The frames of the bus are the same, and whatever reads the folder does with what is there."""
+    out = str(tmp_path / "run")
+    assert main([*SHORT, out, *(word for name in off for word in ("--set", f"outputs.{name}=false"))]) == 0
+    written = {path.name for path in Path(out).iterdir()}
+    assert {name for name, file in FILES.items() if file not in written} == {*off, "figures"}
+    summary = json.loads((Path(out) / "summary.json").read_text())
+    for name in off:
+        assert any(f"outputs.{name} = false" in line for line in summary["left_out"])
+    assert (summary["contact"]["force_true_rms_error_n"] is None) == ("truth" in off)
+    assert ("map" in summary["shape"]) == ("surface_map" not in off)
+    assert summary["traffic"]["can0"]["as_planned"]
+    if "bus_log" not in off:
+        assert (Path(out) / "bus.log").read_bytes() == (whole / "bus.log").read_bytes()
+    capsys.readouterr()
+    assert main(["replay", out, "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)
+    assert replayed["shape"]["map"] is not None
+    assert main(["runs", str(tmp_path)]) == 0
+
+
+def test_only_some_outputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "free", "--duration", "0.1", "--out", str(tmp_path / "run"), "--only"]
+    assert main([*words, "log,bus-log"]) == 2
+    assert "--only: expected some of log,truth,surface_map,bus_log,figures, got bus-log; did you mean bus_log?" in (
+        capsys.readouterr().err
+    )
+    assert main([*words, "log,bus_log"]) == 0
+    assert {path.name for path in (tmp_path / "run").iterdir()} >= {"bus.log", "log.npz", "summary.json"}
+    assert not (tmp_path / "run" / "truth.npz").exists() and not (tmp_path / "run" / "report.png").exists()
+
+
+def test_the_old_key_of_figures_names_the_new_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "free", "--set", "scene.figures=false"]) == 2
+    assert "scene.figures: unknown key; did you mean outputs.figures?" in capsys.readouterr().err

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -31,6 +31,14 @@ from canprobe.mechanics.touch.mesh_fit import MeshHeights
 MIN_CHARACTERS = 40
 """Least length of a line: no line is broken before it."""
 ALL_TABLES = "--full prints all tables"
+OUTPUT_COSTS: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "truth": ("truth.npz", {"direct": "3 % of a cycle", "lockstep": "2 % of a cycle"}),
+    "surface_map": ("surface.npz", {"direct": "6 % of a cycle", "lockstep": "5 % of a cycle"}),
+    "bus_log": ("bus.log", {"lockstep": "6 % of a cycle"}),
+    "figures": ("report.png", {"": "1 to 2 s after the run"}),
+}
+"""File of each output, and its cost by bus: processor time of a cycle of `cylinder` with all outputs and without this
+one, in runs in turn on one machine (2026-11-29, the commit that has this table)."""
 
 
 def verdict_text(plan: Plan, width: int | None = None) -> str:
@@ -172,6 +180,7 @@ def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     yield from _titled("joint speeds", _speed_rows(plan), width)
     yield from _titled("witnesses of the force beside the array", witness_rows(plan), width)
     yield from _titled("uses", _use_rows(plan), width)
+    yield from _titled("outputs, and what each of them costs", output_rows(plan), width)
     yield from _titled("leaves out", plan.left_out, width)
     yield from _titled("could not have", plan.not_available, width)
 
@@ -312,6 +321,16 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
     yield ["outputs", ", ".join(plan.outputs)]
 
 
+def output_rows(plan: Plan) -> Iterator[tuple[str, str, str]]:
+    """Name, cost and file of each output that the cell can have; for one that is off its key in the place of the cost."""
+    bus = plan.setup.bus.interface
+    for name, (file, costs) in OUTPUT_COSTS.items():
+        if file in plan.outputs:
+            yield name, costs.get(bus) or costs.get("", f"not measured on {bus}"), file
+        elif not getattr(plan.setup.outputs, name):
+            yield name, f"off: outputs.{name} = false", file
+
+
 def _measured(setup: Setup) -> str:
     """The quantities of the task's contact that the array measures, in words."""
     support, array = support_of(setup), setup.array
@@ -360,6 +379,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "fidelity": setup.truth.fidelity if setup.emulates else None,
         "bridges": list(setup.bridge.use),
         "outputs": list(plan.outputs),
+        "output_costs": {name: cost for name, cost, _ in output_rows(plan)},
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
         "warnings": list(plan.warnings),
