@@ -12,15 +12,15 @@ changes that would fit. Nothing is opened or sent here.
 2. `free_parameters` closes what the setup leaves open ("auto"). What costs least is tried first: other mappings and
    priorities before other hardware (CAN FD, a second bus), and less from the array last of all. What a scene writes is
    kept. It also suggests changes that would make a scene fit. `advice` names what a scene does not need, and
-   what is carried out and yet said first. For each candidate `make` plans PDOs and identifiers; `wire_time`
-   gives the time of a PDO on the wire, and `traffic` checks SYNC, load, the peak behind one SYNC and the worst-case
-   response time of every message. `array` states what the taxels support, and compares the window of the array with
-   the contact patch.
+   what is carried out and yet said first. For each candidate `make` fills a `BusPlan` step by step: PDOs, identifiers,
+   raw frames, traffic; `wire_time` gives the time of a PDO on the wire, and `traffic` checks SYNC, load, the peak
+   behind one SYNC and the worst-case response time of every message. `array` states what the taxels support, and
+   compares the window of the array with the contact patch.
 3. `surface_path` lays the task's path over the object; `motion` follows it with the arm: reach, stops, speeds.
    `contact` reckons there with the layer: whether the joints' counts hold the force, and whether the array shows it
    before the limit is reached.
-4. `make.make_plan` puts the answer together: `model.Plan` carries the closed setup, nodes, PDOs, buses, choices, what
-   is left out, warnings. Bring-up, cycle, emulator and command line work from it alone.
+4. `make.make_plan` puts the answer together: `model.Plan` carries the closed setup, nodes with their configuration,
+   PDOs, buses, choices, what is left out, warnings. Bring-up, cycle, emulator and command line work from it alone.
 
 `report` writes a plan for people and as JSON, `timeline` draws its cycles, `measured` sets a recorded bus beside it,
 `bridges` is the table of the tools that can be fed. Start reading at `model`, then `make`.

@@ -107,10 +107,10 @@ def cut_patch(setup: Setup) -> tuple[str, bool] | None:
     """How the window of a scene cuts the contact patch, with what to change, and whether the force stays safe.
 
     It is safe where the true force stays below `limits.force_max_n`, which the cell compares with the measured one.
-    None where the window measures nearly all of the force, or the task presses nothing.
+    None where the window measures nearly all of the force or is still open, or the task presses nothing.
     """
     touch = setup.touch
-    if touch is None or touch.array.mode != "window":
+    if touch is None or touch.array.mode != "window" or touch.array.window == "auto":
         return None
     force, probe, side, most = touch.force, touch.probe, int(touch.array.window), setup.limits.force_max
     pitch = touch.array.pad.pitch_m

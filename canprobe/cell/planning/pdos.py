@@ -2,7 +2,7 @@
 
 A PDO whose mapping can be changed is mapped; else one or several are taken whose fixed mappings have the objects. What
 else a fixed RPDO carries gets a safe value; what else a fixed TPDO carries is not read. A TPDO that is not needed and
-cannot be switched off is planned as traffic.
+cannot be switched off is planned as traffic. `BusPlan` is what the steps of the planning pass on, these the first.
 """
 
 from __future__ import annotations
