@@ -47,7 +47,7 @@ from canprobe.cell.planning.units import (
     PROFILE_DECELERATION,
     PROFILE_SPEED_LIMIT,
     ROUNDING_COUNTS,
-    DriveAxis,
+    PlannedAxis,
     profile_values,
     software_limits,
 )
@@ -110,7 +110,7 @@ def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfig
     return found if isinstance(node, Array) else _with_drive(found, bus, bus.axis_of(node.node_id))
 
 
-def _with_drive(found: NodeConfiguration, bus: BusPlan, axis: DriveAxis) -> NodeConfiguration:
+def _with_drive(found: NodeConfiguration, bus: BusPlan, axis: PlannedAxis) -> NodeConfiguration:
     """The configuration with mode, homing and units of a drive."""
     device, times = axis.device, _times(bus.sync, axis.device)
     others = [_interpolation_writes(device, time) for time in times[1:]]
@@ -240,7 +240,7 @@ _MISSED_SYNCS = "SYNCs after which the drive stops by itself"
 _FAST = "the drive itself limits its speed as the device has it, or not at all"
 
 
-def _drive_writes(sync: SyncPlan, axis: DriveAxis) -> Iterator[Write]:
+def _drive_writes(sync: SyncPlan, axis: PlannedAxis) -> Iterator[Write]:
     device, arm, mode = axis.device, axis.setup.needed_arm(), choose_mode(axis.device)
     assert mode is not None  # else the plan has said no
     low, high = (int(ends[axis.number]) for ends in software_limits(arm.model))
@@ -272,7 +272,7 @@ def _drive_writes(sync: SyncPlan, axis: DriveAxis) -> Iterator[Write]:
     yield Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost)
 
 
-def _homing_writes(axis: DriveAxis) -> Iterator[Write]:
+def _homing_writes(axis: PlannedAxis) -> Iterator[Write]:
     """Writes before homing. At home a drive counts -607Ch, or 0 where it has none. Source: CiA 402-2, "Homing mode"."""
     if (zero := axis.drive.zero) is None:
         return
@@ -289,13 +289,13 @@ def _homing_writes(axis: DriveAxis) -> Iterator[Write]:
         yield Write(HOME_OFFSET, 0, -round(_home_units(axis, zero)), "home offset")
 
 
-def _home_units(axis: DriveAxis, zero: HomingParameters) -> float:
+def _home_units(axis: PlannedAxis, zero: HomingParameters) -> float:
     """Position of a drive at home, units, with the other joints in the start posture."""
     others = joints_to_units(axis.model, axis.setup.needed_arm().q_start)
     return float(drive_position_at(axis.model, axis.number, zero.home, others))
 
 
-def _unhomed(axis: DriveAxis) -> Iterator[str]:
+def _unhomed(axis: PlannedAxis) -> Iterator[str]:
     """Why a drive cannot be homed: its modes, joints on which its zero depends, or no 607Ch where home is not 0."""
     if (zero := axis.drive.zero) is None:
         return

@@ -23,7 +23,7 @@ from canprobe.cell.planning.model import (
 )
 from canprobe.cell.planning.node_configuration import Direction, NodeKind
 from canprobe.cell.planning.sync import TARGETS, Place, choose_mode, is_profiled
-from canprobe.cell.planning.units import DriveAxis, profile_values
+from canprobe.cell.planning.units import PlannedAxis, profile_values
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, WINDOW_SIZE, has_known
@@ -93,9 +93,9 @@ class BusPlan:
     not_available: list[tuple[str, str]] = field(default_factory=list)
     untaken: dict[str, list[tuple[str, Setup]]] = field(default_factory=dict)
 
-    def axis_of(self, node_id: int) -> DriveAxis:
+    def axis_of(self, node_id: int) -> PlannedAxis:
         """A drive with its device."""
-        return DriveAxis(self.setup, self.setup.needed_arm().node_ids.index(node_id), self.devices[node_id])
+        return PlannedAxis(self.setup, self.setup.needed_arm().node_ids.index(node_id), self.devices[node_id])
 
     def entries(self, node_id: int, direction: Direction, *objects: tuple[int, int]) -> list[PdoEntry]:
         """The objects as entries; what the device cannot map becomes a problem."""

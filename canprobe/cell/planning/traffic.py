@@ -49,7 +49,7 @@ SYNC_BITS = worst_case_bits(_SYNC_BYTES)
 SYNC_BITS_LEAST = best_case_bits(_SYNC_BYTES)
 
 
-class _Sent(NamedTuple):
+class _BusMessage(NamedTuple):
     """A message of a bus.
 
     Attributes:
@@ -124,10 +124,10 @@ def _raw_messages(raw: Sequence[PlannedFrames], bitrate: int) -> Iterator[Messag
         yield Message(f"raw frames {can_id:03X}h", can_id, length, period, frame_ns=wire_ns(bits, bitrate))
 
 
-def _messages(plan: BusPlan, channel: str, wire: Sequence[PlannedPdo]) -> Iterator[_Sent]:
+def _messages(plan: BusPlan, channel: str, wire: Sequence[PlannedPdo]) -> Iterator[_BusMessage]:
     """The messages of one bus: its SYNC, its PDOs, raw frames and heartbeats."""
     bitrate, sync = plan.setup.bus.bitrate, plan.sync
-    yield _Sent(Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns), "SYNC", MASTER_NODE_ID)
+    yield _BusMessage(Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns), "SYNC", MASTER_NODE_ID)
     for pdo in wire:
         message = Message(
             f"{pdo.direction.upper()} {pdo.cob_id:03X}h",
@@ -137,15 +137,15 @@ def _messages(plan: BusPlan, channel: str, wire: Sequence[PlannedPdo]) -> Iterat
             deadline_ns=pdo.deadline_ns,
             frame_ns=wire_ns(pdo.bits_worst, bitrate),
         )
-        yield _Sent(message, pdo.part, pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID)
+        yield _BusMessage(message, pdo.part, pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID)
     for message in _raw_messages([one for one in plan.raw if one.channel == channel], bitrate):
-        yield _Sent(message, "event", RAW_DEVICE)
+        yield _BusMessage(message, "event", RAW_DEVICE)
     for node in (*plan.channels[channel], MASTER_NODE_ID):
         beat = Message(f"heartbeat of node {node}", HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
-        yield _Sent(beat, "event", node)
+        yield _BusMessage(beat, "event", node)
 
 
-def _analyse(buses: Sequence[Sequence[_Sent]], plan: BusPlan) -> tuple[list[BusAnalysis], CycleBudget]:
+def _analyse(buses: Sequence[Sequence[_BusMessage]], plan: BusPlan) -> tuple[list[BusAnalysis], CycleBudget]:
     """Response times of each bus behind SYNC (of an event behind itself), and the budget of one cycle.
 
     The controller couples the buses: it starts when the feedback of all of them is in.
@@ -199,7 +199,7 @@ def _analyse(buses: Sequence[Sequence[_Sent]], plan: BusPlan) -> tuple[list[BusA
     )
 
 
-def _placed(sent: Sequence[_Sent], queued: Mapping[Part, tuple[int, int]], settings: BusSettings) -> BusAnalysis:
+def _placed(sent: Sequence[_BusMessage], queued: Mapping[Part, tuple[int, int]], settings: BusSettings) -> BusAnalysis:
     """Response times of one bus.
 
     Args:
@@ -243,7 +243,7 @@ def controller_starts(best_ns: int | None, looks: Sequence[int], feedback_ns: in
     return earliest, next((look for look in looks if look >= feedback_ns), looks[-1])
 
 
-def _last(buses: Sequence[Sequence[_Sent]], analyses: Sequence[BusAnalysis], *parts: Part) -> int | None:
+def _last(buses: Sequence[Sequence[_BusMessage]], analyses: Sequence[BusAnalysis], *parts: Part) -> int | None:
     """The latest end of the messages of some parts after the SYNC, on any bus; None without a bound."""
     found: list[int | None] = []
     for bus, analysis in zip(buses, analyses, strict=True):

@@ -44,7 +44,7 @@ _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
 
 
 @dataclass(frozen=True, slots=True)
-class DriveAxis:
+class PlannedAxis:
     """A drive of the arm with its device.
 
     Attributes:
@@ -113,9 +113,9 @@ class DriveAxis:
         return over / (under or 1) if over else None
 
 
-def _axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> list[DriveAxis]:
+def _axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> list[PlannedAxis]:
     """The drives of the arm, from the base; none without an arm."""
-    return [DriveAxis(setup, number, devices[drive.node_id]) for number, drive in enumerate(setup.drives)]
+    return [PlannedAxis(setup, number, devices[drive.node_id]) for number, drive in enumerate(setup.drives)]
 
 
 def range_problems(setup: Setup) -> Iterator[str]:
@@ -154,7 +154,7 @@ class _SpeedLimit:
         return self.most - self.rounding
 
 
-def _speed_problems(axes: Iterable[DriveAxis]) -> Iterator[str]:
+def _speed_problems(axes: Iterable[PlannedAxis]) -> Iterator[str]:
     """Problems of drives whose limit of speed is no more than the rounding of targets takes from cycle to cycle."""
     for axis in axes:
         lowest = _lowest_limit(axis, math.inf)
@@ -195,7 +195,7 @@ def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tu
     return setup.changed("arm", profile_lag=lag), [], (*ranges, *speeds, warning)
 
 
-def profile_values(axis: DriveAxis) -> dict[Place, int]:
+def profile_values(axis: PlannedAxis) -> dict[Place, int]:
     """Velocity, acceleration and deceleration of a drive in profile position, those of its joints at their limits.
 
     A unit that the data of the cell cannot express gives the slowest.
@@ -207,7 +207,7 @@ def profile_values(axis: DriveAxis) -> dict[Place, int]:
     return {(index, 0): max(1, int(value)) for index, value in values.items()}
 
 
-def _within_speeds(setup: Setup, axes: Iterable[DriveAxis]) -> tuple[Setup, tuple[str, ...]]:
+def _within_speeds(setup: Setup, axes: Iterable[PlannedAxis]) -> tuple[Setup, tuple[str, ...]]:
     """Keep joints within 607Fh, 6080h and 6065h of their drives, beyond which a drive faults."""
     model, share = setup.needed_arm().model, setup.limits.speed_share
     slowest, objects = np.ones(model.n), set()
@@ -234,7 +234,7 @@ def _within_speeds(setup: Setup, axes: Iterable[DriveAxis]) -> tuple[Setup, tupl
     return setup.changed("arm", model=replace(model, joints=tuple(limits))), (warning,)
 
 
-def _lowest_limit(axis: DriveAxis, wanted: float) -> _SpeedLimit:
+def _lowest_limit(axis: PlannedAxis, wanted: float) -> _SpeedLimit:
     """The lowest limit of a drive, where a speed of `wanted` position units/s is needed."""
     device, rounding = axis.device, ROUNDING_COUNTS * axis.setup.rate_hz
     limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
