@@ -40,11 +40,11 @@ This page is generated from the definition of a scene: `python docs/generate.py`
 
 ## Sections and tasks
 
-`[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[outputs]`, `[limits]`, `[bring_up]`, `[keep_out]`
-and `[bridge]` may stand in every scene. `[cell]`, `[arm]`, `[joints.NAME]`, `[postures]`, `[keep_out]`, `[sensor]`,
-`[probe]` and `[emulate]` usually come from the cell file, and `[wire]` from the array file. The other sections depend
-on `task.kind`. *required*: the scene must have the section. *default*: a scene without the section has all its
-defaults. *optional*: a scene without the section does without it. *–*: the section is an error.
+`[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[outputs]`, `[limits]`, `[bring_up]`,
+`[keep_out]` and `[bridge]` may stand in every scene. `[cell]`, `[arm]`, `[joints.NAME]`, `[postures]`, `[keep_out]`,
+`[sensor]`, `[probe]` and `[emulate]` usually come from the cell file, and `[wire]` from the array file. The other
+sections depend on `task.kind`. *required*: the scene must have the section. *default*: a scene without the section
+has all its defaults. *optional*: a scene without the section does without it. *–*: the section is an error.
 """
 
 

@@ -110,6 +110,8 @@ def test_outputs_that_are_off_are_not_written_and_said(
     replayed = json.loads(capsys.readouterr().out)
     assert replayed["shape"]["map"] is not None
     assert main(["runs", str(tmp_path)]) == 0
+    assert main(["plan", f"{out}/scene.toml", "--measured", out]) == (2 if "bus_log" in off else 0)
+    assert ("outputs.bus_log = true" in capsys.readouterr().err) == ("bus_log" in off)
 
 
 def test_only_some_outputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

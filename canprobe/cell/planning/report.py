@@ -32,13 +32,13 @@ MIN_CHARACTERS = 40
 """Least length of a line: no line is broken before it."""
 ALL_TABLES = "--full prints all tables"
 OUTPUT_COSTS: Mapping[str, tuple[str, Mapping[str, str]]] = {
-    "truth": ("truth.npz", {"direct": "3 % of a cycle", "lockstep": "2 % of a cycle"}),
-    "surface_map": ("surface.npz", {"direct": "6 % of a cycle", "lockstep": "5 % of a cycle"}),
-    "bus_log": ("bus.log", {"lockstep": "6 % of a cycle"}),
+    "truth": ("truth.npz", {"direct": "3 % of a cycle", "lockstep": "1 % of a cycle"}),
+    "surface_map": ("surface.npz", {"direct": "2 % of a cycle", "lockstep": "1 % of a cycle"}),
+    "bus_log": ("bus.log", {"lockstep": "3 % of a cycle"}),
     "figures": ("report.png", {"": "1 to 2 s after the run"}),
 }
-"""File of each output, and its cost by bus: processor time of a cycle of `cylinder` with all outputs and without this
-one, in runs in turn on one machine (2026-11-29, the commit that has this table)."""
+"""File of each output, and its cost by bus: the share of the processor time of a cycle of `cylinder` that is saved
+without it, by cells that took their cycles in turn, to one percent (2026-11-29, on 44c3a72a)."""
 
 
 def verdict_text(plan: Plan, width: int | None = None) -> str:
@@ -322,7 +322,7 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
 
 
 def output_rows(plan: Plan) -> Iterator[tuple[str, str, str]]:
-    """Name, cost and file of each output that the cell can have; for one that is off its key in the place of the cost."""
+    """Name, cost and file of each output that the cell can have; the key of one that is off, in the cost's place."""
     bus = plan.setup.bus.interface
     for name, (file, costs) in OUTPUT_COSTS.items():
         if file in plan.outputs:

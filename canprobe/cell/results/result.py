@@ -212,7 +212,7 @@ class RunResult:
         if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
             raise UsageError("score: expected a scan that touched its object, got no contacts")
         if "kappa_per_m" not in self.truth:
-            raise UsageError("score: expected an emulated object, got a run without truth")
+            raise UsageError("score: expected an emulated object and outputs.truth = true, got a run without truth")
         start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
         ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
         return score_estimators(

@@ -40,6 +40,10 @@ def measure_traffic(
         PlanError: when the scene does not fit its bus.
     """
     path = Path(log) / LOG if Path(log).is_dir() else Path(log)
+    if path != Path(log) and not path.exists():
+        raise UsageError(
+            f"{log}: no {LOG} in this folder; expected that of a run on a bus, with outputs.bus_log = true"
+        )
     plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()

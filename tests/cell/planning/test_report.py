@@ -101,3 +101,15 @@ def test_the_command_draws_and_prints_it(tmp_path, capsys):
     assert pdo["slack_us"] == pdo["deadline_us"] - pdo["response_us"]
     assert main(["plan", "press", "--full"]) == 0
     assert "cycle 2  can0        SSS" in capsys.readouterr().out
+
+
+def test_each_output_is_listed_with_its_cost_or_the_key_that_turns_it_off(capsys):
+    assert main(["plan", "cylinder", "--full", "--set", "outputs.truth=false"]) == 0
+    printed = capsys.readouterr().out
+    table = printed.partition("outputs, and what each of them costs:\n")[2].partition("\n\n")[0].splitlines()
+    costs = {name: cost for name, cost in (line.split(maxsplit=1) for line in table)}
+    assert list(costs) == ["truth", "surface_map", "bus_log", "figures"]
+    assert costs["truth"].startswith("off: outputs.truth = false")
+    assert costs["bus_log"].startswith("3 % of a cycle")
+    assert main(["plan", "free", "--set", "bus.interface=direct", "--json"]) == 0
+    assert set(json.loads(capsys.readouterr().out)["output_costs"]) <= {"truth", "figures"}
