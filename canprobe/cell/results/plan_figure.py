@@ -10,14 +10,14 @@ from matplotlib.patches import Patch
 from canprobe.cell.planning.model import Part, Plan
 from canprobe.cell.planning.timeline import timeline
 from canprobe.cell.planning.traffic import on_the_wire
-from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, SHADE, SKY, legend, picture
+from canprobe.cell.results.picture import AMBER, BLUE, FAINT, GREY, INK, ORANGE, SHADE, SKY, legend, picture
 
 COLOURS: dict[Part, str] = {
-    "SYNC": INK, "feedback": BLUE, "controller": GREY, "command": AMBER, "tactile": SKY,
+    "SYNC": INK, "feedback": BLUE, "controller": GREY, "command": AMBER, "tactile": SKY, "other": FAINT,
 }  # fmt: skip
 NAMES: dict[Part, str] = {
     "SYNC": "SYNC", "feedback": "feedback (TPDO)", "controller": "controller", "command": "commands (RPDO)",
-    "tactile": "tactile frame",
+    "tactile": "tactile frame", "other": "TPDO that is not used",
 }  # fmt: skip
 _ROW_INCHES = 0.21
 

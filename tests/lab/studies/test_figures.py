@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+from dataclasses import replace
 
 import bridges_bench as bridges
 import matplotlib.image
@@ -220,6 +221,14 @@ def bridge_bars(path):
     bridges._draw(rows, path)
 
 
+def plan_with_a_pdo_that_is_not_used():
+    """As of a drive that sends a TPDO of a fixed identifier beside the one that the cell needs."""
+    plan = canprobe.plan(canprobe.load_scene("cylinder"))
+    first, *others = plan.pdos
+    assert first.part == "feedback"
+    return replace(plan, pdos=(replace(first, used=False), *others))
+
+
 FOUND = {"tool_centre_mm": [0.394, None, 80.478], "sigma_mm": [0.05, None, 0.08], "believed_mm": [0.0, 0.0, 80.0],
          "true_mm": [0.4, -0.3, 80.5], "error_mm": [0.006, None, 0.022], "touches": 13}  # fmt: skip
 REASON = (
@@ -232,7 +241,7 @@ PICTURES = {
     "press": draw_scene("press", 0.5),
     "listen": draw_scene("listen", 1.0),
     "calibrate": draw_scene("press", 0.5, calibration=FOUND),
-    "plan": lambda path: draw_plan(canprobe.plan(canprobe.load_scene("cylinder")), path),
+    "plan": lambda path: draw_plan(plan_with_a_pdo_that_is_not_used(), path),
     "bound": bound,
     "estimators": every_estimator,
     "regions": regions,
