@@ -105,7 +105,9 @@ class TruthRecorder(Participant):
 
     def columns(self) -> LazyColumns:
         """A row for each SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
-        return self._compute().columns()
+        rows = self._compute()
+        rows.flush()  # they stay there where the columns find no place on the disk
+        return rows.columns()
 
     def remove(self) -> None:
         """Remove the file; its rows are in ``truth.npz`` by now."""
