@@ -70,7 +70,7 @@ def edited(folder, name, *changes):
 def test_a_tool_file_that_is_none(tmp_path):
     (tmp_path / "tool.toml").write_text("[probe]\nmass_kg = 1\n")
     (line,) = lines_of(tmp_path, 2, "run", "cylinder", "--tool", "tool.toml")
-    assert "tool.toml: expected the section [probe] with centre_offset_mm and centre_lateral_mm" in line
+    assert "tool.toml: expected the section [probe] with centre_offset_mm, centre_lateral_mm" in line
     assert not (tmp_path / "runs").exists()
 
 

@@ -75,9 +75,7 @@ class Drives:
 def a_cycle(port, *, on_arrival=True, drives=True, **more):
     """A cycle of 2.5 ms that looks at `LOOKS`."""
     budget = SimpleNamespace(looks_ns=tuple(look * 1000 for look in LOOKS))
-    plan = SimpleNamespace(
-        sync=SimpleNamespace(period_ns=PERIOD_NS, overflow=0), traffic=SimpleNamespace(budget=budget)
-    )
+    plan = SimpleNamespace(sync=SimpleNamespace(period_ns=PERIOD_NS, overflow=0), budget=budget)
     return Cycle(
         port,
         plan,

@@ -10,7 +10,7 @@ import pytest
 from canprobe.cli import main
 from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
 from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, LockstepPort
 from canprobe.fieldbus.eds.packaged import load_eds
 
 SAVE_ALL = bytes.fromhex("2310100173617665")
@@ -48,6 +48,13 @@ def change(participants):
         assert node.receive(0x600 + node.node_id, SAVE_ALL, 0)[0][1][0] == 0x60
 
 
+class RunningClock(MonotonicClock):
+    """Real time for a port that waits for nothing."""
+
+    def step(self, until_ns):
+        return False
+
+
 READ_1000 = bytes.fromhex("4000100000000000")
 
 
@@ -79,8 +86,13 @@ def test_faults_are_thrown_from_the_start_and_while_the_nodes_are_served(served,
         answers.append(inject("--clear"))
         answers.append((heard(first), heard(second)))
 
-    monkeypatch.setattr("canprobe.fieldbus.bus.virtual.lockstep.LockstepPort.channel", "lockstep")
-    monkeypatch.setattr("canprobe.fieldbus.bus.virtual.lockstep.LockstepPort.clock", MonotonicClock())
+    opened = LockstepPort.__init__
+
+    def on_a_running_clock(port, bus):
+        opened(port, bus)
+        port.channel, port.clock = "lockstep", RunningClock()
+
+    monkeypatch.setattr(LockstepPort, "__init__", on_a_running_clock)
     assert served(act, "--inject", "node 2: sdo-silent") == 0
     assert answers == [(1, 0), 0, (0, 0), 2, 0, (1, 1)]
     told = capsys.readouterr()

@@ -76,9 +76,10 @@ def test_the_map_says_the_same_and_the_truth_is_as_near(reached):
     start, axes = task.approach.start, task.approach.axes
     points = start + np.column_stack([x.ravel(), y.ravel()]) @ axes[:2]
     feet = np.array([shape.nearest(tuple(point)).point for point in points.tolist()])
-    height, sigma = reached.surface_map.distance(feet)
+    found = reached.surface_map.closest(feet)
+    height = found.height
     assert np.isfinite(height).all()
-    assert sigma.max() < 1.3 * 15e-6
+    assert found.sigma_relative.max() < 1.3 * 15e-6
     assert np.sqrt(np.mean(height**2)) < 2.0 * 15e-6
 
 
