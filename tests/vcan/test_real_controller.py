@@ -81,7 +81,7 @@ def test_what_is_full_while_nobody_acknowledges(
         port.send_batch(FRAMES)
     assert ("type: ip link set" in str(caught.value)) is (queue == 10)
     if not permitted:
-        monkeypatch.setattr("canprobe.fieldbus.bus.real.socketcan.drop_queued", lambda _: False)
+        monkeypatch.setattr("canprobe.fieldbus.bus.real.link.drop_queued", lambda _: False)
     port.close()
     (line,) = told
     if not permitted:
