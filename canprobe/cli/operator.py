@@ -75,16 +75,17 @@ class TerminalOperator:
         say(f"{question} [{_CHOICES[for_way]}]")
 
     def answer(self) -> Answer | SeenWay | None:
-        """The answer in the next whole line; after an unknown word it asks again."""
+        """The answer in the next whole line, or in what the end of the file left of one; an unknown word asks again."""
         self._left -= 1
         if self._left > 0:
             return None
         self._left = _LOOK_EVERY
-        if not self._read():
-            return Answer.QUIT
+        is_open = self._read()
         line, newline, rest = self._text.partition(b"\n")
-        if not newline:
+        if not newline and is_open:
             return None
+        if not (newline or line):
+            return Answer.QUIT
         self._text = rest
         word = line.decode(errors="replace").strip().lower()
         if self._for_way and (way := _WAY.fullmatch(word.replace("°", "deg"))) is not None:
@@ -97,4 +98,4 @@ class TerminalOperator:
         """Read the available text; False at the end of the file."""
         text, is_open = system.typed(self._descriptor)
         self._text += text
-        return is_open or bool(self._text)
+        return is_open

@@ -218,8 +218,10 @@ def test_the_terminal_is_never_waited_for(capsys):
     assert ask(b"10 cm\n", b"n\n", for_way=True) == [Answer.NO]
     assert ask(b"\n", for_way=True) == [Answer.YES]
     operator.ask("move?")
+    os.write(writer, b"y")  # a pipe may end without a new line
     os.close(writer)
-    assert operator.answer() is Answer.QUIT
+    ended = [answer for _ in range(100) if (answer := operator.answer()) is not None]
+    assert ended[:2] == [Answer.YES, Answer.QUIT]
     os.close(reader)
     assert "move? [Enter or y: yes, n: no, q: end]" in capsys.readouterr().err
 

@@ -106,6 +106,14 @@ def test_a_frame_comes_after_the_next_one():
     assert any(n != t for t, _, n in numbers)
 
 
+def test_what_comes_in_comes_after_the_next_one_and_is_never_sent():
+    reordered = fault(BUS_FAULTS["reorder"], incoming=True, share=0.5, seed=1)
+    frames, _, ticker = played(reordered, asked=(2.6, 3.5, 4.5, 5.4, 7.5))
+    heard = [data[0] for _, data in ticker.heard]
+    assert sorted(heard) == [2, 3, 4, 5, 7] and heard != sorted(heard)
+    assert of(frames) == CLEAN and not [row for row in frames if row[1] == 0x100]
+
+
 def test_a_deaf_node_speaks_but_does_not_hear():
     frames, _, ticker = played(fault(BUS_FAULTS["deaf"], incoming=True), asked=(1.5, 3.5, 7.5))
     assert of(frames) == CLEAN

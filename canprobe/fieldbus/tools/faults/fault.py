@@ -128,14 +128,14 @@ class Host:
     Attributes:
         hits: number of frames that were changed, lost, moved or made up, and of reboots.
         late: heap of the frames that go on later: time, number, whether the node receives it, frame.
-        swapped: frames to send behind those that the node sends next.
+        swapped: frames that go on behind the next ones, by whether the node receives them.
         said: frames that the node did not make, to send with its next answers.
     """
 
     def __init__(self, node: SlaveNode) -> None:
         self.node, self.hits = node, 0
         self.late: list[tuple[int, int, bool, Frame]] = []
-        self.swapped: list[Frame] = []
+        self.swapped: dict[bool, list[Frame]] = {False: [], True: []}
         self.said: list[Frame] = []
         self._count = 0
 

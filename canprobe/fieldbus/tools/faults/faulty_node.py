@@ -152,7 +152,8 @@ class FaultyNode(Participant):
         made = [f for e in self._effects if e.due_ns is not None and e.due_ns <= t_ns for f in e.advance(t_ns)]
         self.host.said = made + self.host.said
         out = [*ready, *self._finished(answers, t_ns)]
-        self._busy = bool(self._pending or self._effects or self.host.late or self.host.swapped or self._acts)
+        held = self.host.late or any(self.host.swapped.values())
+        self._busy = bool(self._pending or self._effects or held or self._acts)
         return out
 
     def _is_dark(self) -> bool:
@@ -210,16 +211,14 @@ class FaultyNode(Participant):
         batch = list(frames)
         for effect in self._effects:
             batch = effect.batch(batch, t_ns)
-        sent = self._through(batch, t_ns, incoming=False)
-        if sent:
-            sent += self.host.swapped
-            self.host.swapped = []
-        return sent
+        return self._through(batch, t_ns, incoming=False)
 
     def _through(self, frames: list[Frame], t_ns: int, *, incoming: bool) -> list[Frame]:
         for effect in self._effects:
             if effect.fault.hears is incoming and effect.left > 0:
                 frames = [out for frame in frames for out in self._hit(effect, frame, t_ns)]
+        if frames:
+            frames, self.host.swapped[incoming] = [*frames, *self.host.swapped[incoming]], []
         return frames
 
     def _hit(self, effect: Effect, frame: Frame, t_ns: int) -> Sequence[Frame]:

@@ -90,7 +90,7 @@ class Reorder(FrameFault):
     name = "reorder"
 
     def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
-        self.host.swapped.append(frame)
+        self.host.swapped[self.fault.hears].append(frame)
         return ()
 
 
