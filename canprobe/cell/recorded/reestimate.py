@@ -38,7 +38,7 @@ from canprobe.cell.session.children import Bridges
 from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.errors import ProtocolError, UsageError
-from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.clock import Pace
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.frames import is_sync
@@ -380,20 +380,13 @@ def replay_into(
     observations = _observations(plan, path, folder, result)
     with Bridges(plan, path.parent, virtual=True, say=say) as bridges:
         live = any(BRIDGES[name].live for name in bridge)
-        for observation in _in_real_time(observations) if live else observations:
+        pace = Pace()
+        for observation in observations:
+            if live:
+                pace.keep(observation.t_ns)
             for one in bridges.observers:
                 one.observe(observation)
         return RecordedBridges(result, bridges.end(None) or {})
-
-
-def _in_real_time(observations: Iterator[Observation]) -> Iterator[Observation]:
-    clock = MonotonicClock()
-    start_ns: int | None = None
-    for observation in observations:
-        if start_ns is None:
-            start_ns = clock.now_ns() - observation.t_ns
-        clock.sleep_until_ns(start_ns + observation.t_ns)
-        yield observation
 
 
 def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> Iterator[Observation]:
