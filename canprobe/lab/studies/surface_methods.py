@@ -83,9 +83,9 @@ def map_of_share(samples: Sequence[ContactSample], task: Touch, percent: float, 
 
 
 def evaluate_map(found: SurfaceMap, points: Floats) -> FoundSurface:
-    """A map at points (n, 3), m, near it."""
+    """A map at points (n, 3), m, near it; where tool and arm are is no question of the study."""
     feet = found.closest(points)
-    return FoundSurface(feet.height, feet.normal, found.curvature(points).tensor, feet.sigma)
+    return FoundSurface(feet.height, feet.normal, found.curvature(points).tensor, feet.sigma_relative)
 
 
 def evaluate_heights(
