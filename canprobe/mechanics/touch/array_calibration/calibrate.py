@@ -134,7 +134,7 @@ def calibrate_array(
     if by_force and not any(d.force is not None and id(d) in used for d in dwells):
         raise UsageError(f'force reference "{reference}": expected touches with a known force, got none')
     scale_sigma = None if by_force else max(reference_sigma, 1e-4) if reference == "unit" else 1e-4
-    seen = max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
+    seen = side_seen(dwells, pad)
     blank = _blank(array, date, made_on, reference, reference_sigma, pad.full_scale_pa)
 
     def fit(touches: Touches, own: PatchCalibration) -> tuple[ArrayCalibration, ParameterFit]:
@@ -214,6 +214,17 @@ def _blank(  # noqa: PLR0917
     )
 
 
+def side_seen(dwells: Sequence[Dwell], pad: Pad) -> int:
+    """Taxels along the longer side of what images show."""
+    return max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
+
+
+def at_usual_lightness(errors: Floats, shown: Sequence[Shown]) -> Floats:
+    """Errors (n, k) of the moments of n touches, as those of touches of `USUAL_LIGHTNESS`: light ones err more."""
+    light = np.array([[s.lightness] for s in shown])
+    return errors * (USUAL_LIGHTNESS / light) ** (0.5 * MOMENT_ERROR_POWER)
+
+
 def force_of(patch: PatchCalibration, s: Shown) -> float:
     """Mean force of a touch by the gains of a calibration, N, with its creep."""
     return patch.force_gain * s.total + patch.edge_gain * math.sqrt(s.total)
@@ -254,7 +265,7 @@ def _held_out(
 
 def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
     """Errors of moments from touches that the fit has not seen, with `FORM_SIGMA` for shapes that were not touched."""
-    scaled = errors * (USUAL_LIGHTNESS / np.array([[s.lightness] for s in shown])) ** (0.5 * MOMENT_ERROR_POWER)
+    scaled = at_usual_lightness(errors, shown)
     moment = float(np.mean(scaled[:, :2] ** 2)) + FORM_SIGMA**2
     return MomentErrors(
         moment=moment,

@@ -10,15 +10,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from canprobe.mechanics.touch.array_calibration.calibrate import force_of
+from canprobe.mechanics.touch.array_calibration.calibrate import at_usual_lightness, force_of, side_seen
 from canprobe.mechanics.touch.array_calibration.parameter_fit import moment_errors
 from canprobe.mechanics.touch.array_calibration.push_fit import stiffness_by_depth
 from canprobe.mechanics.touch.array_calibration.touches import LAST_IMAGE_S, Dwell, what_is_shown
 from canprobe.mechanics.touch.image.calibration import ArrayCalibration
-from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS
-from canprobe.mechanics.touch.image.image_model import MOMENT_ERROR_POWER, make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.image.image_model import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.pad import Pad
@@ -59,7 +56,7 @@ def verify_calibration(calibration: ArrayCalibration, dwells: Sequence[Dwell], p
     """Compare touches of one place with a calibration.
 
     Args:
-        calibration: the calibration of the array.
+        calibration: the calibration of the array, with the stiffness by its own touches' way.
         dwells: touches of a known object at one place with different forces.
         pad: taxels of the array.
 
@@ -69,14 +66,13 @@ def verify_calibration(calibration: ArrayCalibration, dwells: Sequence[Dwell], p
     plain = replace(PatchCalibration(pad), gains=calibration.gains)
     touches = [(d, what_is_shown(d, plain, LAST_IMAGE_S)) for d in dwells]
     patch = make_patch_calibration(calibration, pad)
-    seen = None if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
     forces = [force_of(patch, s) for _, s in touches]
-    light = np.array([[s.lightness] for _, s in touches])
-    errors = moment_errors(make_image_model(calibration, patch, seen=seen), touches, forces)[:, :2]
+    model = make_image_model(calibration, patch, seen=side_seen(dwells, pad))
+    errors = moment_errors(model, touches, forces)[:, :2]
     k = calibration.stiffness
     found, sigma, *_ = stiffness_by_depth(touches, forces, pad.radius_m, (k.moments, k.moments_sigma))
     return Verification(
-        moments=rms(errors * (USUAL_LIGHTNESS / light) ** (0.5 * MOMENT_ERROR_POWER)),
+        moments=rms(at_usual_lightness(errors, [s for _, s in touches])),
         moments_sigma=math.sqrt(calibration.moments.moment),
         stiffness=found,
         stiffness_sigma=math.hypot(sigma, MIN_STIFFNESS_SIGMA * found),
