@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     """Touch, fit, print, and write calibration.toml, calibration.png and the recorded buses."""
     from canprobe import api
     from canprobe.cell.results.array_report import as_document, calibration_text, draw_calibration, verification_text
+    from canprobe.cell.results.summary import without_nan
     from canprobe.cell.scene.calibrations import dump_calibration
     from canprobe.cell.scene.load import load_scene, read_cell
     from canprobe.cell.session.array_calibration import CalibrationRequest, calibrate, verify
@@ -94,7 +95,8 @@ def run(args: argparse.Namespace) -> int:
     if args.verify:
         calibration, verification = verify(request, date=today, ask=ask, say=say, out=out)
         if args.json:
-            print_json({**asdict(verification), "holds": verification.holds, "verified": calibration.verified})
+            document = {**asdict(verification), "holds": verification.holds, "verified": calibration.verified}
+            print_json(without_nan(document))
         else:
             print(verification_text(calibration, verification))
         return 0 if verification.holds else 1

@@ -164,7 +164,7 @@ def _open_to_others(setup: Setup) -> Iterator[str]:
         )
 
 
-def _calibration_warnings(array: Array) -> Iterator[str]:
+def _calibration_warnings(array: Array, name: int | str | None) -> Iterator[str]:
     """Warnings of what the calibration of an array does not state, and of what is taken for it."""
     from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
     from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED
@@ -189,13 +189,16 @@ def _calibration_warnings(array: Array) -> Iterator[str]:
             " `canprobe calibrate array CELL` measures what is missing"
         )
     if array.calibrated and array.calibration.of_make:
-        its, this = array.calibration.serial_number, array.serial
-        named = "this one has no name" if this is None else f"this one is {this:#x} (1018h:04)"
-        same = f'; or, if it is that one: sensor.serial_number = "{its}"' if this is None else ""
+        its = array.calibration.serial_number
+        of = its if isinstance(its, str) else f"{its:#x}"
+        this, same = "has no name", ""
+        if name is not None:
+            this = f"is {name:#x} (1018h:04)" if isinstance(name, int) else f"is {name}"
+        if array.raw is not None:
+            same = f'; or, if it is that one: sensor.serial_number = "{its}"'
         yield (
-            f"sensor.calibration: of the array {its if isinstance(its, str) else f'{its:#x}'}, and {named}: its forces"
-            f" are known to {100 * MAKE_SPREAD:g} % (1σ), as of any array of the make;"
-            f" type: canprobe calibrate array CELL{same}"
+            f"sensor.calibration: of the array {of}, and this one {this}: its forces are known to"
+            f" {100 * MAKE_SPREAD:g} % (1σ), as of any array of the make; type: canprobe calibrate array CELL{same}"
         )
 
 
@@ -219,7 +222,8 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
             " for emulated nodes"
         )
     if setup.array is not None:
-        yield from _calibration_warnings(setup.array)
+        sensor = setup.scene.sensor
+        yield from _calibration_warnings(setup.array, None if sensor is None else sensor.serial_number)
     if setup.touch is not None:
         yield from _beyond_the_calibration(setup.touch)
     if (cut := cut_patch(setup)) is not None:

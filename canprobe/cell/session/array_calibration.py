@@ -296,6 +296,9 @@ def verify(
             f"{request.cell}: sensor.calibration: expected the file of this array, got"
             f" {scene.sensor.calibration or 'none'}; make one first: canprobe calibrate array {request.cell}"
         )
+    calibration = load_calibration(str(file))
+    if math.isnan(calibration.stiffness.depth):
+        raise UsageError(f"{file}: stiffness.depth_n_m3: expected a number, got none: nothing to compare the way with")
     ball = KnownObject("ball", request.ball_radius)
     if not array.emulated:
         if ask is None:
@@ -304,7 +307,6 @@ def verify(
     visit = Visit(ball, tuple(Press(force) for force in VERIFIED_FORCES_N))
     plan = _plan(replace(scene, object=ball.settings(scene.task.start_mm)), visit)
     dwells, *_ = touch_object(plan, visit, out, say, ask)
-    calibration = load_calibration(str(file))
     found = verify_calibration(calibration, dwells, array.pad)
     if found.holds:
         write_text(file, dump_calibration(replace(calibration, verified=date)))

@@ -109,6 +109,7 @@ def test_an_array_that_is_no_node_has_a_name_in_the_cell_file(tmp_path):
     told = [line for line in make_plan(nameless).warnings if "sensor.calibration" in line]
     assert "of the array left, and this one has no name" in told[-1]
     assert told[-1].endswith('or, if it is that one: sensor.serial_number = "left"')
+    assert "of the array left, and this one is right: its forces" in " ".join(make_plan(other).warnings)
     with pytest.raises(SceneError, match=r"sensor\.serial_number: expected the number of 1018h:04.*got 'left'"):
         load_scene("press", {"sensor.serial_number": "left"})
 
@@ -245,3 +246,12 @@ def test_only_a_file_of_this_array_is_verified(capsys):
     assert (
         "expected the file of this array, got none; make one first: canprobe calibrate array" in capsys.readouterr().err
     )
+
+
+def test_a_file_without_the_stiffness_by_the_way_is_not_verified(own_array, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cell.toml").write_text((own_array / "cell.toml").read_text())
+    text = packaged_files("calibrations")["inch16"].read_text()
+    (tmp_path / "mine.toml").write_text(re.sub(r"(?m)^(depth|arm_compliance)_.*\n", "", text))
+    assert main(["calibrate", "array", "cell.toml", "--yes", "--verify", "--out", "a"]) == 2
+    assert "mine.toml: stiffness.depth_n_m3: expected a number, got none" in capsys.readouterr().err
