@@ -164,7 +164,7 @@ def _open_to_others(setup: Setup) -> Iterator[str]:
         )
 
 
-def _calibration_warnings(array: Array, name: int | str | None) -> Iterator[str]:
+def _calibration_warnings(array: Array) -> Iterator[str]:
     """Warnings of what the calibration of an array does not state, and of what is taken for it."""
     from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
     from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED
@@ -189,7 +189,7 @@ def _calibration_warnings(array: Array, name: int | str | None) -> Iterator[str]
             " `canprobe calibrate array CELL` measures what is missing"
         )
     if array.calibrated and array.calibration.of_make:
-        its = array.calibration.serial_number
+        its, name = array.calibration.serial_number, array.serial if array.raw is None else array.raw.serial
         of = its if isinstance(its, str) else f"{its:#x}"
         this, same = "has no name", ""
         if name is not None:
@@ -222,8 +222,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
             " for emulated nodes"
         )
     if setup.array is not None:
-        sensor = setup.scene.sensor
-        yield from _calibration_warnings(setup.array, None if sensor is None else sensor.serial_number)
+        yield from _calibration_warnings(setup.array)
     if setup.touch is not None:
         yield from _beyond_the_calibration(setup.touch)
     if (cut := cut_patch(setup)) is not None:

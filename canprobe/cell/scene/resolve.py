@@ -256,6 +256,7 @@ def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCa
     sure = settings.calibration is not None and abs(found.latency_s) > LATENCY_SIGMAS * found.latency_sigma_s
     return RawWire(
         image=image_format(wire, settings.rows, settings.columns),
+        serial=settings.serial_number,
         normal=wire.normal_axis - 1,
         unloaded=wire.unloaded_counts,
         full_scale=wire.full_scale_counts,

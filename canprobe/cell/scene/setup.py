@@ -147,6 +147,7 @@ class RawWire:
 
     Attributes:
         image: layout of its images in frames.
+        serial: serial number or name that the cell file gives it, as its frames do not; None: not stated.
         normal: number of the taxel's value that is the normal pressure, from 0.
         unloaded, full_scale: value without load, and at the pad's full scale; it may fall with pressure.
         tare_images: number of images at the beginning whose mean is the unloaded value of each taxel; 0: `unloaded` is.
@@ -158,6 +159,7 @@ class RawWire:
     """
 
     image: ImageFormat
+    serial: int | str | None
     normal: int
     unloaded: int
     full_scale: int
