@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.cell.master.controller import Command as Command
     from canprobe.cell.master.controller import Controller as Controller
     from canprobe.cell.master.controller import Measurement as Measurement
+    from canprobe.cell.master.external_arm import ExternalArm as ExternalArm
     from canprobe.cell.recorded.reestimate import ReplayResult as ReplayResult
     from canprobe.cell.recorded.reestimate import replay as replay
     from canprobe.cell.results.result import RunResult as RunResult
@@ -52,6 +53,7 @@ __getattr__, __dir__, __all__ = door(
     {
         "api": ("open_cell", "plan", "run"),
         "cell.master.controller": ("Command", "Controller", "Measurement"),
+        "cell.master.external_arm": ("ExternalArm",),
         "errors": (
             *("BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError", "ProtocolError"),
             *("ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
