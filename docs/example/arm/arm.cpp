@@ -1,5 +1,5 @@
-// Serves an arm to canprobe: g++ -std=c++17 -O2 arm.cpp -o arm && ./arm 5810. In place of `pose` and `move` stand the
-// calls of your arm.
+// Serves an arm to canprobe: g++ -std=c++17 -O2 arm.cpp -o arm && ./arm 5810. In place of `pose` and `move_to` stand
+// the calls of your arm.
 #include <arpa/inet.h>
 #include <netinet/tcp.h>
 #include <poll.h>
@@ -16,7 +16,7 @@ using Clock = std::chrono::steady_clock;
 using Pose = std::array<double, 16>;  // T_base_flange in rows, m
 constexpr auto PERIOD = std::chrono::milliseconds(2), STOP_AFTER = std::chrono::milliseconds(100);
 Pose pose{1, 0, 0, -0.12, 0, -1, 0, -0.1225, 0, 0, -1, 0.504, 0, 0, 0, 1};
-void move(const Pose& target) { pose = target; }
+void move_to(const Pose& target) { pose = target; }
 bool say(int fd, const std::string& line) { return write(fd, line.data(), line.size()) == ssize_t(line.size()); }
 std::optional<Pose> parse(const std::string& line) {  // {"T": [...]}; nothing of {"stop": true}
     size_t at = line.find('[');
@@ -35,7 +35,7 @@ void serve(int fd) {
     std::string rest;
     Clock::time_point heard, due = Clock::now();
     for (;;) {
-        if (target && Clock::now() - heard < STOP_AFTER) move(*target);
+        if (target && Clock::now() - heard < STOP_AFTER) move_to(*target);
         char number[32];
         std::string line = "{\"t_ns\": " + std::to_string(Clock::now().time_since_epoch().count()) + ", \"T\": [";
         for (double x : pose) line.append(number, std::snprintf(number, sizeof number, "%.9f, ", x));

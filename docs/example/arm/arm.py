@@ -1,5 +1,6 @@
-"""Serves an arm to canprobe: python arm.py 5810. In place of `pose` and `move` stand the calls of your arm."""
+"""Serves an arm to canprobe: python arm.py 5810. In place of `pose` and `move_to` stand the calls of your arm."""
 
+import contextlib
 import json
 import select
 import socket
@@ -10,7 +11,7 @@ PERIOD_S, STOP_AFTER_S = 0.002, 0.1
 pose = [1, 0, 0, -0.12, 0, -1, 0, -0.1225, 0, 0, -1, 0.504, 0, 0, 0, 1]  # T_base_flange in rows, m
 
 
-def move(target: list[float]) -> None:
+def move_to(target: list[float]) -> None:
     pose[:] = target
 
 
@@ -20,7 +21,7 @@ def serve(canprobe: socket.socket) -> None:
     target, heard, rest, due = None, 0.0, b"", time.monotonic()
     while True:
         if target is not None and time.monotonic() - heard < STOP_AFTER_S:
-            move(target)
+            move_to(target)
         canprobe.sendall(json.dumps({"t_ns": time.monotonic_ns(), "T": pose}).encode() + b"\n")
         due = max(due + PERIOD_S, time.monotonic())
         while (left := due - time.monotonic()) > 0:
@@ -35,7 +36,5 @@ def serve(canprobe: socket.socket) -> None:
 with socket.create_server(("127.0.0.1", int(sys.argv[1]))) as server:
     print(f"listening at 127.0.0.1:{server.getsockname()[1]}", flush=True)
     while True:
-        try:
+        with contextlib.suppress(OSError):  # canprobe has gone
             serve(server.accept()[0])
-        except OSError:
-            pass  # canprobe has gone

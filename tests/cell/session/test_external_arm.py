@@ -12,6 +12,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.emulated import flange_arm
+from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.scene.setup import External
 from canprobe.cell.session.arm_socket import SocketArm
 from canprobe.cell.session.session import Session
@@ -128,8 +129,6 @@ def test_its_clock_may_have_any_zero_and_run_fast_or_slow(watched):
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"arm.stop_after_ms": None}, "arm.stop_after_ms: missing"),
-        ({"arm.delay_ms": None}, "arm.delay_ms: missing"),
         ({"bus.interface": "socketcan"}, "arm.emulated: expected false"),
         ({"joints.x.kind": "prismatic"}, "joints"),
         ({"plant.fidelity": "dynamic"}, 'plant.fidelity: expected "ideal"'),
@@ -139,6 +138,14 @@ def test_its_clock_may_have_any_zero_and_run_fast_or_slow(watched):
 def test_a_cell_that_says_too_little_or_too_much_is_refused(keys, words):
     with pytest.raises(SceneError, match=words):
         scene_of(**keys)
+
+
+@pytest.mark.parametrize("key", ["delay_ms", "stop_after_ms"])
+def test_what_it_does_without_commands_and_how_late_has_to_be_stated(tmp_path, key):
+    lines = packaged_files("cells")["external"].read_text().splitlines()
+    (tmp_path / "mine.toml").write_text("\n".join(line for line in lines if not line.startswith(key)))
+    with pytest.raises(SceneError, match=rf"arm\.{key}: missing"):
+        scene_of(cell=str(tmp_path / "mine.toml"))
 
 
 def test_the_plan_refuses_a_servo_that_the_dead_time_would_let_hunt():
