@@ -62,8 +62,7 @@ class ArmPower:
         if not self._cycle_until(frozenset({DriveState.OPERATION_ENABLED}), enable_s, check):
             i, instead = drives.first_not_in(DriveState.OPERATION_ENABLED)
             node_id = drives.axes[i].node_id
-            raise drives.error(
-                i,
+            raise drives.axes[i].error(
                 f"(joint {i + 1}) is {instead} {enable_s:g} s after the command to enable operation"
                 " (bring_up.enable_s)" + self._watch.last_words(node_id),
             )
@@ -79,7 +78,7 @@ class ArmPower:
             )
         else:
             why = f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
-        return self._drives.error(i, why + self._watch.last_words(node_id))
+        return self._drives.axes[i].error(why + self._watch.last_words(node_id))
 
     def disable(self) -> None:
         """Stop the drives, then disable them, as far as the bus lets it."""

@@ -190,7 +190,8 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> BusError | None:
         return None
     assert seen.drives is not None
     i = next(i for i, age in enumerate(ages) if age >= cycles)
-    return seen.drives.error(i, word + seen.drives.silence(i))
+    axis = seen.drives.axes[i]
+    return axis.error(f"{word}no usable {'TPDO' if axis.node_id else 'pose'} for {ages[i]} cycles")
 
 
 @_checked("joint that does not follow its targets", Reaction.LIFT, _cycles(2))
@@ -202,8 +203,7 @@ def _following(seen: CycleState) -> BusError | None:
     motion = model.joints[i].text(abs(beyond[i] / float(model.units_per_q[i, i])), ".2f")
     lag_ms = seen.limits.lag_ns * 1e-6
     lag = f"a lag of {lag_ms:.3g} ms (servo.drive_lag_ms)" if lag_ms else "its lag"
-    return drives.error(
-        i,
+    return drives.axes[i].error(
         f"(joint {i + 1}) does not follow its targets: its motion is {motion} beside what"
         f" {lag} explains; see to its brake and its power stage, or state the lag of the drive",
     )

@@ -13,14 +13,13 @@ import numpy as np
 
 from canprobe.cell.master.following import Following
 from canprobe.cell.master.position_track import PERIOD_NS, REST_NS, PositionTrack, rest_counts
-from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import TARGETS, Place
 from canprobe.cell.planning.units import lag_s
-from canprobe.errors import BusError, NodeError, ProtocolError
+from canprobe.errors import ArmError, BusError, NodeError, ProtocolError
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
-from canprobe.fieldbus.protocol.frames import Frame, NmtState
+from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.types import Floats
@@ -45,7 +44,7 @@ class DriveAxis:
     """The PDOs of a drive.
 
     Attributes:
-        node_id: node id of the drive.
+        node_id: node id of the drive; 0: it is a coordinate of an external arm.
         feedback: layouts of its TPDOs, which between them have statusword, position (counts) and, where the drive can
             send it, torque (permille). What else they have is not read.
         commands: layouts of its RPDOs, which between them map controlword and target position (counts). Drives whose
@@ -59,6 +58,10 @@ class DriveAxis:
     commands: tuple[PdoLayout, ...]
     mode: int = OperationMode.CYCLIC_SYNC_POSITION
     constants: Mapping[Place, int] = field(default_factory=dict)
+
+    def error(self, reason: str) -> BusError:
+        """The error of the drive, or of the external arm."""
+        return NodeError(self.node_id, reason) if self.node_id else ArmError(reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,21 +327,6 @@ class DriveGroup:
     def jitter_ns(self) -> int:
         """Time by which the drives may have seen the SYNC of this cycle later than usual."""
         return self.period_ns if self._irregular else max(self.answer_ns - self._quickest_ns, 0)
-
-    def error(self, axis: int, reason: str) -> BusError:
-        """The error of a drive, by its number from 0."""
-        return NodeError(self.axes[axis].node_id, reason)
-
-    def silence(self, axis: int) -> str:
-        """For how long a drive has not been heard, in words."""
-        return f"no usable TPDO for {self.ages()[axis]} cycles"
-
-    def obeys(self, axis: int, watch: NodeWatch, error: BaseException) -> bool:
-        """Whether a drive obeys by NMT and EMCY: not the one that the cell is stopped for by an error."""
-        node_id = self.axes[axis].node_id
-        if isinstance(error, NodeError) and error.node_id == node_id:
-            return False
-        return watch.states.get(node_id) is NmtState.OPERATIONAL and node_id not in watch.alarmed
 
 
 class DriveTargets:

@@ -13,10 +13,9 @@ from typing import Protocol
 import numpy as np
 
 from canprobe.cell.master.drives import UNSTATED_LAG_S, DriveAxis, DriveCommand, DriveGroup, DriveTargets
-from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.units import lag_s
-from canprobe.errors import ArmError, BusError, CanprobeError
+from canprobe.errors import ArmError, CanprobeError
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.mechanics.robot.flange import flange_joints, flange_pose
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
@@ -200,15 +199,6 @@ class FlangeGroup(DriveGroup):
     def jitter_ns(self) -> int:
         return self.age_ns
 
-    def error(self, axis: int, reason: str) -> BusError:
-        return ArmError(reason)
-
-    def silence(self, axis: int) -> str:
-        return f"no usable pose for {1e-6 * self.age_ns:.0f} ms"
-
-    def obeys(self, axis: int, watch: NodeWatch, error: BaseException) -> bool:
-        return not isinstance(error, ArmError)
-
 
 class FlangeTargets(DriveTargets):
     """Where the flange is sent.
@@ -225,7 +215,7 @@ class FlangeTargets(DriveTargets):
         super().__init__(drives, 1, lag_s)
 
     @property
-    def goal(self) -> DriveState:  # type: ignore[override]  # an arm is stopped as soon as somebody wants it
+    def goal(self) -> DriveState:
         """State that the arm is led into; leaving operation enabled stops it at once."""
         return self._goal
 

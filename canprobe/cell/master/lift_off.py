@@ -23,7 +23,7 @@ from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, GrowingForce, Retrace, TakenWay, way_gone
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
-from canprobe.errors import CanprobeError
+from canprobe.errors import ArmError, CanprobeError, NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.inverse import lifting_step
@@ -98,8 +98,8 @@ class LiftOff:
         self._model = model
         self._drives = drives
         ages = drives.ages()
-        heard = enumerate(zip(ages, drives.enabled_ones(), strict=True))
-        self._free = np.array([age == 0 and on and drives.obeys(axis, watch, error) for axis, (age, on) in heard])
+        heard = zip(drives.axes, ages, drives.enabled_ones(), strict=True)
+        self._free = np.array([age == 0 and on and _obeys(watch, axis.node_id, error) for axis, age, on in heard])
         self._way = WayBack(model, plan.setup.probe.T_flange_probe, self._period_s, self._free)
         self._trail = trail if self._free.all() else None  # with a drive at rest the others do not go where they were
         self._step_max: Floats = model.qd_max * plan.setup.limits.speed_share * self._period_s
@@ -178,3 +178,12 @@ def lift_off(plan: Plan, cycles: SupervisedCycle, error: BaseException) -> None:
                 break
     except CanprobeError as failure:
         cycles.notes.add(f"while lifting off: {failure}")
+
+
+def _obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:
+    """Whether a node obeys by NMT and EMCY, or an external arm: not the one that the cell is stopped for."""
+    if not node_id:
+        return not isinstance(error, ArmError)
+    if isinstance(error, NodeError) and error.node_id == node_id:
+        return False
+    return watch.states.get(node_id) is NmtState.OPERATIONAL and node_id not in watch.alarmed

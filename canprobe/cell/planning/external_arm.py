@@ -24,6 +24,19 @@ HIGHEST = (math.pi - math.atan(_S)) / (2.0 * math.pi * _S)
 """Highest bandwidth of the height correction times the delay of the loop."""
 
 
+def external_problems(setup: Setup) -> Iterator[str]:
+    """Why a cell with an external arm cannot be brought up."""
+    if setup.arm is None or (external := setup.arm.external) is None:
+        return
+    if setup.array is None:
+        yield "sensor: missing: without an array nothing is on the bus of a cell with an external arm"
+    if external.emulated and not setup.bus.virtual:
+        text = f'arm.emulated: expected false with bus.interface = "{setup.bus.interface}", got true'
+        yield f"{text}: an external arm is emulated in virtual time, on lockstep or direct"
+    if external.address is not None and not external.emulated and setup.bus.virtual:
+        yield f"arm.address: the arm at {external.address} moves in real time, and {setup.bus.interface} does not"
+
+
 def loop_delay_s(setup: Setup, task: Touch) -> float:
     """Longest time from a motion to the one that answers the image of it, s."""
     return blind_s(setup.rate_hz, task.array, task.lag_s)

@@ -11,7 +11,7 @@ from canprobe.cell.planning.array import array_problems, as_supported, cut_patch
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import configure
 from canprobe.cell.planning.device_capabilities import SECTIONS, DeviceCapabilities, lacks
-from canprobe.cell.planning.external_arm import servo_problems
+from canprobe.cell.planning.external_arm import external_problems, servo_problems
 from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes, wants_torque
 from canprobe.cell.planning.identifiers import (
     identifier_problems,
@@ -53,6 +53,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
+    problems += external_problems(setup)
     beyond: list[str] = [*range_problems(setup)]
     narrowed: tuple[str, ...] = ()
     bus: BusPlan | None = None

@@ -89,22 +89,6 @@ def _joints_missing(kind: str, joints: Mapping[str, JointSettings]) -> _Complain
         yield "joints", f"expected 1 to {MAX_JOINTS} sections [joints.NAME], got {len(joints)}"
 
 
-@_across("arm.kind", "arm.emulated", "arm.address?", "bus.interface", "sensor?", "plant.fidelity?")
-def _external(  # noqa: PLR0917
-    kind: str, emulated: bool, address: str | None, bus: str, sensor: object, fidelity: str | None
-) -> _Complaint:
-    if kind != "external":
-        return
-    if sensor is None:
-        yield "sensor", "missing: without an array nothing is on the bus of a cell with an external arm"
-    if emulated and bus not in ("lockstep", "direct"):
-        yield "arm.emulated", f'expected false on bus.interface = "{bus}": an external arm is emulated in virtual time'
-    if not emulated and address is not None and bus in ("lockstep", "direct"):
-        yield "bus.interface", f"expected a bus in real time for the arm at {address}, got {bus}"
-    if fidelity == "dynamic":
-        yield "plant.fidelity", 'expected "ideal" with arm.kind = "external": nobody knows its links'
-
-
 @_across("joints", "postures")
 def _posture_of_other_joints(joints: Mapping[str, JointSettings], postures: Mapping[str, Posture]) -> _Complaint:
     for name, posture in postures.items():

@@ -589,7 +589,7 @@ class Setup:
     def emulates_arm(self) -> bool:
         """Whether a drive or the external arm is emulated."""
         external = self.arm.external if self.arm is not None else None
-        return any(one.emulated for one in (*self.drives, *([external] if external is not None else [])))
+        return external.emulated if external is not None else any(drive.emulated for drive in self.drives)
 
     def line_to_type(self, command: str, *options: str) -> str:
         """The line of a command on the cell's bus; on SocketCAN where the scene names none."""

@@ -25,7 +25,8 @@ def model():
     return flange_model("arm", mount, home, (0.4, 0.1, 0.5), REACH, SPEED)
 
 
-def test_coordinates_are_position_and_yaw_pitch_roll_in_the_base_of_the_arm(model, rng=np.random.default_rng(3)):
+def test_coordinates_are_position_and_yaw_pitch_roll_in_the_base_of_the_arm(model):
+    rng = np.random.default_rng(3)
     mount = pose(Rotation.from_euler("xyz", (0.3, -0.2, 1.0)), (0.1, -0.5, 0.8))
     for q in rng.uniform(model.q_min, model.q_max, (50, 6)):
         x, y, z, yaw, pitch, roll = q
