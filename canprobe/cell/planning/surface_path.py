@@ -18,12 +18,11 @@ from canprobe.mechanics.touch.probe_motion import (
     MOVE_SPEED_M_S,
     RETREAT_SPEED_M_S,
     ROUND_SPEED_M_S,
-    SETTLE_S,
     ArcMotion,
     LineMotion,
     PoseSteps,
 )
-from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.servo import SETTLE_S, ProbePose
 from canprobe.mechanics.touch.shapes import ClosestPoint, PlacedShape
 from canprobe.mechanics.touch.strategies import Rectangle
 from canprobe.mechanics.types import Floats
