@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
+from canprobe.cell.master.carrier import SILENT_CYCLES
 from canprobe.cell.master.image_witness import UNSTATED_NS
 from canprobe.cell.master.supervision import (
     TORQUE_MEAN_NS,
@@ -191,6 +192,11 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> NodeError | None:
     assert seen.drives is not None
     i = next(i for i, age in enumerate(ages) if age >= cycles)
     return NodeError(seen.drives.axes[i].node_id, f"{word}no usable TPDO for {ages[i]} cycles")
+
+
+@_checked("position of the carrier lost, or a jump of it", Reaction.RETREAT, _cycles(SILENT_CYCLES + 1), enabling=True)
+def _carrier(seen: CycleState) -> NodeError | None:
+    return seen.carrier.lost if seen.carrier is not None else None
 
 
 @_checked("joint that does not follow its targets", Reaction.LIFT, _cycles(2))
