@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
 from canprobe.cell.master.bringup import BringUp, FoundNodes, NodeAccess
+from canprobe.cell.master.carrier import make_carrier
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.held_arm import HeldArm
@@ -59,6 +60,7 @@ class Cell:
 
     Attributes:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
+        carrier: receiver of the carrier's position; None where the object stands still.
         log: one row for each cycle.
         tactile_log: one row for each tactile frame, on the same clock.
         notes: faults that did not stop the cell.
@@ -100,8 +102,9 @@ class Cell:
 
             self.drives = make_drives(plan)
         self.tactile: ArrayReceiver | None = make_tactile(plan) if before is None else before.tactile
+        self.carrier = make_carrier(plan)
         self.watch = NodeWatch(plan.node_ids)
-        seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
+        seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters, carrier=self.carrier)
         earlier: SupervisedCycle | None = None if before is None else before.cycles
         self.cycles: SupervisedCycle = SupervisedCycle(
             plan, port, seen, options, observers, log_failure, origin_ns, earlier
@@ -165,6 +168,7 @@ class Cell:
                 self._plan,
                 drives=self.drives,
                 tactile=self.tactile,
+                carrier=self.carrier,
                 watch=self.watch,
                 other=self._network.feed,
                 on_arrival=not isinstance(self.port.clock, VirtualClock),

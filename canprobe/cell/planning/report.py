@@ -92,10 +92,14 @@ def _subjects(plan: Plan) -> Iterator[tuple[str, str]]:
 
 def _nodes(plan: Plan) -> str:
     """The nodes by kind with their ids, and which of them are real."""
-    drives, arrays = ([n.node_id for n in plan.nodes if n.kind == kind] for kind in ("drive", "tactile"))
+    drives, encoders, arrays = (
+        [n.node_id for n in plan.nodes if n.kind == kind] for kind in ("drive", "encoder", "tactile")
+    )
     found = []
     if drives:
         found.append(f"{len(drives)} drive{'s' * (len(drives) > 1)} ({id_ranges(drives)})")
+    if encoders:
+        found.append(f"encoder of the carrier ({id_ranges(encoders)})")
     if arrays:
         found.append(f"tactile array ({id_ranges(arrays)})")
     if plan.raw:

@@ -30,6 +30,7 @@ from canprobe.cell.scene.setup import (
     Arm,
     Array,
     Calibrate,
+    Carrier,
     Drive,
     Dynamics,
     Free,
@@ -253,6 +254,19 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
     )
 
 
+def _carrier(scene: Scene) -> Carrier | None:
+    if (settings := scene.carrier) is None:
+        return None
+    from canprobe.mechanics.touch.carrier import CarrierMotion
+
+    s, si, point, units = settings, in_si(settings), None, settings.counts_per_m
+    if s.counts_per_turn is not None:
+        point, units = np.array(si["point"]), s.counts_per_turn / (2.0 * math.pi)
+    motion = CarrierMotion(np.array(s.axis) / np.linalg.norm(s.axis), point)
+    node = s.node_id, s.channel or scene.bus.channel, s.eds, s.emulated, s.serial_number
+    return Carrier(*node, motion, speed=si["speed"], units=units or 1.0, zero=s.zero_counts)
+
+
 def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCalibration) -> RawWire:
     found = calibration.centroid
     sure = settings.calibration is not None and abs(found.latency_s) > LATENCY_SIGMAS * found.latency_sigma_s
@@ -348,6 +362,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
         "force": settings.force_n,
         "duration_s": settings.duration_s,
         "lag_s": servo.drive_lag_ms * 1e-3 + arm.delay_s,
+        "carrier": _carrier(scene),
     }
     if settings.kind == "calibrate":
         from canprobe.mechanics.robot.tool_calibration import ball_approaches

@@ -12,6 +12,7 @@ scene whose values are SI already (`[bus]`, `[bring_up]`, `[bridge]`) are taken 
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.model import ArmModel, Body
     from canprobe.mechanics.robot.tool_calibration import BallApproach
     from canprobe.mechanics.touch import ArrayCalibration, Pad
+    from canprobe.mechanics.touch.carrier import CarrierMotion
     from canprobe.mechanics.touch.servo import SurfaceGains
     from canprobe.mechanics.touch.shapes import PlacedShape
     from canprobe.mechanics.touch.strategies import Rectangle, Strategy
@@ -233,6 +235,32 @@ class Array(Node):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Carrier(Node):
+    """The turntable or conveyor that the object stands on, with the encoder that is its node.
+
+    Attributes:
+        motion: its axis.
+        speed: speed that the plan counts with, rad/s or m/s.
+        units: units of the position value per rad or m.
+        zero: position value at position 0.
+    """
+
+    motion: CarrierMotion
+    speed: float
+    units: float
+    zero: int
+
+    @property
+    def column(self) -> str:
+        """Column of its position in the log."""
+        return "carrier_m" if self.motion.point is None else "carrier_rad"
+
+    def text(self, way: float) -> str:
+        """A way of it, rad or m, for people."""
+        return f"{1e3 * way:.3g} mm" if self.motion.point is None else f"{math.degrees(way):.3g} deg"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Probe:
     """The sphere that carries the array, with its elastic layer; the middle of the flange where the arm carries none.
 
@@ -358,6 +386,7 @@ class Touching:
         force: target of the contact force, N.
         duration_s: duration of the scan or of the hold; of a calibration, the duration that the plan expects.
         lag_s: lag of the drives behind a ramp, with the dead time of an external arm.
+        carrier: what the object moves with; None: it stands still.
     """
 
     arm: Arm
@@ -367,6 +396,7 @@ class Touching:
     force: float
     duration_s: float
     lag_s: float
+    carrier: Carrier | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -569,6 +599,11 @@ class Setup:
     def tares(self) -> bool:
         """Whether bring-up tares the array: a cell that only listens knows no moment at which nothing touches it."""
         return self.array is not None and self.arm is not None
+
+    @property
+    def carrier(self) -> Carrier | None:
+        """What the object moves with; None: it stands still."""
+        return self.task.carrier if isinstance(self.task, Touching) else None
 
     @property
     def scan(self) -> Scan | None:
