@@ -246,7 +246,8 @@ class TactileServo:
         """
         point, normal = checked("contact.p_base", contact.p_base, (3,)), checked("contact.n_base", contact.n_base, (3,))
         axes = np.array([*transported(checked("along", along, (3,)).tolist(), normal.tolist()), normal])
-        surface, follower = LocalSurface(point, normal, SurfaceGains()), strategy and PathFollower(strategy, BRAKE_M)
+        surface = LocalSurface(point, normal, SurfaceGains())
+        follower = None if strategy is None else PathFollower(strategy, BRAKE_M)
         servo = cls(surface, follower, axes=axes, origin=point, probe_radius=positive("radius", radius))
         servo.depth, servo._first = positive("depth", depth), contact
         return servo

@@ -165,9 +165,12 @@ class SurfaceEstimate:
         Raises:
             UsageError: T_base_frame is no finite (4, 4).
         """
-        T = self.T_frame_contact if T_base_frame is None else checked("T_base_frame", T_base_frame, (4, 4))
-        L = linear_map(np.eye(4) if T is self.T_frame_contact else np.linalg.solve(self.T_frame_contact, T))
-        return matrix_behind(L, self.S, (self.covariance, self.combinations, self.information), self.model_root)
+        T_contact_frame = np.eye(4)
+        if T_base_frame is not None:
+            T_contact_frame = np.linalg.solve(self.T_frame_contact, checked("T_base_frame", T_base_frame, (4, 4)))
+        return matrix_behind(
+            linear_map(T_contact_frame), self.S, (self.covariance, self.combinations, self.information), self.model_root
+        )
 
     def predict(self, point: Floats) -> tuple[Floats, Floats]:
         """Point and outward normal of the estimated surface where a line along the contact normal meets it.
