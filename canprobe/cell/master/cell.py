@@ -33,6 +33,7 @@ from canprobe.fieldbus.protocol.cia402 import DriveState
 if TYPE_CHECKING:
     from canprobe.cell.master.arm_power import ArmPower
     from canprobe.cell.master.drives import DriveGroup
+    from canprobe.cell.master.external_arm import ExternalArm
 
 TARE_S = 0.3
 """Time in which an array takes the images of a tare, s."""
@@ -54,6 +55,7 @@ class Cell:
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
         zeros: file that records the zeros of real drives that are homed.
         before: stopped cell of the same run, whose log, notes, counters and time this one continues.
+        arm: the arm that is not on the bus; None with drives, or without an arm.
 
     Attributes:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
@@ -84,11 +86,16 @@ class Cell:
         origin_ns: int = 0,
         zeros: Path | None = None,
         before: Cell | None = None,
+        arm: ExternalArm | None = None,
     ) -> None:
         setup = plan.setup
         self.port = port
         self.drives: DriveGroup | None = None
-        if setup.arm is not None:
+        if arm is not None:
+            from canprobe.cell.master.external_arm import FlangeGroup
+
+            self.drives = FlangeGroup(plan, arm)
+        elif setup.arm is not None:
             from canprobe.cell.master.drives import make_drives
 
             self.drives = make_drives(plan)

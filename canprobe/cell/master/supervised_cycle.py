@@ -134,7 +134,8 @@ class SupervisedCycle:
             if measurement.q is not None:
                 row.update(joint_columns("q", measurement.q, self._slides))
             row["q_age"] = measurement.q_age
-            row["statusword"] = measurement.statuswords
+            if measurement.statuswords:
+                row["statusword"] = measurement.statuswords
             if measurement.torque_permille:
                 row["torque_permille"] = measurement.torque_permille
         if command is not None:

@@ -11,6 +11,7 @@ from canprobe.cell.planning.array import array_problems, as_supported, cut_patch
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import configure
 from canprobe.cell.planning.device_capabilities import SECTIONS, DeviceCapabilities, lacks
+from canprobe.cell.planning.external_arm import external_problems, servo_problems
 from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes, wants_torque
 from canprobe.cell.planning.identifiers import (
     identifier_problems,
@@ -52,6 +53,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
+    problems += external_problems(setup)
     beyond: list[str] = [*range_problems(setup)]
     narrowed: tuple[str, ...] = ()
     bus: BusPlan | None = None
@@ -104,7 +106,7 @@ def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpee
         from canprobe.cell.planning.motion import check_motion
 
         speeds, unreachable = check_motion(setup, setup.arm)
-    problems = [*unsuited, *speed_over_array_problems(setup)]
+    problems = [*unsuited, *speed_over_array_problems(setup), *servo_problems(setup)]
     cut, safe = cut_patch(setup) or ("", True)
     problems += [cut] if not safe else []
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
@@ -113,7 +115,7 @@ def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpee
         problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
     problems += [*unreachable, *narrowed] if unreachable else []
     truth, arm = setup.truth, setup.arm
-    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in setup.drives):
+    if arm is not None and truth.fidelity == "dynamic" and setup.emulates_arm:
         from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
 
         problem = dynamics_problem(arm.model.name, truth.bodies)

@@ -219,6 +219,8 @@ class LogCycles:
     """
 
     def __init__(self, plan: Plan, recording: Recording) -> None:
+        if plan.setup.arm is not None and plan.setup.arm.external is not None:
+            raise UsageError(f"{plan.setup.name}: the poses of an external arm are not in a log of the bus")
         overflow = recording.sync_overflow or plan.sync.overflow or SYNCS_REMEMBERED
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan, overflow)

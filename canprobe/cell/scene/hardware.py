@@ -31,6 +31,8 @@ MM = 1e-3
 REVOLUTE_ONLY = Only("kind", ("revolute",))
 PRISMATIC_ONLY = Only("kind", ("prismatic",))
 HOMING_ONLY = Only("zero", ("homing",))
+DRIVES_ONLY = Only("kind", ("drives",))
+EXTERNAL_ONLY, EXTERNAL_REQUIRED = (Only("kind", ("external",), required=given) for given in (False, True))
 HOMING_METHOD = Check(
     "from -128 to 127, but not 0",
     lambda value: -128 <= value <= 127 and value != 0,
@@ -110,21 +112,41 @@ class BringUpSettings:
 
 @dataclass(frozen=True, slots=True)
 class ArmSettings:
-    """`[arm]`: the chain of the arm, and what holds for all its drives.
+    """`[arm]`: the chain of the arm, and what holds for all its drives; or an arm that is not on the bus.
 
-    The chain is either a URDF with its base and tip link, or the Denavit-Hartenberg rows of the joints.
+    The chain is either a URDF with its base and tip link, or the Denavit-Hartenberg rows of the joints. An external arm
+    has neither joints nor drives: poses of its flange are read and commanded, and `cycle.rate_hz` is its rate.
     """
 
-    urdf: Annotated[str | None, ScenePath()] = None
+    kind: Literal["drives", "external"] = "drives"
+    """drives: CANopen drives on the bus. external: an arm behind an interface of its own (docs/external-arm.md)."""
+    address: Annotated[str | None, Pattern(r"[^\s:]+:\d{1,5}", "such as 127.0.0.1:5810"), EXTERNAL_ONLY] = None
+    """Host and port at which the program of the arm listens. Left out: the arm is given in Python, or emulated."""
+    delay_ms: Annotated[float, Range(0, 500), EXTERNAL_REQUIRED] = 0.0
+    """Dead time from a command until the arm moves by it, with that of both ways of its interface. Its lag behind a
+    ramp is `servo.drive_lag_ms`."""
+    stop_after_ms: Annotated[float, Range(1, 5000), EXTERNAL_REQUIRED] = 100.0
+    """Time without a command after which the arm stops by itself."""
+    start_mm: Annotated[Vec3, EXTERNAL_REQUIRED] = (0.0, 0.0, 0.0)
+    """Position of the flange at the start, in the base frame of the arm; `flange_deg` is its orientation there."""
+    reach_mm: Annotated[float, Range(1, 5000), EXTERNAL_ONLY] = 300.0
+    """Distance from `start_mm` along each axis up to which the flange may go."""
+    reach_deg: Annotated[float, Range(1, 80), EXTERNAL_ONLY] = 60.0
+    """Yaw, pitch and roll from `flange_deg` up to which the flange may turn."""
+    speed_mm_s: Annotated[float, Range(0, 10_000, open_low=True), EXTERNAL_ONLY] = 250.0
+    """Highest speed of the flange along each axis."""
+    speed_deg_s: Annotated[float, Range(0, 3600, open_low=True), EXTERNAL_ONLY] = 60.0
+    """Highest speed of its yaw, pitch and roll."""
+    urdf: Annotated[str | None, ScenePath(), DRIVES_ONLY] = None
     """URDF file of the arm, relative to the cell file. Left out: the rows in `[joints.*]` count."""
-    base: str | None = None
+    base: Annotated[str | None, DRIVES_ONLY] = None
     """Link of the URDF that is the base. Left out: its root."""
-    tip: str | None = None
+    tip: Annotated[str | None, DRIVES_ONLY] = None
     """Link of the URDF that is the flange. Left out: the only link without children that drives can move."""
-    convention: Convention = "standard"
+    convention: Annotated[Convention, DRIVES_ONLY] = "standard"
     """Denavit-Hartenberg convention of the rows."""
     mount_mm: Vec3 = (0.0, 0.0, 0.0)
-    """Where the chain begins in the base frame."""
+    """Where the chain, or the base frame of an external arm, begins in the base frame."""
     mount_deg: Vec3 = (0.0, 0.0, 0.0)
     """Roll, pitch and yaw of the beginning of the chain about the fixed axes x, y and z."""
     flange_mm: Vec3 = (0.0, 0.0, 0.0)
@@ -134,15 +156,15 @@ class ArmSettings:
     accuracy_mm: Annotated[float | None, Range(0, 100)] = None
     """Standard deviation of where the flange is in the base frame, along each axis, by the chain's lengths and zeros.
     Left out: 0.5 of a real arm, and 0 of an emulated one, which is as its file says."""
-    eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
+    eds: Annotated[str, ScenePath(), DRIVES_ONLY] = "puma260_joint.eds"
     """EDS of the drives that name none: a packaged name, or a path relative to the file."""
     emulated: bool = True
-    """canprobe serves the drives. false: the drives are real."""
-    missed_syncs: Annotated[int, Range(1, 250)] = 5
+    """canprobe serves the drives, or emulates the external arm. false: they are real."""
+    missed_syncs: Annotated[int, Range(1, 250), DRIVES_ONLY] = 5
     """SYNC periods of silence after which master and drives treat each other as lost."""
-    grouped_rpdo: bool | Auto = False
+    grouped_rpdo: Annotated[bool | Auto, DRIVES_ONLY] = False
     """Put two targets into one RPDO by dummy mapping."""
-    torque: bool = True
+    torque: Annotated[bool, DRIVES_ONLY] = True
     """Map the motor torque (6077h) into the TPDO of each drive, where the drive has it and the bus has room for it."""
     when_disabled: WhenDisabled = "unknown"
     """What the arm does when its drives are disabled: its brakes hold it, or it sinks. It is said before a person

@@ -135,9 +135,11 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
     """The arm, and the bodies of its links."""
     if scene.arm is None:
         return None, None
-    from canprobe.cell.scene.arms import arm_model, homing_of, per_joint, posture_in_si
+    from canprobe.cell.scene.arms import arm_model, external_arm, homing_of, per_joint, posture_in_si
 
     settings, joints = scene.arm, scene.joints
+    if settings.kind == "external":
+        return external_arm(scene.cell.name, settings, scene.cycle.rate_hz), None
     model, bodies, warnings = arm_model(scene.cell.name, settings, joints)
     each = zip(scene.drives.items(), joints.values(), strict=True)
     drives = tuple(
@@ -317,10 +319,11 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     """The setup of the task; `canprobe.cell.scene.rules` has checked that the scene has what it needs."""
     settings = scene.task
     if settings.kind == "free":
-        from canprobe.cell.scene.arms import per_joint
+        from canprobe.cell.scene.arms import EXTERNAL_SWING, per_joint
 
         assert arm is not None
-        return Free(arm, per_joint(scene.joints, "swing"), settings.swing_period_s, settings.duration_s)
+        swing = EXTERNAL_SWING if arm.external is not None else per_joint(scene.joints, "swing")
+        return Free(arm, swing, settings.swing_period_s, settings.duration_s)
     assert array is not None
     if settings.kind == "listen":
         return Listen(array, probe, settings.duration_s)
@@ -344,7 +347,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
         ),
         "force": settings.force_n,
         "duration_s": settings.duration_s,
-        "lag_s": servo.drive_lag_ms * 1e-3,
+        "lag_s": servo.drive_lag_ms * 1e-3 + arm.delay_s,
     }
     if settings.kind == "calibrate":
         from canprobe.mechanics.robot.tool_calibration import ball_approaches

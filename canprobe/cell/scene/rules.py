@@ -80,9 +80,12 @@ def _across(*keys: str) -> Callable[[Callable[..., _Complaint]], Callable[..., _
     return take
 
 
-@_across("arm", "joints")
-def _joints_missing(arm: object, joints: Mapping[str, JointSettings]) -> _Complaint:
-    if not 1 <= len(joints) <= MAX_JOINTS:
+@_across("arm.kind", "joints")
+def _joints_missing(kind: str, joints: Mapping[str, JointSettings]) -> _Complaint:
+    if kind == "external":
+        if joints:
+            yield "joints", 'not with arm.kind = "external", which has no joints; remove the sections'
+    elif not 1 <= len(joints) <= MAX_JOINTS:
         yield "joints", f"expected 1 to {MAX_JOINTS} sections [joints.NAME], got {len(joints)}"
 
 

@@ -96,13 +96,32 @@ class Drive(Node):
     quirks: Quirks | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class External:
+    """An arm that is not on the bus.
+
+    Attributes:
+        address: host and port of its program; None: it is given, or emulated.
+        emulated: it is emulated.
+        delay_s: dead time from a command to its motion.
+        stop_after_s: time without a command after which it stops by itself.
+    """
+
+    address: str | None
+    emulated: bool
+    delay_s: float
+    stop_after_s: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm:
     """The arm: its chain, and a drive for each of its n joints.
 
+    The joints of an external arm are the coordinates of its flange, see `canprobe.mechanics.robot.flange`.
+
     Attributes:
         model: geometry, limits and motor counts.
-        drives: one a joint, from the base.
+        drives: one a joint, from the base; none of an external arm.
         q_start: (n,) rad; selects the branch of the inverse kinematics, and is where an emulated arm stands.
         missed_syncs: SYNC periods of silence after which drive and master treat each other as lost.
         grouped: two targets share an RPDO through dummy mapping.
@@ -112,6 +131,7 @@ class Arm:
         temperature: entry of the drives' temperature (index, sub-index), and its unit, °C; None: not stated.
         when_disabled: what it does when its drives are disabled, as the cell file says.
         profile_lag: lag that profile position adds to that of the drives, s; 0 where no drive goes by it.
+        external: the arm as one that is not on the bus; None of an arm with drives.
     """
 
     model: ArmModel
@@ -125,6 +145,12 @@ class Arm:
     temperature: tuple[int, int, float] | None = None
     when_disabled: WhenDisabled = "unknown"
     profile_lag: float = 0.0
+    external: External | None = None
+
+    @property
+    def delay_s(self) -> float:
+        """Dead time of an external arm, s; 0 with drives."""
+        return self.external.delay_s if self.external is not None else 0.0
 
     @property
     def left_alone(self) -> str:
@@ -331,7 +357,7 @@ class Touching:
     Attributes:
         force: target of the contact force, N.
         duration_s: duration of the scan or of the hold; of a calibration, the duration that the plan expects.
-        lag_s: lag of the drives behind a ramp.
+        lag_s: lag of the drives behind a ramp, with the dead time of an external arm.
     """
 
     arm: Arm
@@ -557,7 +583,13 @@ class Setup:
     @property
     def emulates(self) -> bool:
         """Whether any part of the cell is emulated."""
-        return any(drive.emulated for drive in self.drives) or (self.array is not None and self.array.emulated)
+        return self.emulates_arm or (self.array is not None and self.array.emulated)
+
+    @property
+    def emulates_arm(self) -> bool:
+        """Whether a drive or the external arm is emulated."""
+        external = self.arm.external if self.arm is not None else None
+        return external.emulated if external is not None else any(drive.emulated for drive in self.drives)
 
     def line_to_type(self, command: str, *options: str) -> str:
         """The line of a command on the cell's bus; on SocketCAN where the scene names none."""

@@ -10,6 +10,7 @@ import pytest
 
 from canprobe.cell.master.conditions import BY_KEY, CONDITIONS, COUNTERS
 from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.drives import DriveAxis
 from canprobe.cell.master.supervision import CycleState, Limits, Reaction, TouchState
 from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.master.watch import NodeWatch
@@ -35,7 +36,7 @@ def seen(limits=LIMITS, **fields):
 def with_ages(*ages):
     """Two drives that were heard last so many cycles ago."""
     found = seen(measurement=Measurement(100, 0, q_age=ages))
-    found.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=1), SimpleNamespace(node_id=2)])
+    found.drives = SimpleNamespace(axes=[DriveAxis(1, (), ()), DriveAxis(2, (), ())])
     return found
 
 
