@@ -28,6 +28,10 @@ from canprobe.mechanics.types import Floats
 MIN_SLOPE_COSINE = 0.2
 """Least cosine between surface normal and approach direction, 78 degrees: a steeper slope is taken as this steep."""
 
+TARGET_RATES = {"target_force_n": 2.0, "speed_m_s": 0.1}
+"""Highest rates at which targets change, N/s and m/s²: a jump is a ramp in time. At 2 N/s the delay of 27 ms leaves the
+force 0.05 N behind, as much as the servo errs at rest."""
+
 
 @dataclass(frozen=True, slots=True)
 class SurfaceGains:
@@ -166,6 +170,9 @@ class TactileServo:
         probe_radius: radius of the undeformed probe, m.
         rolling_share: 0 if the pad follows the normal, 1 if it keeps its first orientation, or between. Why not always
             0: to follow the normal takes joint speeds that an arm may not have.
+
+    Attributes:
+        travelled: path of the reference contact over the surface, m.
     """
 
     def __init__(
@@ -179,6 +186,7 @@ class TactileServo:
         rolling_share: float,
     ) -> None:
         self.surface = surface
+        self.travelled = 0.0
         self._follower = follower
         self._heading, self._across, self._up = axes.tolist()
         self._origin = origin.tolist()
@@ -202,7 +210,9 @@ class TactileServo:
         """
         foot, normal = self.surface.foot(self._reference)
         if speed > 0 and self._follower is not None:
-            foot, normal = self._march(self._follower, foot, normal, speed * self._follower.pace * dt)
+            distance = speed * self._follower.pace * dt
+            foot, normal = self._march(self._follower, foot, normal, distance)
+            self.travelled += distance
         self._reference = foot
         reach, share = self._radius - depth, self._share
         (f0, f1, f2), (n0, n1, n2), (p0, p1, p2), flat = foot, normal, self._first_pole, 1 - share
