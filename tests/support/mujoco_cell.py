@@ -18,11 +18,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.plant.contact import PlantState, ProbeState, SolvedContact
 from canprobe.cell.plant.elastic_contact import NO_CONTACT, Indentation, depth_for_force
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.pressure import pad_coordinates
-from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.flange import flange_joints, flange_pose

@@ -105,9 +105,8 @@ class Cell:
         self.carrier = make_carrier(plan)
         self.watch = NodeWatch(plan.node_ids)
         seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters, carrier=self.carrier)
-        earlier: SupervisedCycle | None = None if before is None else before.cycles
         self.cycles: SupervisedCycle = SupervisedCycle(
-            plan, port, seen, options, observers, log_failure, origin_ns, earlier
+            plan, port, seen, options, observers, log_failure, origin_ns, before.cycles if before else None
         )
         self.supervisor = self.cycles.supervisor
         self.log, self.tactile_log, self.notes = self.cycles.log, self.cycles.tactile_log, self.cycles.notes

@@ -63,7 +63,6 @@ def pressed(arm_type: Any) -> list[tuple[float, ...]]:
 
 def test_near_its_working_force_the_contact_is_as_stiff_as_the_layer(mujoco_arm: Any) -> None:
     rows = np.array(pressed(mujoco_arm))
-    import sys
 
     np.set_printoptions(linewidth=150, precision=6, suppress=True)
     print(rows[::50])

@@ -165,9 +165,10 @@ class SurfaceEstimate:
         Raises:
             UsageError: T_base_frame is no finite (4, 4).
         """
-        T_contact_frame = np.eye(4)
+        T_contact_frame: Floats = np.eye(4)
         if T_base_frame is not None:
-            T_contact_frame = np.linalg.solve(self.T_frame_contact, checked("T_base_frame", T_base_frame, (4, 4)))
+            T_frame = checked("T_base_frame", T_base_frame, (4, 4))
+            T_contact_frame = np.asarray(np.linalg.solve(self.T_frame_contact, T_frame))
         return matrix_behind(
             linear_map(T_contact_frame), self.S, (self.covariance, self.combinations, self.information), self.model_root
         )
