@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
+from canprobe.cell.master.carrier import SILENT_CYCLES
 from canprobe.cell.master.image_witness import UNSTATED_NS
 from canprobe.cell.master.supervision import (
     TORQUE_MEAN_NS,
@@ -192,6 +193,11 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> BusError | None:
     i = next(i for i, age in enumerate(ages) if age >= cycles)
     axis = seen.drives.axes[i]
     return axis.error(f"{word}no usable {'TPDO' if axis.node_id else 'pose'} for {ages[i]} cycles")
+
+
+@_checked("position of the carrier lost, or a jump of it", Reaction.RETREAT, _cycles(SILENT_CYCLES + 1), enabling=True)
+def _carrier(seen: CycleState) -> NodeError | None:
+    return seen.carrier.lost if seen.carrier is not None else None
 
 
 @_checked("joint that does not follow its targets", Reaction.LIFT, _cycles(2))
