@@ -23,8 +23,8 @@ from canprobe.mechanics.types import Floats
 
 FRESH_PERIODS = 1.5
 """Age of a pose, periods, up to which it is of this cycle: the arm's period and the cycle's go past each other."""
-OFFSET_NS = 10_000_000_000
-"""Time over which the least delay counts for the offset of the arm's clock, ns: drifts of 100 ppm are 1 ms in it."""
+DRIFT = 5000
+"""Inverse of the drift between the clocks that the offset follows: 200 ppm."""
 RIGID = 1e-4
 """Largest error of a pose's rotation: five digits on a wire."""
 
@@ -79,45 +79,15 @@ def stopping(arm: ExternalArm) -> Iterator[ExternalArm]:
             arm.stop()
 
 
-class ArmClock:
-    """Offset of the arm's clock from that of the bus, by the least delay of the poses in the last while.
-
-    The least delay itself cannot be told from an offset: it counts as none.
-
-    Attributes:
-        offset_ns: time on the clock of the bus less that on the arm's; None before the first pose.
-        jitter_ns: longest delay of a pose beyond the least one.
-    """
-
-    def __init__(self) -> None:
-        self.offset_ns: int | None = None
-        self.jitter_ns = 0
-        self._begun_ns = 0
-        self._least_ns: list[int] = []  # of the while before, where there was one, and of this one
-
-    def take(self, arm_ns: int, now_ns: int) -> int:
-        """Take the time of a new pose that is read now; its age, ns."""
-        delay_ns = now_ns - arm_ns
-        if not self._least_ns or now_ns - self._begun_ns > OFFSET_NS:
-            self._least_ns = [*self._least_ns[-1:], delay_ns]
-            self._begun_ns = now_ns
-        self._least_ns[-1] = min(self._least_ns[-1], delay_ns)
-        self.offset_ns = min(self._least_ns)
-        self.jitter_ns = max(self.jitter_ns, delay_ns - self.offset_ns)
-        return delay_ns - self.offset_ns
-
-
 class FlangeGroup(DriveGroup):
     """The coordinates of the flange of an external arm, in the place of drives; none of them has a statusword.
+
+    The offset of the arm's clock from that of the bus is known by the least delay of its poses: that delay itself
+    counts as none. What is later than it is the age of a pose.
 
     Args:
         plan: plan of a cell with an external arm.
         arm: the arm.
-
-    Attributes:
-        clock: the clock of the arm.
-        age_ns: age at the SYNC of this cycle of the newest pose that was believed.
-        oldest_ns: largest age so far.
     """
 
     def __init__(self, plan: Plan, arm: ExternalArm) -> None:
@@ -125,10 +95,8 @@ class FlangeGroup(DriveGroup):
         super().__init__(tuple(DriveAxis(0, (), ()) for _ in model.joints), model, period_ns=plan.sync.period_ns)
         self.targets: FlangeTargets = FlangeTargets(self, arm, lag_s(plan.setup, UNSTATED_LAG_S))
         self.statuswords = []
-        self.clock = ArmClock()
-        self.age_ns = self.oldest_ns = 0
-        self._arm, self._pose_ns = arm, 0
-        self._arm_ns: int | None = None
+        self._arm, self._arm_ns, self._offset_ns = arm, 0, 0  # of the newest pose, on the arm's clock
+        self._pose_ns = self._age_ns = self._jitter_ns = self._oldest_ns = 0
         self._disbelieved = False
 
     def begin(self, cycle: int, t_ns: int = 0, deadline_ns: int | None = None) -> None:
@@ -139,15 +107,18 @@ class FlangeGroup(DriveGroup):
         R = T[:3, :3] if T.shape == (4, 4) else np.zeros((3, 3))
         if not (np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < RIGID and np.linalg.det(R) > 0.0):
             raise ArmError(f"read: expected a pose (4, 4) with a rotation, got {T.tolist()}")
-        if self._arm_ns is None or arm_ns > self._arm_ns:
+        if arm_ns > self._arm_ns or not self._all_heard:
+            offset_ns = self._offset_ns + (arm_ns - self._arm_ns) // DRIFT
+            self._offset_ns = min(offset_ns, t_ns - arm_ns) if self._all_heard else t_ns - arm_ns
             self._arm_ns = arm_ns
-            self._take(joints_to_units(self.model, flange_joints(self.model, T)), self.clock.take(arm_ns, t_ns))
-        self.age_ns = self.deadline_ns - self._pose_ns
-        self.oldest_ns = max(self.oldest_ns, self.age_ns)
+            self._take(joints_to_units(self.model, flange_joints(self.model, T)), t_ns - arm_ns - self._offset_ns)
+        self._age_ns = self.deadline_ns - self._pose_ns
+        self._oldest_ns = max(self._oldest_ns, self._age_ns)
 
     def _take(self, counts: Floats, age_ns: int) -> None:
         """Take a pose of an age; where a coordinate cannot have come there, it is not believed."""
         pose_ns, guarded = self.deadline_ns - age_ns, self.enabled and self.targets.sent is not None
+        self._jitter_ns = max(self._jitter_ns, age_ns)
         tracks = zip(self.tracks, counts.tolist(), strict=True)
         taken = [track.take(round(one), self.cycle, pose_ns, guarded=guarded) for track, one in tracks]
         self._disbelieved = not all(taken)
@@ -156,21 +127,17 @@ class FlangeGroup(DriveGroup):
         else:
             self._pose_ns, self._all_heard = pose_ns, True
 
-    def figures(self) -> dict[str, float | None]:
-        """Offset of the arm's clock from that of the bus, and its jitter; age of the oldest pose that was used; ms."""
-        ages = {
-            "clock_offset_ms": self.clock.offset_ns,
-            "jitter_ms": self.clock.jitter_ns,
-            "age_max_ms": self.oldest_ns,
-        }
-        return {name: None if ns is None else 1e-6 * ns for name, ns in ages.items()}
+    def figures(self) -> dict[str, float]:
+        """Offset of the arm's clock from that of the bus and its jitter, and the age of the oldest pose in use, ms."""
+        times = {"clock_offset": self._offset_ns, "jitter": self._jitter_ns, "age_max": self._oldest_ns}
+        return {f"{name}_ms": 1e-6 * ns for name, ns in times.items()}
 
     @property
     def heard_all(self) -> bool:
         return self._all_heard
 
     def ages(self) -> tuple[int, ...]:
-        overdue_ns = max(self.age_ns - round(FRESH_PERIODS * self.period_ns), 0)
+        overdue_ns = max(self._age_ns - round(FRESH_PERIODS * self.period_ns), 0)
         return (-(-overdue_ns // self.period_ns),) * len(self.tracks)
 
     def joints(self) -> Floats:
@@ -197,7 +164,7 @@ class FlangeGroup(DriveGroup):
 
     @property
     def jitter_ns(self) -> int:
-        return self.age_ns
+        return self._age_ns
 
 
 class FlangeTargets(DriveTargets):

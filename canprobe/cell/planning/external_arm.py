@@ -31,8 +31,7 @@ def external_problems(setup: Setup) -> Iterator[str]:
     if setup.array is None:
         yield "sensor: missing: without an array nothing is on the bus of a cell with an external arm"
     if external.emulated and not setup.bus.virtual:
-        text = f'arm.emulated: expected false with bus.interface = "{setup.bus.interface}", got true'
-        yield f"{text}: an external arm is emulated in virtual time, on lockstep or direct"
+        yield f"arm.emulated: expected false on {setup.bus.interface}: an external arm is emulated in virtual time only"
     if external.address is not None and not external.emulated and setup.bus.virtual:
         yield f"arm.address: the arm at {external.address} moves in real time, and {setup.bus.interface} does not"
 
@@ -59,16 +58,12 @@ def servo_problems(setup: Setup) -> Iterator[str]:
 
 def arm_text(setup: Setup) -> str:
     """The external arm in a line of the plan; empty with drives."""
-    arm, task = setup.arm, setup.task
-    if arm is None or (external := arm.external) is None:
+    if setup.arm is None or (external := setup.arm.external) is None:
         return ""
     where = "emulated" if external.emulated else f"at {external.address}" if external.address else "given in Python"
-    line = f"external, {where}: poses at {setup.rate_hz:g} Hz, dead time {1e3 * external.delay_s:g} ms, stops by itself"
-    line += f" {1e3 * external.stop_after_s:g} ms after the last command"
-    if not isinstance(task, Touch):
+    times = f"dead time {1e3 * external.delay_s:g} ms, stops by itself after {1e3 * external.stop_after_s:g} ms"
+    line = f"external, {where}: poses at {setup.rate_hz:g} Hz, {times}"
+    if not isinstance(task := setup.task, Touch):
         return line
-    delay_s = loop_delay_s(setup, task)
-    return (
-        f"{line}; the servo answers after {1e3 * delay_s:.0f} ms and has {task.gains.height_hz:g} of at most"
-        f" {HIGHEST / delay_s:.3g} Hz"
-    )
+    delay_s, has_hz = loop_delay_s(setup, task), task.gains.height_hz
+    return f"{line}; the servo answers after {1e3 * delay_s:.0f} ms: {has_hz:g} of at most {HIGHEST / delay_s:.3g} Hz"

@@ -17,6 +17,7 @@ from canprobe.errors import ArmError
 from canprobe.mechanics.types import Floats
 
 VERSION = 1
+GREETING = f'{{"canprobe_arm": {VERSION}, "stop_after_ms": …}}'
 CONNECT_S = 2.0
 """Longest time to the connection, to the greeting and to the first pose, each, s."""
 SEND_S = 0.05
@@ -48,7 +49,7 @@ class SocketArm:
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             hello, *poses = self._lines(CONNECT_S)
-            self._greet(self._parsed(hello), external)
+            self._greet(hello, external)
             self._pose = self._pose_of((poses or self._lines(CONNECT_S))[-1])
         except BaseException:
             self._socket.close()
@@ -71,13 +72,20 @@ class SocketArm:
     def stop(self) -> None:
         self._send({"stop": True})
 
-    def _greet(self, hello: dict[str, Any], external: External) -> None:
-        if hello.get("canprobe_arm") != VERSION:
-            raise ArmError(f'{self._address}: expected {{"canprobe_arm": {VERSION}, …}} first, got {hello}')
-        stops_ms, stated_ms = hello.get("stop_after_ms"), 1e3 * external.stop_after_s
-        if not isinstance(stops_ms, int | float) or not 0 < stops_ms <= stated_ms:
-            more = f"of at most arm.stop_after_ms = {stated_ms:g}, got {stops_ms}"
-            raise ArmError(f"{self._address}: expected a stop_after_ms {more}: the arm would go on for longer")
+    def _greet(self, line: bytes, external: External) -> None:
+        try:
+            hello = json.loads(line)
+            version, stops_ms = hello["canprobe_arm"], float(hello["stop_after_ms"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._unexpected(GREETING, line) from error
+        if version != VERSION:
+            raise self._unexpected(GREETING, line)
+        if not 0.0 < stops_ms <= 1e3 * external.stop_after_s:
+            stated = f"at most arm.stop_after_ms = {1e3 * external.stop_after_s:g}"
+            raise ArmError(f"{self._address}: expected a stop_after_ms of {stated}, got {stops_ms:g}")
+
+    def _unexpected(self, expected: str, line: bytes) -> ArmError:
+        return ArmError(f"{self._address}: expected {expected}, got {line[:80]!r}")
 
     def _lines(self, wait_s: float) -> list[bytes]:
         """The whole lines that are in; with a time to wait, at least one."""
@@ -99,22 +107,12 @@ class SocketArm:
             raise ArmError(f"{self._address}: {error}") from error
         return lines
 
-    def _parsed(self, line: bytes) -> dict[str, Any]:
+    def _pose_of(self, line: bytes) -> tuple[Floats, int]:
         try:
             message = json.loads(line)
-        except ValueError:
-            message = None
-        if not isinstance(message, dict):
-            raise ArmError(f"{self._address}: expected an object in JSON, got {line[:80]!r}")
-        return message
-
-    def _pose_of(self, line: bytes) -> tuple[Floats, int]:
-        message = self._parsed(line)
-        try:
             return np.array(message["T"], dtype=np.float64).reshape(4, 4), int(message["t_ns"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            got = line[:80]
-            raise ArmError(f'{self._address}: expected {{"t_ns": …, "T": [16 numbers]}}, got {got!r}') from error
+            raise self._unexpected('{"t_ns": …, "T": [16 numbers]}', line) from error
 
     def _send(self, message: dict[str, Any]) -> None:
         """Send a line whole: a part of one would end in the next."""
