@@ -310,10 +310,31 @@ def scan(name: str, arm_type: Any = None, *, friction: float = Layer.friction, *
     )
 
 
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "example" / "arm"))
+HEADINGS = (
+    *("object", "plant", "force off by (RMS)", "highest", "reading less true force (mean, RMS)"),
+    *("curvature, 1/m", "off by (RMS)", "stated", "regions that hold it"),
+)
+
+
+def main(*names: str) -> None:
+    """Print a table of scans on both plants."""
     from mujoco_arm import MujocoArm
 
-    for scene in sys.argv[1:] or ("sphere", "cylinder"):
-        for what, kind in (("canprobe's", None), ("MuJoCo's", MujocoArm)):
-            print(scene, what, scan(scene, kind), flush=True)
+    print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
+    plants = ("canprobe's", {}), ("MuJoCo's", {"arm_type": MujocoArm})
+    rubbing = "MuJoCo's, friction 0.5", {"arm_type": MujocoArm, "friction": 0.5}
+    for name in names:
+        for plant, given in (*plants, rubbing):
+            found = scan(name, **given)
+            first, second = found.kappa_per_m
+            cells = (
+                *(name, plant, f"{found.force_error:.1%}", f"{found.force_highest:.0%}"),
+                *(f"{found.reading_bias:+.1%}, {found.reading_error:.1%}", f"{first:.2f}, {second:.2f}"),
+                *(f"{found.kappa_error_per_m:.2f}", f"{found.stated_per_m:.2f}", f"{found.held:.0%}"),
+            )
+            print("| " + " | ".join(cells).replace("%", " %") + " |", flush=True)
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "example" / "arm"))
+    main(*(sys.argv[1:] or ("sphere", "cylinder")))
