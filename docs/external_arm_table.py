@@ -1,7 +1,8 @@
 """The table of docs/external-arm.md: where the servo of an external arm settles behind a dead time.
 
-`python docs/external_arm_table.py`: for each arm the verge of the sampled loop, and a press in direct mode on a contact
-six times as stiff as stated, at the bandwidth that the plan allows and at three times it, without learning the stiffness.
+`python docs/external_arm_table.py`: for each arm the verge of the sampled loop, and how presses in direct mode end on a
+contact six times as stiff as stated, at the bandwidth that the plan allows and at three times it, without learning the
+stiffness.
 """
 
 from __future__ import annotations

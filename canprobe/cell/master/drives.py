@@ -262,7 +262,7 @@ class DriveGroup:
     @property
     def heard_all(self) -> bool:
         """Every drive was heard at least once."""
-        self._all_heard = self._all_heard or min(self._heard) >= 0
+        self._all_heard = self._all_heard or min(self._heard, default=-1) >= 0
         return self._all_heard
 
     def ages(self) -> tuple[int, ...]:

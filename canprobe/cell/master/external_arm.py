@@ -132,13 +132,9 @@ class FlangeGroup(DriveGroup):
         times = {"clock_offset": self._offset_ns, "jitter": self._jitter_ns, "age_max": self._oldest_ns}
         return {f"{name}_ms": 1e-6 * ns for name, ns in times.items()}
 
-    @property
-    def heard_all(self) -> bool:
-        return self._all_heard
-
     def ages(self) -> tuple[int, ...]:
-        overdue_ns = max(self._age_ns - round(FRESH_PERIODS * self.period_ns), 0)
-        return (-(-overdue_ns // self.period_ns),) * len(self.tracks)
+        overdue = -(-(self._age_ns - round(FRESH_PERIODS * self.period_ns)) // self.period_ns)
+        return (max(overdue, int(self._disbelieved)),) * len(self.tracks)
 
     def joints(self) -> Floats:
         q = units_to_joints(self.model, [track.position(self.cycle + 1, self.deadline_ns) for track in self.tracks])
@@ -149,18 +145,10 @@ class FlangeGroup(DriveGroup):
     def states(self) -> tuple[DriveState | None, ...]:
         """The state that the arm is led into, by its poses: it is left once the arm rests."""
         stopped = DriveState.SWITCH_ON_DISABLED if all(self.rests) else DriveState.QUICK_STOP_ACTIVE
-        return (DriveState.OPERATION_ENABLED if self.enabled else stopped,) * len(self.tracks)
-
-    @property
-    def enabled(self) -> bool:
-        return self.targets.goal is DriveState.OPERATION_ENABLED
+        return tuple([DriveState.OPERATION_ENABLED if on else stopped for on in self.enabled_ones()])
 
     def enabled_ones(self) -> tuple[bool, ...]:
-        return (self.enabled,) * len(self.tracks)
-
-    @property
-    def disbelieved(self) -> bool:
-        return self._disbelieved
+        return (self.targets.goal is DriveState.OPERATION_ENABLED,) * len(self.tracks)
 
     @property
     def jitter_ns(self) -> int:

@@ -111,15 +111,9 @@ def external_arm(name: str, arm: ArmSettings, rate_hz: float) -> Arm:
     )
     start = np.array(arm.start_mm) * MM
     external = External(arm.address, arm.emulated, arm.delay_ms * 1e-3, arm.stop_after_ms * 1e-3)
-    return Arm(
-        flange_model(name, mount, home[:3, :3], start, reach, speed),
-        drives=(),
-        q_start=np.concatenate((start, np.zeros(3))),
-        missed_syncs=max(1, int(external.stop_after_s * rate_hz)),
-        grouped=False,
-        torque=False,
-        external=external,
-    )
+    model = flange_model(name, mount, home[:3, :3], start, reach, speed)
+    q_start, missed = np.concatenate((start, np.zeros(3))), max(1, int(external.stop_after_s * rate_hz))
+    return Arm(model, (), q_start, missed, grouped=False, torque=False, external=external)
 
 
 def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], arm: ArmSettings) -> None:

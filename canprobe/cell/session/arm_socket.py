@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import socket
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from canprobe.cell.scene.setup import External
 from canprobe.errors import ArmError
 from canprobe.mechanics.types import Floats
 
+Taken = TypeVar("Taken")
 VERSION = 1
 GREETING = f'{{"canprobe_arm": {VERSION}, "stop_after_ms": …}}'
 CONNECT_S = 2.0
@@ -29,7 +31,7 @@ MAX_READS = 16
 
 
 class SocketArm:
-    """An external arm at an address; see `ExternalArm`. A context manager: leaving closes the connection.
+    """An external arm at an address; see `ExternalArm`.
 
     Args:
         external: the arm as its cell file describes it.
@@ -55,10 +57,8 @@ class SocketArm:
             self._socket.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Close the connection, at which the program stops the arm."""
         self._socket.close()
 
     def read(self) -> tuple[Floats, int]:
@@ -73,19 +73,11 @@ class SocketArm:
         self._send({"stop": True})
 
     def _greet(self, line: bytes, external: External) -> None:
-        try:
-            hello = json.loads(line)
-            version, stops_ms = hello["canprobe_arm"], float(hello["stop_after_ms"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise self._unexpected(GREETING, line) from error
-        if version != VERSION:
-            raise self._unexpected(GREETING, line)
-        if not 0.0 < stops_ms <= 1e3 * external.stop_after_s:
-            stated = f"at most arm.stop_after_ms = {1e3 * external.stop_after_s:g}"
-            raise ArmError(f"{self._address}: expected a stop_after_ms of {stated}, got {stops_ms:g}")
-
-    def _unexpected(self, expected: str, line: bytes) -> ArmError:
-        return ArmError(f"{self._address}: expected {expected}, got {line[:80]!r}")
+        stated_ms = 1e3 * external.stop_after_s
+        form = f"{GREETING}, of at most arm.stop_after_ms = {stated_ms:g}"
+        version, stops_ms = self._parsed(line, form, lambda m: (m["canprobe_arm"], float(m["stop_after_ms"])))
+        if version != VERSION or not 0.0 < stops_ms <= stated_ms:
+            raise ArmError(f"{self._address}: expected {form}, got {line[:80]!r}")
 
     def _lines(self, wait_s: float) -> list[bytes]:
         """The whole lines that are in; with a time to wait, at least one."""
@@ -108,11 +100,16 @@ class SocketArm:
         return lines
 
     def _pose_of(self, line: bytes) -> tuple[Floats, int]:
-        try:
-            message = json.loads(line)
+        def pose(message: Any) -> tuple[Floats, int]:
             return np.array(message["T"], dtype=np.float64).reshape(4, 4), int(message["t_ns"])
+
+        return self._parsed(line, '{"t_ns": …, "T": [16 numbers]}', pose)
+
+    def _parsed(self, line: bytes, form: str, take: Callable[[Any], Taken]) -> Taken:
+        try:
+            return take(json.loads(line))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise self._unexpected('{"t_ns": …, "T": [16 numbers]}', line) from error
+            raise ArmError(f"{self._address}: expected {form}, got {line[:80]!r}") from error
 
     def _send(self, message: dict[str, Any]) -> None:
         """Send a line whole: a part of one would end in the next."""

@@ -226,24 +226,26 @@ class Session:
 
     def _external_arm(self, port: Port) -> ExternalArm | None:
         """The arm that is not on the bus, stopped on every way out; None with drives, or without an arm."""
-        given, external = self.options.arm, self.plan.setup.arm.external if self.plan.setup.arm is not None else None
-        if external is None:
-            if given is not None:
-                raise UsageError('arm: expected a scene with arm.kind = "external", got one without')
-            return None
         from canprobe.cell.master.external_arm import stopping
 
-        if given is not None:
-            return self._stack.enter_context(stopping(given))
-        if external.emulated:
+        arm, external = self.options.arm, self.plan.setup.arm and self.plan.setup.arm.external
+        if external is None:
+            if arm is not None:
+                raise UsageError('arm: expected a scene with arm.kind = "external", got one without')
+            return None
+        if arm is None and external.emulated:
             from canprobe.cell.emulated.flange_arm import EmulatedArm
 
-            return self._stack.enter_context(stopping(EmulatedArm(self.plan, self.buses.world.plant, port.clock)))
-        if external.address is None:
-            raise UsageError("arm.address: missing: expected the address of the arm's program, or arm= in Python")
-        from canprobe.cell.session.arm_socket import SocketArm
+            arm = EmulatedArm(self.plan, self.buses.world.plant, port.clock)
+        elif arm is None:
+            if external.address is None:
+                raise UsageError(
+                    "arm.address: missing: expected where the program of the arm listens, or arm= in Python"
+                )
+            from canprobe.cell.session.arm_socket import SocketArm
 
-        return self._stack.enter_context(stopping(self._stack.enter_context(SocketArm(external))))
+            arm = self._stack.enter_context(contextlib.closing(SocketArm(external)))
+        return self._stack.enter_context(stopping(arm))
 
     def _close(self) -> None:
         try:

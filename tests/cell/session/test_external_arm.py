@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -188,7 +189,7 @@ def test_the_programs_of_the_example_follow_and_stop_by_themselves(program, lang
             external = External(address, emulated=False, delay_s=0.0, stop_after_s=0.1)
             with pytest.raises(ArmError, match="stop_after_ms"):
                 SocketArm(replace(external, stop_after_s=0.05))
-            with SocketArm(external) as arm:
+            with closing(SocketArm(external)) as arm:
                 T, t_ns = arm.read()
                 np.testing.assert_allclose(T[:3, 3], (-0.12, -0.1225, 0.504))
                 T = T.copy()
