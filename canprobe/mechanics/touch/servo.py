@@ -75,7 +75,7 @@ class LocalSurface:
         gains: correction bandwidths.
     """
 
-    def __init__(self, point: Floats, normal: Floats, gains: SurfaceGains) -> None:
+    def __init__(self, point: Floats, normal: Floats, gains: SurfaceGains = SurfaceGains()) -> None:
         self._point: Sequence[float]
         self._normal: Sequence[float]
         self.move_to(point, normal)
@@ -242,8 +242,10 @@ class TactileServo:
         """
         point, normal = checked("contact.p_base", contact.p_base, (3,)), checked("contact.n_base", contact.n_base, (3,))
         axes = np.array([*transported(checked("along", along, (3,)).tolist(), normal.tolist()), normal])
-        surface, follower = LocalSurface(point, normal, SurfaceGains()), strategy and PathFollower(strategy, BRAKE_M)
-        servo = cls(surface, follower, axes=axes, origin=point, probe_radius=positive("radius", radius))
+        follower = None if strategy is None else PathFollower(strategy, BRAKE_M)
+        servo = cls(
+            LocalSurface(point, normal), follower, axes=axes, origin=point, probe_radius=positive("radius", radius)
+        )
         servo.depth, servo._first = positive("depth", depth), contact
         return servo
 
