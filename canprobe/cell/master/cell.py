@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
 from canprobe.cell.master.bringup import BringUp, FoundNodes, NodeAccess
+from canprobe.cell.master.carrier import make_carrier
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.held_arm import HeldArm
@@ -33,6 +34,7 @@ from canprobe.fieldbus.protocol.cia402 import DriveState
 if TYPE_CHECKING:
     from canprobe.cell.master.arm_power import ArmPower
     from canprobe.cell.master.drives import DriveGroup
+    from canprobe.cell.master.external_arm import ExternalArm
 
 TARE_S = 0.3
 """Time in which an array takes the images of a tare, s."""
@@ -54,9 +56,11 @@ class Cell:
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
         zeros: file that records the zeros of real drives that are homed.
         before: stopped cell of the same run, whose log, notes, counters and time this one continues.
+        arm: the arm that is not on the bus; None with drives, or without an arm.
 
     Attributes:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
+        carrier: receiver of the carrier's position; None where the object stands still.
         log: one row for each cycle.
         tactile_log: one row for each tactile frame, on the same clock.
         notes: faults that did not stop the cell.
@@ -84,17 +88,23 @@ class Cell:
         origin_ns: int = 0,
         zeros: Path | None = None,
         before: Cell | None = None,
+        arm: ExternalArm | None = None,
     ) -> None:
         setup = plan.setup
         self.port = port
         self.drives: DriveGroup | None = None
-        if setup.arm is not None:
+        if arm is not None:
+            from canprobe.cell.master.external_arm import FlangeGroup
+
+            self.drives = FlangeGroup(plan, arm)
+        elif setup.arm is not None:
             from canprobe.cell.master.drives import make_drives
 
             self.drives = make_drives(plan)
         self.tactile: ArrayReceiver | None = make_tactile(plan) if before is None else before.tactile
+        self.carrier = make_carrier(plan)
         self.watch = NodeWatch(plan.node_ids)
-        seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
+        seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters, carrier=self.carrier)
         earlier: SupervisedCycle | None = None if before is None else before.cycles
         self.cycles: SupervisedCycle = SupervisedCycle(
             plan, port, seen, options, observers, log_failure, origin_ns, earlier
@@ -158,6 +168,7 @@ class Cell:
                 self._plan,
                 drives=self.drives,
                 tactile=self.tactile,
+                carrier=self.carrier,
                 watch=self.watch,
                 other=self._network.feed,
                 on_arrival=not isinstance(self.port.clock, VirtualClock),

@@ -237,17 +237,40 @@ def _check_touch(
     down = stops.speeds(np.abs(joints[_POSES_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
     slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
     problems += _too_fast(down, f"lower task.approach_mm_s to {at_most(slowly)}")
+    carried, elsewhere = _check_carried(task, path, stops, joints[_POSES_BEFORE_CONTACT])
+    problems += elsewhere
     if task.scan is None:
-        return stops.speeds(np.zeros_like(task.arm.q_start)), problems
+        speeds = stops.speeds(carried)
+        return speeds, problems + _too_fast(speeds, "let the carrier move slower")
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
     rates = np.abs(np.diff(joints[_POSES_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
-    speeds = stops.speeds(rates.max(axis=0))
+    speeds = stops.speeds(rates.max(axis=0) + carried)
     if isinstance(task.scan.strategy, Rectangle):  # the path may take any direction
         along, across = np.abs(np.diff(path.points, axis=0) @ task.approach.axes[:2].T).T
         speeds = stops.speeds(np.hypot(rates[along >= across].max(axis=0), rates[along < across].max(axis=0)))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {at_most(possible)}, turn task.heading_deg, or raise task.rolling_share"
     return speeds, problems + _too_fast(speeds, way_out)
+
+
+def _check_carried(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> tuple[Floats, list[str]]:
+    """Highest joint speeds (n,), rad/s or m/s, to follow a carrier alone in a run, and why it cannot; 0 without one.
+
+    Args:
+        q_start: joint positions at the first contact (n,), rad or m.
+    """
+    from canprobe.cell.planning.surface_path import CARRIED_STEP_S, carried
+    from canprobe.mechanics.touch.servo import ProbePose
+
+    if (carrier := task.carrier) is None:
+        return np.zeros_like(q_start), []
+    T = forward(task.arm.model.chain, q_start) @ task.probe.T_flange_probe
+    far = "carrier: {:.1f} s into the run the contact is out of reach: {{why}}; shorten task.duration_s"
+    run = carried(task, carrier, path, ProbePose(T[:3, 3], T[:3, 2]))
+    poses = (_Pose(one.centre, -one.pole, _TOUCH_MOVE_RAD, far.format(t)) for t, both in run for one in both)
+    joints = _follow(task.arm, task.probe, poses, q_start)
+    rates = np.abs(joints[1::2] - joints[::2]) / CARRIED_STEP_S
+    return rates.max(axis=0), stops.problems(joints, touching=True)
 
 
 def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> str | None:

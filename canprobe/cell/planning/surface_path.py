@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.cell.planning.contact import edge_margin
-from canprobe.cell.scene.setup import Approach, Arm, Calibrate, Probe, Touch
+from canprobe.cell.scene.setup import Approach, Arm, Calibrate, Carrier, Probe, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.touch.probe_motion import (
@@ -31,6 +31,8 @@ SAMPLES = 240
 """Number of points of a path."""
 LINE_M, MIN_LINES, MAX_LINES = 4e-3, 4, 14
 """Distance between the lines on which a rectangle is checked, m; least and largest number of them."""
+CARRIED_STEP_S, MAX_CARRIED = 0.1, 1000
+"""Time between two poses at which a run on a carrier is checked, s, 2.5 mm of a path; of a long run, their number."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
 _BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
@@ -272,6 +274,30 @@ def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[Timed
     if task.scan is not None:
         for last, here in itertools.pairwise(poses):
             yield here, float(np.linalg.norm(here.centre - last.centre)) / task.scan.speed
+
+
+def carried(
+    task: Touch, carrier: Carrier, path: SurfacePath, pose: ProbePose
+) -> Iterator[tuple[float, list[ProbePose]]]:
+    """Times, s, of a run on a carrier that moves from position 0 on, with the pose in contact then, in base.
+
+    Beside it that to which the carrier alone takes it in `CARRIED_STEP_S`. The path goes round until the run, or one
+    turn of the carrier, is over.
+    """
+    way = [*over_path(task, path, pose)]
+    again = way[1 - len(path.points) :] if task.scan is not None else [(way[-1][0], CARRIED_STEP_S)]
+    turn_s = 2.0 * math.pi / carrier.speed if carrier.motion.point is not None else math.inf
+    run_s = max(min(task.duration_s, turn_s), 2.0 * CARRIED_STEP_S)
+    t, due_s = sum(seconds for _, seconds in way[: -len(again)]), 0.0
+    end_s, step_s = t + run_s, max(CARRIED_STEP_S, run_s / MAX_CARRIED)
+    for one, seconds in itertools.cycle(again):
+        t += seconds
+        if t >= min(due_s, end_s):
+            at = (carrier.motion.T_base_carrier(carrier.speed * time_s) for time_s in (t, t + CARRIED_STEP_S))
+            yield t, [one.moved(T) for T in at]
+            due_s = t + step_s
+        if t >= end_s:
+            return
 
 
 def round_ball(task: Calibrate, pose: ProbePose) -> Iterator[TimedPose]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
+from canprobe.cell.master.external_arm import FlangeGroup
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
@@ -107,6 +108,8 @@ def summarise(
     }
     if record.explored is not None:
         summary["explore"] = record.explored
+    if isinstance(cell.drives, FlangeGroup):
+        summary["external_arm"] = cell.drives.figures()
     if scene.task.kind == "listen":
         summary["listen"] = _listened(log)
     return {name: without_nan(value) for name, value in summary.items()}

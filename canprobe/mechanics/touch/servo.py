@@ -168,6 +168,10 @@ class ProbePose:
     centre: Floats
     pole: Floats
 
+    def moved(self, T: Floats) -> ProbePose:
+        """The pose that a transform (4, 4) makes of this one."""
+        return ProbePose(T[:3, :3] @ self.centre + T[:3, 3], T[:3, :3] @ self.pole)
+
 
 class TactileServo:
     """Marches a reference contact over the local surface and gives the pose of the probe that holds it.

@@ -164,16 +164,21 @@ class Chen1996Estimator(WindowEstimator):
         return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 
 
-def paper_rates(T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int) -> tuple[Floats, Floats]:
-    """x (28) and y (29), each (n − lag, 3), times the time between samples `lag` apart; the object stands still.
+def paper_rates(
+    T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int, object_twist: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """x (28) and y (29), each (n − lag, 3), times the time between samples `lag` apart.
 
-    `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, in base axes, all taken half-way between the samples; K_f = 1/|r_probe|.
+    `x = (ω_f − ω_o) × n_f + K_f v_f`, `y = V_f − V_o + v_f` (16)–(19), in base axes, all taken half-way between the
+    samples; K_f = 1/|r_probe|. In the frame of the object ω_o and V_o are 0, and x and y are the same vectors.
 
     Args:
         T_base_probe: (n, 3 or 4, 4) poses of the probe, m.
         r_probe: (n, 3) contact points in its frame, m.
         n_base: (n, 3) outward unit normals of the object there.
         lag: number of samples between the two of a difference.
+        object_twist: (6,) rotation, rad, and displacement of the object's point at the base's origin, m, in the time
+            between those two; None: it stands still.
     """
     R, r = T_base_probe[:, :3, :3], r_probe[:, :, None]
     Ra, Rb, ra, rb = R[:-lag], R[lag:], r[:-lag], r[lag:]
@@ -182,4 +187,8 @@ def paper_rates(T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int)
     arm = (0.5 * (Ra @ ra + Rb @ rb))[:, :, 0]
     slide = (0.5 * (Ra + Rb) @ (rb - ra))[:, :, 0]
     V = T_base_probe[lag:, :3, 3] - T_base_probe[:-lag, :3, 3] + np.cross(turn, arm)
+    if object_twist is not None:
+        contact = 0.5 * (T_base_probe[lag:, :3, 3] + T_base_probe[:-lag, :3, 3]) + arm
+        V = V - object_twist[3:] - np.cross(object_twist[:3], contact)
+        turn = turn - object_twist[:3]
     return slide / np.linalg.norm(rb, axis=1) - np.cross(turn, n), V + slide
