@@ -105,9 +105,8 @@ class Cell:
         self.carrier = make_carrier(plan)
         self.watch = NodeWatch(plan.node_ids)
         seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters, carrier=self.carrier)
-        earlier: SupervisedCycle | None = None if before is None else before.cycles
         self.cycles: SupervisedCycle = SupervisedCycle(
-            plan, port, seen, options, observers, log_failure, origin_ns, earlier
+            plan, port, seen, options, observers, log_failure, origin_ns, before.cycles if before else None
         )
         self.supervisor = self.cycles.supervisor
         self.log, self.tactile_log, self.notes = self.cycles.log, self.cycles.tactile_log, self.cycles.notes
@@ -126,7 +125,8 @@ class Cell:
         self.found = FoundNodes(access) if check else None
         self.stopped_by: Condition | None = None
         self.doubted: frozenset[int] = frozenset()
-        self._stopped, self._before = False, before
+        self._stopped = self._running = False
+        self._before = before
         self._power: ArmPower | None = None
         self._lift_off: Callable[[BaseException], None] = nothing
         if self.drives is not None:
@@ -138,7 +138,6 @@ class Cell:
         homed = any(one.homing for one in setups)
         self.homing = Homing(plan, access, self._supervise_homing, zeros) if homed else None
         self._held = HeldArm()
-        self._running = False
         self._retreats_for: CanprobeError | None = None
         if before is not None:  # the counters go on
             if self.drives is not None and before.drives is not None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from canprobe.cell.scene.hardware import JointSettings, Vec3
-from canprobe.cell.scene.model import TOUCH_KINDS, Posture, WireSettings
+from canprobe.cell.scene.model import FORCES, SPEEDS, TOUCH_KINDS, Posture, TargetPoints, WireSettings, highest
 from canprobe.cell.scene.toml_files import toml_value
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageFormat
@@ -225,9 +225,30 @@ def _torus_radii(kind: str, ring: float, tube: float) -> _Complaint:
 
 
 @_across("task.kind", "task.force_n", "limits.force_max_n")
-def _force_target(kind: str, force: float, limit: float) -> _Complaint:
-    if kind in TOUCH_KINDS and force >= limit:
-        yield "task.force_n", f"expected less than limits.force_max_n = {limit:g}, got {force:g}"
+def _force_target(kind: str, force: float | TargetPoints, limit: float) -> _Complaint:
+    if kind in TOUCH_KINDS and highest(force) >= limit:
+        yield "task.force_n", f"expected less than limits.force_max_n = {limit:g}, got {highest(force):g}"
+
+
+@_across("task.kind", "task.force_n", "task.speed_mm_s")
+def _target_tables(kind: str, force: float | TargetPoints, speed: float | TargetPoints) -> _Complaint:
+    for key, target, allowed in (("force_n", force, FORCES), ("speed_mm_s", speed, SPEEDS)):
+        if not isinstance(target, Mapping):
+            continue
+        bad = kind == "calibrate" or (kind == "press" and "path_mm" in target)
+        if bad or len(target) != 1 or not all(target.values()):
+            wanted = {"calibrate": "a number", "press": "points over time_s, as there is no path"}
+            expects = f'expected {wanted.get(kind, "points over path_mm or over time_s")} with task.kind = "{kind}"'
+            got = ", ".join(f"{len(points)} points over {over}" for over, points in target.items())
+            yield f"task.{key}", f"{expects}, got {got or 'an empty table'}"
+        for over, points in target.items():
+            last = 0.0
+            for number, (place, value) in enumerate(points, 1):
+                if place < last or not allowed.accepts(value):
+                    expects = f"expected {over} from {last:g} on and a number {allowed.text} in point {number}"
+                    yield f"task.{key}.{over}", f"{expects}, got [{place:g}, {value:g}]"
+                    break
+                last = place
 
 
 @_across("cycle.rate_hz", "sensor.rate_hz")

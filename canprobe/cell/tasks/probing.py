@@ -224,7 +224,11 @@ class ProbingTask(Task):
     @property
     def _pose(self) -> ProbePose:
         """The commanded pose in the frame of the contacts."""
-        return self._motion.pose if self.sensing.track is None else self._motion.pose.moved(np.linalg.inv(self._T))
+        return (
+            self._motion.pose
+            if self.sensing.track is None
+            else self._motion.pose.moved(np.asarray(np.linalg.inv(self._T)))
+        )
 
     def retreat(self, reason: str) -> None:
         if self._begun and self.reason is None and self.phase is not Phase.DONE:

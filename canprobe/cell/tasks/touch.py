@@ -25,7 +25,15 @@ from canprobe.mechanics.robot.motion_profile import smooth_step
 from canprobe.mechanics.touch import CalibrationCheck, ContactSample, Patch, Slope, SurfaceEstimate
 from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, LineMotion
-from canprobe.mechanics.touch.servo import RAMP_S, SETTLE_S, LocalSurface, ProbePose, Sinking, TactileServo
+from canprobe.mechanics.touch.servo import (
+    RAMP_S,
+    SETTLE_S,
+    TARGET_RATES,
+    LocalSurface,
+    ProbePose,
+    Sinking,
+    TactileServo,
+)
 from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
 from canprobe.mechanics.touch.strategies import PathFollower, Rectangle
 from canprobe.mechanics.types import Floats
@@ -45,6 +53,19 @@ BRAKE_S = 0.02
 """Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
 REST_S = 0.25
 """Time at rest on the surface that was found, until the wanted force is reached and the scan goes on."""
+
+CHANGE_M = 5e-3
+"""Path over which a curvature is compared with those before, m: on a cylinder answers differ by less than σ."""
+
+
+def towards(wanted: float, now: float, step: float) -> float:
+    """A target that is one step, at most, nearer to the wanted one."""
+    return now + min(max(wanted - now, -step), step)
+
+
+def target_column(target: str) -> str:
+    """Column of the log with one of `TouchTask.targets`."""
+    return f"target_{target.removeprefix('target_')}"
 
 
 class ContactLearning:
@@ -165,6 +186,7 @@ class TouchTask(ProbingTask):
 
     Attributes:
         targets: what the servo aims at, `target_force_n` and `speed_m_s`; it follows a small step at once.
+        tables: tables over path or time that these follow, by the same names; each has a column of the log.
         learned: what the contact has taught, by the same sensing.
     """
 
@@ -186,6 +208,10 @@ class TouchTask(ProbingTask):
         self._scan_end: int | None = None
         self._task = task
         self.targets = {"target_force_n": task.force, "speed_m_s": task.scan.speed if task.scan is not None else 0.0}
+        self.tables = dict(task.tables)
+        self.targets |= {name: table.at(0.0, 0.0) for name, table in self.tables.items()}
+        self._shares = dict.fromkeys(self.tables, 1.0)
+        self._answered: tuple[Floats, float] = np.zeros(2), -math.inf  # fading mean of κ, and the path up to it
         self._touched = False
         self._servo: TactileServo  # from the first touch on, as the next
         self._sinking: Sinking
@@ -221,6 +247,11 @@ class TouchTask(ProbingTask):
         command = super().step(measurement)
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
+            for name, table in self.tables.items():
+                now = self.targets[name]
+                wanted = self._shares[name] * table.at(self._servo.travelled, self._scan_t)
+                self._columns[target_column(name)] = now
+                self.targets[name] = towards(wanted, now, TARGET_RATES[name] * self._dt)
         return command
 
     def update(self) -> None:
@@ -240,8 +271,21 @@ class TouchTask(ProbingTask):
             if contact is not None and self._touched:
                 all_observed = learned.follow(estimate, contact, self._servo.surface)
                 self._columns = self._columns | learned.columns
+                if all_observed:
+                    self._ease(estimate)
                 if all_observed and self.phase not in LEAVING and is_too_hollow(estimate, self.sensing.radius):
                     self._at_hollow(-1.0 / float(estimate.kappa[1]))
+
+    def _ease(self, estimate: SurfaceEstimate) -> None:
+        """Lower the targets by an answer: the speed where the curvature changes, the force where it is known well."""
+        kappa, C, path = np.array(estimate.kappa), estimate.covariance, self._servo.travelled
+        sigma = math.sqrt(max(0.0, C[0, 0] + 2.0 * C[1, 1] + C[2, 2]))
+        before, till = self._answered
+        mean = kappa + (before - kappa) * math.exp((till - path) / CHANGE_M)
+        self._answered, change = (mean, path), max(float(np.linalg.norm(kappa - mean)), 1e-9)
+        eased = {"speed_m_s": sigma / change, "target_force_n": sigma / (self._task.sigma_wanted or 1.0)}
+        for name, table in self.tables.items():
+            self._shares[name] = max(table.least_share, min(1.0, eased[name]))
 
     # sensing and supervision
 

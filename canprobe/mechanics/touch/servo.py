@@ -45,6 +45,10 @@ BRAKE_M = 1e-3
 SINK_SPEED = 4e-3
 """Speed of `TactileServo.step` out of a first touch that went too deep, m/s."""
 
+TARGET_RATES = {"target_force_n": 2.0, "speed_m_s": 0.1}
+"""Highest rates at which targets change, N/s and m/s²: a jump is a ramp in time. At 2 N/s the delay of 27 ms leaves the
+force 0.05 N behind, as much as the servo errs at rest."""
+
 
 @dataclass(frozen=True, slots=True)
 class SurfaceGains:
@@ -75,7 +79,7 @@ class LocalSurface:
         gains: correction bandwidths.
     """
 
-    def __init__(self, point: Floats, normal: Floats, gains: SurfaceGains = SurfaceGains()) -> None:
+    def __init__(self, point: Floats, normal: Floats, gains: SurfaceGains) -> None:
         self._point: Sequence[float]
         self._normal: Sequence[float]
         self.move_to(point, normal)
@@ -203,6 +207,7 @@ class TactileServo:
         depth: indentation that `step` holds, m; of a force (N) it is `indentation_from_force`.
         speed: speed of the contact over the surface in `step`, m/s; 0 at first. It counts from `SETTLE_S` after the
             first step on.
+        travelled: path of the reference contact over the surface, m.
     """
 
     depth = speed = _t = _blind = 0.0
@@ -219,6 +224,7 @@ class TactileServo:
         rolling_share: float = 0.0,
     ) -> None:
         self.surface = surface
+        self.travelled = 0.0
         self._follower = follower
         self._heading, self._across, self._up = axes.tolist()
         self._origin = origin.tolist()
@@ -246,10 +252,9 @@ class TactileServo:
         """
         point, normal = checked("contact.p_base", contact.p_base, (3,)), checked("contact.n_base", contact.n_base, (3,))
         axes = np.array([*transported(checked("along", along, (3,)).tolist(), normal.tolist()), normal])
+        surface = LocalSurface(point, normal, SurfaceGains())
         follower = None if strategy is None else PathFollower(strategy, BRAKE_M)
-        servo = cls(
-            LocalSurface(point, normal), follower, axes=axes, origin=point, probe_radius=positive("radius", radius)
-        )
+        servo = cls(surface, follower, axes=axes, origin=point, probe_radius=positive("radius", radius))
         servo.depth, servo._first = positive("depth", depth), contact
         return servo
 
@@ -304,7 +309,9 @@ class TactileServo:
         """
         foot, normal = self.surface.foot(self._reference)
         if speed > 0 and self._follower is not None:
-            foot, normal = self._march(self._follower, foot, normal, speed * self._follower.pace * dt)
+            distance = speed * self._follower.pace * dt
+            foot, normal = self._march(self._follower, foot, normal, distance)
+            self.travelled += distance
         self._reference = foot
         reach, share = self._radius - depth, self._share
         (f0, f1, f2), (n0, n1, n2), (p0, p1, p2), flat = foot, normal, self._first_pole, 1 - share

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.mechanics.touch.checks import checked, read_only
-from canprobe.mechanics.touch.estimate.matrix import MAX_HIDDEN_ENTRY, UncertainMatrix, matrix_in
+from canprobe.mechanics.touch.estimate.matrix import MAX_HIDDEN_ENTRY, UncertainMatrix, linear_map, matrix_behind
 from canprobe.mechanics.touch.estimate.observed import CurvatureInformation, Decision, outside, tensor
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import transport
@@ -165,9 +165,13 @@ class SurfaceEstimate:
         Raises:
             UsageError: T_base_frame is no finite (4, 4).
         """
-        to_contact = np.linalg.inv(self.T_frame_contact)
-        T = np.eye(4) if T_base_frame is None else to_contact @ checked("T_base_frame", T_base_frame, (4, 4))
-        return matrix_in(T, self.S, (self.covariance, self.combinations, self.information), self.model_root)
+        T_contact_frame: Floats = np.eye(4)
+        if T_base_frame is not None:
+            T_frame = checked("T_base_frame", T_base_frame, (4, 4))
+            T_contact_frame = np.asarray(np.linalg.solve(self.T_frame_contact, T_frame))
+        return matrix_behind(
+            linear_map(T_contact_frame), self.S, (self.covariance, self.combinations, self.information), self.model_root
+        )
 
     def predict(self, point: Floats) -> tuple[Floats, Floats]:
         """Point and outward normal of the estimated surface where a line along the contact normal meets it.

@@ -51,21 +51,19 @@ class UncertainMatrix(NamedTuple):
         Args:
             T: (4, 4) transform that takes new coordinates to the present ones, m.
         """
-        return _mapped(_linear_map(checked("T", T, (4, 4))), self.S[UPPER], self.covariance)
+        return _mapped(linear_map(checked("T", T, (4, 4))), self.S[UPPER], self.covariance)
 
 
-def matrix_in(
-    T_contact_frame: Floats, S: Floats, K: tuple[Floats, Floats, Floats], model_root: Floats | None
-) -> UncertainMatrix:
-    """The matrix of an answer in a frame, from fields of the answer (`SurfaceEstimate.matrix`).
+def matrix_behind(L: Floats, S: Floats, K: tuple[Floats, Floats, Floats], model_root: Floats | None) -> UncertainMatrix:
+    """The matrix of an answer behind a map of its ten unknowns (`linear_map`), from fields of the answer.
 
     Args:
-        T_contact_frame: (4, 4) the frame, to the contact frame.
+        L: (10, 10) map to the frame.
         S: (4, 4) in the contact frame.
-        K: covariance, combinations and information of the curvature.
+        K: covariance, combinations and information of K.
         model_root: (n, 9) root of the information about the nine parameters; None where it is not known.
     """
-    L, (covariance, combinations, information) = _linear_map(T_contact_frame), K
+    covariance, combinations, information = K
     stated = bool(np.isfinite(covariance).all())
     V = np.eye(3) if stated else combinations
     # an entry in the frame may hold observed combinations alone, where each entry in the contact frame holds others too
@@ -88,7 +86,7 @@ def matrix_in(
     return _mapped(L, S[UPPER], C, hidden)
 
 
-def _linear_map(T: Floats) -> Floats:
+def linear_map(T: Floats) -> Floats:
     """(10, 10) map of the ten unknowns to those of Tᵀ S T."""
     L: Floats = (T.T @ _UNIT @ T)[:, UPPER[0], UPPER[1]].T
     return np.where(np.abs(L) > 1e-12 * np.abs(L).max(axis=1, keepdims=True), L, 0.0)
