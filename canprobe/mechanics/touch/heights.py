@@ -312,10 +312,7 @@ class Heights(PlacedShape):
         """Every local minimum of the distance within reach, where there are several, as on the edges of a groove."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [place for place in self._minima(x, y, z, reach) if place[0] < reach * reach]
-        if len(near) < 2:
-            return None
-        feet = np.array([self._foot_at(place, x, y, z) for place in near])
-        return self._placed(feet[:, :3], feet[:, 3:6], feet[:, 6], feet[:, 7:9], np.zeros(len(feet)))
+        return self._several([self._foot_at(place, x, y, z) for place in near])
 
     def gaps(self, points_base: Floats) -> Floats:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface.
