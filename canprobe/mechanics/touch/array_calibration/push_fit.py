@@ -47,7 +47,7 @@ def fit_force(
     """
     dwells = [d for d, _ in touches]
     forces = [_forces(d, patch) for d in dwells]
-    units = [math.sqrt(2.0 * math.sqrt(_det(d, patch.pad.radius_m)) / (math.pi * stiffness)) for d in dwells]
+    units = [indentation_from_force(1.0, stiffness, patch.pad.radius_m, d.kappa) for d in dwells]
     creep, sigma = _creep(dwells, forces, units)
     loads = [i for i, d in enumerate(dwells) if d.force is not None]
     pairs = zip(dwells, forces, strict=True)
@@ -66,11 +66,6 @@ def fit_force(
         spread=spread,
         highest=float(corrected.max()),
     )
-
-
-def _det(dwell: Dwell, radius: float) -> float:
-    a, b = (0.5 * (1.0 / radius + kappa) for kappa in dwell.kappa)
-    return a * b
 
 
 def _forces(dwell: Dwell, patch: PatchCalibration) -> Floats:

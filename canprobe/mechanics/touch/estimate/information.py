@@ -83,7 +83,8 @@ class InformationFilter:
         self.length = length
         self.root: Floats
         self.inverse: Floats
-        self._prior_rows = _prior_rows(prior, length)
+        self._prior_rows = DIFFUSE_INFORMATION * np.eye(9)  # root of the information without samples
+        self._prior_rows[3:6] = prior.rows(length)[0][:3]
         self.omitted = OmittedTerms(self._prior_rows.T @ self._prior_rows, correlation)
         self.begin(np.eye(4))
 
@@ -184,10 +185,3 @@ class InformationFilter:
         self.omitted.carry(back, x[0], x[1])
         R = self.T[:3, :3]
         self.T = homogeneous(R.dot(turned), self.T[:3, 3] + self.length * R.dot(x))
-
-
-def _prior_rows(prior: Prior, length: float) -> Floats:
-    """(9, 9) root of the information that the filter has without samples."""
-    own = DIFFUSE_INFORMATION * np.eye(9)
-    own[3:6] = prior.rows(length)[0][:3]
-    return own
