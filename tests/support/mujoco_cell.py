@@ -1,5 +1,7 @@
 """A second plant, whose arm and contact are MuJoCo's: a Panda with a ball at its flange, and an object.
 
+    python tests/support/mujoco_cell.py     # the table of docs/external-arm.md
+
 The arm is the Franka Panda of gymnasium-robotics (after github.com/vikashplus/franka), without its hand; geometry,
 masses, actuators and damping are that file's. The contact is MuJoCo's soft contact of two bodies, with friction. Of
 canprobe's plant one thing remains, the sensor: the pressure on the taxels at MuJoCo's depth, point and normal. The
@@ -9,6 +11,7 @@ object's curvature there, which the sensor needs and a contact of two points doe
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -18,12 +21,19 @@ from typing import Any
 import mujoco
 import numpy as np
 
+import canprobe
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.plant.contact import PlantState, ProbeState, SolvedContact
 from canprobe.cell.plant.elastic_contact import NO_CONTACT, Indentation, depth_for_force
-from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.pressure import pad_coordinates
+from canprobe.cell.results.open_cell import OpenCell
 from canprobe.cell.scene.setup import Touch
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.fieldbus.bus.port import Port
+from canprobe.lab.studies.region_scores import scores_of
+from canprobe.lab.studies.result import CHI2_95_OF_3
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.flange import flange_joints, flange_pose
 from canprobe.mechanics.robot.model import joints_to_units
@@ -72,7 +82,7 @@ class Layer:
 
 
 def panda(
-    layer: Layer, T_flange_probe: Floats, radius_m: float, geom: dict[str, Any], *, timestep_s: float = 5e-4
+    layer: Layer, T_flange_probe: Floats, radius_m: float, geom: dict[str, Any], *, timestep_s: float = 1e-3
 ) -> mujoco.MjModel:
     """The cell's model.
 
@@ -166,33 +176,38 @@ class MujocoCell:
     Args:
         plan: plan of a cell with an external arm and a sphere or a cylinder.
         arm_type: `MujocoArm` of docs/example.
-        layer: the contact; None: as stiff as the scene's layer at the scene's force, with some friction.
+        friction: of the contact, which is otherwise as stiff as the scene's layer at the scene's force.
 
     Attributes:
         arm: the arm, to be given to the cell.
         now_ns: time of the cell, once its port is known.
     """
 
-    def __init__(self, plan: Plan, arm_type: Any, layer: Layer | None = None) -> None:
+    def __init__(self, plan: Plan, arm_type: Any, friction: float = Layer.friction) -> None:
         setup = plan.setup
         arm, task, shape, stiffness = setup.needed_arm(), setup.task, setup.truth.object, setup.truth.stiffness
         assert isinstance(task, Touch) and shape is not None
         self._model, self._shape, self._radius = arm.model, shape, setup.probe.radius
         start = flange_pose(arm.model, arm.q_start)
         self._T_base_world = forward(arm.model.chain, arm.q_start) @ np.linalg.inv(start)
-        if layer is None:
-            near = shape.closest(shape.T_base_object[:3, 3])
-            kappa = float(near.kappa[0]), float(near.kappa[1])
-            layer = Layer(task.force, depth_for_force(task.force, kappa, self._radius, stiffness))
+        near = shape.closest(shape.T_base_object[:3, 3])
+        depth = depth_for_force(task.force, (float(near.kappa[0]), float(near.kappa[1])), self._radius, stiffness)
+        layer = Layer(task.force, depth, friction=friction)
         geom = geom_of(shape, np.linalg.inv(self._T_base_world))
         self.simulated = panda(layer, setup.truth.T_flange_probe, self._radius, geom)
         self.now_ns: Callable[[], int] = lambda: 0
-        self.arm = arm_type(self.simulated, "flange", lambda: self.now_ns(), Q_START)
+        self.arm = arm_type(self.simulated, "flange", lambda: self.now_ns(), Q_START)  # noqa: PLW0108 - another one later
         self.arm.place(start)
         self._probe = self.simulated.body("probe").id
 
-    def stand_in(self, plant: Plant) -> None:
-        """Take the place of a plant's arm and contact."""
+    def stand_in(self, session: Session) -> None:
+        """Take the place of the arm and the contact in the plant of a session, by the time of its bus."""
+
+        def around(port: Port) -> Port:
+            self.now_ns = port.clock.now_ns
+            return port
+
+        session.around, plant = around, session.buses.world.plant
         plant.arm = self  # type: ignore[assignment]
         plant.motor_counts = lambda axis: self.motors()[0][axis]
         plant._solver = self  # type: ignore[assignment]
@@ -224,3 +239,102 @@ class MujocoCell:
         push = tuple((contact.force * np.array(near.normal)).tolist())
         uv = pad_coordinates((x, y, z), self._radius)
         return SolvedContact(q, probe, near, depth, 0.0, contact, uv, (x, y, z), push)
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Figures of a scan, against the plant that it ran on.
+
+    Attributes:
+        completed: it ended by itself.
+        force_error, force_highest: error of the true force, RMS over the scan, and the highest one, shares of the goal.
+        reading_bias, reading_error: what the array read less the true force, mean and RMS, shares of the goal.
+        contact_fraction: share of the scan in contact.
+        kappa_per_m: mean estimated curvatures.
+        kappa_error_per_m, stated_per_m: RMS error of the answers in the loop, and what they state (Frobenius).
+        held: share of the answers whose stated region of 95 % holds the true curvature.
+        depth_m: mean depth.
+    """
+
+    completed: bool
+    force_error: float
+    force_highest: float
+    reading_bias: float
+    reading_error: float
+    contact_fraction: float
+    kappa_per_m: list[float]
+    kappa_error_per_m: float
+    stated_per_m: float
+    held: float
+    depth_m: float
+
+
+PLACE = {"cell": "external", "arm.mount_mm": [-620, -122.5, 0], "arm.start_mm": [500, 0, 504], "shape.also": []}
+"""The cell of an external arm, whose base frame is where a Panda reaches the object well."""
+
+
+def scan(name: str, arm_type: Any = None, *, friction: float = Layer.friction, **keys: Any) -> Scan:
+    """Scan the object of a packaged scene.
+
+    Args:
+        name: name of the scene.
+        arm_type: `MujocoArm` of docs/example; None: on canprobe's own plant, with its emulated external arm.
+        friction: of MuJoCo's contact.
+        **keys: keys of the scene, with two underscores for a dot.
+    """
+    plan = canprobe.plan(name, PLACE | {key.replace("__", "."): value for key, value in keys.items()})
+    task: Any = make_task(plan)
+    simulated = MujocoCell(plan, arm_type, friction) if arm_type is not None else None
+    cell = OpenCell(plan, RunOptions(arm=None if simulated is None else simulated.arm), task=task)
+    if simulated is not None:
+        simulated.stand_in(cell.session)
+    with cell:
+        result = cell.run(task)
+    summary, session = result.summary, cell.session
+    contact, goal = summary["contact"], summary["contact"]["force_target_n"]
+    answers = [row for row in scores_of(session, task.shape.records)[0] if row]
+    _, errors, stated, squares, _ = np.array(answers).T
+    first, last = task.record().scan_cycles
+    return Scan(
+        summary["completed"],
+        contact["force_rms_error_n"] / goal,
+        contact["force_max_n"] / goal,
+        contact["force_true_bias_n"] / goal,
+        contact["force_true_rms_error_n"] / goal,
+        contact["contact_fraction"],
+        summary["shape"]["kappa_est_per_m"],
+        math.sqrt(errors.mean()),
+        math.sqrt(stated.mean()),
+        float(np.mean(squares < CHI2_95_OF_3)),
+        float(session.buses.truth["depth_m"][first:last].mean()),
+    )
+
+
+HEADINGS = (
+    *("object", "plant", "force off by (RMS)", "highest", "reading less true force (mean, RMS)"),
+    *("curvature, 1/m", "off by (RMS)", "stated", "regions that hold it"),
+)
+
+
+def main(*names: str) -> None:
+    """Print a table of scans on both plants."""
+    from mujoco_arm import MujocoArm
+
+    print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
+    plants = ("canprobe's", {}), ("MuJoCo's", {"arm_type": MujocoArm})
+    rubbing = "MuJoCo's, friction 0.5", {"arm_type": MujocoArm, "friction": 0.5}
+    for name in names:
+        for plant, given in (*plants, rubbing):
+            found = scan(name, **given)
+            first, second = found.kappa_per_m
+            cells = (
+                *(name, plant, f"{found.force_error:.1%}", f"{found.force_highest:.0%}"),
+                *(f"{found.reading_bias:+.1%}, {found.reading_error:.1%}", f"{first:.2f}, {second:.2f}"),
+                *(f"{found.kappa_error_per_m:.2f}", f"{found.stated_per_m:.2f}", f"{found.held:.0%}"),
+            )
+            print("| " + " | ".join(cells).replace("%", " %") + " |", flush=True)
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "example" / "arm"))
+    main(*(sys.argv[1:] or ("sphere", "cylinder")))

@@ -32,6 +32,8 @@ DEVIATION_RAD = math.radians(1.0)
 """Angle by which the joints of a touch may go beyond its planned way, which knows neither depth nor servo; for a
 prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
 such bound."""
+MAX_OFF_M = 0.3e-3
+"""Distance of the probe from a pose on a carrier beyond which that is out of reach, m: a step falls short by less."""
 PARKED_ABOVE_M = 5e-3
 """Height of an emulated arm above the approach's first point at power on, m."""
 
@@ -244,7 +246,7 @@ def _check_touch(
         return speeds, problems + _too_fast(speeds, "let the carrier move slower")
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
     rates = np.abs(np.diff(joints[_POSES_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
-    speeds = stops.speeds(rates.max(axis=0) + carried)
+    speeds = stops.speeds(np.maximum(rates.max(axis=0), carried))
     if isinstance(task.scan.strategy, Rectangle):  # the path may take any direction
         along, across = np.abs(np.diff(path.points, axis=0) @ task.approach.axes[:2].T).T
         speeds = stops.speeds(np.hypot(rates[along >= across].max(axis=0), rates[along < across].max(axis=0)))
@@ -254,23 +256,28 @@ def _check_touch(
 
 
 def _check_carried(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> tuple[Floats, list[str]]:
-    """Highest joint speeds (n,), rad/s or m/s, to follow a carrier alone in a run, and why it cannot; 0 without one.
+    """Highest joint speeds (n,), rad/s or m/s, of a run on a carrier, and why the arm cannot do it; 0 without one.
+
+    The joints follow the poses as those of the task will.
 
     Args:
         q_start: joint positions at the first contact (n,), rad or m.
     """
-    from canprobe.cell.planning.surface_path import CARRIED_STEP_S, carried
-    from canprobe.mechanics.touch.servo import ProbePose
-
     if (carrier := task.carrier) is None:
         return np.zeros_like(q_start), []
-    T = forward(task.arm.model.chain, q_start) @ task.probe.T_flange_probe
-    far = "carrier: {:.1f} s into the run the contact is out of reach: {{why}}; shorten task.duration_s"
-    run = carried(task, carrier, path, ProbePose(T[:3, 3], T[:3, 2]))
-    poses = (_Pose(one.centre, -one.pole, _TOUCH_MOVE_RAD, far.format(t)) for t, both in run for one in both)
-    joints = _follow(task.arm, task.probe, poses, q_start)
-    rates = np.abs(joints[1::2] - joints[::2]) / CARRIED_STEP_S
-    return rates.max(axis=0), stops.problems(joints, touching=True)
+    from canprobe.cell.planning.surface_path import carried, in_mm
+    from canprobe.mechanics.touch.probe_motion import PoseSteps
+
+    steps, joints, rates, before = PoseSteps(task.arm.model, task.probe.T_flange_probe, q_start), [q_start], [], None
+    for t, seconds, pose in carried(task, carrier, path):
+        move = np.array(steps.step(joints[-1].tolist(), pose, seconds))
+        if before is not None and float(np.linalg.norm(steps.at.flange - before.centre)) > MAX_OFF_M:
+            place = f"the probe's centre at {in_mm(before.centre)} mm is out of reach"
+            raise PlanError([f"carrier: {t:.1f} s into the run {place}; shorten task.duration_s, or move the object"])
+        joints.append(joints[-1] + move)
+        rates.append(np.abs(move) / seconds)
+        before = pose
+    return np.max(rates, axis=0), stops.problems(np.array(joints), touching=True)
 
 
 def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> str | None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.cell.planning.contact import edge_margin
+from canprobe.cell.planning.model import TASK_OVERHEAD_S
 from canprobe.cell.scene.setup import Approach, Arm, Calibrate, Carrier, Probe, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
@@ -31,8 +32,8 @@ SAMPLES = 240
 """Number of points of a path."""
 LINE_M, MIN_LINES, MAX_LINES = 4e-3, 4, 14
 """Distance between the lines on which a rectangle is checked, m; least and largest number of them."""
-CARRIED_STEP_S, MAX_CARRIED = 0.1, 1000
-"""Time between two poses at which a run on a carrier is checked, s, 2.5 mm of a path; of a long run, their number."""
+CARRIED_STEP_S, MAX_CARRIED_STEPS = 0.05, 10_000
+"""Longest step at rest in the check of a run on a carrier, s, and about the largest number of its steps."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
 _BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
@@ -265,10 +266,7 @@ def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[Timed
     approach, radius = task.approach, task.probe.radius
     above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
     yield from _moving(LineMotion(pose, above, MOVE_SPEED_M_S))
-    poses = [
-        ProbePose(point + radius * normal, -pole)
-        for point, normal, pole in zip(path.points, path.normals, poles_at_contacts(task, path), strict=True)
-    ]
+    poses = contact_poses(task, path)
     yield ProbePose(poses[0].centre, above.pole), approach.clearance / approach.speed
     yield poses[0], SETTLE_S
     if task.scan is not None:
@@ -276,28 +274,33 @@ def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[Timed
             yield here, float(np.linalg.norm(here.centre - last.centre)) / task.scan.speed
 
 
-def carried(
-    task: Touch, carrier: Carrier, path: SurfacePath, pose: ProbePose
-) -> Iterator[tuple[float, list[ProbePose]]]:
-    """Times, s, of a run on a carrier that moves from position 0 on, with the pose in contact then, in base.
+def carried(task: Touch, carrier: Carrier, path: SurfacePath) -> Iterator[tuple[float, float, ProbePose]]:
+    """Poses in contact, in base, of a run on a carrier that moves from position 0 on: time, step in time, s, and pose.
 
-    Beside it that to which the carrier alone takes it in `CARRIED_STEP_S`. The path goes round until the run, or one
-    turn of the carrier, is over.
+    The path goes round until the run, or one turn of the carrier, is over. A very long run is gone through faster.
     """
-    way = [*over_path(task, path, pose)]
-    again = way[1 - len(path.points) :] if task.scan is not None else [(way[-1][0], CARRIED_STEP_S)]
+    poses, scan = contact_poses(task, path), task.scan
+    resting, ways = (poses[0], CARRIED_STEP_S), np.linalg.norm(path.points - np.roll(path.points, 1, axis=0), axis=1)
+    steps = (
+        [(poses[0], CARRIED_STEP_S)]
+        if scan is None
+        else [(pose, max(way / scan.speed, 1e-3)) for pose, way in zip(poses, ways.tolist(), strict=True)]
+    )
     turn_s = 2.0 * math.pi / carrier.speed if carrier.motion.point is not None else math.inf
-    run_s = max(min(task.duration_s, turn_s), 2.0 * CARRIED_STEP_S)
-    t, due_s = sum(seconds for _, seconds in way[: -len(again)]), 0.0
-    end_s, step_s = t + run_s, max(CARRIED_STEP_S, run_s / MAX_CARRIED)
-    for one, seconds in itertools.cycle(again):
-        t += seconds
-        if t >= min(due_s, end_s):
-            at = (carrier.motion.T_base_carrier(carrier.speed * time_s) for time_s in (t, t + CARRIED_STEP_S))
-            yield t, [one.moved(T) for T in at]
-            due_s = t + step_s
+    end_s, t = TASK_OVERHEAD_S + min(task.duration_s, turn_s), 0.0
+    pace = max(1.0, end_s * len(steps) / sum(seconds for _, seconds in steps) / MAX_CARRIED_STEPS)
+    before = [resting] * math.ceil(TASK_OVERHEAD_S / CARRIED_STEP_S)
+    for pose, seconds in itertools.chain(before, itertools.cycle(steps)):
+        t += pace * seconds
+        yield t, seconds, pose.moved(carrier.motion.T_base_carrier(carrier.speed * t))
         if t >= end_s:
             return
+
+
+def contact_poses(task: Touch, path: SurfacePath) -> list[ProbePose]:
+    """The pose of the probe at each contact."""
+    places = zip(path.points, path.normals, poles_at_contacts(task, path), strict=True)
+    return [ProbePose(point + task.probe.radius * normal, -pole) for point, normal, pole in places]
 
 
 def round_ball(task: Calibrate, pose: ProbePose) -> Iterator[TimedPose]:

@@ -61,9 +61,9 @@ class Plant:
             if config.fidelity == "ideal":
                 self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
             else:
-                from canprobe.cell.plant.dynamic_arm import make_dynamic_arm
+                from canprobe.cell.plant.dynamic_arm import DynamicArm
 
-                self.arm = make_dynamic_arm(config)
+                self.arm = DynamicArm(config)
             self.motor_counts, self.torque_permille = self.arm.motor_counts, self.arm.torque_permille
             if isinstance(self.arm, IdealArm) and config.object is not None:
                 self.arm.push = lambda: self._solver.torques(self._solution())

@@ -339,8 +339,7 @@ def write_files(result: RunData, out: Path) -> None:
     if (surface_map := result.surface_map) is not None:
         from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
 
-        answers = next(iter(result.estimates.values()), [])
-        writers.append(lambda: save_surface_map(surface_map, out / SURFACE, answers))
+        writers.append(lambda: save_surface_map(surface_map, out / SURFACE, next(iter(result.estimates.values()), [])))
     failed = []
     for write in writers:
         try:

@@ -126,8 +126,8 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
             f"{file}: expected format_version {FORMAT_VERSION}, got {version} of another canprobe; make the map again"
             f' of the run\'s contacts: canprobe.replay("{file.parent}").surface_map'
         )
-    needed = _COLUMNS if version == FORMAT_VERSION else _COLUMNS[: -len(_PER_ANSWER)]
-    if missing := [name for name in needed if name not in columns]:
+    newer = () if version == FORMAT_VERSION else tuple(_PER_ANSWER)
+    if missing := [name for name in _COLUMNS if name not in columns and name not in newer]:
         raise UsageError(f"{file}: missing {', '.join(missing)}")
     if unknown := [name for name in columns if name not in _COLUMNS]:
         raise UsageError(f"{file}: unknown {', '.join(unknown)}; expected {', '.join(_COLUMNS)}")

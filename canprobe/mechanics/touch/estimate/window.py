@@ -16,9 +16,9 @@ from canprobe.mechanics.touch.checks import whole
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
-from canprobe.mechanics.touch.estimate.differences import Pairs, chord_pairs, solve_pairs, usable_lag
+from canprobe.mechanics.touch.estimate.differences import Pairs, pairs_of, solve_pairs, usable_lag
 from canprobe.mechanics.touch.estimate.estimator import Estimator
-from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, batch_of, fit_ml, working_frame
 from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.prior import Prior
@@ -56,13 +56,12 @@ class WindowEstimator(Estimator):
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
         self._kept: deque[tuple[ContactSample, MeasuredContact]] = deque(maxlen=kept)
-        self._pad = PadPathLength(sigma_point)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._gate.passes(sample, self.dropped):
-            self._kept.append((sample, self._pad.measured(sample, self._gate, self._coupling)))
+            self._kept.append((sample, self._gate.measured(sample, self._coupling)))
             self._answer = None
 
     def estimate(self) -> SurfaceEstimate | None:
@@ -123,7 +122,7 @@ class ChordEstimator(WindowEstimator):
     """`n_i − n_0 = 2 S₃ (p_i − p_0)` over a window, p_0 the last sample."""
 
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
-        return solve_pairs(touches, chord_pairs(touches), "chord")
+        return solve_pairs(touches, pairs_of(touches), "chord")
 
 
 class Chen1996Estimator(WindowEstimator):
