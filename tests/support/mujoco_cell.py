@@ -45,7 +45,7 @@ Q_START = np.array((0.0, 0.2, 0.0, -2.2, 0.0, 0.83, 0.785))
 FLANGE_M = (0.0, 0.0, 0.107)
 """Place of the flange behind the last joint, after Franka's data sheet."""
 STIFFER = 16.0
-"""Gain of the joints over that of the file, whose arm is as soft as 1.5 N/mm at the flange, and lags by 0.1 s."""
+"""Gain of the joints over that of the file, whose arm gives way by 0.6 mm/N at the flange and lags by 0.1 s."""
 IMPEDANCE = 0.05
 """MuJoCo's d of the contact at the working depth. A soft constraint resists acceleration as `d / (1 - d)` of the mass
 of the bodies does, which no layer of rubber has: a small d makes that small."""
@@ -310,6 +310,8 @@ def scan(name: str, arm_type: Any = None, *, friction: float = Layer.friction, *
     )
 
 
+SCAN_S = 3.0
+"""Length of a scan of tests and of the table, s: 75 mm of path, of which the last 55 are scored."""
 HEADINGS = (
     *("object", "plant", "force off by (RMS)", "highest", "reading less true force (mean, RMS)"),
     *("curvature, 1/m", "off by (RMS)", "stated", "regions that hold it"),
@@ -325,7 +327,7 @@ def main(*names: str) -> None:
     rubbing = "MuJoCo's, friction 0.5", {"arm_type": MujocoArm, "friction": 0.5}
     for name in names:
         for plant, given in (*plants, rubbing):
-            found = scan(name, **given)
+            found = scan(name, **given, task__duration_s=SCAN_S)
             first, second = found.kappa_per_m
             cells = (
                 *(name, plant, f"{found.force_error:.1%}", f"{found.force_highest:.0%}"),

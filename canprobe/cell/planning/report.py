@@ -318,8 +318,8 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
     for name, table in setup.touch.tables.items() if setup.touch is not None else ():
         what, unit, si = {"target_force_n": ("force", "N", 1.0), "speed_m_s": ("speed", "mm/s", 1e-3)}[name]
         low, high, over = table.lowest / si, table.values.max() / si, "path" if table.over_path else "time"
-        jumps = f"jumps are ramps of {TARGET_RATES[name] / si:g} {unit}/s"
-        yield [what, f"{low:.3g} to {high:.3g} {unit} over the {over}; {jumps}"]
+        most = f"{TARGET_RATES[name] / si:g} {unit}/s".replace("/s/s", "/s²")
+        yield [what, f"{low:.3g} to {high:.3g} {unit} over the {over}, changed by {most} at most"]
     if (shape := setup.shape) is not None:
         also = f"; on the same data afterwards: {', '.join(shape.also)}" if shape.also else ""
         yield ["estimator", shape.method + also]

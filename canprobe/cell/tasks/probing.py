@@ -205,7 +205,7 @@ class ProbingTask(Task):
             self._begun = True
             if track is not None:
                 self._T = self._T_next = T_base_carrier
-            self._begin(self._pose)
+            self._begin(self._commanded)
         self._measured = measurement.q
         if self.phase in COMING and track is None:  # where it came along there is something else by now
             self._way_here.add(measurement.q, measurement.q_age)
@@ -222,13 +222,11 @@ class ProbingTask(Task):
         return self._command(pose)
 
     @property
-    def _pose(self) -> ProbePose:
+    def _commanded(self) -> ProbePose:
         """The commanded pose in the frame of the contacts."""
-        return (
-            self._motion.pose
-            if self.sensing.track is None
-            else self._motion.pose.moved(np.asarray(np.linalg.inv(self._T)))
-        )
+        if self.sensing.track is None:
+            return self._motion.pose
+        return self._motion.pose.moved(np.asarray(np.linalg.inv(self._T)))
 
     def retreat(self, reason: str) -> None:
         if self._begun and self.reason is None and self.phase is not Phase.DONE:
@@ -336,7 +334,7 @@ class ProbingTask(Task):
         """
         if self._measured is not None and self.phase in COMING:
             self._retrace = self._way_here.back(self._measured, self._motion.step_max)
-        pose = self._pose
+        pose = self._commanded
         self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED_M_S, at_once=True)
         self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
         self._enter(Phase.RETREAT)
@@ -347,7 +345,7 @@ class ProbingTask(Task):
             grows = f"the force grows on the way back, to {touch.force:.2f} N: the probe was stopped there"
             self.reason = grows if self.reason is None else f"{self.reason}; {grows}"
             self._enter(Phase.DONE)
-            return self._pose
+            return self._commanded
         pose = self._line.at(self._t)
         over = self._t >= self._line.duration + self._lead_s
         if over if self._retrace is None else self._retrace.step(self._dt) is None:

@@ -345,7 +345,7 @@ class TouchTask(ProbingTask):
     def _let_go(self) -> None:
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
-        self._draw_back(-RETREAT_WAY * self._pose.pole)
+        self._draw_back(-RETREAT_WAY * self._commanded.pole)
 
     # phases: each returns the pose for this cycle
 
@@ -418,7 +418,7 @@ class TouchTask(ProbingTask):
         """Leave the path for where the object should be."""
         if self.phase is Phase.SCAN:
             self.losses.append(Loss(self._cycle))
-        self._search = Search(self._pose, self._velocity)
+        self._search = Search(self._commanded, self._velocity)
         self._floor = self._touch.force
         self._asked, self._velocity = None, np.zeros(3)
         self._searched_before = self.losses[-1].searched

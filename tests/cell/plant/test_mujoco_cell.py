@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from mujoco_cell import Q_START, Layer, felt, panda, scan
+from mujoco_cell import Q_START, SCAN_S, Layer, felt, panda, scan
 
 from canprobe.cell.plant.elastic_contact import depth_for_force, elastic_contact
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
@@ -69,7 +69,7 @@ def test_near_the_working_force_the_contact_is_as_stiff_as_the_layer(arm_type: A
 def test_a_scan_on_another_plant_finds_the_shape_and_keeps_the_force(
     name: str, kappa: tuple[float, float], arm_type: Any
 ) -> None:
-    found = scan(name, arm_type, task__duration_s=3.0)
+    found = scan(name, arm_type, task__duration_s=SCAN_S)
     assert found.completed and found.contact_fraction == 1.0
     assert found.force_error < 0.1 and found.reading_error < 0.1
     assert found.held > 0.9, "the stated regions hold the curvature"

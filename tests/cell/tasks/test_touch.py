@@ -11,9 +11,10 @@ from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.results.text import losses_text
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.requested import FORCE_RATE, Request, RequestedTask
+from canprobe.cell.tasks.requested import Request, RequestedTask
 from canprobe.cell.tasks.task import Loss
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.servo import TARGET_RATES
 
 FOUND = {"searched_mm": 0.93, "regained_after_ms": 465.0}
 GONE = {"searched_mm": 2.0, "regained_after_ms": None}
@@ -92,7 +93,7 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
     log = press.cell.log.arrays()
     target = log["target_force_n"][np.isfinite(log["target_force_n"])]
     assert target[-1] == 3.0
-    assert np.abs(np.diff(target)).max() == pytest.approx(FORCE_RATE * 2.5e-3)  # no step
+    assert np.abs(np.diff(target)).max() == pytest.approx(TARGET_RATES["target_force_n"] * 2.5e-3)  # no step
     first, last = task.record().scan_cycles
     assert last - first == pytest.approx(480, abs=2)
     assert log["force_n"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.1)
