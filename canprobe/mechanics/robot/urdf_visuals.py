@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from os.path import isfile
 from pathlib import Path
 from urllib.parse import unquote
 from xml.etree import ElementTree
@@ -100,7 +99,14 @@ def find_mesh(urdf: Path, name: str) -> Path | None:
         places = [above / part for above in (folder, *folder.parents) for part in (rest, inside)]
     else:
         places = [folder / (unquote(rest) if scheme == "file" else rest)] if scheme in ("", "file") else []
-    return next(filter(isfile, places), None)  # unlike Path.is_file, false for a name that the system refuses
+    return next(filter(_is_file, places), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that the system refuses
+        return False
 
 
 def with_meshes_found(urdf: Path) -> bytes:
