@@ -126,9 +126,9 @@ class _Describer:
     def _sync(self) -> Any:
         readers = [self._names[node_id] for node_id in self._plan.node_ids]
         counter = self._signal("counter", 0, 8, readers, comment="1 to 1019h")
-        period_ms = self._plan.sync.period_ns / 1e6
+        period_ms = _whole_ms(self._plan.sync.period_ns / 1e6)
         return self._message(
-            SYNC_ID, "SYNC", 1, MASTER_NODE_ID, [counter], period_ms=period_ms, comment="synchronisation object"
+            SYNC_ID, "SYNC", 1, MASTER_NODE_ID, [counter], cycle_time=period_ms, comment="synchronisation object"
         )
 
     def _pdos(self, pdos: list[PlannedPdo]) -> Any:
@@ -144,7 +144,7 @@ class _Describer:
             first.node_id if first.direction == "tpdo" else MASTER_NODE_ID,
             signals,
             comment=f"transmission type {first.transmission_type}, {first.rate_hz:g} a second",
-            period_ms=1000 / first.rate_hz if first.layout.synchronous else None,
+            cycle_time=_whole_ms(1000 / first.rate_hz) if first.layout.synchronous else None,
             bus_name=identifier(first.channel),
         )
 
@@ -173,25 +173,14 @@ class _Describer:
         state = self._signal("nmt_state", 0, 7, others if node_id == MASTER_NODE_ID else [_MASTER], choices=choices)
         cob_id, name = HEARTBEAT_BASE + node_id, f"{self._names[node_id]}_heartbeat"
         period_ms = HEARTBEAT_PRODUCED_MS
-        return self._message(cob_id, name, 1, node_id, [state], comment="NMT error control", period_ms=period_ms)
+        return self._message(cob_id, name, 1, node_id, [state], comment="NMT error control", cycle_time=period_ms)
 
-    def _message(
-        self,
-        cob_id: int,
-        name: str,
-        length: int,
-        sender: int,
-        signals: list[Any],
-        *,
-        period_ms: float | None = None,
-        **more: Any,
-    ) -> Any:
+    def _message(self, cob_id: int, name: str, length: int, sender: int, signals: list[Any], **more: Any) -> Any:
         """A message; `more` are arguments of cantools."""
         more = {"bus_name": identifier(self._channels[sender])} | more
         return self._can.Message(
-            cob_id, name, length, signals, senders=[self._names[sender]], is_fd=length > CLASSIC_BYTES,
-            cycle_time=None if period_ms is None else max(1, round(period_ms)), **more,
-        )  # fmt: skip
+            cob_id, name, length, signals, senders=[self._names[sender]], is_fd=length > CLASSIC_BYTES, **more
+        )
 
     def _signal(
         self, name: str, start: int, bits: int, receivers: list[str], choices: dict[int, str] | None = None, **more: Any
@@ -199,6 +188,10 @@ class _Describer:
         """A signal; `more` are arguments of cantools."""
         conversion = self._conversion.factory(choices=choices)
         return self._can.Signal(name, start, bits, receivers=receivers, conversion=conversion, **more)
+
+
+def _whole_ms(period_ms: float) -> int:
+    return max(1, round(period_ms))
 
 
 def _fields(entry: PdoEntry) -> tuple[_Field, ...]:

@@ -172,14 +172,11 @@ class Feed:
     def put(self, record: bytes) -> None:
         """Take one record; it is dropped and counted where the queue is full."""
         self.taken += 1
-        if self.broken:
-            self.dropped += 1
-            return
         if len(self._waiting) >= self._batch:  # the batch before could not leave
             self.flush()
-            if len(self._waiting) >= self._batch:
-                self.dropped += 1
-                return
+        if self.broken or len(self._waiting) >= self._batch:
+            self.dropped += 1
+            return
         self._waiting.append(_LENGTH.pack(len(record)) + record)
         if len(self._waiting) >= self._batch:
             self.flush()

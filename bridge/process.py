@@ -77,8 +77,6 @@ class BridgeProcess(ChildProcess):
             UsageError: when it could not start; with its message.
             ResultsError: when it could not write its file.
         """
-        if self._where is not None:
-            return self._where
         deadline = elapsed_ns() + round(READY_TIMEOUT_S * 1e9)
         while self._where is None and self._error is None:
             left = _left_s(deadline)

@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.lab.bridge.view.meshes import arc, revolved, sheet
 from canprobe.mechanics.touch.heights import Heights
@@ -32,12 +31,6 @@ def object_mesh(shape: PlacedShape) -> Any:
     heights within `REACH_M`, everything else over a square of twice `REACH_M`.
     """
     T, radius = shape.T_base_object, getattr(shape, "radius", math.inf)
-    if isinstance(shape, Heights):
-        points, exists = _relief(shape)
-        mesh = sheet(points)
-        mesh.update_faces(exists.ravel()[mesh.faces].all(axis=1))
-        mesh.remove_unreferenced_vertices()
-        return mesh
     if isinstance(shape, Sphere) and radius <= WHOLE_M:
         return revolved(arc(radius, -math.pi / 2, math.pi / 2, 32), T @ _at(z=-radius))
     if isinstance(shape, Cylinder) and radius <= WHOLE_M:
@@ -48,7 +41,10 @@ def object_mesh(shape: PlacedShape) -> Any:
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
         ring = np.add(arc(radius, -math.pi, math.pi, 48), (shape.ring_radius, 0.0))
         return revolved(ring, T @ _at(x=-shape.ring_radius, z=-radius))
-    return sheet(_sheet(shape, REACH_M))
+    mesh = sheet(_sheet(shape, REACH_M))
+    mesh.update_faces(np.isfinite(mesh.triangles).all(axis=(1, 2)))
+    mesh.remove_unreferenced_vertices()
+    return mesh
 
 
 _ALONG_X = homogeneous(np.array(((0, 0, 1), (0, 1, 0), (-1, 0, 0))), (0.0, 0.0, 0.0))
@@ -62,22 +58,16 @@ def _at(x: float = 0.0, z: float = 0.0) -> Floats:
 def object_lines(shape: PlacedShape) -> Floats:
     """Lines on the surface in two directions, which show its curvature: segments (n, 2, 3), base frame, m."""
     radius = math.inf if isinstance(shape, Cylinder) else getattr(shape, "radius", math.inf)
-    if isinstance(shape, Heights):
-        points, exists = _relief(shape)
-        lines = _lines(np.where(exists[..., None], points, np.nan))
-        return lines[np.isfinite(lines).all(axis=(1, 2))]
-    return _lines(_sheet(shape, min(REACH_M, 0.7 * radius)))  # not over the edge of a body seen from above
-
-
-def _lines(points: Floats) -> Floats:
+    points = _sheet(shape, min(REACH_M, 0.7 * radius))  # not over the edge of a body seen from above
     rows, columns = (np.linspace(0, n - 1, LINES).round().astype(int) for n in points.shape[:2])
     along = [np.stack([points[i, :-1], points[i, 1:]], axis=1) for i in rows]
     across = [np.stack([points[:-1, j], points[1:, j]], axis=1) for j in columns]
-    return np.concatenate([*along, *across])
+    lines = np.concatenate([*along, *across])
+    return lines[np.isfinite(lines).all(axis=(1, 2))]
 
 
-def _relief(shape: Heights) -> tuple[Floats, NDArray[np.bool_]]:
-    """Points (m, n, 3) of heights within `REACH_M` of the origin, base frame, and whether the surface exists (m, n)."""
+def _relief(shape: Heights) -> Floats:
+    """Points (m, n, 3) of heights within `REACH_M` of the origin, base frame; NaN where there is no surface."""
     x, y = (
         np.linspace(max(low, -REACH_M), min(high, REACH_M), RELIEF)
         for low, high in zip(shape.spline.corner, shape.spline.far, strict=True)
@@ -85,12 +75,14 @@ def _relief(shape: Heights) -> tuple[Floats, NDArray[np.bool_]]:
     x, y = (one.ravel() for one in np.meshgrid(x, y, indexing="ij"))
     local = np.column_stack((x, y, shape.spline.many(x, y)[0]))
     T = shape.T_base_object
-    points: Floats = (local @ T[:3, :3].T + T[:3, 3]).reshape(RELIEF, RELIEF, 3)
-    return points, shape.exists(x, y).reshape(RELIEF, RELIEF)
+    points = np.where(shape.exists(x, y)[:, None], local @ T[:3, :3].T + T[:3, 3], np.nan)
+    return points.reshape(RELIEF, RELIEF, 3)
 
 
 def _sheet(shape: PlacedShape, reach_m: float) -> Floats:
-    """Feet (STEPS + 1, STEPS + 1, 3) of a square of the tangent plane, base frame; its front side is outside."""
+    """A grid (m, n, 3) of the surface, base frame: feet of a square of the tangent plane; its front side is outside."""
+    if isinstance(shape, Heights):
+        return _relief(shape)
     T = shape.T_base_object
     across = min(reach_m, 0.85 * shape.radius) if isinstance(shape, Cylinder) else reach_m
     xs, ys = np.linspace(-reach_m, reach_m, STEPS + 1), np.linspace(-across, across, STEPS + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,6 @@ from canprobe.fieldbus.bus.clock import Pace
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.frames import is_sync
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.fit import METHODS, unknown_method
 from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.types import Floats
@@ -183,45 +182,6 @@ def _changes(K: Floats) -> Floats:
     return K[new]
 
 
-def replay_text(summary: dict[str, Any]) -> str:
-    """A summary as text."""
-    online = summary["online"]
-    how = (
-        "the scene's task drove: its scan is replayed"
-        if summary["driven_by"] == "task"
-        else "whoever drove: every contact is fed to the estimators"
-    )
-    counts = ", ".join(
-        f"{count} {name.replace('_', ' ').replace('pdos', 'PDOs').replace('syncs', 'SYNCs')}"
-        for name, count in summary["cycle"].items()
-        if count or name == "cycles"
-    )
-    where = summary["log"] if summary["channel"] is None else f"{summary['log']}, {summary['channel']}"
-    lines = [
-        f"{where}: scene {summary['scene']}",
-        f"  replay     {how}",
-        f"  record     {counts}; {summary['contacts']} contacts",
-        *(f"  log        {note}" for note in summary["notes"]),
-        *_estimate_lines(summary),
-    ]
-    if online is not None:
-        difference = online["K_max_difference_per_m"]
-        lines.append(
-            f"  online     {online['replayed']} of {online['estimates']} estimates"
-            + (f", largest difference {difference:.3g} 1/m" if difference is not None else "")
-        )
-    return "\n".join(lines)
-
-
-def _estimate_lines(summary: dict[str, Any]) -> list[str]:
-    if summary["shape"]["kappa_true_per_m"] is not None:
-        return shape_lines(summary["shape"])
-    return [
-        f"  curvature  {name}: {curvature_text(last['kappa_per_m'])}, the last of {last['count']} estimates"
-        for name, last in summary["estimates"].items()
-    ]
-
-
 @dataclass(frozen=True, slots=True)
 class ReplayResult:
     """One replayed log.
@@ -248,7 +208,37 @@ class ReplayResult:
 
     def text(self) -> str:
         """The summary as text."""
-        return replay_text(self.summary)
+        summary, shape, online = self.summary, self.summary["shape"], self.summary["online"]
+        how = (
+            "the scene's task drove: its scan is replayed"
+            if summary["driven_by"] == "task"
+            else "whoever drove: every contact is fed to the estimators"
+        )
+        counts = ", ".join(
+            f"{count} {name.replace('_', ' ').replace('pdos', 'PDOs').replace('syncs', 'SYNCs')}"
+            for name, count in summary["cycle"].items()
+            if count or name == "cycles"
+        )
+        where = summary["log"] if summary["channel"] is None else f"{summary['log']}, {summary['channel']}"
+        lines = [
+            f"{where}: scene {summary['scene']}",
+            f"  replay     {how}",
+            f"  record     {counts}; {summary['contacts']} contacts",
+            *(f"  log        {note}" for note in summary["notes"]),
+        ]
+        if shape["kappa_true_per_m"] is not None:
+            lines += shape_lines(shape)
+        else:
+            for name, last in summary["estimates"].items():
+                found = curvature_text(last["kappa_per_m"])
+                lines.append(f"  curvature  {name}: {found}, the last of {last['count']} estimates")
+        if online is not None:
+            difference = online["K_max_difference_per_m"]
+            lines.append(
+                f"  online     {online['replayed']} of {online['estimates']} estimates"
+                + (f", largest difference {difference:.3g} 1/m" if difference is not None else "")
+            )
+        return "\n".join(lines)
 
     def save(self, path: Path | str) -> None:
         """Write the estimates as columns, ``<method>_<column>``, into a compressed npz file, exactly that file."""
@@ -390,49 +380,42 @@ def replay_into(
 
 
 def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> Iterator[Observation]:
-    """The observations of a recorded log; `folder` is that of a run, None for another log."""
-    estimates = _estimates(result)
+    """The observations of a recorded log; `folder` is that of a run, None for another log.
+
+    Those of a run have the measurements of its master, with the frames from each SYNC to the next.
+    """
+    # the answers of the scene's estimator, by the cycle's time since the first, ns
+    estimates = {} if result is None else {round(r.reported_s * 1e9): r.estimate for r in result.tracker.records}
     run = read_run(folder, plan.setup) if folder is not None else None
-    if run is not None:
-        yield from _observations_of(run, path, plan, estimates)
-        return
-    recording = read_recording(path, plan)
-    groups = frames_by_sync(path, recording.channel, plan)
-    before = next(groups)
-    if before:
-        yield Observation(before[-1][2], None, None, before)
-    cycles = LogCycles(plan, recording)
-    for m, frames in zip(cycles, groups, strict=True):
-        estimate = estimates.get(m.t_ns)
-        command = None if estimate is None else Command(estimate=estimate)
-        yield Observation(cycles.start_ns + m.t_ns, m, command, frames)
-
-
-def _observations_of(
-    run: RunFolder, path: Path, plan: Plan, estimates: dict[int, SurfaceEstimate]
-) -> Iterator[Observation]:
-    """The observations of a run: the measurements of its master, with the frames from each SYNC to the next."""
-    groups = frames_by_sync(path, plan.buses[0].channel, plan) if path.is_file() else iter(())
+    columns: dict[str, Floats] = {}
+    if run is None:
+        recording = read_recording(path, plan)
+        cycles = LogCycles(plan, recording)
+        start_ns, measurements, channel = cycles.start_ns, iter(cycles), recording.channel
+    else:
+        start_ns, measurements, channel = round(run.start_s * 1e9), run.measurements(), plan.buses[0].channel
+        columns = {name: run.log[name] for name in TASK_COLUMNS if name in run.log}
+    groups = frames_by_sync(path, channel, plan) if path.is_file() else iter(())
     if before := next(groups, []):
         yield Observation(before[-1][2], None, None, before)
-    start_ns = round(run.start_s * 1e9)
-    waiting = next(groups, [])
-    deadlines = [*run.times_ns[1:].tolist(), math.inf]
-    names = [name for name in TASK_COLUMNS if name in run.log]
-    for k, m in enumerate(run.measurements()):
-        frames: list[TimedFrame] = []
-        while waiting and waiting[0][2] - start_ns < deadlines[k]:
-            frames += waiting
-            waiting = next(groups, [])
-        columns = {name: float(run.log[name][k]) for name in names if np.isfinite(run.log[name][k])}
+    if run is not None:
+        groups = _until(groups, [*(start_ns + run.times_ns[1:]).tolist(), math.inf])
+    for k, (m, frames) in enumerate(zip(measurements, groups, strict=True)):
+        known = {name: float(column[k]) for name, column in columns.items() if np.isfinite(column[k])}
         estimate = estimates.get(m.t_ns)
-        command = Command(columns=dict(columns), estimate=estimate) if columns or estimate is not None else None
+        command = Command(columns=dict(known), estimate=estimate) if known or estimate is not None else None
         yield Observation(start_ns + m.t_ns, m, command, frames)
 
 
-def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
-    """The answers of the scene's estimator, by the cycle's time since the first, ns."""
-    return {} if result is None else {round(r.reported_s * 1e9): r.estimate for r in result.tracker.records}
+def _until(groups: Iterator[list[TimedFrame]], ends_ns: Iterable[float]) -> Iterator[list[TimedFrame]]:
+    """The frames of groups that begin before each of some instants."""
+    waiting = next(groups, [])
+    for end_ns in ends_ns:
+        frames: list[TimedFrame] = []
+        while waiting and waiting[0][2] < end_ns:
+            frames += waiting
+            waiting = next(groups, [])
+        yield frames
 
 
 def frames_by_sync(path: Path, first: str, plan: Plan) -> Iterator[list[TimedFrame]]:

@@ -37,21 +37,18 @@ def read_expected() -> dict[str, Any]:
 def figures_of(summary: Mapping[str, Any]) -> dict[str, float]:
     """The figures of one run that apply, from its summary."""
     contact, shape, tool = summary["contact"], summary["shape"], summary["calibration"]
-    percent = shape["kappa_rms_error_percent"]
+    percent, target = shape["kappa_rms_error_percent"], contact["force_target_n"]
     found = {
-        "contact": _times(100.0, contact["contact_fraction"]),
-        "force": _times(100.0 / (contact["force_target_n"] or 1.0), contact["force_rms_error_n"]),
+        "contact": contact["contact_fraction"],
+        "force": contact["force_rms_error_n"],
         "curvature": percent,
         "curvature_per_m": shape["kappa_rms_error_per_m"] if percent is None else None,
         "normal": shape["normal_rms_deg"],
         "position": shape["position_rms_mm"],
         "tool": None if tool is None else sum(error**2 for error in tool["error_mm"]) ** 0.5,
     }
-    return {name: value for name, value in found.items() if value is not None}
-
-
-def _times(factor: float, value: float | None) -> float | None:
-    return None if value is None else factor * value
+    scale = {"contact": 100.0, "force": 100.0 / (target or 1.0)}
+    return {name: scale.get(name, 1.0) * value for name, value in found.items() if value is not None}
 
 
 def range_text(name: str, between: Sequence[float]) -> str:

@@ -429,14 +429,10 @@ def _draw(data: RunData, path: Path) -> str | None:
     """Draw one picture; returns why that failed. Whatever a drawing library raises, the results are written."""
     try:
         with interrupts_repeated():
-            if path.name == REPORT:
-                from canprobe.cell.results.figures import draw_run
+            from canprobe.cell.results.figures import draw_run
+            from canprobe.cell.results.surface_figure import draw_surface
 
-                draw_run(data, path)
-            else:
-                from canprobe.cell.results.surface_figure import draw_surface
-
-                draw_surface(data, path)
+            (draw_run if path.name == REPORT else draw_surface)(data, path)
     except (CanprobeError, OSError) as error:
         return str(error)
     except Exception as error:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import SubFigure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -27,15 +27,6 @@ MARGIN_M, TRUE_POINTS = 5e-3, 34
 """Margin of a true surface beyond the path, m, and its points on each side."""
 MAP_POINTS = 64
 """Number of points of a map's surface along its longer side."""
-
-
-class MapView(NamedTuple):
-    """A map, the path (n, 3), m, of the contact or None, the true object or None, and the plane of the drawing."""
-
-    map: SurfaceMap
-    path: Floats | None
-    shape: PlacedShape | None
-    plane: MapPlane
 
 
 class MapPlane(NamedTuple):
@@ -102,43 +93,32 @@ def add_sheet(axes: Any, corners: Floats, colours: Floats | str, **style: Any) -
     axes.auto_scale_xyz(*cells[known].reshape(-1, 3).T)
 
 
-def draw_map_surface(part: Part, view: MapView) -> None:
+def draw_map_surface(
+    part: Part, surface_map: SurfaceMap, plane: MapPlane, walked: Floats | None, shape: PlacedShape | None
+) -> None:
     """Draw the map's one surface, coloured by its distance from the truth or by its own σ, in three dimensions."""
     part, scale = parts(part, 1, 2, width_ratios=(8, 1))
     axes = part.add_subplot(projection="3d", computed_zorder=False)
-    plane = view.plane
-    shown, points = ["surface: recovered, as far as 4 mm from a contact"], view.map.points
-    if view.path is not None:
+    points, sigma = map_surface(surface_map, plane)
+    shown = ["surface: recovered, as far as 4 mm from a contact"]
+    if walked is not None:
         shown.append("line: path of the contact")
-    if view.shape is not None:
+        axes.plot(*plane.mm(walked).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
+    values, what, colours = 1e6 * sigma, "σ of the height, without tool and arm (µm)", colormaps["viridis"]
+    if shape is not None:
         shown.append("light grey: true surface")
-        near = plane.mm(true_surface(view.shape, points, plane))
+        near = plane.mm(true_surface(shape, surface_map.points, plane))
         axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
-    points, sigma = map_surface(view.map, plane)
-    values, what, colours = _values(points, sigma, view.shape)
-    norm = _scale(values, signed=view.shape is not None)
+        values, what, colours = np.full(sigma.shape, np.nan), "above the true surface (µm)", colormaps["RdBu_r"]
+        for place in zip(*np.nonzero(np.isfinite(points[:, :, 0])), strict=True):
+            values[place] = 1e6 * shape.nearest(tuple(points[place].tolist())).distance
+    known = np.abs(values[np.isfinite(values)])
+    most = max(float(np.percentile(known, 98)), 1.0) if len(known) else 1.0
+    norm = Normalize(0.0 if shape is None else -most, most)
     add_sheet(axes, plane.mm(points), colours.with_extremes(bad=GREY)(norm(np.ma.masked_invalid(values))), zorder=2)
-    if view.path is not None:
-        axes.plot(*plane.mm(view.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
     box(part, axes, " · ".join(shown), labels, elev=42, azim=-68, beside_in=2.0)
     scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
-
-
-def _values(points: Floats, sigma: Floats, shape: PlacedShape | None) -> tuple[Floats, str, Colormap]:
-    """Values (rows, columns) of a surface, µm, their name, and their colours."""
-    if shape is None:
-        return 1e6 * sigma, "σ of the height, without tool and arm (µm)", colormaps["viridis"]
-    above = np.full(sigma.shape, np.nan)
-    for place in zip(*np.nonzero(np.isfinite(points[:, :, 0])), strict=True):
-        above[place] = shape.nearest(tuple(points[place].tolist())).distance
-    return 1e6 * above, "above the true surface (µm)", colormaps["RdBu_r"]
-
-
-def _scale(values: Floats, *, signed: bool) -> Normalize:
-    known = np.abs(values[np.isfinite(values)])
-    most = max(float(np.percentile(known, 98)), 1.0) if len(known) else 1.0
-    return Normalize(-most if signed else 0.0, most)
 
 
 COMMON = (("lag", 1e6, "µm"), ("pad scale", 1e2, "%"), ("pad x", 1e6, "µm"), ("pad y", 1e6, "µm"))
@@ -186,7 +166,6 @@ def draw_map(
     """
     points = surface_map.points
     plane = MapPlane.of(points if walked is None else walked, surface_map.normals)
-    view = MapView(surface_map, walked, shape, plane)
     common = any(surface_map.noise.common)
     with picture(
         path,
@@ -194,20 +173,20 @@ def draw_map(
         7.8,
     ) as figure:
         upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
-        draw_map_surface(upper, view)
+        draw_map_surface(upper, surface_map, plane, walked, shape)
         left, *right = parts(lower, 1, 2 if common else 1)
-        _draw_disagreement(left, view)
+        _draw_disagreement(left, surface_map, plane, walked)
         for part in right:
             _draw_common(part, surface_map)
 
 
-def _draw_disagreement(part: SubFigure, view: MapView) -> None:
+def _draw_disagreement(part: SubFigure, surface_map: SurfaceMap, plane: MapPlane, walked: Floats | None) -> None:
     axes = part.subplots()
-    if view.path is not None:
-        path = view.plane.mm(view.path)
+    if walked is not None:
+        path = plane.mm(walked)
         axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
-    points = view.map.points[drawn_rows(len(view.map))]
-    places, beyond = view.plane.mm(points), view.map.disagreement(points)
+    points = surface_map.points[drawn_rows(len(surface_map))]
+    places, beyond = plane.mm(points), surface_map.disagreement(points)
     groups = ((beyond == 0.0, BLUE, "agree within their noise"), (beyond > 0.0, ORANGE, "disagree"))
     for chosen, colour, what in (group for group in groups if group[0].any()):
         size = np.clip(8.0 + 8.0 * beyond[chosen], 8.0, 60.0)

@@ -123,28 +123,24 @@ class EmulatorChild(ChildProcess):
     ) -> None:
         super().__init__()
         self._plan = plan
-        self._scene = plan.scene
-        self._channels = channels
-        self._wants_truth = truth
-        self._origin_ns = origin_ns
         self._truth = (out or self.folder) / "truth.npz"
         self.unwritten: str | None = None
         self._clock = MonotonicClock()
         self._started_ns = self._clock.now_ns()
-
-    def start(self) -> None:
-        """Start the process."""
-        bus, nodes = self._scene.bus, self._scene.emulated_node_ids
-        words = [
+        bus, nodes = plan.scene.bus, plan.scene.emulated_node_ids
+        self._words = [
             *("canprobe", "emulate", str(self.scene_file), "--bus", bus.interface, "--bitrate", str(bus.bitrate)),
-            *(word for channel in self._channels for word in ("--channel", f"{channel}={channel}")),
+            *(word for channel in channels for word in ("--channel", f"{channel}={channel}")),
             *("--parent", str(os.getpid())),
         ]
         if nodes:
-            words += ["--nodes", ",".join(str(n) for n in nodes)]
-        if self._wants_truth:
-            words += ["--truth", str(self._truth), "--origin", str(self._origin_ns)]
-        self.launch(self._plan, words)
+            self._words += ["--nodes", ",".join(str(n) for n in nodes)]
+        if truth:
+            self._words += ["--truth", str(self._truth), "--origin", str(origin_ns)]
+
+    def start(self) -> None:
+        """Start the process."""
+        self.launch(self._plan, self._words)
 
     def await_boot_ups(
         self,
@@ -163,16 +159,16 @@ class EmulatorChild(ChildProcess):
             BusError: when the process ended; with its last message.
             NodeError: when a node did not boot in time.
         """
-        waiting = set(self._scene.emulated_node_ids)
+        waiting = set(self._plan.scene.emulated_node_ids)
         clock = port.clock
         start = clock.now_ns()
-        deadline = start + round(self._scene.bring_up.emulated_s * 1e9)
+        deadline = start + round(self._plan.scene.bring_up.emulated_s * 1e9)
         report = start + round(REPORT_EVERY_S * 1e9)
         while waiting or not self._serves():
             now = clock.now_ns()
             self.raise_ended()
             if now >= deadline:
-                allowed = f"within {self._scene.bring_up.emulated_s:g} s, and its process still runs"
+                allowed = f"within {self._plan.scene.bring_up.emulated_s:g} s, and its process still runs"
                 why = f"the emulated node did not boot {allowed}: a busier machine needs a larger [bring_up] emulated_s"
                 raise NodeError(min(waiting, default=0), why)
             if now >= report:
@@ -195,7 +191,7 @@ class EmulatorChild(ChildProcess):
 
     def _serves(self) -> bool:
         """Whether an array of raw frames is served: it sends no boot-up, and the process says so."""
-        if self._scene.sensor is None or self._scene.array_is_node or not self._scene.sensor.emulated:
+        if self._plan.scene.sensor is None or self._plan.scene.array_is_node or not self._plan.scene.sensor.emulated:
             return True
         return SERVING_WORD.encode() in (self.folder / ERRORS).read_bytes()  # leaves the child's place in it
 
