@@ -162,7 +162,7 @@ class ArmSettings:
     """EDS of the drives that name none: a packaged name, or a path relative to the file."""
     emulated: bool = True
     """canprobe serves the drives, or emulates the external arm. false: they are real."""
-    missed_syncs: Annotated[int, Range(1, 250), DRIVES_ONLY] = 5
+    missed_syncs: Annotated[int, Range(1, 250)] = 5
     """SYNC periods of silence after which master and drives treat each other as lost."""
     grouped_rpdo: Annotated[bool | Auto, DRIVES_ONLY] = False
     """Put two targets into one RPDO by dummy mapping."""
