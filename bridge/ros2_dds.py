@@ -138,8 +138,12 @@ class Ros2Sink:
             for topic, reader in self._readers.items():
                 kind = self._node.types.of(topic.type_name)
                 for message in reader.take(N=10):
-                    if isinstance(message, kind):  # the last writer's exit or death comes as a sample without data
-                        self._take(topic, message)
+                    if not isinstance(message, kind):  # the last writer's exit or death: a sample without data
+                        continue
+                    if topic is TRAJECTORY:
+                        self._follow(message)
+                    else:
+                        self._command(topic, message.data if topic.type_name == FLOAT64 else None)
 
     def close(self, summary: str | None) -> None:
         """Let the last messages arrive; the domain is left when this process ends."""
@@ -153,13 +157,6 @@ class Ros2Sink:
     def _is_read(self, topic: Topic) -> bool:
         """Whether a topic has a reader, or keeps its last message for a later one."""
         return topic.transient or bool(self._writers[topic.name].get_matched_subscriptions())
-
-    def _take(self, topic: Topic, message: Any) -> None:
-        """Take a command, a message of the topic's type."""
-        if topic is TRAJECTORY:
-            self._follow(message)
-        else:
-            self._command(topic, message.data if topic.type_name == FLOAT64 else None)
 
     def _command(self, topic: Topic, value: float | None) -> None:
         kind = COMMANDS[topic]

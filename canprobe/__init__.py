@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.cell.master.controller import Command as Command
     from canprobe.cell.master.controller import Controller as Controller
     from canprobe.cell.master.controller import Measurement as Measurement
+    from canprobe.cell.master.external_arm import ExternalArm as ExternalArm
     from canprobe.cell.recorded.reestimate import ReplayResult as ReplayResult
     from canprobe.cell.recorded.reestimate import replay as replay
     from canprobe.cell.results.result import RunResult as RunResult
@@ -25,6 +26,7 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.cell.results.surface_file import load_surface_map as load_surface_map
     from canprobe.cell.results.traffic import measure_traffic as measure_traffic
     from canprobe.cell.scene.load import load_scene as load_scene
+    from canprobe.errors import ArmError as ArmError
     from canprobe.errors import BusError as BusError
     from canprobe.errors import CanprobeError as CanprobeError
     from canprobe.errors import EdsError as EdsError
@@ -53,9 +55,10 @@ __getattr__, __dir__, __all__ = door(
     {
         "api": ("open_cell", "plan", "run", "sample_target"),
         "cell.master.controller": ("Command", "Controller", "Measurement"),
+        "cell.master.external_arm": ("ExternalArm",),
         "errors": (
-            *("BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError", "ProtocolError"),
-            *("ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
+            *("ArmError", "BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError"),
+            *("ProtocolError", "ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
         ),
         "cell.recorded.reestimate": ("ReplayResult", "replay"),
         "cell.scene.load": ("load_scene",),

@@ -31,6 +31,7 @@ from canprobe.fieldbus.bus.real.adapters import interface_of
 if TYPE_CHECKING:
     from can import BusABC
 
+    from canprobe.cell.master.external_arm import ExternalArm
     from canprobe.cell.session.bus_tools import commission, emulate, monitor, scan
     from canprobe.cell.session.check import check
     from canprobe.cell.session.served import emulate_eds
@@ -66,6 +67,7 @@ def run(
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
     early_summary: Callable[[Mapping[str, Any]], None] = unread,
+    arm: ExternalArm | None = None,
 ) -> RunResult:
     """Run a scene's task and write its results.
 
@@ -86,6 +88,7 @@ def run(
         bridge: names of bridges to other tools, besides those of the scene; see `canprobe.cell.planning.bridges`.
         early_summary: called with the summary of a completed run before other estimators compute (``shape.also``) and
             pictures are drawn.
+        arm: the arm of a cell with ``arm.kind = "external"``, in the place of that of the cell file.
 
     Returns:
         The finished run.
@@ -104,7 +107,7 @@ def run(
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = results_folder(resolved, out) if files else None
     check_free(folder, force=force)
-    options = RunOptions(folder, say, observers, early_summary=early_summary)
+    options = RunOptions(folder, say, observers, early_summary=early_summary, arm=arm)
     return run_plan(make_plan(resolve(resolved)), options, progress)
 
 
@@ -216,6 +219,7 @@ def open_cell(
     rows_kept: int | None = None,
     recover: bool = False,
     to_home: bool = False,
+    arm: ExternalArm | None = None,
 ) -> OpenCell:
     """A cell for your own controllers; leaving its block always disables the drives and closes the bus.
 
@@ -239,6 +243,7 @@ def open_cell(
             the loss, and the next `run` waits for the nodes and brings them up again. A controller that says
             `resumable` is held instead where the arm stands, and goes on after `OpenCell.resume`.
         to_home: joints may be without a known zero, for `OpenCell.home`.
+        arm: as for `run`.
 
     Returns:
         The cell; ``with`` brings it up.
@@ -259,5 +264,5 @@ def open_cell(
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
-    options = RunOptions(folder, say, observers, rows_kept, recover=recover, to_home=to_home, bus=opened)
+    options = RunOptions(folder, say, observers, rows_kept, recover=recover, to_home=to_home, bus=opened, arm=arm)
     return OpenCell(make_plan(resolve(resolved)), options)

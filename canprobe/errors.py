@@ -7,7 +7,8 @@
     │   └── EdsError         2  an EDS file cannot be used
     ├── BusError             3  interface missing or lost, node missing, node refused
     │   ├── InterfaceError   3  the CAN interface itself
-    │   └── NodeError        3  one node: absent, wrong identity, refused an access, failed
+    │   ├── NodeError        3  one node: absent, wrong identity, refused an access, failed
+    │   └── ArmError         3  the external arm: lost, or a method of it failed
     ├── StudyError           3  a case, a worker or the files of a study failed
     ├── ResultsError         3  a file that cannot be written: on a full disk, for example
     ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
@@ -97,6 +98,13 @@ class NodeError(BusError):
         self.node_id = node_id
         self.reason = message
         super().__init__(f"node {node_id}: {message}")
+
+
+class ArmError(BusError):
+    """The external arm did not do what it must, or was lost."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"external arm: {reason}")
 
 
 class StudyError(CanprobeError):

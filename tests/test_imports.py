@@ -114,6 +114,8 @@ EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sche
 AT_THE_EDGE = {"bus", "tools", "vcan"}
 SERVES_OTHERS = {"lab/bridge/front.py", "lab/bridge/ros2_dds.py"}
 """Modules of a bridge's own process that hold its sockets; the cell does not import them."""
+SPEAKS_TO_ARMS = {"cell/session/arm_socket.py"}
+"""An arm that is not on the bus has an edge of its own, which the session opens beside the bus."""
 NUMERIC = {"numpy", "scipy"}
 NEVER_IN_PURE = EDGE_ONLY | {
     "canopen",
@@ -209,7 +211,7 @@ def pointing_elsewhere(path, relative):
         elif layer == "studies" and top == "time":
             fine = what in ("perf_counter", "process_time")
         else:
-            fine = layer in AT_THE_EDGE or str(relative) in SERVES_OTHERS or top not in EDGE_ONLY
+            fine = layer in AT_THE_EDGE or str(relative) in SERVES_OTHERS | SPEAKS_TO_ARMS or top not in EDGE_ONLY
         if not fine:
             wrong.append(f"{relative}:{line} imports {name}")
     return wrong

@@ -168,17 +168,14 @@ class GrowingPath:
 
     def __init__(self, api: Any, trail: Trail) -> None:
         self._api, self._trail = api, trail
-        self._done = self._sent = 0
+        self._sent = 0
 
     def refresh(self) -> None:
         """Send the new segments."""
         while self._sent < len(self._trail):
-            end = min(self._done + STRETCH, len(self._trail))
-            name = f"/path/{self._done // STRETCH:04d}"
-            _add(self._api, name, self._trail, slice(self._done, end), visible=True)
-            self._sent = end
-            if end - self._done == STRETCH:
-                self._done = end
+            number = self._sent // STRETCH  # of the last stretch, which is sent again while it grows
+            self._sent = min((number + 1) * STRETCH, len(self._trail))
+            _add(self._api, f"/path/{number:04d}", self._trail, slice(number * STRETCH, self._sent), visible=True)
 
 
 class PathAhead:
@@ -189,17 +186,18 @@ class PathAhead:
     """
 
     def __init__(self, api: Any) -> None:
-        self._api, self._points, self._shown = api, np.zeros((0, 3)), np.zeros((0, 3))
+        self._api = api
+        self._new: Floats | None = None
 
     def take(self, points: Floats) -> None:
         """Take the points (n, 3) of the path ahead, m."""
-        self._points = points
+        self._new = points
 
     def refresh(self) -> None:
         """Send it if it has changed."""
-        if self._points is not self._shown and len(self._points) > 1:
-            self._shown = self._points
-            segments = np.stack([self._shown[:-1], self._shown[1:]], axis=1).astype(np.float32)
+        points, self._new = self._new, None
+        if points is not None and len(points) > 1:
+            segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
             self._api.add_line_segments(
                 "/ahead", segments, AHEAD, thickness=2.0 * THICKNESS_M, thickness_units="world", visible=True
             )

@@ -67,11 +67,8 @@ class RecordedScene:
 
     def __init__(self, server: Any, run: RecordedRun) -> None:
         self._run = run
-        self.stage, self.errors, trail = (
-            Stage(server, run.setup),
-            deviation_scale(run.setup.truth.object, run.setup.scan),
-            trail_of(run),
-        )
+        self.stage, trail = Stage(server, run.setup), trail_of(run)
+        self.errors = deviation_scale(run.setup.truth.object, run.setup.scan)
         self._path = LoadedPath(server.scene, trail)
         self._surface = LoadedSurface(server.scene, run.surface_map, trail, self.errors)
 

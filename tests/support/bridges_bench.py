@@ -143,7 +143,7 @@ def _measure(case: Case, observations: Sequence[Observation]) -> Row:
         Bridges(plan, Path(folder), virtual=False) as bridges,
         _viewer(case, bridges),
     ):
-        pids = [bridge.pid for bridge in bridges.observers]
+        pids = [bridge.process.pid for bridge in bridges.observers]
         before, started = sum(map(_cpu_s, pids)), perf_counter()
         added = _feed(bridges, observations)
         share = (sum(map(_cpu_s, pids)) - before) / (perf_counter() - started)

@@ -45,11 +45,12 @@ class ImageFault(ArrayEffect):
 
     def _sampled(self, raw: Raw, t_ns: int) -> Raw:
         self.host.hits += 1
-        return self.changed(raw, (t_ns - self._begun_ns) * 1e-9)
+        image = raw.copy()
+        self.change(image, (t_ns - self._begun_ns) * 1e-9)
+        return image
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
-        """The image that is sampled, of counts; `held_s`: time since the beginning, s."""
-        return raw
+    def change(self, image: Raw, held_s: float) -> None:
+        """Change the image that is sampled, of counts; `held_s`: time since the beginning, s."""
 
     def rows(self) -> slice:
         """The rows of taxels that it hits."""
@@ -62,10 +63,8 @@ class DeadRows(ImageFault):
 
     name = "dead-rows"
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
-        image = raw.copy()
+    def change(self, image: Raw, held_s: float) -> None:
         image[self.rows()] = 0
-        return image
 
 
 class StuckImage(ImageFault):
@@ -74,9 +73,9 @@ class StuckImage(ImageFault):
     name = "stuck-image"
     _kept: Raw | None = None
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
-        self._kept = raw if self._kept is None else self._kept
-        return self._kept
+    def change(self, image: Raw, held_s: float) -> None:
+        self._kept = image.copy() if self._kept is None else self._kept
+        image[...] = self._kept
 
 
 class ReplayedImage(ImageFault):
@@ -93,13 +92,14 @@ class ReplayedImage(ImageFault):
         self._noise = np.random.default_rng(self.fault.seed)
         super().begin(t_ns)
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
+    def change(self, image: Raw, held_s: float) -> None:
         if len(self._recorded) < int(self.fault.value("images")):
-            self._recorded.append(raw)
-            return raw
-        image = self._recorded[self._replayed % len(self._recorded)]
+            self._recorded.append(image.copy())
+            return
+        shown = self._recorded[self._replayed % len(self._recorded)]
         self._replayed += 1
-        return _as_sampled(_noisy(image, self.fault.value("noise"), self._noise), raw)
+        noise = self.fault.value("noise") * self._noise.standard_normal(shown.shape)
+        _set(image, np.where(shown > 0, shown + noise, 0.0))  # what is below the threshold reads zero with noise, too
 
 
 class GainLost(ImageFault):
@@ -107,8 +107,8 @@ class GainLost(ImageFault):
 
     name = "gain-lost"
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
-        return _as_sampled(self.fault.value("gain") * raw.astype(np.float64), raw)
+    def change(self, image: Raw, held_s: float) -> None:
+        _set(image, self.fault.value("gain") * image.astype(np.float64))
 
 
 class StuckRows(ImageFault):
@@ -117,11 +117,9 @@ class StuckRows(ImageFault):
     name = "stuck-rows"
     _kept: Raw | None = None
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
-        self._kept = raw if self._kept is None else self._kept
-        image = raw.copy()
+    def change(self, image: Raw, held_s: float) -> None:
+        self._kept = image.copy() if self._kept is None else self._kept
         image[self.rows()] = self._kept[self.rows()]
-        return image
 
 
 class Drift(ImageFault):
@@ -129,10 +127,8 @@ class Drift(ImageFault):
 
     name = "drift"
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
-        image = raw.copy()
-        image[...] = np.minimum(raw + self.fault.value("counts_s") * held_s, COUNTS_MAX)
-        return image
+    def change(self, image: Raw, held_s: float) -> None:
+        image[...] = np.minimum(image + self.fault.value("counts_s") * held_s, COUNTS_MAX)
 
 
 class Saturation(ImageFault):
@@ -140,23 +136,13 @@ class Saturation(ImageFault):
 
     name = "saturation"
 
-    def changed(self, raw: Raw, held_s: float) -> Raw:
-        image = raw.copy()
-        image[raw > 0] = COUNTS_MAX
-        return image
+    def change(self, image: Raw, held_s: float) -> None:
+        image[image > 0] = COUNTS_MAX
 
 
-def _noisy(image: Raw, sigma_counts: float, rng: np.random.Generator) -> Floats:
-    """An image with fresh noise on its pressed taxels: what is below the threshold reads zero with noise, too."""
-    noise: Floats = sigma_counts * rng.standard_normal(image.shape)
-    return np.where(image > 0, image + noise, 0.0)
-
-
-def _as_sampled(counts: Floats, raw: Raw) -> Raw:
-    """Counts within the scale, and whole where those of the array are."""
-    image = raw.copy()
-    image[...] = np.clip(np.rint(counts) if raw.dtype == np.uint8 else counts, 0, COUNTS_MAX)
-    return image
+def _set(image: Raw, counts: Floats) -> None:
+    """Set an image to counts within the scale, and whole where its own are."""
+    image[...] = np.clip(np.rint(counts) if image.dtype == np.uint8 else counts, 0, COUNTS_MAX)
 
 
 class Torn(ArrayEffect):

@@ -16,7 +16,6 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration
 from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.cell.plant.config import PlantConfig, PressMotion
-from canprobe.cell.plant.contact import PlantState, TruthRow
 from canprobe.cell.plant.plant import Plant, truth_columns
 from canprobe.cell.plant.taxels import TaxelConfig
 from canprobe.cell.rows import BLOCK_ROWS, ROWS_SUFFIX, TRUTH_PHASE, LazyColumns, Rows, joint_columns
@@ -86,18 +85,14 @@ class TruthRecorder(Participant):
         self.origin_ns = 0
         self.rows: Rows | None = None
         self._stamps: list[tuple[int, int]] = []
-        self._states: list[PlantState] = []
-        self._truths: list[TruthRow] = []
+        self._seen: list[Any] = []  # truths where they are computed at once, else states
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         if can_id == SYNC_ID:
             self._plant.advance(t_ns)
             self._stamps.append((t_ns, data[0] if data else 0))
-            if not self._at_once:
-                self._states.append(self._plant.state())
-                return []
-            self._truths.append(self._plant.truth_row())
-            if len(self._truths) >= TRUTH_BLOCK:
+            self._seen.append(self._plant.truth_row() if self._at_once else self._plant.state())
+            if self._at_once and len(self._seen) >= TRUTH_BLOCK:
                 rows = self._compute()
                 if len(rows) % BLOCK_ROWS == TRUTH_PHASE:
                     rows.flush()
@@ -118,10 +113,10 @@ class TruthRecorder(Participant):
         """Make rows of what waits."""
         if not self._stamps and self.rows is not None:
             return self.rows
-        stamps, states, truths = self._stamps, self._states, self._truths
-        self._stamps, self._states, self._truths = [], [], []
+        stamps, seen = self._stamps, self._seen
+        self._stamps, self._seen = [], []
         model = self._plant.config.model
-        found = truth_columns(truths) if self._at_once else self._plant.truths(states)
+        found = truth_columns(seen) if self._at_once else self._plant.truths(seen)
         columns: dict[str, NDArray[Any]] = {
             "t_s": np.array([t_ns - self.origin_ns for t_ns, _ in stamps], dtype=np.float64) * 1e-9,
             "sync_count": np.arange(len(stamps), dtype=np.int64) + (0 if self.rows is None else len(self.rows)),
@@ -246,6 +241,12 @@ def _node(setup: Setup, planned: NodeConfiguration, node_id: int, plant: Plant, 
             seed=setup.seed,
         )
         _set_turn_units(node, drive.turn_units)
+    elif planned.kind == "encoder":
+        from canprobe.cell.emulated.encoder import EncoderApplication
+
+        assert setup.carrier is not None
+        application = EncoderApplication(plant, setup.carrier, planned.counts_range)
+        node = SlaveNode(dictionary, node_id, application, od_of=od_of)
     else:
         assert setup.array is not None
         node = SlaveNode(dictionary, node_id, TactileApplication(plant, pad=setup.array.pad), od_of=od_of)
@@ -276,6 +277,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         bandwidth_hz=truth.bandwidth_hz,
         press=PressMotion(after_s=_tared_s(setup)),
         seed=setup.seed,
+        carrier=setup.carrier,
     )
     if setup.arm is None or truth.model is None:
         return config
@@ -304,8 +306,5 @@ def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats
 
 def _tared_s(setup: Setup) -> float:
     """Time of the tare at the beginning of an array that takes one, with a reserve, s; 0 for others."""
-    raw = setup.array.raw if setup.array is not None else None
-    if raw is None or not raw.tare_images:
-        return 0.0
-    assert setup.array is not None
-    return 1.5 * raw.tare_images / setup.array.rate_hz
+    array = setup.array
+    return 0.0 if array is None or array.raw is None else 1.5 * array.raw.tare_images / array.rate_hz

@@ -8,7 +8,7 @@ from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.drives import DriveGroup
 from canprobe.cell.master.supervised_cycle import SupervisedCycle
 from canprobe.cell.planning.model import Plan
-from canprobe.errors import CanprobeError, NodeError, SafetyStop
+from canprobe.errors import BusError, CanprobeError, SafetyStop
 from canprobe.fieldbus.protocol.cia402 import DISABLED_STATES, UNPOWERED_STATES, DriveState
 
 WARM_UP_S = 0.1
@@ -62,13 +62,12 @@ class ArmPower:
         if not self._cycle_until(frozenset({DriveState.OPERATION_ENABLED}), enable_s, check):
             i, instead = drives.first_not_in(DriveState.OPERATION_ENABLED)
             node_id = drives.axes[i].node_id
-            raise NodeError(
-                node_id,
+            raise drives.axes[i].error(
                 f"(joint {i + 1}) is {instead} {enable_s:g} s after the command to enable operation"
                 " (bring_up.enable_s)" + self._watch.last_words(node_id),
             )
 
-    def _restless(self) -> NodeError:
+    def _restless(self) -> BusError:
         """The error of a drive that is not known to be at rest: its first target is its reported position."""
         i = self._drives.rests.index(False)
         node_id = self._drives.axes[i].node_id
@@ -79,7 +78,7 @@ class ArmPower:
             )
         else:
             why = f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
-        return NodeError(node_id, why + self._watch.last_words(node_id))
+        return self._drives.axes[i].error(why + self._watch.last_words(node_id))
 
     def disable(self) -> None:
         """Stop the drives, then disable them, as far as the bus lets it."""
@@ -91,7 +90,7 @@ class ArmPower:
         self._drives.targets.goal = DriveState.SWITCH_ON_DISABLED
         if not self._stop_until(DISABLED_STATES):
             stuck = self._others_than(DISABLED_STATES)
-            which = f"node {stuck[0] if stuck else '?'}"
+            which = f"node {stuck[0]}" if any(stuck) else "the arm"
             self._cycles.notes.add(f"while stopping: {which} did not confirm that it is disabled")
 
     def _stop_until(self, states: frozenset[DriveState]) -> bool:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
+from canprobe.cell.master.carrier import SILENT_CYCLES
 from canprobe.cell.master.image_witness import UNSTATED_NS
 from canprobe.cell.master.supervision import (
     TORQUE_MEAN_NS,
@@ -23,7 +24,7 @@ from canprobe.cell.master.supervision import (
     TouchState,
 )
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS
-from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
+from canprobe.errors import BusError, InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtState
@@ -174,27 +175,33 @@ _counted("pdo_missed", "TPDO of a drive missed, late, twice, malformed or imposs
 
 
 @_checked("drive late", Reaction.HOLD, lambda limits: (HOLD_CYCLES + 1) * limits.period_ns)
-def _drive_late(seen: CycleState) -> NodeError | None:
+def _drive_late(seen: CycleState) -> BusError | None:
     return _not_heard(seen, HOLD_CYCLES, "")
 
 
 @_checked("drive silent", Reaction.LIFT, lambda limits: (limits.missed_cycles + 2) * limits.period_ns)
-def _drive_silent(seen: CycleState) -> NodeError | None:
+def _drive_silent(seen: CycleState) -> BusError | None:
     return _not_heard(seen, seen.limits.missed_cycles + 1, "lost: ")
 
 
-def _not_heard(seen: CycleState, cycles: int, word: str) -> NodeError | None:
+def _not_heard(seen: CycleState, cycles: int, word: str) -> BusError | None:
     """The first drive without a usable TPDO for so many cycles."""
     ages = seen.measurement.q_age
     if not any(ages) or max(ages) < cycles:
         return None
     assert seen.drives is not None
     i = next(i for i, age in enumerate(ages) if age >= cycles)
-    return NodeError(seen.drives.axes[i].node_id, f"{word}no usable TPDO for {ages[i]} cycles")
+    axis = seen.drives.axes[i]
+    return axis.error(f"{word}no usable {'TPDO' if axis.node_id else 'pose'} for {ages[i]} cycles")
+
+
+@_checked("position of the carrier lost, or a jump of it", Reaction.RETREAT, _cycles(SILENT_CYCLES + 1), enabling=True)
+def _carrier(seen: CycleState) -> NodeError | None:
+    return seen.carrier.lost if seen.carrier is not None else None
 
 
 @_checked("joint that does not follow its targets", Reaction.LIFT, _cycles(2))
-def _following(seen: CycleState) -> NodeError | None:
+def _following(seen: CycleState) -> BusError | None:
     drives = seen.drives
     if drives is None or seen.compares_motion or not (beyond := drives.targets.beyond_lag()):
         return None
@@ -202,8 +209,7 @@ def _following(seen: CycleState) -> NodeError | None:
     motion = model.joints[i].text(abs(beyond[i] / float(model.units_per_q[i, i])), ".2f")
     lag_ms = seen.limits.lag_ns * 1e-6
     lag = f"a lag of {lag_ms:.3g} ms (servo.drive_lag_ms)" if lag_ms else "its lag"
-    return NodeError(
-        drives.axes[i].node_id,
+    return drives.axes[i].error(
         f"(joint {i + 1}) does not follow its targets: its motion is {motion} beside what"
         f" {lag} explains; see to its brake and its power stage, or state the lag of the drive",
     )

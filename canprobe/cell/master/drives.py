@@ -16,7 +16,7 @@ from canprobe.cell.master.position_track import PERIOD_NS, REST_NS, PositionTrac
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import TARGETS, Place
 from canprobe.cell.planning.units import lag_s
-from canprobe.errors import ProtocolError
+from canprobe.errors import ArmError, BusError, NodeError, ProtocolError
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.frames import Frame
@@ -44,7 +44,7 @@ class DriveAxis:
     """The PDOs of a drive.
 
     Attributes:
-        node_id: node id of the drive.
+        node_id: node id of the drive; 0: it is a coordinate of an external arm.
         feedback: layouts of its TPDOs, which between them have statusword, position (counts) and, where the drive can
             send it, torque (permille). What else they have is not read.
         commands: layouts of its RPDOs, which between them map controlword and target position (counts). Drives whose
@@ -58,6 +58,10 @@ class DriveAxis:
     commands: tuple[PdoLayout, ...]
     mode: int = OperationMode.CYCLIC_SYNC_POSITION
     constants: Mapping[Place, int] = field(default_factory=dict)
+
+    def error(self, reason: str) -> BusError:
+        """The error of the drive, or of the external arm."""
+        return NodeError(self.node_id, reason) if self.node_id else ArmError(reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +262,7 @@ class DriveGroup:
     @property
     def heard_all(self) -> bool:
         """Every drive was heard at least once."""
-        self._all_heard = self._all_heard or min(self._heard) >= 0
+        self._all_heard = self._all_heard or min(self._heard, default=-1) >= 0
         return self._all_heard
 
     def ages(self) -> tuple[int, ...]:

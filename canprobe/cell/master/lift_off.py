@@ -23,7 +23,7 @@ from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, GrowingForce, Retrace, TakenWay, way_gone
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
-from canprobe.errors import CanprobeError, NodeError
+from canprobe.errors import ArmError, CanprobeError, NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.inverse import lifting_step
@@ -181,7 +181,9 @@ def lift_off(plan: Plan, cycles: SupervisedCycle, error: BaseException) -> None:
 
 
 def _obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:
-    """Whether a node obeys by NMT and EMCY: not the one that the cell is stopped for."""
+    """Whether a node obeys by NMT and EMCY, or an external arm: not the one that the cell is stopped for."""
+    if not node_id:
+        return not isinstance(error, ArmError)
     if isinstance(error, NodeError) and error.node_id == node_id:
         return False
     return watch.states.get(node_id) is NmtState.OPERATIONAL and node_id not in watch.alarmed

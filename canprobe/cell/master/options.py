@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.observers import AnyObserver
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.external_arm import ExternalArm
 
 Say = Callable[[str], None]
 """Called with a line of text for each step."""
@@ -39,6 +42,7 @@ class RunOptions:
         rows_folder: folder of the rows while the run goes on, whose caller makes files of them at its end; None keeps
             them in memory.
         bus: a bus of python-can that its caller has opened, in the place of the scene's interface; it stays open.
+        arm: external arm in the place of the scene's.
     """
 
     out: Path | None = None
@@ -51,6 +55,7 @@ class RunOptions:
     to_check: bool = False
     rows_folder: Path | None = None
     bus: Any = None
+    arm: ExternalArm | None = None
 
 
 DEFAULT_OPTIONS = RunOptions()

@@ -58,6 +58,8 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
         yield BUS_LOG, "outputs.bus_log = false"
     if setup.arm is None:
         yield "drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
+    elif setup.arm.external is not None:
+        yield "drives, their PDOs, torques and homing", 'arm.kind = "external": poses of the flange take their place'
     elif not setup.arm.torque:
         yield "motor torque (6077h)", "arm.torque is false, or the bus has no room for it beside what the task needs"
     if array is None:
@@ -98,7 +100,7 @@ def _not_emulated(setup: Setup) -> Iterator[tuple[str, str]]:
         yield TRUTH_PARTS, "no [object]: nothing to compare with"
     elif not setup.outputs.truth:
         yield TRUTH_PARTS, "outputs.truth = false: true values, errors and the map's coverage are null in summary.json"
-    if setup.truth.fidelity == "ideal" and any(drive.emulated for drive in setup.drives):
+    if setup.truth.fidelity == "ideal" and setup.emulates_arm:
         yield "arm dynamics", 'plant.fidelity = "ideal": each drive tracks as a second-order system'
     for effect, what in _EFFECTS.items():
         if array is not None and effect in setup.truth.without:

@@ -391,7 +391,7 @@ STEADY_S = 0.25
 
 def reports_torque(plan: Plan) -> bool:
     """Whether each drive of the arm sends its torque (6077h)."""
-    return plan.setup.arm is not None and all(
+    return bool(plan.setup.drives) and all(
         any(
             (entry.index, entry.subindex) == TORQUE
             for pdo in plan.pdos_of(drive.node_id, "tpdo")
@@ -429,8 +429,9 @@ def _torques(plan: Plan, touch: Touch | Calibrate) -> str:
     approach, probe = touch.approach, plan.setup.probe
     if not reports_torque(plan):
         blind, unseen = _force(probe, approach.search), _force(probe, approach.blind_search)
+        why = "not each drive sends 6077h" if plan.setup.drives else "an external arm has no drives"
         return (
-            "none, as not each drive sends 6077h: a blind array would let the search press with up to"
+            f"none, as {why}: a blind array would let the search press with up to"
             f" {blind:.0f} N, {unseen:.0f} N as long as no image has changed since bring-up"
         )
     steady_s = approach.clearance / approach.speed

@@ -55,9 +55,9 @@ def _modes(setup: Setup) -> list[tuple[TactileModeName, str]]:
 
 
 def _channels(setup: Setup) -> list[tuple[str, str]]:
-    if setup.arm is None:
+    if not setup.drives:
         return [(setup.bus.channel, "one bus carries everything")]
-    first, *others = dict.fromkeys(drive.channel for drive in setup.arm.drives)
+    first, *others = dict.fromkeys(drive.channel for drive in setup.drives)
     return [
         (first, "beside its drives" if others else "one bus carries everything"),
         *((channel, "beside its drives") for channel in others),
@@ -163,7 +163,7 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
     if bus.transmit_queue == "fifo":
         text = 'controllers that send their most urgent frame first (bus.transmit_queue = "priority")'
         yield text, setup.changed("bus", transmit_queue="priority")
-    if setup.arm is not None and not setup.arm.grouped:
+    if setup.arm is not None and setup.drives and not setup.arm.grouped:
         yield "arm.grouped_rpdo = true", setup.changed("arm", grouped=True)
     yield from _split(setup)
     if array is None:

@@ -11,6 +11,7 @@ from canprobe.cell.planning.array import array_problems, as_supported, cut_patch
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import configure
 from canprobe.cell.planning.device_capabilities import SECTIONS, DeviceCapabilities, lacks
+from canprobe.cell.planning.external_arm import external_problems, servo_problems
 from canprobe.cell.planning.free_parameters import at_rate, candidates, suggested_changes, wants_torque
 from canprobe.cell.planning.identifiers import (
     identifier_problems,
@@ -20,7 +21,7 @@ from canprobe.cell.planning.identifiers import (
 )
 from canprobe.cell.planning.model import SYNC_OVERFLOW, Choice, JointSpeeds, Plan
 from canprobe.cell.planning.node_configuration import NodeKind
-from canprobe.cell.planning.pdos import BusPlan, plan_drive_pdos, plan_tactile_pdos
+from canprobe.cell.planning.pdos import BusPlan, plan_drive_pdos, plan_encoder_pdo, plan_tactile_pdos
 from canprobe.cell.planning.sync import (
     early_stops,
     is_profiled,
@@ -52,6 +53,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
+    problems += external_problems(setup)
     beyond: list[str] = [*range_problems(setup)]
     narrowed: tuple[str, ...] = ()
     bus: BusPlan | None = None
@@ -104,7 +106,7 @@ def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpee
         from canprobe.cell.planning.motion import check_motion
 
         speeds, unreachable = check_motion(setup, setup.arm)
-    problems = [*unsuited, *speed_over_array_problems(setup)]
+    problems = [*unsuited, *speed_over_array_problems(setup), *servo_problems(setup)]
     cut, safe = cut_patch(setup) or ("", True)
     problems += [cut] if not safe else []
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
@@ -113,7 +115,7 @@ def _check_task(setup: Setup, narrowed: tuple[str, ...] = ()) -> tuple[JointSpee
         problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
     problems += [*unreachable, *narrowed] if unreachable else []
     truth, arm = setup.truth, setup.arm
-    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in setup.drives):
+    if arm is not None and truth.fidelity == "dynamic" and setup.emulates_arm:
         from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
 
         problem = dynamics_problem(arm.model.name, truth.bodies)
@@ -197,6 +199,7 @@ def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: 
         bus.untaken[untimed] = [(f"{rate:.6g}", setup.changed("array", rate_hz=rate)) for rate in near]
     bus.problems += bus.untaken
     plan_drive_pdos(bus)
+    plan_encoder_pdo(bus)
     plan_tactile_pdos(bus, ratio)
     if setup.bus.cob_ids == "by_deadline":
         bus.pdos = order_by_deadline(bus.pdos, devices.values())
@@ -279,10 +282,12 @@ def _fits(setup: Setup, known: frozenset[str]) -> BusPlan | None:
 
 
 def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
-    """Every node with its kind and its role, the drives from the base, the array last."""
+    """Every node with its kind and its role, the drives from the base, then the encoder, the array last."""
     roles: list[tuple[NodeKind, str, Node]] = [
         ("drive", f"joint {axis}", drive) for axis, drive in enumerate(setup.drives, start=1)
     ]
+    if setup.carrier is not None:
+        roles.append(("encoder", "encoder of the carrier", setup.carrier))
     array = setup.array
     return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]
 

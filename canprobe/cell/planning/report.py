@@ -12,6 +12,7 @@ from typing import Any
 from canprobe.cell.planning.array import array_text, support_of
 from canprobe.cell.planning.bridges import BRIDGES
 from canprobe.cell.planning.contact import witness_rows
+from canprobe.cell.planning.external_arm import arm_text
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -76,6 +77,8 @@ def _subjects(plan: Plan) -> Iterator[tuple[str, str]]:
     channels = " and ".join(one.channel for one in plan.buses)
     yield "fits", f"on {channels} ({bus.interface}), {bus.bitrate} bit/s, {plan.sync.rate_hz:g} Hz"
     yield "nodes", _nodes(plan)
+    if external := arm_text(plan.setup):
+        yield "arm", external
     yield "load", _load(plan)
     if witnesses := witness_rows(plan):
         yield "witnesses", _witnesses(witnesses)
@@ -90,10 +93,14 @@ def _subjects(plan: Plan) -> Iterator[tuple[str, str]]:
 
 def _nodes(plan: Plan) -> str:
     """The nodes by kind with their ids, and which of them are real."""
-    drives, arrays = ([n.node_id for n in plan.nodes if n.kind == kind] for kind in ("drive", "tactile"))
+    drives, encoders, arrays = (
+        [n.node_id for n in plan.nodes if n.kind == kind] for kind in ("drive", "encoder", "tactile")
+    )
     found = []
     if drives:
         found.append(f"{len(drives)} drive{'s' * (len(drives) > 1)} ({id_ranges(drives)})")
+    if encoders:
+        found.append(f"encoder of the carrier ({id_ranges(encoders)})")
     if arrays:
         found.append(f"tactile array ({id_ranges(arrays)})")
     if plan.raw:
@@ -378,6 +385,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "choices": [{"key": one.key, "value": one.written, "why": one.why} for one in plan.choices],
         "timeline": [_picked(slot) | {"channel": slot.channel or None} for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
+        "external_arm": arm_text(setup) or None,
         "witnesses": dict(witness_rows(plan)),
         "estimator": shape.method if shape is not None else None,
         "offline_estimators": list(shape.also) if shape is not None else [],

@@ -121,7 +121,7 @@ def _axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> list[Plann
 def range_problems(setup: Setup) -> Iterator[str]:
     """Joints whose positions leave the 32 bits of 6064h and 607Ah, where they would wrap round."""
     arm = setup.arm
-    if arm is None:
+    if arm is None or not arm.drives:
         return
     low, high = software_limits(arm.model)
     for joint, drive, least, most in zip(arm.model.joints, arm.drives, low.tolist(), high.tolist(), strict=True):
@@ -180,7 +180,7 @@ def within_drives(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> tu
         The setup, the problems of joints that have no room or speed left, and warnings where that is less.
     """
     beyond = [*range_problems(setup), *_speed_problems(_axes(setup, devices))]
-    if setup.arm is None or beyond:
+    if setup.arm is None or not setup.drives or beyond:
         return setup, beyond, ()
     setup, ranges = _within_ranges(setup, setup.arm, devices)
     setup, speeds = _within_speeds(setup, _axes(setup, devices))
@@ -254,10 +254,13 @@ def _lowest_limit(axis: PlannedAxis, wanted: float) -> _SpeedLimit:
 
 
 def stated_lag_s(setup: Setup) -> float:
-    """Lag of the drives behind a ramp, s: the larger of the scene's and the emulated drives'; 0: unknown."""
+    """Lag of the drives behind a ramp, s: the larger of the scene's and the emulated drives'; 0: unknown.
+
+    That of an external arm has its dead time.
+    """
     believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
-    emulated = any(drive.emulated for drive in setup.drives)
-    return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
+    delay_s = setup.arm.delay_s if setup.arm is not None else 0.0
+    return max(believed, (LAG_BANDWIDTH / setup.truth.bandwidth_hz if setup.emulates_arm else 0.0) + delay_s)
 
 
 def lag_s(setup: Setup, unstated_s: float = 0.0) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.array import make_tactile
+from canprobe.cell.master.carrier import make_carrier
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.cycle import SYNCS_REMEMBERED, Intake
 from canprobe.cell.master.drives import DriveGroup, make_drives
@@ -43,55 +44,46 @@ STAMP_JITTER_NS = 300_000
 """Stamps that go back by no more are jitter: the lines are in the order of the bus."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Recording:
     """The frames of one channel that the cell receives or sends.
 
     Attributes:
-        path: path of the log.
+        bus: reader of the log, with the steps of its clock and the frames that candump lost.
         channel: channel of the nodes.
         frames: SYNC, TPDOs and RPDOs of the planned nodes, (can_id, data, t_ns).
-        times: their stamps (n,), ns.
-        syncs: indices of the SYNCs among them.
+        heard: number of TPDOs by their identifier.
         other: number of other frames on this channel.
         malformed: number of PDOs of a wrong length, left out.
+        long_syncs: number of SYNCs of more than a byte by their length.
         error_frames: bus errors on all channels.
-        bus: reader of the log, with the steps of its clock and the frames that candump lost.
     """
 
-    path: Path
-    channel: str
-    frames: list[TimedFrame]
-    times: NDArray[np.int64]
-    syncs: NDArray[np.int64]
-    other: int
-    malformed: int
-    error_frames: int
     bus: RecordedBus
+    channel: str
+    frames: list[TimedFrame] = field(default_factory=list)
+    heard: Counter[int] = field(default_factory=Counter)
+    other: int = 0
+    malformed: int = 0
+    long_syncs: Counter[int] = field(default_factory=Counter)
+    error_frames: int = 0
+
+    @property
+    def syncs(self) -> list[int]:
+        """Indices of the SYNCs among the frames."""
+        return [i for i, frame in enumerate(self.frames) if frame[0] == SYNC_ID]
 
     @property
     def sync_stamps(self) -> NDArray[np.int64]:
         """Time of each SYNC (n,), ns."""
-        return self.times[self.syncs]
+        return np.array([t_ns for can_id, _, t_ns in self.frames if can_id == SYNC_ID], np.int64)
 
     @property
     def sync_overflow(self) -> int | None:
         """Value after which the SYNC counter restarts; None without a counter, or where it did not restart twice."""
-        counters = [data[0] for _, data, _ in map(self.frames.__getitem__, self.syncs) if data]
+        counters = [data[0] for can_id, data, _ in self.frames if can_id == SYNC_ID and data]
         last = [a for a, b in pairwise(counters) if b < a]
         return max(counters) if last and last.count(max(counters)) >= 2 else None
-
-
-@dataclass(slots=True)
-class _RecordedChannel:
-    """Frames and counts of one channel so far."""
-
-    frames: list[TimedFrame] = field(default_factory=list)
-    heard: set[int] = field(default_factory=set)
-    answers: int = 0
-    other: int = 0
-    malformed: int = 0
-    long_syncs: Counter[int] = field(default_factory=Counter)
 
 
 def read_recording(path: Path, plan: Plan) -> Recording:
@@ -107,27 +99,22 @@ def read_recording(path: Path, plan: Plan) -> Recording:
             rate.
     """
     bus = RecordedBus(path)
-    channels, error_frames = _read(bus, plan)
-    name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
-    chosen = channels.get(name, _RecordedChannel())
-    _check_heard(path, plan, name, chosen)
-    frames = _in_bus_order(chosen.frames)
-    syncs = [i for i, frame in enumerate(frames) if frame[0] == SYNC_ID]
-    times = np.array([frame[2] for frame in frames], np.int64)
-    recording = Recording(
-        path, name, frames, times, np.array(syncs, np.int64), chosen.other, chosen.malformed, error_frames, bus
-    )
-    _check_syncs(recording, plan, chosen.long_syncs)
+    channels = _read(bus, plan)
+    recording = max(channels, key=lambda one: (one.heard.total(), len(one.frames)), default=Recording(bus, ""))
+    recording.error_frames = sum(one.error_frames for one in channels)
+    _check_heard(path, plan, recording)
+    recording.frames = _in_bus_order(recording.frames)
+    _check_syncs(path, recording, plan)
     return recording
 
 
-def _read(bus: RecordedBus, plan: Plan) -> tuple[dict[str, _RecordedChannel], int]:
+def _read(bus: RecordedBus, plan: Plan) -> list[Recording]:
+    """The frames of each channel, in their order in the log."""
     lengths: dict[int, int] = {pdo.cob_id: pdo.layout.length for pdo in plan.pdos}
     answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
     may_be_longer = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo" and pdo.kind == "drive"}
     raw = {(frames.channel, frames.can_id) for frames in plan.raw}  # their formats say what is in them
-    channels: dict[str, _RecordedChannel] = {}
-    error_frames = 0
+    channels: dict[str, Recording] = {}
     main, *others = [bus.channel for bus in plan.buses]
     for t_ns, on, can_id, data in bus:
         if on in others and can_id == SYNC_ID:
@@ -135,25 +122,23 @@ def _read(bus: RecordedBus, plan: Plan) -> tuple[dict[str, _RecordedChannel], in
         name = main if on in others else on
         channel = channels.get(name)
         if channel is None:
-            channel = channels[name] = _RecordedChannel()
+            channel = channels[name] = Recording(bus, name)
         if is_sync(can_id, data) or (on if on in others else main, can_id) in raw:
             channel.frames.append((can_id, data, t_ns))
         elif (length := lengths.get(can_id)) is None:
             channel.other += 1
             if can_id == SYNC_ID:
                 channel.long_syncs[len(data)] += 1
-            error_frames += is_bus_error(can_id)
+            channel.error_frames += is_bus_error(can_id)
         elif len(data) < length or (len(data) > length and can_id not in may_be_longer):
             channel.malformed += 1
         else:
             channel.frames.append((can_id, data, t_ns))
-            if can_id in answers:
-                channel.heard.add(can_id)
-                channel.answers += 1
+            channel.heard[can_id] += can_id in answers
     for name, count in bus.xl.items():
         if name in channels:
             channels[name].other += count
-    return channels, error_frames
+    return list(channels.values())
 
 
 def _in_bus_order(frames: list[TimedFrame]) -> list[TimedFrame]:
@@ -165,29 +150,29 @@ def _in_bus_order(frames: list[TimedFrame]) -> list[TimedFrame]:
     return [(can_id, data, t_ns) for (can_id, data, _), t_ns in zip(frames, latest.tolist(), strict=True)]
 
 
-def _check_heard(path: Path, plan: Plan, name: str, channel: _RecordedChannel) -> None:
+def _check_heard(path: Path, plan: Plan, channel: Recording) -> None:
     silent = []
     for node in plan.nodes:
-        missing = [pdo for pdo in plan.pdos_of(node.node_id, "tpdo") if pdo.cob_id not in channel.heard]
+        missing = [pdo for pdo in plan.pdos_of(node.node_id, "tpdo") if not channel.heard[pdo.cob_id]]
         if missing:
             ids = ", ".join(f"{pdo.cob_id:03X}h" for pdo in missing)
             silent.append(f"node {node.node_id} ({node.name}) was never heard: no TPDO {ids}")
     if silent:
-        where = f"{path}: on {name}" if name else f"{path}: no frame at all;"
+        where = f"{path}: on {channel.channel}" if channel.channel else f"{path}: no frame at all;"
         wrong = f" ({channel.malformed} PDOs of a wrong length)" if channel.malformed else ""
         raise UsageError("\n".join(f"{where} {line}{wrong}" for line in silent))
 
 
-def _check_syncs(recording: Recording, plan: Plan, long_syncs: Counter[int]) -> None:
-    where = f"{recording.path}: on {recording.channel}"
-    if len(recording.syncs) < 2:
-        longer = long_syncs_text(long_syncs)
+def _check_syncs(path: Path, recording: Recording, plan: Plan) -> None:
+    where, stamps = f"{path}: on {recording.channel}", recording.sync_stamps
+    if len(stamps) < 2:
+        longer = long_syncs_text(recording.long_syncs)
         but = f" of 0 or 1 byte, but {longer}" if longer else ""
-        raise UsageError(f"{where} {len(recording.syncs)} SYNC (080h){but}; a replay goes from SYNC to SYNC")
-    steps = np.diff(recording.sync_stamps)
+        raise UsageError(f"{where} {len(stamps)} SYNC (080h){but}; a replay goes from SYNC to SYNC")
+    steps = np.diff(stamps)
     if 3 * (twice := np.count_nonzero(steps < STAMP_JITTER_NS)) > len(steps):
         raise UsageError(
-            f"{where} {twice} of {len(recording.syncs)} SYNCs (080h) have the stamp of the one before: was every"
+            f"{where} {twice} of {len(stamps)} SYNCs (080h) have the stamp of the one before: was every"
             " frame logged twice?"
         )
     period = float(np.median(steps))
@@ -219,20 +204,23 @@ class LogCycles:
     """
 
     def __init__(self, plan: Plan, recording: Recording) -> None:
+        if plan.setup.arm is not None and plan.setup.arm.external is not None:
+            raise UsageError(f"{plan.setup.name}: the poses of an external arm are not in a log of the bus")
         overflow = recording.sync_overflow or plan.sync.overflow or SYNCS_REMEMBERED
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan, overflow)
+        carrier = make_carrier(plan)
         self.sync_times_s: list[float] = []
         self.lost_syncs = 0
         self.start_ns = int(recording.sync_stamps[0])
-        self._intake = Intake(self.drives, self.tactile, overflow)
+        self._intake = Intake(self.drives, self.tactile, overflow, carrier)
         self._recording = recording
         self._overflow = overflow
         self._period_ns = plan.sync.period_ns
 
     def __iter__(self) -> Iterator[Measurement]:
         recording, intake = self._recording, self._intake
-        frames, syncs = recording.frames, recording.syncs.tolist()
+        frames, syncs = recording.frames, recording.syncs
         intake.route(frames[: syncs[0]])
         counter_before = 0
         for first, end in zip(syncs, [*syncs[1:], len(frames)], strict=True):
@@ -332,6 +320,7 @@ class RunFolder:
         )
         torques = log.get("torque_permille", np.zeros((rows, 0)))
         tactile_ages = log.get("tactile_age", np.full(rows, np.nan))
+        carried = log.get("carrier_rad", log.get("carrier_m", np.full(rows, np.nan))).tolist()
         for k, t_ns in enumerate(self.times_ns.tolist()):
             statuswords = tuple(words[k].tolist())
             yield Measurement(
@@ -344,6 +333,7 @@ class RunFolder:
                 enabled=all(known_state(word) is DriveState.OPERATION_ENABLED for word in statuswords),
                 tactile=samples.get(t_ns),
                 tactile_age=int(tactile_ages[k]) if np.isfinite(tactile_ages[k]) else None,
+                carrier=carried[k] if np.isfinite(carried[k]) else None,
             )
 
     def _samples(self) -> dict[int, TactileSample]:

@@ -61,13 +61,13 @@ def _draw_responses(axes: Axes, plan: Plan) -> None:
     messages = on_the_wire(plan.pdos)
     for y, pdo in enumerate(messages):
         part: Part = "tactile" if pdo.kind == "tactile" else "command" if pdo.direction == "rpdo" else "feedback"
-        share = None if pdo.response_ns is None else 100 * pdo.response_ns / pdo.deadline_ns
         axes.barh(y, 100, height=0.72, color=SHADE)
-        if share is None:
+        if pdo.response_ns is None:
             axes.text(1, y, "no bound", va="center", fontsize=8, color=ORANGE)
             continue
+        share = 100 * pdo.response_ns / pdo.deadline_ns
         axes.barh(y, share, height=0.72, color=COLOURS[part] if share <= 100 else ORANGE)
-        text = f"{pdo.response_ns / 1000:.0f} of {pdo.deadline_ns / 1000:.0f} µs" if pdo.response_ns is not None else ""
+        text = f"{pdo.response_ns / 1000:.0f} of {pdo.deadline_ns / 1000:.0f} µs"
         axes.text(101, y, text, va="center", fontsize=8)
     labels = [f"{pdo.cob_id:03X}h  node {pdo.node_id:2} {pdo.direction.upper()}{pdo.number}" for pdo in messages]
     axes.set_yticks(range(len(messages)), labels, fontsize=8, family="monospace")

@@ -201,13 +201,13 @@ def bound_of_scan(
         coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
     from canprobe.mechanics.touch import SurfaceMatrix
-    from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
+    from canprobe.mechanics.touch.estimate.gate import Gate
     from canprobe.mechanics.touch.estimate.likelihood import batch_of, osculating_bound
 
     points = np.array([s.p_base for s in samples])
     gate = Gate(1.0, sigma_normal)
-    pad = PadPathLength(float(np.median([gate.sigmas(s)[0] for s in samples])))
-    touches = [pad.measured(s, gate, coupling) for s in samples]
+    gate = Gate(float(np.median([gate.sigmas(s)[0] for s in samples])), sigma_normal)
+    touches = [gate.measured(s, coupling) for s in samples]
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
         return None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
+from canprobe.cell.master.external_arm import FlangeGroup
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
@@ -108,6 +109,8 @@ def summarise(
     }
     if record.explored is not None:
         summary["explore"] = record.explored
+    if isinstance(cell.drives, FlangeGroup):
+        summary["external_arm"] = cell.drives.figures()
     if scene.task.kind == "listen":
         summary["listen"] = _listened(log)
     return {name: without_nan(value) for name, value in summary.items()}
@@ -336,7 +339,7 @@ def write_files(result: RunData, out: Path) -> None:
     if (surface_map := result.surface_map) is not None:
         from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
 
-        writers.append(lambda: save_surface_map(surface_map, out / SURFACE))
+        writers.append(lambda: save_surface_map(surface_map, out / SURFACE, next(iter(result.estimates.values()), [])))
     failed = []
     for write in writers:
         try:

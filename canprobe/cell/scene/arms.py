@@ -14,10 +14,11 @@ import numpy as np
 
 from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.hardware import MM, ArmSettings, JointSettings
-from canprobe.cell.scene.setup import HomingParameters
+from canprobe.cell.scene.setup import Arm, External, HomingParameters
 from canprobe.cell.scene.units import in_si
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
+from canprobe.mechanics.robot.flange import flange_model
 from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
 from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
 from canprobe.mechanics.types import Floats
@@ -39,6 +40,8 @@ _FIELDS = {
     "viscous": "viscous",
 }
 """Field of a `Joint` by the key of a section without its unit."""
+EXTERNAL_SWING = np.array((10e-3,) * 3 + (math.radians(5.0),) * 3)
+"""Amplitude of an external arm in `free`, m and rad: that of joints by default."""
 _PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 20.0, "viscous": 20.0}
 
 
@@ -91,6 +94,26 @@ def arm_model(
         warnings = ()
     model = ArmModel(chain, tuple(joints), _units_per_q(sections), np.array([s.zero_counts for s in sections.values()]))
     return model, bodies, warnings
+
+
+def external_arm(name: str, arm: ArmSettings, rate_hz: float) -> Arm:
+    """An arm that is not on the bus: its joints are the coordinates of its flange.
+
+    Args:
+        name: name of the cell.
+        arm: the section `[arm]`.
+        rate_hz: rate of the cycle.
+    """
+    mount, home = transform(arm.mount_mm, arm.mount_deg), transform((0.0, 0.0, 0.0), arm.flange_deg)
+    reach, speed = (
+        np.array((*(length * MM,) * 3, *(math.radians(angle),) * 3))
+        for length, angle in ((arm.reach_mm, arm.reach_deg), (arm.speed_mm_s, arm.speed_deg_s))
+    )
+    start = np.array(arm.start_mm) * MM
+    external = External(arm.address, arm.emulated, arm.delay_ms * 1e-3, arm.stop_after_ms * 1e-3)
+    model = flange_model(name, mount, home[:3, :3], start, reach, speed)
+    q_start, missed = np.concatenate((start, np.zeros(3))), max(1, int(external.stop_after_s * rate_hz))
+    return Arm(model, (), q_start, missed, grouped=False, torque=False, external=external)
 
 
 def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], arm: ArmSettings) -> None:

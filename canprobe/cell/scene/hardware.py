@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from canprobe.cell.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Range, ScenePath
+from canprobe.cell.scene.checks import DIRECTION, DISTINCT, Check, OneOf, Only, Pattern, Range, ScenePath
 
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
@@ -30,7 +30,11 @@ MM = 1e-3
 """A millimetre in metres."""
 REVOLUTE_ONLY = Only("kind", ("revolute",))
 PRISMATIC_ONLY = Only("kind", ("prismatic",))
+TURNTABLE = Only("kind", ("turntable",), required=True)
+CONVEYOR = Only("kind", ("conveyor",), required=True)
 HOMING_ONLY = Only("zero", ("homing",))
+DRIVES_ONLY = Only("kind", ("drives",))
+EXTERNAL_ONLY, EXTERNAL_REQUIRED = (Only("kind", ("external",), required=given) for given in (False, True))
 HOMING_METHOD = Check(
     "from -128 to 127, but not 0",
     lambda value: -128 <= value <= 127 and value != 0,
@@ -110,21 +114,41 @@ class BringUpSettings:
 
 @dataclass(frozen=True, slots=True)
 class ArmSettings:
-    """`[arm]`: the chain of the arm, and what holds for all its drives.
+    """`[arm]`: the chain of the arm, and what holds for all its drives; or an arm that is not on the bus.
 
-    The chain is either a URDF with its base and tip link, or the Denavit-Hartenberg rows of the joints.
+    The chain is either a URDF with its base and tip link, or the Denavit-Hartenberg rows of the joints. An external arm
+    has neither joints nor drives: poses of its flange are read and commanded, and `cycle.rate_hz` is its rate.
     """
 
-    urdf: Annotated[str | None, ScenePath()] = None
+    kind: Literal["drives", "external"] = "drives"
+    """drives: CANopen drives on the bus. external: an arm behind an interface of its own (docs/external-arm.md)."""
+    address: Annotated[str | None, Pattern(r"[^\s:]+:\d{1,5}", "such as 127.0.0.1:5810"), EXTERNAL_ONLY] = None
+    """Host and port at which the program of the arm listens. Left out: the arm is given in Python, or emulated."""
+    delay_ms: Annotated[float, Range(0, 500), EXTERNAL_REQUIRED] = 0.0
+    """Dead time from a command until the arm moves by it, with that of both ways of its interface. Its lag behind a
+    ramp is `servo.drive_lag_ms`."""
+    stop_after_ms: Annotated[float, Range(1, 5000), EXTERNAL_REQUIRED] = 100.0
+    """Time without a command after which the arm stops by itself."""
+    start_mm: Annotated[Vec3, EXTERNAL_REQUIRED] = (0.0, 0.0, 0.0)
+    """Position of the flange at the start, in the base frame of the arm; `flange_deg` is its orientation there."""
+    reach_mm: Annotated[float, Range(1, 5000), EXTERNAL_ONLY] = 300.0
+    """Distance from `start_mm` along each axis up to which the flange may go."""
+    reach_deg: Annotated[float, Range(1, 80), EXTERNAL_ONLY] = 60.0
+    """Yaw, pitch and roll from `flange_deg` up to which the flange may turn."""
+    speed_mm_s: Annotated[float, Range(0, 10_000, open_low=True), EXTERNAL_ONLY] = 250.0
+    """Highest speed of the flange along each axis."""
+    speed_deg_s: Annotated[float, Range(0, 3600, open_low=True), EXTERNAL_ONLY] = 60.0
+    """Highest speed of its yaw, pitch and roll."""
+    urdf: Annotated[str | None, ScenePath(), DRIVES_ONLY] = None
     """URDF file of the arm, relative to the cell file. Left out: the rows in `[joints.*]` count."""
-    base: str | None = None
+    base: Annotated[str | None, DRIVES_ONLY] = None
     """Link of the URDF that is the base. Left out: its root."""
-    tip: str | None = None
+    tip: Annotated[str | None, DRIVES_ONLY] = None
     """Link of the URDF that is the flange. Left out: the only link without children that drives can move."""
-    convention: Convention = "standard"
+    convention: Annotated[Convention, DRIVES_ONLY] = "standard"
     """Denavit-Hartenberg convention of the rows."""
     mount_mm: Vec3 = (0.0, 0.0, 0.0)
-    """Where the chain begins in the base frame."""
+    """Where the chain, or the base frame of an external arm, begins in the base frame."""
     mount_deg: Vec3 = (0.0, 0.0, 0.0)
     """Roll, pitch and yaw of the beginning of the chain about the fixed axes x, y and z."""
     flange_mm: Vec3 = (0.0, 0.0, 0.0)
@@ -134,15 +158,15 @@ class ArmSettings:
     accuracy_mm: Annotated[float | None, Range(0, 100)] = None
     """Standard deviation of where the flange is in the base frame, along each axis, by the chain's lengths and zeros.
     Left out: 0.5 of a real arm, and 0 of an emulated one, which is as its file says."""
-    eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
+    eds: Annotated[str, ScenePath(), DRIVES_ONLY] = "puma260_joint.eds"
     """EDS of the drives that name none: a packaged name, or a path relative to the file."""
     emulated: bool = True
-    """canprobe serves the drives. false: the drives are real."""
-    missed_syncs: Annotated[int, Range(1, 250)] = 5
+    """canprobe serves the drives, or emulates the external arm. false: they are real."""
+    missed_syncs: Annotated[int, Range(1, 250), DRIVES_ONLY] = 5
     """SYNC periods of silence after which master and drives treat each other as lost."""
-    grouped_rpdo: bool | Auto = False
+    grouped_rpdo: Annotated[bool | Auto, DRIVES_ONLY] = False
     """Put two targets into one RPDO by dummy mapping."""
-    torque: bool = True
+    torque: Annotated[bool, DRIVES_ONLY] = True
     """Map the motor torque (6077h) into the TPDO of each drive, where the drive has it and the bus has room for it."""
     when_disabled: WhenDisabled = "unknown"
     """What the arm does when its drives are disabled: its brakes hold it, or it sinks. It is said before a person
@@ -286,6 +310,43 @@ class JointSettings:
     """Centre of mass of the link, in the frame of its Denavit-Hartenberg row."""
     inertia_kg_m2: Vec6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """Inertia of the link about its centre of mass: xx, yy, zz, xy, xz, yz."""
+
+
+@dataclass(frozen=True, slots=True)
+class CarrierSettings:
+    """`[carrier]`: what the object stands on and moves with: a turntable or a conveyor with an encoder (CiA 406).
+
+    Where the encoder shows position 0 the object is where the scene places it; start point and path move with it.
+    Positions of the encoder are `zero_counts + counts_per_turn * turns`, or counts_per_m times metres.
+    """
+
+    kind: Literal["turntable", "conveyor"] = "turntable"
+    """Turns about its axis, or moves along it."""
+    axis: Annotated[Vec3, DIRECTION] = (0.0, 0.0, 1.0)
+    """Direction of the axis in the base frame, of any length. Counts grow counter-clockwise about it, or along it."""
+    point_mm: Annotated[Vec3 | None, TURNTABLE] = None
+    """Point of the axis in the base frame."""
+    speed_deg_s: Annotated[float | None, Range(0, 360, open_low=True), TURNTABLE] = None
+    """Speed with which the plan counts from position 0 on, and an emulated one turns. A report of a motion faster than
+    1.5 times that is not believed."""
+    speed_mm_s: Annotated[float | None, Range(0, 1000, open_low=True), CONVEYOR] = None
+    """The same of a conveyor."""
+    counts_per_turn: Annotated[float | None, Range(1, 1e9), TURNTABLE] = None
+    """Units of the position value (6004h) per turn of the table."""
+    counts_per_m: Annotated[float | None, Range(1, 1e12), CONVEYOR] = None
+    """Units of the position value per metre of the conveyor."""
+    zero_counts: int = 0
+    """Position value where the object is where the scene places it."""
+    node_id: NodeId = 17
+    """Node id of the encoder."""
+    channel: Channel | None = None
+    """Channel of the bus that the encoder is on. Left out: `bus.channel`."""
+    eds: Annotated[str, ScenePath()] = "encoder.eds"
+    """EDS of the encoder: a packaged name, or a path relative to the file."""
+    emulated: bool = True
+    """canprobe serves the encoder, and moves the emulated object. false: the encoder is real."""
+    serial_number: SerialNumber | None = None
+    """Serial number (1018h:04) that the encoder must have. Left out: any."""
 
 
 @dataclass(frozen=True, slots=True)

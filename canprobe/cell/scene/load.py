@@ -388,8 +388,9 @@ def _scene(own: dict[str, Any], file: str, folder: Path | None, *, whole: bool =
         document = _with_array(document, folder)
     reader = Reader(folder)
     values = reader.read(Scene, document, (*_ALWAYS_PRESENT, *defaults))
+    jointless = values.get("arm") is not None and values["arm"].kind == "external"
     for section, (need, why) in needs.items():
-        if need == "must" and section not in document:
+        if need == "must" and section not in document and not (jointless and section == "joints"):
             reader.complain(section, f'missing: task.kind = "{kind}" needs a section [{section}]: {why}')
         elif need == "never" and section in document:
             reader.complain(section, f'not with task.kind = "{kind}": {why}; remove the section')

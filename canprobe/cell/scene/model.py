@@ -17,6 +17,7 @@ from canprobe.cell.scene.hardware import (
     Auto,
     BringUpSettings,
     BusSettings,
+    CarrierSettings,
     CellInfo,
     Channel,
     EmulateSettings,
@@ -521,6 +522,7 @@ class CellFile:
     sensor: SensorSettings | None = None
     wire: WireSettings | None = None
     probe: ProbeSettings | None = None
+    carrier: CarrierSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
     emulate: EmulateSettings | None = None
@@ -565,6 +567,7 @@ class Scene:
     probe: ProbeSettings | None = None
     object: ObjectSettings | None = None
     shape: ShapeSettings | None = None
+    carrier: CarrierSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
     bridge: BridgeSettings | None = None
@@ -589,6 +592,7 @@ class Scene:
     def channels(self) -> tuple[str, ...]:
         """Channels that the scene names, that of `[bus]` first; not one that is left to the plan."""
         named = [joint.channel for joint in self.joints.values()]
+        named += [self.carrier.channel] if self.carrier is not None else []
         named += [self.sensor.channel] if self.sensor is not None and self.sensor.channel != "auto" else []
         return tuple(dict.fromkeys((self.bus.channel, *(name for name in named if name is not None))))
 
@@ -597,7 +601,8 @@ class Scene:
         """The nodes that the scene wants emulated, ascending."""
         drives = [node_id for node_id, emulated in self.drives.items() if emulated]
         sensor = (self.sensor.node_id,) if self.sensor is not None and self.sensor.emulated else ()
-        return tuple(sorted((*drives, *(sensor if self.array_is_node else ()))))
+        carrier = (self.carrier.node_id,) if self.carrier is not None and self.carrier.emulated else ()
+        return tuple(sorted((*drives, *(sensor if self.array_is_node else ()), *carrier)))
 
     @property
     def array_is_node(self) -> bool:

@@ -31,6 +31,7 @@ from canprobe.cell.scene.setup import (
     Arm,
     Array,
     Calibrate,
+    Carrier,
     Drive,
     Dynamics,
     Free,
@@ -139,9 +140,11 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
     """The arm, and the bodies of its links."""
     if scene.arm is None:
         return None, None
-    from canprobe.cell.scene.arms import arm_model, homing_of, per_joint, posture_in_si
+    from canprobe.cell.scene.arms import arm_model, external_arm, homing_of, per_joint, posture_in_si
 
     settings, joints = scene.arm, scene.joints
+    if settings.kind == "external":
+        return external_arm(scene.cell.name, settings, scene.cycle.rate_hz), None
     model, bodies, warnings = arm_model(scene.cell.name, settings, joints)
     each = zip(scene.drives.items(), joints.values(), strict=True)
     drives = tuple(
@@ -255,6 +258,19 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
     )
 
 
+def _carrier(scene: Scene) -> Carrier | None:
+    if (settings := scene.carrier) is None:
+        return None
+    from canprobe.mechanics.touch.carrier import CarrierMotion
+
+    s, si, point, units = settings, in_si(settings), None, settings.counts_per_m
+    if s.counts_per_turn is not None:
+        point, units = np.array(si["point"]), s.counts_per_turn / (2.0 * math.pi)
+    motion = CarrierMotion(np.array(s.axis) / np.linalg.norm(s.axis), point)
+    node = s.node_id, s.channel or scene.bus.channel, s.eds, s.emulated, s.serial_number
+    return Carrier(*node, motion, speed=si["speed"], units=units or 1.0, zero=s.zero_counts)
+
+
 def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCalibration) -> RawWire:
     found = calibration.centroid
     sure = settings.calibration is not None and abs(found.latency_s) > LATENCY_SIGMAS * found.latency_sigma_s
@@ -321,10 +337,11 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     """The setup of the task; `canprobe.cell.scene.rules` has checked that the scene has what it needs."""
     settings = scene.task
     if settings.kind == "free":
-        from canprobe.cell.scene.arms import per_joint
+        from canprobe.cell.scene.arms import EXTERNAL_SWING, per_joint
 
         assert arm is not None
-        return Free(arm, per_joint(scene.joints, "swing"), settings.swing_period_s, settings.duration_s)
+        swing = EXTERNAL_SWING if arm.external is not None else per_joint(scene.joints, "swing")
+        return Free(arm, swing, settings.swing_period_s, settings.duration_s)
     assert array is not None
     if settings.kind == "listen":
         return Listen(array, probe, settings.duration_s)
@@ -349,7 +366,8 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
         "force": highest(settings.force_n),
         "tables": _target_tables(settings),
         "duration_s": settings.duration_s,
-        "lag_s": servo.drive_lag_ms * 1e-3,
+        "lag_s": servo.drive_lag_ms * 1e-3 + arm.delay_s,
+        "carrier": _carrier(scene),
     }
     if settings.kind == "calibrate":
         from canprobe.mechanics.robot.tool_calibration import ball_approaches

@@ -8,6 +8,7 @@ from typing import Any
 
 from canprobe.cell.scene.hardware import JointSettings, Vec3
 from canprobe.cell.scene.model import FORCES, SPEEDS, TOUCH_KINDS, Posture, TargetPoints, WireSettings, highest
+from canprobe.cell.scene.toml_files import toml_value
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageFormat
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE, WINDOW_SIZES
@@ -19,6 +20,7 @@ _USUALLY = {
     "wire": ("default", ""),
     "probe": ("default", ""),
     "object": ("may", ""),
+    "carrier": ("mounted", ""),
     "shape": ("default", ""),
     "servo": ("default", ""),
     "plant": ("default", ""),
@@ -37,12 +39,14 @@ _BESIDES = {
     "calibrate": {
         "arm": ("must", "a calibration moves the probe"),
         "sensor": ("must", "a calibration measures where the ball is touched"),
+        "carrier": ("never", "the ball stands still"),
         "shape": ("never", "the ball's shape is known"),
         "servo": ("never", "no surface is followed"),
     },
     "listen": {
         "arm": ("never", "listening moves nothing"),
         "sensor": ("must", "there is nothing else to listen to"),
+        "carrier": ("never", "listening moves nothing"),
         "shape": ("never", "without motion there is no shape to estimate"),
         "servo": ("never", "listening moves nothing"),
     },
@@ -51,6 +55,7 @@ _BESIDES = {
         "wire": ("may", ""),
         "probe": ("mounted", ""),
         "object": ("never", "free motion touches nothing"),
+        "carrier": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
         "servo": ("never", "there is no touch to control"),
     },
@@ -80,9 +85,12 @@ def _across(*keys: str) -> Callable[[Callable[..., _Complaint]], Callable[..., _
     return take
 
 
-@_across("arm", "joints")
-def _joints_missing(arm: object, joints: Mapping[str, JointSettings]) -> _Complaint:
-    if not 1 <= len(joints) <= MAX_JOINTS:
+@_across("arm.kind", "joints")
+def _joints_missing(kind: str, joints: Mapping[str, JointSettings]) -> _Complaint:
+    if kind == "external":
+        if joints:
+            yield "joints", 'not with arm.kind = "external", which has no joints; remove the sections'
+    elif not 1 <= len(joints) <= MAX_JOINTS:
         yield "joints", f"expected 1 to {MAX_JOINTS} sections [joints.NAME], got {len(joints)}"
 
 
@@ -121,14 +129,18 @@ def _joint_incomplete(joints: Mapping[str, JointSettings], urdf: str | None) -> 
                 yield f"joints.{name}.coupling", f"expected names of other joints ({names}), got {other}"
 
 
-@_across("joints", "sensor.node_id?", "wire.kind?")
-def _duplicate_node(joints: Mapping[str, JointSettings], sensor: int | None, wire: str | None) -> _Complaint:
+@_across("joints", "sensor.node_id?", "wire.kind?", "carrier.node_id?")
+def _duplicate_node(
+    joints: Mapping[str, JointSettings], sensor: int | None, wire: str | None, carrier: int | None
+) -> _Complaint:
     owners = {sensor: "sensor"} if sensor is not None and wire != "frames" else {}
+    if carrier is not None and owners.setdefault(carrier, "carrier") == "sensor":
+        yield "carrier.node_id", f"expected another node id than sensor.node_id, got {carrier}"
     for number, (name, joint) in enumerate(joints.items(), start=1):
         node_id = joint.node_id or number
         other = owners.setdefault(node_id, name)
-        if other == "sensor":
-            yield "sensor.node_id", f"expected a node id that no joint has, got {node_id}, as joints.{name}"
+        if other in ("sensor", "carrier"):
+            yield f"{other}.node_id", f"expected a node id that no joint has, got {node_id}, as joints.{name}"
         elif other != name:
             yield f"joints.{name}.node_id", f"expected node ids all different, got {node_id}, as joints.{other} has"
 
@@ -165,6 +177,21 @@ def _heading_along_normal(kind: str, normal: tuple[float, ...], heading: float) 
     if kind == "scan" and abs(along) >= 0.99:
         why = f"expected a heading across task.approach_normal, got {heading:g}, which runs along it"
         yield "task.heading_deg", why
+
+
+@_across("carrier.emulated", "arm.emulated")
+def _half_moved(carrier: bool, arm: bool) -> _Complaint:
+    if carrier != arm:
+        why = "an emulated carrier moves an emulated object, a real one a real object"
+        yield "carrier.emulated", f"expected {toml_value(arm)}, as arm.emulated: {why}"
+
+
+@_across("carrier", "joints", "plant.fidelity", "task.strategy?")
+def _moved_object(carrier: object, joints: Mapping[str, JointSettings], fidelity: str, strategy: str) -> _Complaint:
+    if strategy == "explore":
+        yield "task.strategy", "expected a path that can be planned in time with a [carrier], got explore"
+    if fidelity == "dynamic" or any(joint.stiffness_nm_rad or joint.stiffness_n_m for joint in joints.values()):
+        yield "plant.fidelity", "expected an ideal arm with rigid joints with a [carrier]: no other is emulated"
 
 
 @_across("joints", "plant.fidelity")

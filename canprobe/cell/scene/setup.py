@@ -12,6 +12,7 @@ scene whose values are SI already (`[bus]`, `[bring_up]`, `[bridge]`) are taken 
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.model import ArmModel, Body
     from canprobe.mechanics.robot.tool_calibration import BallApproach
     from canprobe.mechanics.touch import ArrayCalibration, Pad
+    from canprobe.mechanics.touch.carrier import CarrierMotion
     from canprobe.mechanics.touch.servo import SurfaceGains
     from canprobe.mechanics.touch.shapes import PlacedShape
     from canprobe.mechanics.touch.strategies import Rectangle, Strategy
@@ -98,13 +100,32 @@ class Drive(Node):
     quirks: Quirks | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class External:
+    """An arm that is not on the bus.
+
+    Attributes:
+        address: host and port of its program; None: it is given, or emulated.
+        emulated: it is emulated.
+        delay_s: dead time from a command to its motion.
+        stop_after_s: time without a command after which it stops by itself.
+    """
+
+    address: str | None
+    emulated: bool
+    delay_s: float
+    stop_after_s: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm:
     """The arm: its chain, and a drive for each of its n joints.
 
+    The joints of an external arm are the coordinates of its flange, see `canprobe.mechanics.robot.flange`.
+
     Attributes:
         model: geometry, limits and motor counts.
-        drives: one a joint, from the base.
+        drives: one a joint, from the base; none of an external arm.
         q_start: (n,) rad; selects the branch of the inverse kinematics, and is where an emulated arm stands.
         missed_syncs: SYNC periods of silence after which drive and master treat each other as lost.
         grouped: two targets share an RPDO through dummy mapping.
@@ -114,6 +135,7 @@ class Arm:
         temperature: entry of the drives' temperature (index, sub-index), and its unit, °C; None: not stated.
         when_disabled: what it does when its drives are disabled, as the cell file says.
         profile_lag: lag that profile position adds to that of the drives, s; 0 where no drive goes by it.
+        external: the arm as one that is not on the bus; None of an arm with drives.
     """
 
     model: ArmModel
@@ -127,6 +149,12 @@ class Arm:
     temperature: tuple[int, int, float] | None = None
     when_disabled: WhenDisabled = "unknown"
     profile_lag: float = 0.0
+    external: External | None = None
+
+    @property
+    def delay_s(self) -> float:
+        """Dead time of an external arm, s; 0 with drives."""
+        return self.external.delay_s if self.external is not None else 0.0
 
     @property
     def left_alone(self) -> str:
@@ -206,6 +234,32 @@ class Array(Node):
         from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
 
         return self.calibration.newtons if self.calibrated else NO_FORCE_REFERENCE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carrier(Node):
+    """The turntable or conveyor that the object stands on, with the encoder that is its node.
+
+    Attributes:
+        motion: its axis.
+        speed: speed that the plan counts with, rad/s or m/s.
+        units: units of the position value per rad or m.
+        zero: position value at position 0.
+    """
+
+    motion: CarrierMotion
+    speed: float
+    units: float
+    zero: int
+
+    @property
+    def column(self) -> str:
+        """Column of its position in the log."""
+        return "carrier_m" if self.motion.point is None else "carrier_rad"
+
+    def text(self, way: float) -> str:
+        """A way of it, rad or m, for people."""
+        return f"{1e3 * way:.3g} mm" if self.motion.point is None else f"{math.degrees(way):.3g} deg"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -360,7 +414,8 @@ class Touching:
         force: target of the contact force, N; of a table the highest.
         tables: targets that vary, `target_force_n` in N and `speed_m_s` in m/s; of the others there is one value.
         duration_s: duration of the scan or of the hold; of a calibration, the duration that the plan expects.
-        lag_s: lag of the drives behind a ramp.
+        lag_s: lag of the drives behind a ramp, with the dead time of an external arm.
+        carrier: what the object moves with; None: it stands still.
     """
 
     arm: Arm
@@ -371,6 +426,7 @@ class Touching:
     tables: Mapping[str, TargetTable]
     duration_s: float
     lag_s: float
+    carrier: Carrier | None = field(default=None, kw_only=True)
 
     @property
     def least_force(self) -> float:
@@ -582,6 +638,11 @@ class Setup:
         return self.array is not None and self.arm is not None
 
     @property
+    def carrier(self) -> Carrier | None:
+        """What the object moves with; None: it stands still."""
+        return self.task.carrier if isinstance(self.task, Touching) else None
+
+    @property
     def scan(self) -> Scan | None:
         """The path; None where no surface is followed."""
         return self.task.scan if isinstance(self.task, Touch) else None
@@ -594,7 +655,13 @@ class Setup:
     @property
     def emulates(self) -> bool:
         """Whether any part of the cell is emulated."""
-        return any(drive.emulated for drive in self.drives) or (self.array is not None and self.array.emulated)
+        return self.emulates_arm or (self.array is not None and self.array.emulated)
+
+    @property
+    def emulates_arm(self) -> bool:
+        """Whether a drive or the external arm is emulated."""
+        external = self.arm.external if self.arm is not None else None
+        return external.emulated if external is not None else any(drive.emulated for drive in self.drives)
 
     def line_to_type(self, command: str, *options: str) -> str:
         """The line of a command on the cell's bus; on SocketCAN where the scene names none."""

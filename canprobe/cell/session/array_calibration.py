@@ -22,6 +22,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.motion import reach_problems
 from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
+from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.scene.hardware import Vec3
 from canprobe.cell.scene.load import load_scene, packaged_files
 from canprobe.cell.scene.model import ObjectSettings, Scene
@@ -43,7 +44,6 @@ from canprobe.mechanics.touch.array_calibration.verify import Verification, veri
 from canprobe.mechanics.touch.contact import direction_to_pad
 from canprobe.mechanics.touch.image.calibration import ArrayCalibration, ForceReference
 from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD
-from canprobe.mechanics.types import Floats
 
 Ask = Callable[[str], str]
 """Asks a person a text, and returns the answer."""
@@ -384,15 +384,15 @@ def touch_object(
         say: called with each step.
         ask: asks for reference loads.
     """
-    task, roll = plan.setup.task, _roll_task(plan, visit)
-    assert isinstance(task, Touch)
+    array, roll = plan.setup.array, _roll_task(plan, visit)
+    assert array is not None
     with Session(plan, RunOptions(out, say)) as session:
-        ids = [task.array.node_id] if task.array.raw is None else []
+        ids = [array.node_id] if array.raw is None else []
         serials = session.cell.bring_up.serial_numbers(ids)
         session.run(roll)
     log, truth = session.cell.log.arrays(), session.buses.truth
-    presses = roll.presses
-    places = list(dict.fromkeys(p.at if not p.hz[1:] else (p.at, p.heading) for p in presses))
+    touched = [p.at if not p.hz[1:] else (p.at, p.heading) for p in roll.presses]
+    places = list(dict.fromkeys(touched))
     dwells = []
     for i, pressed in enumerate(roll.pressed):
         press = pressed.press
@@ -403,9 +403,8 @@ def touch_object(
             force = float(truth["force_n"][: len(rows)][rows].mean())
         elif visit.load:
             force = _read(ask, press.force)
-        place = visit.first + places.index(press.at if not press.hz[1:] else (press.at, press.heading))
-        place += 50 * bool(press.hz[1:])
-        dwells.append(as_dwell(pressed, visit, task.approach.start, task.probe.radius, place, force))
+        place = visit.first + places.index(touched[i]) + 50 * bool(press.hz[1:])
+        dwells.append(as_dwell(pressed, plan, visit, place, force))
     return dwells, roll.unloaded, next(iter(serials.values()), 0) or None
 
 
@@ -439,45 +438,34 @@ def _along_rod(plan: Plan, known: KnownObject) -> float:
     return math.atan2(y, x) - known.angle
 
 
-def as_dwell(  # noqa: PLR0917
-    pressed: RollRecord, visit: Visit, start: Floats, probe_radius: float, place: int, force: float | None
-) -> Dwell:
+def as_dwell(pressed: RollRecord, plan: Plan, visit: Visit, place: int, force: float | None) -> Dwell:
     """Make the input of the fit from a touch: where its contacts should lie by joints and object.
 
     Args:
         pressed: record of the touch.
-        visit: visit of the object, which is level under the probe.
-        start: highest point of the object (3,), m.
-        probe_radius: radius of the probe, m.
+        plan: plan of the visit, whose scene has the object.
+        visit: visit of the object.
         place: number of the place.
         force: force by the reference, N.
     """
-    known, up = visit.known, np.array([0.0, 0.0, 1.0])
-    axis = np.array([math.cos(known.angle), math.sin(known.angle), 0.0])
-    expected, push, angles = [], [], []
-    for T in pressed.T_base_probe:
-        centre = T[:3, 3]
-        inward, depth = -up, float(up @ (start - centre)) + probe_radius
-        if known.name != "plane":
-            way = start - known.radius * up - centre
-            way = way - axis * float(axis @ way) if known.name == "rod" else way
-            distance = float(np.linalg.norm(way))
-            inward, depth = way / distance, known.radius + probe_radius - distance
-        expected.append(direction_to_pad(T[:3, :3].T @ inward, probe_radius))
-        push.append(depth)
-        across = np.cross(axis, up)
-        angles.append(math.atan2(float(across @ T[:3, 1]), float(across @ T[:3, 0])))
-    k = 0.0 if math.isinf(known.radius) else 1.0 / known.radius
+    known, radius, poses = visit.known, plan.setup.probe.radius, pressed.T_base_probe
+    assert plan.scene.object is not None
+    shape = true_object(plan.scene.object)
+    near = [shape.closest(T[:3, 3]) for T in poses]
+    u, v = poses[0][:3, :2].T @ (math.sin(known.angle), -math.cos(known.angle), 0.0)  # across a rod
+    larger, smaller = near[0].kappa.tolist()
     return Dwell(
         name=known.name,
-        kappa=(k, 0.0 if known.name == "rod" else k),
-        angle=angles[0] if known.name == "rod" else 0.0,
+        kappa=(larger, smaller),
+        angle=math.atan2(v, u) if known.name == "rod" else 0.0,
         place=place,
         t_s=np.array(pressed.t_s),
         images=pressed.images,
         windows=[w or (0, 0, 16, 16) for w in pressed.windows],
-        expected=np.array(expected),
-        push=np.array(push),
+        expected=np.array(
+            [direction_to_pad(-T[:3, :3].T @ at.normal, radius) for T, at in zip(poses, near, strict=True)]
+        ),
+        push=np.array([radius - at.distance for at in near]),
         turn=math.pi if visit.turned else 0.0,
         force=force,
         to_and_fro=len(pressed.press.hz) > 1,

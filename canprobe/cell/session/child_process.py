@@ -81,11 +81,6 @@ class ChildProcess:
         assert self._process is not None
         return self._process
 
-    @property
-    def pid(self) -> int:
-        """Process id, once it is started."""
-        return self.process.pid
-
     def last_words(self) -> str:
         """Last line that the process wrote to its standard error; empty without any."""
         if self._errors is None:

@@ -75,17 +75,15 @@ class JointRecord:
             ResultsError: the file cannot be written.
         """
         for node_id, axis in self._axes.items():
-            if axis == finding.joint and finding.skipped is None:
-                witness = {
-                    "seen": finding.seen,
-                    "asked": f"{finding.asked:+.2f} {finding.unit}",
-                    "array_n": finding.force,
-                }
-                entry = {**self._settings(axis, serials.get(node_id)), **witness}
-                entry["date"] = datetime.now().astimezone().isoformat(timespec="seconds")
-                right = finding.fault is None and finding.seen is not None
-                if right or finding.fault is not None:
-                    self._record.put(node_id, entry if right else None)
+            if axis != finding.joint or finding.skipped is not None:
+                continue
+            if finding.fault is not None:
+                self._record.put(node_id, None)
+            elif finding.seen is not None:
+                entry = self._settings(axis, serials.get(node_id))
+                entry |= {"seen": finding.seen, "asked": f"{finding.asked:+.2f} {finding.unit}"}
+                entry |= {"array_n": finding.force, "date": datetime.now().astimezone().isoformat(timespec="seconds")}
+                self._record.put(node_id, entry)
 
     def _settings(self, axis: int, serial: int | None) -> dict[str, Any]:
         """The values with which what was seen is valid, as JSON gives them back; None where one is not known."""

@@ -78,11 +78,6 @@ def expected_of(plan: Plan) -> dict[str, ExpectedLink]:
     }
 
 
-def check_link(link: LinkState, expected: ExpectedLink) -> list[Remark]:
-    """All findings about an interface; none for a virtual one."""
-    return [] if link.kind in VIRTUAL_KINDS else [*_remarks(link, expected)]
-
-
 def controller_trouble(link: LinkState, *, typed: bool = True) -> str | None:
     """Why a controller cannot send or receive, and what to do; None where its state is no reason.
 
@@ -93,7 +88,10 @@ def controller_trouble(link: LinkState, *, typed: bool = True) -> str | None:
     known = link.tx_errors is not None or link.rx_errors is not None
     counters = f" (error counters: {link.tx_errors} transmit, {link.rx_errors} receive)" if known else ""
     if link.state == "BUS-OFF":
-        look, line = f"check wiring, bit rate and termination ({TERMINATION})", _restart_line(link)
+        look = f"check wiring, bit rate and termination ({TERMINATION})"
+        line = f"then type: {ip_line(f'{link.name} type can restart')}"
+        if link.restart_ms:
+            line = f"it restarts by itself every {link.restart_ms} ms"
     elif link.state == "ERROR-PASSIVE":
         look, line = f"{_symptom(link)}; {TERMINATION}", f"then type: {emptying_line(link.name)}"
     else:
@@ -101,13 +99,10 @@ def controller_trouble(link: LinkState, *, typed: bool = True) -> str | None:
     return f"{link.state.lower()}{counters}: {look}" + (f"; {line}" if typed else "")
 
 
-def _restart_line(link: LinkState) -> str:
-    if link.restart_ms:
-        return f"it restarts by itself every {link.restart_ms} ms"
-    return f"then type: {ip_line(f'{link.name} type can restart')}"
-
-
-def _remarks(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
+def check_link(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
+    """All findings about an interface; none for a virtual one."""
+    if link.kind in VIRTUAL_KINDS:
+        return
     name, line = link.name, setting_line(link.name, expected.bitrate, expected.data_bitrate)
     pairs = [("bit rate", link.bitrate, expected.bitrate)]
     if expected.data_bitrate is not None:

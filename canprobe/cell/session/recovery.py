@@ -115,14 +115,14 @@ class Recovery:
                 self._lose(error)
             if self._lost is not None:
                 self._come_back(PausedController(runs, self._place, None))
-                self._report_back("")
             while (error := self._attempt(lambda: self.cell.advance(None, progress))) is not None:
                 self._lose(error)
                 if not runs.resumable:
                     raise error
-                self._come_back(PausedController(runs, self._place, lambda: self._asked, self._note_resumed))
-                self._asked = False
-                self._report_back(" and holds; motion goes on when it is asked for (resume)")
+                self._come_back(
+                    PausedController(runs, self._place, lambda: self._asked, self._note_resumed),
+                    " and holds; motion goes on when it is asked for (resume)",
+                )
         finally:
             self._running = False
 
@@ -139,7 +139,6 @@ class Recovery:
         else:
             self._tries = 0
             self._come_back(None)
-            self._report_back("")
 
     def close(self) -> None:
         """Stop safely and close the bus."""
@@ -182,13 +181,11 @@ class Recovery:
         self._say("motion goes on")
         self.cell.notes.add("motion was asked for, and went on", t_s=self._run_s(self.cell))
 
-    def _report_back(self, then: str) -> None:
-        after_s = (self._port.clock.now_ns() - self._lost_ns) * 1e-9
-        self._say(f"the cell is back after {after_s:.1f} s{then}")
-        self.cell.notes.add("the cell came back", t_s=self._run_s(self.cell))
+    def _come_back(self, task: Controller | None, then: str = "") -> None:
+        """Wait, bring the cell up, and enable it for a task; a failure before that is waited out, a few times.
 
-    def _come_back(self, task: Controller | None) -> None:
-        """Wait, bring the cell up, and enable it for a task; a failure before that is waited out, a few times."""
+        What was asked for meanwhile does not count. The report of the return ends with `then`.
+        """
         assert self._lost is not None
         while True:
             self._tries += 1
@@ -213,7 +210,9 @@ class Recovery:
                 if isinstance(error, InterfaceError):
                     self._reopened()
             else:
-                self._lost, self._back_ns = None, self._port.clock.now_ns()
+                self._lost, self._back_ns, self._asked = None, self._port.clock.now_ns(), False
+                self._say(f"the cell is back after {(self._back_ns - self._lost_ns) * 1e-9:.1f} s{then}")
+                self.cell.notes.add("the cell came back", t_s=self._run_s(self.cell))
                 return
 
     def _wait(self) -> None:
@@ -260,7 +259,6 @@ class _Wait:
 
     def __init__(self, plan: Plan, foreign: bool) -> None:
         self._plan, self._settings = plan, plan.setup.bring_up
-        self._setups = {setup.node_id: setup for setup in plan.nodes}
         self._watch = NodeWatch(plan.node_ids)
         self._absent: set[int] = set()
         self._listen_s = MASTER_QUIET_S if foreign else max(self._settings.listen_s, ANSWER_S)
@@ -292,7 +290,7 @@ class _Wait:
         """
         lost = {node_id for node_id, number in self._watch.boot_ups.items() if number} | (self._absent & released)
         network, asked = PumpedNetwork(port, other=self._watch.push), dict[int, Dialogue]()
-        for setup in self._setups.values():
+        for setup in self._plan.nodes:
             if setup.homing and setup.node_id not in lost | released:
                 asked[setup.node_id] = self._compare(setup, lost)
         hold_dialogues(network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)

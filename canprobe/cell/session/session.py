@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
@@ -35,6 +35,9 @@ from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.tools.link import AnswerFigures, Fitness, LinkFigures, LinkLimits, judge_link
+
+if TYPE_CHECKING:
+    from canprobe.cell.master.external_arm import ExternalArm
 
 REHEARSED_S = 0.3
 """Length of the scene's phase in a rehearsal, s: an estimator answers several times in it."""
@@ -84,6 +87,7 @@ class Session:
         self._cell: Cell | None = None
         self._recovery: Recovery | None = None
         self._stopped_for: CanprobeError | None = None
+        self._arm: ExternalArm | None = None
 
     @property
     def cell(self) -> Cell:
@@ -122,6 +126,7 @@ class Session:
         try:
             port = self.around(self.buses.open(self.record))
             self.steps.time_s = lambda: (port.clock.now_ns() - self.record.origin_ns) * 1e-9
+            self._arm = self._external_arm(port)
             self._cell = self._make_cell(port)
             if isinstance(self.buses, RealBuses):
                 self._get_ready(port, self._cell, self.buses)
@@ -216,7 +221,31 @@ class Session:
             origin_ns=self.record.origin_ns,
             zeros=zeros_file(self.plan),
             before=before,
+            arm=self._arm,
         )
+
+    def _external_arm(self, port: Port) -> ExternalArm | None:
+        """The arm that is not on the bus, stopped on every way out; None with drives, or without an arm."""
+        from canprobe.cell.master.external_arm import stopping
+
+        arm, its = self.options.arm, self.plan.setup.arm
+        if its is None or (external := its.external) is None:
+            if arm is not None:
+                raise UsageError('arm: expected a scene with arm.kind = "external", got one without')
+            return None
+        if arm is None and external.emulated:
+            from canprobe.cell.emulated.flange_arm import EmulatedArm
+
+            arm = EmulatedArm(self.plan, self.buses.world.plant, port.clock)
+        elif arm is None:
+            if external.address is None:
+                raise UsageError(
+                    "arm.address: missing: expected where the program of the arm listens, or arm= in Python"
+                )
+            from canprobe.cell.session.arm_socket import SocketArm
+
+            arm = self._stack.enter_context(contextlib.closing(SocketArm(external)))
+        return self._stack.enter_context(stopping(arm))
 
     def _close(self) -> None:
         try:

@@ -10,6 +10,7 @@ import pytest
 
 from canprobe.cell.master.conditions import BY_KEY, CONDITIONS, COUNTERS
 from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.drives import DriveAxis
 from canprobe.cell.master.supervision import CycleState, Limits, Reaction, TouchState
 from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.master.watch import NodeWatch
@@ -35,7 +36,7 @@ def seen(limits=LIMITS, **fields):
 def with_ages(*ages):
     """Two drives that were heard last so many cycles ago."""
     found = seen(measurement=Measurement(100, 0, q_age=ages))
-    found.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=1), SimpleNamespace(node_id=2)])
+    found.drives = SimpleNamespace(axes=[DriveAxis(1, (), ()), DriveAxis(2, (), ())])
     return found
 
 
@@ -164,7 +165,7 @@ def test_what_is_counted():
 def test_what_ends_the_enabling_of_the_drives_already():
     """All that is wrong with nodes, bus, array or log; the rest needs a drive in operation, or a controller."""
     assert {condition.key for condition in CONDITIONS if condition.enabling} == {
-        *("foreign_master", "heartbeat", "nmt_state", "emcy"),
+        *("foreign_master", "heartbeat", "nmt_state", "emcy", "carrier"),
         *("error_passive", "bus_off", "preload", "joint_speed", "log"),
     }
 

@@ -79,6 +79,7 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
     assert {field.name for field in dataclasses.fields(scene) if getattr(scene, field.name) is None} == {
         *absent,
         "bridge",
+        "carrier",
         "keep_out",
     }
 
