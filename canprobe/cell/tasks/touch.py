@@ -248,8 +248,7 @@ class TouchTask(ProbingTask):
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
             for name, table in self.tables.items():
-                now = self.targets[name]
-                wanted = self._shares[name] * table.at(self._servo.travelled, self._scan_t)
+                now, wanted = self.targets[name], self._shares[name] * table.at(self._servo.travelled, self._scan_t)
                 self._columns[target_column(name)] = now
                 self.targets[name] = towards(wanted, now, TARGET_RATES[name] * self._dt)
         return command
