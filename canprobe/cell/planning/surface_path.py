@@ -280,12 +280,16 @@ def carried(task: Touch, carrier: Carrier, path: SurfacePath) -> Iterator[tuple[
     The path goes round until the run, or one turn of the carrier, is over. A very long run is gone through faster.
     """
     poses, scan = contact_poses(task, path), task.scan
-    resting, ways = (poses[0], CARRIED_STEP_S), np.linalg.norm(path.points - np.roll(path.points, 1, axis=0), axis=1)
-    steps = (
-        [(poses[0], CARRIED_STEP_S)]
-        if scan is None
-        else [(pose, max(way / scan.speed, 1e-3)) for pose, way in zip(poses, ways.tolist(), strict=True)]
-    )
+    resting = poses[0], CARRIED_STEP_S
+    steps = [] if scan is not None else [resting]
+    ways = np.linalg.norm(np.roll(path.points, -1, axis=0) - path.points, axis=1).tolist()
+    for last, here, way in zip(poses, [*poses[1:], poses[0]], ways, strict=True) if scan is not None else ():
+        seconds = max(way / scan.speed, 1e-3)
+        count = math.ceil(seconds / CARRIED_STEP_S)
+        for share in (np.arange(count) + 1) / count:
+            pole = last.pole + share * (here.pole - last.pole)
+            centre = last.centre + share * (here.centre - last.centre)
+            steps.append((ProbePose(centre, pole / np.linalg.norm(pole)), seconds / count))
     turn_s = 2.0 * math.pi / carrier.speed if carrier.motion.point is not None else math.inf
     end_s, t = TASK_OVERHEAD_S + min(task.duration_s, turn_s), 0.0
     pace = max(1.0, end_s * len(steps) / sum(seconds for _, seconds in steps) / MAX_CARRIED_STEPS)

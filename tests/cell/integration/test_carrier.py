@@ -46,16 +46,17 @@ def test_an_object_on_a_conveyor_is_followed(tmp_path):
 
 def test_a_run_that_leaves_the_reach_of_the_arm_is_refused():
     long = CONVEYOR | {"axis": [1, 0, 0], "speed_mm_s": 50}
-    problems = reasons(canprobe.load_scene("turntable", {"carrier": long}))
-    assert any("into the run the contact is out of reach" in p or "joint" in p for p in problems)
+    (problem,) = reasons(canprobe.load_scene("turntable", {"carrier": long}))
+    assert problem.startswith("carrier: ") and "into the run the probe's centre at (" in problem
 
 
 def test_the_speed_of_the_object_counts_in_the_speeds_of_the_joints():
-    at_rest, turning, fast = (
-        canprobe.plan("turntable", {"task.duration_s": 5.0, "carrier.speed_deg_s": speed}).joint_speeds.worst_share
-        for speed in (0.01, 5.0, 20.0)
+    keys = {"task.duration_s": 2.0, "task.speed_mm_s": 2.0}
+    at_rest, turning = (
+        canprobe.plan("turntable", keys | {"carrier.speed_deg_s": speed}).joint_speeds.worst_share
+        for speed in (0.01, 90.0)
     )
-    assert at_rest < turning < fast
+    assert turning > 2.0 * at_rest
 
 
 def test_an_encoder_that_cannot_send_its_position_is_refused(tmp_path):
