@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # for type checkers, which do not read the table
     from canprobe.api import open_cell as open_cell
     from canprobe.api import plan as plan
     from canprobe.api import run as run
+    from canprobe.api import sample_target as sample_target
     from canprobe.cell.master.controller import Command as Command
     from canprobe.cell.master.controller import Controller as Controller
     from canprobe.cell.master.controller import Measurement as Measurement
@@ -52,7 +53,7 @@ __version__ = "0.2.0"
 __getattr__, __dir__, __all__ = door(
     __name__,
     {
-        "api": ("open_cell", "plan", "run"),
+        "api": ("open_cell", "plan", "run", "sample_target"),
         "cell.master.controller": ("Command", "Controller", "Measurement"),
         "cell.master.external_arm": ("ExternalArm",),
         "errors": (

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.observers import AnyObserver, Observation
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions, Say, quiet, unread
@@ -107,6 +109,28 @@ def run(
     check_free(folder, force=force)
     options = RunOptions(folder, say, observers, early_summary=early_summary, arm=arm)
     return run_plan(make_plan(resolve(resolved)), options, progress)
+
+
+def sample_target(
+    function: Callable[[float], float], over: str, end: float, *, lowest: float, highest: float, points: int = 201
+) -> dict[str, list[tuple[float, float]]]:
+    """A function as the table of ``task.force_n`` or ``task.speed_mm_s``, which plan, run and saved scene then have.
+
+    Args:
+        function: target in N or mm/s at a path in mm, or at a time in s.
+        over: ``path_mm`` or ``time_s``.
+        end: place up to which it is sampled, evenly from 0 on; beyond it the last value holds.
+        lowest, highest: range that it must stay in.
+        points: number of samples; between them the target is on straight lines.
+
+    Raises:
+        UsageError: the function leaves its range.
+    """
+    table = [(place, float(function(place))) for place in np.linspace(0.0, end, points).tolist()]
+    for place, value in table:
+        if not lowest <= value <= highest:
+            raise UsageError(f"function: expected {lowest:g} to {highest:g} at {over} = {place:g}, got {value:g}")
+    return {over: table}
 
 
 def run_plan(plan: Plan, options: RunOptions = DEFAULT_OPTIONS, progress: Progress | None = None) -> RunResult:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -193,6 +194,8 @@ def execute_notebooks() -> None:
     for path in sorted((DOCS / "notebooks").glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         with tempfile.TemporaryDirectory() as folder:
+            for recorded in path.parent.glob("*.csv"):
+                shutil.copy(recorded, folder)
             NotebookClient(notebook, resources={"metadata": {"path": folder}}, record_timing=False).execute()
         notebook.metadata.language_info = {"name": "python"}
         nbformat.write(notebook, path)

@@ -117,6 +117,9 @@ def value_schema(annotation: Any) -> JsonSchema:
     elif origin is tuple:
         length = {} if parts[-1] is Ellipsis else {"minItems": len(parts), "maxItems": len(parts)}
         schema = {"type": "array", "items": value_schema(parts[0]), **length}
+    elif origin is Mapping and typing.get_origin(parts[0]) is Literal:
+        keys = dict.fromkeys(typing.get_args(parts[0]), value_schema(parts[1]))
+        schema = {"type": "object", "properties": keys, "additionalProperties": False}
     elif origin is Mapping:
         schema = {"type": "object", "additionalProperties": value_schema(parts[1])}
     else:

@@ -2,6 +2,7 @@
 
     puma260_joint      nodes 1..6, a CiA 402 drive a joint    vendor CA5Eh, product 0260h, revision 0001_0000h
     tactile_array      node 16, 16 × 16 taxels                vendor CA5Eh, product 1616h, revision 0001_0000h
+    encoder            node 17, of what carries the object  vendor CA5Eh, product 0406h, revision 0001_0000h
     tactile_array_fd   the same with PDOs of up to 64 bytes   vendor CA5Eh, product 161Fh, revision 0001_0000h
 
 The vendor number is this project's own choice; CiA has not assigned it. Source of the format: CiA 306-1.

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import shutil
 from pathlib import Path
 
 import matplotlib
@@ -31,6 +32,8 @@ LONG = pytest.mark.slow(reason="a whole notebook; the default runs the first one
 )
 def test_a_notebook_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for recorded in path.parent.glob("*.csv"):
+        shutil.copy(recorded, tmp_path)
     with matplotlib.rc_context({"backend": "agg"}):
         names = {"__name__": "__main__"}
         for cell in cells_of(path):

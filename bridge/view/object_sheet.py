@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from canprobe.lab.bridge.view.meshes import arc, revolved, sheet
 from canprobe.mechanics.touch.heights import Heights
-from canprobe.mechanics.touch.objects import Cylinder, Sphere
-from canprobe.mechanics.touch.shapes import Bowl, PlacedShape, Torus, Wave
+from canprobe.mechanics.touch.objects import Sphere
+from canprobe.mechanics.touch.shapes import Bowl, Cylinder, PlacedShape, Torus, Wave
 from canprobe.mechanics.touch.tangent_frames import homogeneous
 from canprobe.mechanics.types import Floats
 

@@ -9,7 +9,7 @@ import base64
 import html
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,7 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
         "scene": scene.name,
         "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
         "phases": [m.phase for m in moments],
-        "target": task.force_n if task.kind in ("scan", "press") else None,
+        "target": task.force_n if task.kind in ("scan", "press") and not isinstance(task.force_n, Mapping) else None,
         "truth": run.setup.truth.object is not None,
         "shape": scene.shape is not None,
         "sensor": sensor is not None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import importlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,8 @@ class Panel:
         gui = server.gui
         gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
         gui.set_panel_label(f"canprobe · {scene.name}")
-        self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
+        force = scene.task.force_n if scene.task.kind in ("scan", "press") else None
+        self._target = None if isinstance(force, Mapping) else force
         self._status = gui.add_html("")
         rows = [_KEY.format(colour, html.escape(text)) for colour, text in legend_of(scene)]
         gui.add_html(_PHONE + _STYLED.format("<br>".join([" &ensp; ".join(rows), *map(html.escape, stage.notes)])))

@@ -6,10 +6,12 @@ On a terminal the image is renewed ten times a second. Elsewhere each line is on
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.argument_types import seconds
@@ -29,6 +31,7 @@ examples:
   canprobe listen puma260
   canprobe listen cell.toml --bus socketcan --channel can0
   canprobe listen cell.toml --bus socketcan --channel can0 --json --every 0.01
+  canprobe listen puma260 --record images.csv
 """
 _CLEAR = "\x1b[H\x1b[J"
 
@@ -37,6 +40,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
     parser.add_option("--duration S", "end after S seconds [10]", seconds, default=10.0)
     parser.add_option("--every S", "time between two images [0.1]", seconds, default=0.1)
+    parser.add_option("--record FILE.csv", "write each image with its time into this file, one a line", Path)
     parser.add_option("--json", "print one JSON document a line")
     parser.add_shared("-v")
 
@@ -56,15 +60,19 @@ def array_only(scene: Scene) -> Scene:
 def run(args: argparse.Namespace) -> None:
     """Print images until the time is over, or Ctrl-C."""
     from canprobe.cell.master.controller import Command
+    from canprobe.cell.results.recording import recording
 
     duration_s, args.duration = args.duration, None
     on_terminal = sys.stdout.isatty() and not args.json
     next_s, pace = 0.0, Pace()
-    with opened(args, prepared=array_only) as cell:
+    file = contextlib.nullcontext() if args.record is None else recording(args.record)
+    with file as record, opened(args, prepared=array_only) as cell:
 
         def step(measurement: Measurement) -> Command:
             nonlocal next_s
             t_s = 1e-9 * measurement.t_ns
+            if record is not None and (sample := measurement.tactile) is not None:
+                record(1e-9 * sample.t_sample_ns, sample.frame.taxels)
             if measurement.tactile is not None and t_s >= next_s:
                 next_s = t_s + args.every
                 if args.json:

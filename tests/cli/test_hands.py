@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 
+from canprobe.cell.results.recording import recording
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cli import main
 
@@ -125,6 +126,31 @@ def test_a_posture_that_does_not_fit_is_named(mine, capsys):
         "postures.far: expected a position of each of the 6 joints, got 4"
         in told(capsys, "posture", "check", mine, status=2).err
     )
+
+
+def test_listen_records_each_image_and_leaves_out_a_pose_that_is_not_there(capsys, tmp_path):
+    path = tmp_path / "images.csv"
+    told(capsys, "listen", "puma260", "--duration", 0.2, "--every", 0.1, "--record", path, "-q")
+    head = path.read_text().partition("\n")[0].split(",")
+    assert (head[:3], head[-1], len(head)) == (["t_s", "p0_0", "p0_1"], "p15_15", 257)
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    assert np.diff(rows[1:, 0]) == pytest.approx([0.005] * (len(rows) - 2), abs=2e-5) and len(rows) > 35
+    assert ((rows[:, 1:] == rows[:, 1:].round()) & (rows[:, 1:] >= 0) & (rows[:, 1:] < 256)).all()
+    missing = tmp_path / "no" / "images.csv"
+    err = told(capsys, "listen", "puma260", "--duration", 0.1, "--record", missing, "-q", status=3).err
+    assert f"{missing}: cannot be written: No such file or directory" in err
+
+
+def test_a_recording_has_the_pose_of_each_image(tmp_path):
+    T = np.eye(4)
+    T[:3, 3] = 0.1, -0.2, 0.3
+    with recording(tmp_path / "touch.csv") as add:
+        add(1.5, np.arange(6, dtype=np.uint8).reshape(2, 3), T)
+    head, row = (tmp_path / "touch.csv").read_text().splitlines()
+    assert head == "t_s,T00,T01,T02,T03,T10,T11,T12,T13,T20,T21,T22,T23,p0_0,p0_1,p0_2,p1_0,p1_1,p1_2"
+    values = np.array(row.split(","), dtype=float)
+    np.testing.assert_array_equal(values[1:13].reshape(3, 4), T[:3])
+    np.testing.assert_array_equal(values[13:], np.arange(6))
 
 
 def test_listen_prints_each_image_as_a_document(capsys):

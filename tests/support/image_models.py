@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from canprobe.mechanics.touch import ContactSample, ImageModel
 from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.image.image_model import USUAL_LIGHTNESS
+from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 RADIUS, STIFFNESS, PITCH, COUNT_PA = 0.040, 1.27e8, 1.5875e-3, 100e3 / 255
@@ -25,7 +26,9 @@ HERE_FLOOR = HERE_T / USUAL_LIGHTNESS * np.array(FLOOR)
 
 
 def model(parameters=PARAMETERS, level=LEVEL_PA, seen=16):
-    return ImageModel(parameters, RADIUS, PITCH, level, COUNT_PA, 16, seen, ERRORS)
+    found = ImageModel(parameters, ERRORS, Pad(pitch_m=PITCH, mount_radius_m=RADIUS), seen)
+    found.level = level
+    return found
 
 
 def entries(K):

@@ -25,9 +25,12 @@ FREE_CYCLE = 80
 HOLD_CYCLE = 200
 """A cycle in which `press`, with 200 cycles a second, holds its force."""
 SCAN_CYCLE = 440
-"""A cycle in which `cylinder` and `plane` scan."""
+"""A cycle in which `cylinder`, `plane` and `turntable` scan."""
 _SCAN = {"task.clearance_mm": 0.3}
-_QUICK = {"press": {"cycle.rate_hz": 200.0, "task.clearance_mm": 0.05}, "cylinder": _SCAN, "plane": _SCAN}
+_QUICK = {
+    "press": {"cycle.rate_hz": 200.0, "task.clearance_mm": 0.05},
+    **dict.fromkeys(("cylinder", "plane", "turntable"), _SCAN),
+}
 
 
 class Injected:

@@ -246,6 +246,12 @@ def _node(setup: Setup, planned: NodeConfiguration, node_id: int, plant: Plant, 
             seed=setup.seed,
         )
         _set_turn_units(node, drive.turn_units)
+    elif planned.kind == "encoder":
+        from canprobe.cell.emulated.encoder import EncoderApplication
+
+        assert setup.carrier is not None
+        application = EncoderApplication(plant, setup.carrier, planned.counts_range)
+        node = SlaveNode(dictionary, node_id, application, od_of=od_of)
     else:
         assert setup.array is not None
         node = SlaveNode(dictionary, node_id, TactileApplication(plant, pad=setup.array.pad), od_of=od_of)
@@ -276,6 +282,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         bandwidth_hz=truth.bandwidth_hz,
         press=PressMotion(after_s=_tared_s(setup)),
         seed=setup.seed,
+        carrier=setup.carrier,
     )
     if setup.arm is None or truth.model is None:
         return config

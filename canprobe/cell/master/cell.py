@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_tactile
 from canprobe.cell.master.bringup import BringUp, FoundNodes, NodeAccess
+from canprobe.cell.master.carrier import make_carrier
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.held_arm import HeldArm
@@ -59,6 +60,7 @@ class Cell:
 
     Attributes:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
+        carrier: receiver of the carrier's position; None where the object stands still.
         log: one row for each cycle.
         tactile_log: one row for each tactile frame, on the same clock.
         notes: faults that did not stop the cell.
@@ -100,11 +102,11 @@ class Cell:
 
             self.drives = make_drives(plan)
         self.tactile: ArrayReceiver | None = make_tactile(plan) if before is None else before.tactile
+        self.carrier = make_carrier(plan)
         self.watch = NodeWatch(plan.node_ids)
-        seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
-        earlier: SupervisedCycle | None = None if before is None else before.cycles
+        seen = CycleState(limits_of(plan), self.watch, self.drives, self.tactile, port.counters, carrier=self.carrier)
         self.cycles: SupervisedCycle = SupervisedCycle(
-            plan, port, seen, options, observers, log_failure, origin_ns, earlier
+            plan, port, seen, options, observers, log_failure, origin_ns, before.cycles if before else None
         )
         self.supervisor = self.cycles.supervisor
         self.log, self.tactile_log, self.notes = self.cycles.log, self.cycles.tactile_log, self.cycles.notes
@@ -123,7 +125,8 @@ class Cell:
         self.found = FoundNodes(access) if check else None
         self.stopped_by: Condition | None = None
         self.doubted: frozenset[int] = frozenset()
-        self._stopped, self._before = False, before
+        self._stopped = self._running = False
+        self._before = before
         self._power: ArmPower | None = None
         self._lift_off: Callable[[BaseException], None] = nothing
         if self.drives is not None:
@@ -135,7 +138,6 @@ class Cell:
         homed = any(one.homing for one in setups)
         self.homing = Homing(plan, access, self._supervise_homing, zeros) if homed else None
         self._held = HeldArm()
-        self._running = False
         self._retreats_for: CanprobeError | None = None
         if before is not None:  # the counters go on
             if self.drives is not None and before.drives is not None:
@@ -165,6 +167,7 @@ class Cell:
                 self._plan,
                 drives=self.drives,
                 tactile=self.tactile,
+                carrier=self.carrier,
                 watch=self.watch,
                 other=self._network.feed,
                 on_arrival=not isinstance(self.port.clock, VirtualClock),

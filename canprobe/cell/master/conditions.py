@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
+from canprobe.cell.master.carrier import SILENT_CYCLES
 from canprobe.cell.master.image_witness import UNSTATED_NS
 from canprobe.cell.master.supervision import (
     TORQUE_MEAN_NS,
@@ -191,7 +192,14 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> BusError | None:
     assert seen.drives is not None
     i = next(i for i, age in enumerate(ages) if age >= cycles)
     axis = seen.drives.axes[i]
-    return axis.error(f"{word}no usable {'TPDO' if axis.node_id else 'pose'} for {ages[i]} cycles")
+    if not axis.node_id:
+        return axis.error(f"{word}no usable pose for {ages[i] * seen.limits.period_ns * 1e-6:.0f} ms more than usual")
+    return axis.error(f"{word}no usable TPDO for {ages[i]} cycles")
+
+
+@_checked("position of the carrier lost, or a jump of it", Reaction.RETREAT, _cycles(SILENT_CYCLES + 1), enabling=True)
+def _carrier(seen: CycleState) -> NodeError | None:
+    return seen.carrier.lost if seen.carrier is not None else None
 
 
 @_checked("joint that does not follow its targets", Reaction.LIFT, _cycles(2))

@@ -34,6 +34,7 @@ class Measurement:
             cycle k + 1 at the earliest, on every bus.
         tactile_age: cycles since the trigger of the newest tactile sample, or since the first SYNC where none has come;
             None without a sensor.
+        carrier: position of the object's carrier at this SYNC, rad or m; None without one or its report.
     """
 
     cycle: int
@@ -45,6 +46,7 @@ class Measurement:
     enabled: bool = False
     tactile: TactileSample | None = None
     tactile_age: int | None = None
+    carrier: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,9 @@ class Command:
     estimate: SurfaceEstimate | None = None
 
 
-OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
+OWN_COLUMNS = frozenset(
+    {"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m", "carrier_rad", "carrier_m"}
+)
 """Columns of the cell in the log; a controller's `Command.columns` have other names."""
 
 

@@ -17,6 +17,7 @@ from canprobe.fieldbus.protocol.frames import NmtState, SyncCounter, pack_heartb
 
 if TYPE_CHECKING:
     from canprobe.cell.master.array import ArrayReceiver
+    from canprobe.cell.master.carrier import CarrierReceiver
     from canprobe.cell.master.drives import DriveGroup
 
 SYNCS_REMEMBERED = 240
@@ -29,11 +30,20 @@ class Intake:
     Args:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
         sync_overflow: overflow of the SYNC counter (1019h), and number of SYNCs that are remembered.
+        carrier: receiver of the carrier's position; None where the object stands still.
     """
 
-    def __init__(self, drives: DriveGroup | None, tactile: ArrayReceiver | None, sync_overflow: int) -> None:
+    def __init__(
+        self,
+        drives: DriveGroup | None,
+        tactile: ArrayReceiver | None,
+        sync_overflow: int,
+        carrier: CarrierReceiver | None = None,
+    ) -> None:
         self.drives = drives
         self.tactile = tactile
+        self.carrier = carrier
+        self._carrier_id = carrier.cob_id if carrier is not None else None
         self.number = -1
         self._feedback = drives.feedback_ids if drives is not None else frozenset()
         self._taxels = frozenset(tactile.cob_ids) if tactile is not None else frozenset()
@@ -53,6 +63,8 @@ class Intake:
         self._sync_stamps.append(sync_ns)
         if self.drives is not None:
             self.drives.begin(number, sync_ns, t_ns)
+        if self.carrier is not None:
+            self.carrier.begin(t_ns, sync_ns)
 
     def route(self, frames: list[TimedFrame]) -> list[TimedFrame]:
         """Take the PDOs among ``frames``; the others are returned."""
@@ -64,14 +76,16 @@ class Intake:
                 self.drives.push(can_id, data, t_ns)  # type: ignore[union-attr]
             elif can_id in taxels:
                 self.tactile.push(can_id, data, t_ns)  # type: ignore[union-attr]
+            elif can_id == self._carrier_id:
+                self.carrier.push(data, t_ns)  # type: ignore[union-attr]
             else:
                 rest.append(frame)
         return rest
 
     @property
     def complete(self) -> bool:
-        """Whether all drives have sent their TPDOs of this cycle."""
-        return self.drives is None or self.drives.complete
+        """Whether all drives, and the encoder of the carrier, have sent their TPDOs of this cycle."""
+        return (self.drives is None or self.drives.complete) and (self.carrier is None or self.carrier.complete)
 
     def end(self) -> None:
         """End the collection: a TPDO that comes now is late."""
@@ -99,6 +113,7 @@ class Intake:
             enabled=drives.enabled,
             tactile=sample,
             tactile_age=age,
+            carrier=self.carrier.position if self.carrier is not None else None,
         )
 
 
@@ -146,6 +161,7 @@ class Cycle:
             do not wake the process: a real bus brings one after the other, and most are in by then.
         kept: number of cycles whose times are kept; None for all.
         before: cycle of a cell that this one comes after; number, time and statistics go on from it.
+        carrier: receiver of the carrier's position; None where the object stands still.
 
     Attributes:
         begun: a SYNC was sent, and the commands of its cycle were not.
@@ -163,6 +179,7 @@ class Cycle:
         on_arrival: bool,
         kept: int | None = None,
         before: Cycle | None = None,
+        carrier: CarrierReceiver | None = None,
     ) -> None:
         now_ns, period_ns = port.clock.now_ns(), plan.sync.period_ns
         self.number: int = -1 if before is None else before.number
@@ -177,7 +194,7 @@ class Cycle:
         self._looks_ns = plan.budget.looks_ns
         self._on_arrival = on_arrival
         self._drives, self._tactile = drives, tactile
-        self._intake = Intake(drives, tactile, plan.sync.overflow or SYNCS_REMEMBERED)
+        self._intake = Intake(drives, tactile, plan.sync.overflow or SYNCS_REMEMBERED, carrier)
         self._watch = watch
         self._other = other
         self._sync = SyncCounter(plan.sync.overflow)

@@ -82,6 +82,7 @@ class SupervisedCycle:
         self._observers, self._log_failure, self._origin_ns = observers, log_failure, origin_ns
         slides = plan.setup.arm.model.chain.prismatic if plan.setup.arm is not None else ()
         self._slides = np.array(slides, dtype=bool) if any(slides) else None
+        self._carrier_column = plan.setup.carrier.column if plan.setup.carrier is not None else ""
         self._remarks_noted = 0
 
     def start(self, cycle: Cycle) -> None:
@@ -138,6 +139,8 @@ class SupervisedCycle:
                 row["statusword"] = measurement.statuswords
             if measurement.torque_permille:
                 row["torque_permille"] = measurement.torque_permille
+        if measurement.carrier is not None:
+            row[self._carrier_column] = measurement.carrier
         if command is not None:
             if command.q_target is not None:
                 row.update(joint_columns("q_target", command.q_target, self._slides))

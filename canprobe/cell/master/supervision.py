@@ -26,6 +26,7 @@ from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
 
 if TYPE_CHECKING:
     from canprobe.cell.master.array import ArrayReceiver
+    from canprobe.cell.master.carrier import CarrierReceiver
     from canprobe.cell.master.drives import DriveGroup
     from canprobe.mechanics.touch import Patch
     from canprobe.mechanics.touch.depth_witness import DepthWitness
@@ -114,6 +115,7 @@ class CycleState:
         compares_motion: the controller compares the motion of the joints with its targets itself.
         unfelt: push in the drives' torques that the array does not measure, N; None without one.
         patch: patch in the last image of the array; None before it, and without an arm that could press.
+        carrier: receiver of the carrier's position; None where the object stands still.
     """
 
     limits: Limits
@@ -137,6 +139,7 @@ class CycleState:
     compares_motion: bool = False
     unfelt: float | None = None
     patch: Patch | None = None
+    carrier: CarrierReceiver | None = None
 
     @property
     def force(self) -> float:

@@ -147,7 +147,8 @@ class Support:
     """Quantities of its task's contact that an array measures.
 
     Attributes:
-        taxels: number of taxels under the patch on a plane at the task's force; all where the task presses nothing.
+        taxels: number of taxels under the patch on a plane at the task's lowest force; all of them where the task
+            presses nothing.
         centroid: whether there are enough taxels for a centroid.
         no_curvature: why the patch shows no curvature; None where it shows it. The force is always measured.
     """
@@ -174,7 +175,7 @@ def support_of(setup: Setup) -> Support | None:
         return None
     taxels = float(array.pad.taxels)
     if touch is not None and not array.pad.is_flat:
-        patch = math.pi * patch_radius_m(touch.force, touch.probe) ** 2
+        patch = math.pi * patch_radius_m(touch.least_force, touch.probe) ** 2
         taxels = min(taxels, patch / array.pad.pitch_m**2)
     lacks = None
     if array.pad.is_flat:
@@ -228,9 +229,9 @@ def array_problems(setup: Setup) -> Iterator[str]:
             yield f"{what}: {covers} of the array {array.name}, and {why}"
     elif setup.touch is not None and not array.pad.is_flat and array.pad.is_grid and support.taxels < PRESS_TAXELS:
         yield (
-            f"sensor.pitch_mm = {1e3 * array.pad.pitch_m:g}: at task.force_n = {setup.touch.force:g} the patch covers "
-            f"{support.taxels:.1f} taxels of the array {array.name}, and fewer than {PRESS_TAXELS} do not show where "
-            "on the probe it presses; raise task.force_n, or take a finer array"
+            f"sensor.pitch_mm = {1e3 * array.pad.pitch_m:g}: at task.force_n = {setup.touch.least_force:g} the patch "
+            f"covers {support.taxels:.1f} taxels of the array {array.name}, and fewer than {PRESS_TAXELS} do not show "
+            "where on the probe it presses; raise task.force_n, or take a finer array"
         )
 
 

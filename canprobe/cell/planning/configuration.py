@@ -11,7 +11,7 @@ impossible where it is required. What the EDS allows and the device refuses is f
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, DeviceCapabilities
@@ -51,7 +51,7 @@ from canprobe.cell.planning.units import (
     profile_values,
     software_limits,
 )
-from canprobe.cell.scene.setup import Array, HomingParameters, Node, Setup
+from canprobe.cell.scene.setup import Array, Carrier, Drive, HomingParameters, Node, Setup
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, LONG_PDOS, MISSED_SYNCS, WINDOW_SIZE, has_known
 from canprobe.fieldbus.eds.values import name_of
@@ -75,6 +75,7 @@ FOLLOWING_TIMEOUT_MS = 50
 QUICK_STOP_AND_DISABLE = 2  # 605Ah: slow down on the quick stop ramp, then switch on disabled
 GO_PRE_OPERATIONAL = 0  # 1029h:01
 STARTUP, NOT_BY_ITSELF = 0x1F80, 1 << 2  # CiA 302-2: the device does not become operational without its master
+OPERATING_PARAMETERS, TOTAL_RANGE = 0x6000, 0x6002  # CiA 406
 ABORT_QUICK_STOP = 3  # 6007h: quick stop when the connection is lost
 
 
@@ -89,6 +90,8 @@ def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfig
     used = [pdo for _, pdo in sorted(planned.items()) if pdo.used]
     if isinstance(node, Array):
         own, given = _array_writes(bus.setup, node, device), _array_given(node, device)
+    elif isinstance(node, Carrier):
+        own, given = iter(()), _as_in_eds(device, _ENCODER_OTHERWISE)
     else:
         own, given = _drive_writes(bus.sync, bus.axis_of(node.node_id)), _drive_given(device)
     wanted = [*_pdo_writes(device, used, switched_off), *_common_writes(bus.sync, device), *own]
@@ -106,8 +109,9 @@ def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfig
         writes=writes,
         given=given,
         left_out=left_out,
+        counts_range=device.number(TOTAL_RANGE) or 1 << 32,
     )
-    return found if isinstance(node, Array) else _with_drive(found, bus, bus.axis_of(node.node_id))
+    return _with_drive(found, bus, bus.axis_of(node.node_id)) if isinstance(node, Drive) else found
 
 
 def _with_drive(found: NodeConfiguration, bus: BusPlan, axis: PlannedAxis) -> NodeConfiguration:
@@ -341,6 +345,17 @@ def _drive_given(device: DeviceCapabilities) -> tuple[FixedEntry, ...]:
         VELOCITY_UNIT_INDEX: "limits of speed would be wrong by the ratio of the units; set 60A9h back in the drive, or"
         " take the drive's value into the EDS",
     }
+    return _as_in_eds(device, otherwise)
+
+
+_ENCODER_OTHERWISE = {
+    OPERATING_PARAMETERS: "it may count the other way round; set 6000h back in the encoder",
+    TOTAL_RANGE: "its counts begin again at 0 elsewhere; set 6002h back in the encoder, or take its value into the EDS",
+}
+
+
+def _as_in_eds(device: DeviceCapabilities, otherwise: Mapping[int, str]) -> tuple[FixedEntry, ...]:
+    """Entries that must hold what the EDS says, by what is wrong otherwise."""
     return tuple(
         FixedEntry(index, 0, device.number(index) or 0, "as its EDS says", text)
         for index, text in otherwise.items()

@@ -198,7 +198,7 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, holds: Callab
     model, tool = task.arm.model, task.probe.T_flange_probe
     each = np.abs([position_per_unit(model, q, tool, normal) for q, normal in zip(joints, normals, strict=True)])
     sigmas = np.linalg.norm(each, axis=1) / math.sqrt(12.0)
-    depth = pressed(task.force, task.probe, task.array, (0.0, 0.0)).depth
+    depth = pressed(task.least_force, task.probe, task.array, (0.0, 0.0)).depth
     worst = int(np.argmax(sigmas))
     spread = 2.0 * float(sigmas[worst]) / depth
     if spread <= MAX_FORCE_SPREAD:
@@ -206,14 +206,14 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, holds: Callab
     coarsest = int(np.argmax(each[worst]))
     joint, beyond = model.joints[coarsest], spread / MAX_FORCE_SPREAD
     ways = [f"let the drive of {joint.name} count finer"]
-    force, stiffness = at_least(1.01 * task.force * beyond**2), at_most(0.99 * task.probe.stiffness / beyond**2)
-    if holds(replace(task, force=float(force))):
+    force, stiffness = at_least(1.01 * task.least_force * beyond**2), at_most(0.99 * task.probe.stiffness / beyond**2)
+    if holds(replace(task, force=float(force), tables={})):
         ways.append(f"raise task.force_n to {force}")
     if holds(replace(task, probe=replace(task.probe, stiffness=float(stiffness)))):
         ways.append(f"take a softer layer (probe.stiffness_n_m3 = {stiffness})")
     return (
         f"joints.{joint.name}: one count moves the probe by {1e3 * each[worst, coarsest]:.2g} mm along the normal, and "
-        f"all joints together by {1e3 * sigmas[worst]:.2g} mm (1σ), where {task.force:g} N press the layer in by "
+        f"all joints together by {1e3 * sigmas[worst]:.2g} mm (1σ), where {task.least_force:g} N press the layer in by "
         f"{1e3 * depth:.2g} mm: the force would swing by {100 * spread:.0f} %, and above "
         f"{100 * MAX_FORCE_SPREAD:.0f} % it does not settle; {' or '.join(ways)}"
     )
@@ -357,8 +357,8 @@ def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[
     array, probe, limit_n = task.array, task.probe, setup.limits.force_max
     shown_n = first_shown_n(array)
     needed_n = shown_n / MIN_SHOWN_SHARE
-    if shown_n > TOUCH_FORCE and task.force < needed_n:
-        pitch_mm, full_kpa, share = 1e3 * array.pad.pitch_m, 1e-3 * array.pad.full_scale_pa, task.force / needed_n
+    if shown_n > TOUCH_FORCE and task.least_force < needed_n:
+        pitch_mm, full_kpa, share = 1e3 * array.pad.pitch_m, 1e-3 * array.pad.full_scale_pa, task.least_force / needed_n
         ways = [f"task.force_n = {at_least(1.01 * needed_n)}"] if needed_n < 0.9 * limit_n else []
         ways.append(
             f"sensor.pitch_mm = {at_most(0.99 * pitch_mm * math.sqrt(share))} or sensor.full_scale_kpa = "
@@ -366,7 +366,7 @@ def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[
         )
         yield (
             f"sensor.pitch_mm = {pitch_mm:g}, sensor.full_scale_kpa = {full_kpa:g}: between its taxels the array shows "
-            f"a contact from {shown_n:.2g} N on, and less than half of task.force_n = {task.force:g}; take "
+            f"a contact from {shown_n:.2g} N on, and less than half of task.force_n = {task.least_force:g}; take "
             + " or ".join(ways)
         )
         return

@@ -139,7 +139,7 @@ _EVERY_NODE: Mapping[int, str] = {
     0x1017: "producer heartbeat",
     0x1018: "identity",
 }
-SECTIONS: Mapping[NodeKind, str] = {"drive": "arm", "tactile": "sensor"}
+SECTIONS: Mapping[NodeKind, str] = {"drive": "arm", "tactile": "sensor", "encoder": "carrier"}
 """Sections of a scene that name the EDS files."""
 _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
     "drive": {
@@ -150,6 +150,7 @@ _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
         0x6064: "position actual value",
     },
     "tactile": {0x2000: "tactile mode"},
+    "encoder": {0x6004: "position value"},
 }
 
 

@@ -21,7 +21,7 @@ from canprobe.cell.planning.identifiers import (
 )
 from canprobe.cell.planning.model import SYNC_OVERFLOW, Choice, JointSpeeds, Plan
 from canprobe.cell.planning.node_configuration import NodeKind
-from canprobe.cell.planning.pdos import BusPlan, plan_drive_pdos, plan_tactile_pdos
+from canprobe.cell.planning.pdos import BusPlan, plan_drive_pdos, plan_encoder_pdo, plan_tactile_pdos
 from canprobe.cell.planning.sync import (
     early_stops,
     is_profiled,
@@ -199,6 +199,7 @@ def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: 
         bus.untaken[untimed] = [(f"{rate:.6g}", setup.changed("array", rate_hz=rate)) for rate in near]
     bus.problems += bus.untaken
     plan_drive_pdos(bus)
+    plan_encoder_pdo(bus)
     plan_tactile_pdos(bus, ratio)
     if setup.bus.cob_ids == "by_deadline":
         bus.pdos = order_by_deadline(bus.pdos, devices.values())
@@ -281,10 +282,12 @@ def _fits(setup: Setup, known: frozenset[str]) -> BusPlan | None:
 
 
 def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
-    """Every node with its kind and its role, the drives from the base, the array last."""
+    """Every node with its kind and its role, the drives from the base, then the encoder, the array last."""
     roles: list[tuple[NodeKind, str, Node]] = [
         ("drive", f"joint {axis}", drive) for axis, drive in enumerate(setup.drives, start=1)
     ]
+    if setup.carrier is not None:
+        roles.append(("encoder", "encoder of the carrier", setup.carrier))
     array = setup.array
     return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]
 

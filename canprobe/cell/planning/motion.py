@@ -32,6 +32,8 @@ DEVIATION_RAD = math.radians(1.0)
 """Angle by which the joints of a touch may go beyond its planned way, which knows neither depth nor servo; for a
 prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
 such bound."""
+MAX_OFF_M = 0.3e-3
+"""Distance of the probe from a pose on a carrier beyond which that is out of reach, m: a step falls short by less."""
 PARKED_ABOVE_M = 5e-3
 """Height of an emulated arm above the approach's first point at power on, m."""
 
@@ -237,17 +239,45 @@ def _check_touch(
     down = stops.speeds(np.abs(joints[_POSES_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
     slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
     problems += _too_fast(down, f"lower task.approach_mm_s to {at_most(slowly)}")
+    carried, elsewhere = _check_carried(task, path, stops, joints[_POSES_BEFORE_CONTACT])
+    problems += elsewhere
     if task.scan is None:
-        return stops.speeds(np.zeros_like(task.arm.q_start)), problems
+        speeds = stops.speeds(carried)
+        return speeds, problems + _too_fast(speeds, "let the carrier move slower")
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
     rates = np.abs(np.diff(joints[_POSES_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
-    speeds = stops.speeds(rates.max(axis=0))
+    speeds = stops.speeds(np.maximum(rates.max(axis=0), carried))
     if isinstance(task.scan.strategy, Rectangle):  # the path may take any direction
         along, across = np.abs(np.diff(path.points, axis=0) @ task.approach.axes[:2].T).T
         speeds = stops.speeds(np.hypot(rates[along >= across].max(axis=0), rates[along < across].max(axis=0)))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {at_most(possible)}, turn task.heading_deg, or raise task.rolling_share"
     return speeds, problems + _too_fast(speeds, way_out)
+
+
+def _check_carried(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> tuple[Floats, list[str]]:
+    """Highest joint speeds (n,), rad/s or m/s, of a run on a carrier, and why the arm cannot do it; 0 without one.
+
+    The joints follow the poses as those of the task will.
+
+    Args:
+        q_start: joint positions at the first contact (n,), rad or m.
+    """
+    if (carrier := task.carrier) is None:
+        return np.zeros_like(q_start), []
+    from canprobe.cell.planning.surface_path import carried, in_mm
+    from canprobe.mechanics.touch.probe_motion import PoseSteps
+
+    steps, joints, rates, before = PoseSteps(task.arm.model, task.probe.T_flange_probe, q_start), [q_start], [], None
+    for t, seconds, pose in carried(task, carrier, path):
+        move = np.array(steps.step(joints[-1].tolist(), pose, seconds))
+        if before is not None and float(np.linalg.norm(steps.at.flange - before.centre)) > MAX_OFF_M:
+            place = f"the probe's centre at {in_mm(before.centre)} mm is out of reach"
+            raise PlanError([f"carrier: {t:.1f} s into the run {place}; shorten task.duration_s, or move the object"])
+        joints.append(joints[-1] + move)
+        rates.append(np.abs(move) / seconds)
+        before = pose
+    return np.max(rates, axis=0), stops.problems(np.array(joints), touching=True)
 
 
 def _unreached(task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats) -> str | None:

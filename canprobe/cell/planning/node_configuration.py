@@ -11,7 +11,7 @@ from canopen import ObjectDictionary
 from canprobe.errors import NodeError
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 
-NodeKind = Literal["drive", "tactile"]
+NodeKind = Literal["drive", "tactile", "encoder"]
 Direction = Literal["tpdo", "rpdo"]
 
 MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
@@ -144,7 +144,7 @@ class NodeConfiguration:
 
     Attributes:
         node_id: node id, 1–126.
-        kind: `drive` or `tactile`.
+        kind: `drive`, `tactile` or `encoder`.
         name: its name for people: `joint 3`, `tactile array`.
         eds: name or path of its EDS.
         dictionary: object dictionary of the package canopen, as the EDS was read for this plan. Treat it as read-only.
@@ -162,6 +162,7 @@ class NodeConfiguration:
             joints, the home offset depends on their positions; here they are in the start posture.
         turn: position units of a motor turn, to compare with those that the device states; None: not known.
         speed_unit: position units/s in one velocity unit of the drive.
+        counts_range: number of counts after which the position value of an encoder begins again.
     """
 
     node_id: int
@@ -182,6 +183,7 @@ class NodeConfiguration:
     homing: tuple[Write, ...] = ()
     turn: TurnUnits | None = None
     speed_unit: float = 1.0
+    counts_range: int = 1 << 32
 
     def error(self, reason: str) -> NodeError:
         """The error of this node, by its name."""

@@ -35,6 +35,7 @@ STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
 POSITION = (0x6064, 0)
 TORQUE = (0x6077, 0)
 MODE = (0x6060, 0)
+ENCODER_POSITION = (0x6004, 0)
 STATES = frozenset((0x1001, 0x603F, 0x6041, 0x6061))
 """Objects that change with the state of a drive and not with its motion."""
 DUMMY_INTEGER32 = 0x0004
@@ -329,6 +330,16 @@ def _plan_tolerated(bus: BusPlan, node_id: int) -> None:
         bus.add(node_id, "tpdo", number, PdoLayout(cob_id, entries, kind))
         added, period_ns = bus.pdos.pop(), round(1e9 / rate)
         bus.pdos.append(replace(added, used=False, rate_hz=rate, deadline_ns=period_ns, event_timer_ms=0))
+
+
+def plan_encoder_pdo(bus: BusPlan) -> None:
+    """The position of the carrier, at every SYNC."""
+    if (carrier := bus.setup.carrier) is None:
+        return
+    node_id = carrier.node_id
+    for number, mapped in bus.choose(node_id, "tpdo", (ENCODER_POSITION,)).items():
+        bus.add(node_id, "tpdo", number, PdoLayout(DRIVE_TPDOS[0] + node_id, mapped, EVERY_SYNC), kind="encoder")
+    _plan_tolerated(bus, node_id)
 
 
 def plan_tactile_pdos(bus: BusPlan, ratio: int) -> None:

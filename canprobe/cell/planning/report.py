@@ -28,6 +28,7 @@ from canprobe.cell.scene.geometry import mesh_text
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.protocol.pdo import PdoEntry
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
+from canprobe.mechanics.touch.servo import TARGET_RATES
 
 MIN_CHARACTERS = 40
 """Least length of a line: no line is broken before it."""
@@ -92,10 +93,14 @@ def _subjects(plan: Plan) -> Iterator[tuple[str, str]]:
 
 def _nodes(plan: Plan) -> str:
     """The nodes by kind with their ids, and which of them are real."""
-    drives, arrays = ([n.node_id for n in plan.nodes if n.kind == kind] for kind in ("drive", "tactile"))
+    drives, encoders, arrays = (
+        [n.node_id for n in plan.nodes if n.kind == kind] for kind in ("drive", "encoder", "tactile")
+    )
     found = []
     if drives:
         found.append(f"{len(drives)} drive{'s' * (len(drives) > 1)} ({id_ranges(drives)})")
+    if encoders:
+        found.append(f"encoder of the carrier ({id_ranges(encoders)})")
     if arrays:
         found.append(f"tactile array ({id_ranges(arrays)})")
     if plan.raw:
@@ -310,6 +315,11 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
         yield ["object", mesh_text(setup.truth.object.fit)]
     if (scan := setup.scan) is not None:
         yield ["strategy", scan.name]
+    for name, table in setup.touch.tables.items() if setup.touch is not None else ():
+        what, unit, si = {"target_force_n": ("force", "N", 1.0), "speed_m_s": ("speed", "mm/s", 1e-3)}[name]
+        low, high, over = table.lowest / si, table.values.max() / si, "path" if table.over_path else "time"
+        jumps = f"jumps are ramps of {TARGET_RATES[name] / si:g} {unit}/s"
+        yield [what, f"{low:.3g} to {high:.3g} {unit} over the {over}; {jumps}"]
     if (shape := setup.shape) is not None:
         also = f"; on the same data afterwards: {', '.join(shape.also)}" if shape.also else ""
         yield ["estimator", shape.method + also]
@@ -340,7 +350,7 @@ def _measured(setup: Setup) -> str:
     assert support is not None and array is not None
     if setup.touch is None or array.pad.is_flat:
         return f"it measures {support}"
-    return f"at {setup.touch.force:g} N on a plane about {support.taxels:.0f} taxels are pressed: {support}"
+    return f"at {setup.touch.least_force:g} N on a plane about {support.taxels:.0f} taxels are pressed: {support}"
 
 
 def _us(t_ns: int | None) -> str:

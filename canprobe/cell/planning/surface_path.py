@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.cell.planning.contact import edge_margin
-from canprobe.cell.scene.setup import Approach, Arm, Calibrate, Probe, Touch
+from canprobe.cell.planning.model import TASK_OVERHEAD_S
+from canprobe.cell.scene.setup import Approach, Arm, Calibrate, Carrier, Probe, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.touch.probe_motion import (
@@ -18,12 +19,11 @@ from canprobe.mechanics.touch.probe_motion import (
     MOVE_SPEED_M_S,
     RETREAT_SPEED_M_S,
     ROUND_SPEED_M_S,
-    SETTLE_S,
     ArcMotion,
     LineMotion,
     PoseSteps,
 )
-from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.servo import SETTLE_S, ProbePose
 from canprobe.mechanics.touch.shapes import ClosestPoint, PlacedShape
 from canprobe.mechanics.touch.strategies import Rectangle
 from canprobe.mechanics.types import Floats
@@ -32,6 +32,8 @@ SAMPLES = 240
 """Number of points of a path."""
 LINE_M, MIN_LINES, MAX_LINES = 4e-3, 4, 14
 """Distance between the lines on which a rectangle is checked, m; least and largest number of them."""
+CARRIED_STEP_S, MAX_CARRIED_STEPS = 0.05, 10_000
+"""Longest step at rest in the check of a run on a carrier, s, and about the largest number of its steps."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
 _BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
@@ -264,15 +266,41 @@ def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[Timed
     approach, radius = task.approach, task.probe.radius
     above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
     yield from _moving(LineMotion(pose, above, MOVE_SPEED_M_S))
-    poses = [
-        ProbePose(point + radius * normal, -pole)
-        for point, normal, pole in zip(path.points, path.normals, poles_at_contacts(task, path), strict=True)
-    ]
+    poses = contact_poses(task, path)
     yield ProbePose(poses[0].centre, above.pole), approach.clearance / approach.speed
     yield poses[0], SETTLE_S
     if task.scan is not None:
         for last, here in itertools.pairwise(poses):
             yield here, float(np.linalg.norm(here.centre - last.centre)) / task.scan.speed
+
+
+def carried(task: Touch, carrier: Carrier, path: SurfacePath) -> Iterator[tuple[float, float, ProbePose]]:
+    """Poses in contact, in base, of a run on a carrier that moves from position 0 on: time, step in time, s, and pose.
+
+    The path goes round until the run, or one turn of the carrier, is over. A very long run is gone through faster.
+    """
+    poses, scan = contact_poses(task, path), task.scan
+    resting, ways = (poses[0], CARRIED_STEP_S), np.linalg.norm(path.points - np.roll(path.points, 1, axis=0), axis=1)
+    steps = (
+        [(poses[0], CARRIED_STEP_S)]
+        if scan is None
+        else [(pose, max(way / scan.speed, 1e-3)) for pose, way in zip(poses, ways.tolist(), strict=True)]
+    )
+    turn_s = 2.0 * math.pi / carrier.speed if carrier.motion.point is not None else math.inf
+    end_s, t = TASK_OVERHEAD_S + min(task.duration_s, turn_s), 0.0
+    pace = max(1.0, end_s * len(steps) / sum(seconds for _, seconds in steps) / MAX_CARRIED_STEPS)
+    before = [resting] * math.ceil(TASK_OVERHEAD_S / CARRIED_STEP_S)
+    for pose, seconds in itertools.chain(before, itertools.cycle(steps)):
+        t += pace * seconds
+        yield t, seconds, pose.moved(carrier.motion.T_base_carrier(carrier.speed * t))
+        if t >= end_s:
+            return
+
+
+def contact_poses(task: Touch, path: SurfacePath) -> list[ProbePose]:
+    """The pose of the probe at each contact."""
+    places = zip(path.points, path.normals, poles_at_contacts(task, path), strict=True)
+    return [ProbePose(point + task.probe.radius * normal, -pole) for point, normal, pole in places]
 
 
 def round_ball(task: Calibrate, pose: ProbePose) -> Iterator[TimedPose]:

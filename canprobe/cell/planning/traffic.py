@@ -86,13 +86,15 @@ def plan_traffic(plan: BusPlan) -> None:
     response_ns: dict[tuple[str, int], int | None] = {}
     for (channel, wire), analysis in zip(wires.items(), analyses, strict=True):
         response_ns |= {(channel, one.message.cob_id): one.response_ns for one in analysis.responses}
-        drives, tactile = (
-            sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == kind) for kind in ("drive", "tactile")
+        drives, encoder, tactile = (
+            sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == kind)
+            for kind in ("drive", "encoder", "tactile")
         )
         heartbeats = 1000 / HEARTBEAT_PRODUCED_MS * (len(plan.channels[channel]) + 1)
         bits_per_s = {
             "SYNC": SYNC_BITS * sync.rate_hz,
             "drives": drives,
+            "encoder": encoder,
             "tactile": tactile + sum(one.bits_worst * one.rate_hz for one in plan.raw if one.channel == channel),
             "heartbeats": worst_case_bits(1) * heartbeats,
         }
@@ -255,7 +257,7 @@ def _last(buses: Sequence[Sequence[_BusMessage]], analyses: Sequence[BusAnalysis
 def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterator[Demand]:
     """Demand of the frames that one SYNC releases, and of those for which a tactile frame waits."""
     cyclic = [pdo for pdo in wire if pdo.layout.synchronous]
-    drives = SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
+    drives = SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind != "tactile")
     tactile = [pdo for pdo in cyclic if pdo.kind == "tactile"]
     what = "SYNC and drive PDOs" if drives > SYNC_BITS else "SYNC"
     yield Demand(what, 1, wire_ns(drives, bitrate), sync.period_ns)

@@ -8,7 +8,7 @@ import numpy as np
 
 from canprobe.cell.plant.taxels import TaxelConfig
 from canprobe.cell.scene.hardware import Fidelity
-from canprobe.cell.scene.setup import Dynamics
+from canprobe.cell.scene.setup import Carrier, Dynamics
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.touch.pad import Pad
@@ -58,6 +58,7 @@ class PlantConfig:
         compliance: compliance (n,) of the joints of an ideal arm between motor and link, rad/(N m) or m/N; None: all
             are rigid.
         base_offset_m: position (3,) of the arm's base in the frame that counts as base.
+        carrier: what the object moves with, at its speed from time 0 on; None: it stands still.
     """
 
     model: ArmModel | None
@@ -78,3 +79,4 @@ class PlantConfig:
     bodies: tuple[Body | None, ...] | None = None
     compliance: Floats | None = None
     base_offset_m: Floats = field(default_factory=lambda: np.zeros(3))
+    carrier: Carrier | None = None

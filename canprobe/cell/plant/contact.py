@@ -19,6 +19,7 @@ from canprobe.cell.plant.elastic_contact import (
     total_force,
 )
 from canprobe.cell.plant.pressure import Directions, Vec, pad_basis, pad_coordinates
+from canprobe.cell.scene.setup import Carrier
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
 from canprobe.mechanics.robot.model import joints_per_motor, units_to_joints
@@ -30,7 +31,7 @@ Axes = tuple[Vec, Vec, Vec]
 
 @dataclass(slots=True, eq=False)
 class ProbeState:
-    """Probe sphere now: centre, axes (columns x, y, z = pole) and velocity of the centre, base frame."""
+    """Probe sphere now: centre, axes (columns x, y, z = pole) and velocity of the centre, in base or on the carrier."""
 
     centre: Vec
     axes: Axes
@@ -98,6 +99,15 @@ def _along(axes: Axes, e: Vec) -> Vec:
 
 def _dot(a: Vec, b: Vec) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _seen_from(T_base_carrier: Floats, carrier: Carrier, probe: ProbeState) -> ProbeState:
+    """The probe in the frame of a carrier, with its velocity over the carrier."""
+    R, origin = T_base_carrier[:3, :3], T_base_carrier[:3, 3]
+    turn, centre = carrier.motion.twist(carrier.speed), np.array(probe.centre)
+    velocity = np.array(probe.velocity) - turn[3:] - np.cross(turn[:3], centre)
+    centre, velocity, *axes = ((vector @ R).tolist() for vector in (centre - origin, velocity, *np.array(probe.axes)))
+    return ProbeState(tuple(centre), tuple(map(tuple, axes)), tuple(velocity))  # type: ignore[arg-type]
 
 
 _POLE = (0.0, 0.0, 1.0)
@@ -200,6 +210,9 @@ class ContactSolver:
         if self._at_zero is not None:
             q = tuple([a + b for a, b in zip(q, self._at_zero, strict=True)])
         probe = self._probe(q, qd) if self._pressed is None else self._pressed.at(1e-9 * state.t_ns, first_image_s)
+        if config.carrier is not None:
+            T = config.carrier.motion.T_base_carrier(1e-9 * state.t_ns * config.carrier.speed)
+            probe = _seen_from(T, config.carrier, probe)
         if config.object is None:
             return SolvedContact(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), _POLE, _ORIGIN)
         foot = config.object.nearest(probe.centre)
@@ -224,6 +237,8 @@ class ContactSolver:
         uv = pad_coordinates(d, config.radius_m)
         force = contact.force
         push = (force * nx, force * ny, force * nz) if push is None else push
+        if config.carrier is not None:
+            push = tuple((T[:3, :3] @ push).tolist())
         return SolvedContact(
             q, probe, foot, depth, rate, contact, uv, d, push, several=config.object.by_gaps or touches is not None
         )

@@ -1,4 +1,4 @@
-"""Dynamic arm: rigid links, friction, drive cascade and the object's push, in the ideal arm's place; and its choice.
+"""Dynamic arm: rigid links, friction, drive cascade and the object's push, in the place of the ideal arm.
 
 Time goes in steps from the last change of a reference on; a step ends where a reference bends. What is asked between
 two steps is answered by a shorter step that is then forgotten, so that asking changes nothing. Mass matrix, bias and
@@ -8,19 +8,14 @@ contact geometry are held over ``hold_ns``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.equations import ArmEquations, DriveLoops, Effects
+from canprobe.cell.plant.equations import ArmEquations, Effects
 from canprobe.cell.plant.ideal_arm import NEVER, PEAK_PERMILLE, Ramp
 from canprobe.cell.plant.integrators import STEPS
-from canprobe.cell.plant.pushing import Neighbourhood, Rubbing
-from canprobe.errors import PlanError
-from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
-from canprobe.mechanics.robot.model import ArmModel, joints_per_motor, joints_to_units, units_per_motor
+from canprobe.mechanics.robot.model import joints_to_units, units_per_motor
 from canprobe.mechanics.types import Floats
 
 
@@ -81,44 +76,30 @@ class Reference:
         return bend
 
 
-@dataclass(frozen=True, slots=True)
-class Stepping:
-    """Settings of the integration of the arm.
-
-    Args:
-        method: name of the integrator, a key of ``integrators.STEPS``.
-        step_ns: longest step.
-        hold_ns: time for which mass matrix, bias and contact geometry are held.
-    """
-
-    method: str = "rosenbrock"
-    step_ns: int = 625_000
-    hold_ns: int = 2_500_000
-
-
 class DynamicArm:
     """The n motors that drive the arm's links.
 
     Args:
-        model: the arm's geometry.
-        q0: (n,) joint positions at time 0, at rest, rad or m.
-        equations: equations of motion.
-        stepping: how they are integrated.
+        config, effects, held: as for ``ArmEquations``; the arm begins at rest.
+
+    Raises:
+        PlanError: see ``ArmEquations``.
     """
 
-    def __init__(self, model: ArmModel, q0: npt.ArrayLike, equations: ArmEquations, stepping: Stepping) -> None:
-        self.model = model
-        self.equations = equations
+    def __init__(self, config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> None:
+        assert config.model is not None
+        self.model = model = config.model
+        self.equations = ArmEquations(config, effects or Effects(), held=held)
         self.t_ns = 0
-        self._stepping, self._step = stepping, STEPS[stepping.method]
-        units = joints_to_units(model, q0)
+        self._dynamics, self._step = config.dynamics, STEPS[config.dynamics.integrator]
+        units = joints_to_units(model, config.q0)
         self._scales = units_per_motor(model)
         # of a drive that counts backwards negative: its torques are in its own sense
         self._rated = np.sign(self._scales) * [joint.rated_torque for joint in model.joints]
         self._references = [Reference(c) for c in units.tolist()]
-        self._y = equations.resting((units - model.zero_units) / self._scales)
+        self._y = self.equations.resting((units - model.zero_units) / self._scales)
         self._y_ns = 0
-        self._hold_ns = -stepping.hold_ns
+        self._hold_ns = -self._dynamics.hold_ns
         self._bend_ns = 0
         self._now: tuple[int, Floats] | None = None
         self._torques: tuple[Floats, Floats] | None = None
@@ -193,7 +174,7 @@ class DynamicArm:
         while self._y_ns < t_ns:
             if self._y_ns >= self._bend_ns:
                 self._bend()
-            end_ns = min(self._y_ns + self._stepping.step_ns, self._bend_ns)
+            end_ns = min(self._y_ns + self._dynamics.step_ns, self._bend_ns)
             if end_ns > t_ns:
                 break
             self._y, self._y_ns = self._stepped(end_ns), end_ns
@@ -211,59 +192,7 @@ class DynamicArm:
         self._bend_ns = min(reference.next_bend(now_ns) for reference in self._references)
 
     def _stepped(self, end_ns: int) -> Floats:
-        if self._y_ns >= self._hold_ns + self._stepping.hold_ns:
+        if self._y_ns >= self._hold_ns + self._dynamics.hold_ns:
             self.equations.hold(self._y)
             self._hold_ns = self._y_ns
         return self._step(self.equations, 1e-9 * self._y_ns, self._y, 1e-9 * (end_ns - self._y_ns))
-
-
-def make_dynamic_arm(config: PlantConfig) -> DynamicArm:
-    """A dynamic arm.
-
-    Args:
-        config: configuration of a plant with an arm.
-
-    Raises:
-        PlanError: the arm has no bodies, or the extra `dynamics` is missing.
-    """
-    assert config.model is not None
-    d = config.dynamics
-    return DynamicArm(config.model, config.q0, make_equations(config), Stepping(d.integrator, d.step_ns, d.hold_ns))
-
-
-def make_equations(config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> ArmEquations:
-    """Equations of motion of a dynamic arm.
-
-    Args:
-        config: configuration of a plant with an arm and the bodies of its links.
-        effects: effects that act; all by default.
-        held: see ``ArmEquations``.
-
-    Raises:
-        PlanError: see ``make_dynamic_arm``.
-    """
-    assert config.model is not None
-    model, d, T_probe, effects = config.model, config.dynamics, config.T_flange_probe_centre, effects or Effects()
-    if config.bodies is None:
-        raise PlanError([dynamics_problem(model.name, None) or ""])
-    centre = (model.chain.T_last_flange @ T_probe)[:3, 3]
-    bodies = *config.bodies[:-1], joined(config.bodies[-1], ball(d.payload, config.radius_m, centre))
-    body = RigidBody(model.chain, bodies, GRAVITY_M_S2 if effects.gravity else 0.0)
-    back = joints_per_motor(model)
-    inertia = np.array([joint.rotor_inertia for joint in model.joints])
-    if effects.links:  # a drive is tuned to what its motor moves in the first posture
-        inertia = inertia + np.diag(back.T @ body.terms(config.q0, np.zeros(model.n))[0] @ back)
-    loops = DriveLoops(model, inertia, config.bandwidth_hz, config.damping_ratio, d, friction=effects.friction)
-    if config.object is None:
-        return ArmEquations(model, body, loops, effects=effects, held=held)
-    touching = Neighbourhood(
-        model.chain,
-        back,
-        T_probe,
-        config.base_offset_m,
-        config.object,
-        radius=config.radius_m,
-        stiffness_n_m3=config.stiffness_n_m3,
-        rubbing=Rubbing(config.damping_s_m, d.friction),
-    )
-    return ArmEquations(model, body, loops, touching, effects, held=held)

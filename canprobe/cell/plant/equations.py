@@ -14,18 +14,18 @@ inertia J and nothing else is the second-order system of the ideal arm: same ban
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.ideal_arm import STICTION_RATE, natural_frequency
 from canprobe.cell.plant.integrators import Linearised
-from canprobe.cell.plant.pushing import HeldContact
-from canprobe.cell.scene.setup import Dynamics
-from canprobe.mechanics.robot.dynamics import RigidBody
-from canprobe.mechanics.robot.model import ArmModel, joints_per_motor
+from canprobe.cell.plant.pushing import HeldContact, Neighbourhood
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
+from canprobe.mechanics.robot.model import joints_per_motor
 from canprobe.mechanics.types import Floats
 
 
@@ -41,11 +41,8 @@ class DriveLoops:
     """Position and velocity loops, torque limits and friction of the n motors, on straight references.
 
     Args:
-        model: the arm, for rated torques and friction.
+        config: configuration of a plant with an arm: tuning, rated torques, friction.
         inertia: (n,) inertia of the motors as the drives are tuned for, kg m^2.
-        bandwidth_hz: -3 dB frequency of position.
-        damping_ratio: 1 is critical.
-        dynamics: the rest of the tuning.
         friction: whether motors and gears rub.
 
     Attributes:
@@ -56,19 +53,12 @@ class DriveLoops:
         viscous, coulomb: (n,) friction.
     """
 
-    def __init__(
-        self,
-        model: ArmModel,
-        inertia: Floats,
-        bandwidth_hz: float,
-        damping_ratio: float,
-        dynamics: Dynamics,
-        *,
-        friction: bool,
-    ) -> None:
-        w, reset_s = natural_frequency(bandwidth_hz, damping_ratio), dynamics.integral_s
-        self.position, self.unwind = w / (2.0 * damping_ratio), 1.0 / reset_s if reset_s > 0.0 else 0.0
-        self.gain: Floats = 2.0 * damping_ratio * w * inertia
+    def __init__(self, config: PlantConfig, inertia: Floats, *, friction: bool) -> None:
+        assert config.model is not None
+        model, z, dynamics = config.model, config.damping_ratio, config.dynamics
+        w, reset_s = natural_frequency(config.bandwidth_hz, z), dynamics.integral_s
+        self.position, self.unwind = w / (2.0 * z), 1.0 / reset_s if reset_s > 0.0 else 0.0
+        self.gain: Floats = 2.0 * z * w * inertia
         self.integral: Floats = self.gain * self.unwind
         rated = np.array([joint.rated_torque for joint in model.joints])
         self._most: Floats = rated * (1e-3 * dynamics.torque_limit_permille)
@@ -130,10 +120,6 @@ class DriveLoops:
         return free * self.gain, drag, self.integral - unwind * self.gain, -unwind
 
 
-Touching = Callable[[Floats], HeldContact | None]
-"""Motor positions (n,) -> the contact near there, None where nothing is near."""
-
-
 @dataclass(frozen=True, slots=True)
 class Effects:
     """Effects that act on the arm; each can be switched off.
@@ -156,34 +142,38 @@ class ArmEquations:
     """Equations of the driven arm.
 
     Args:
-        model: the arm.
-        body: links and payload.
-        loops: the drives; references and feed-forwards are set there.
-        touching: contact near a posture.
-        effects: effects that act; gravity is a property of the body.
+        config: configuration of a plant with an arm and the bodies of its links.
+        effects: effects that act.
         held: whether ``hold`` sets what the calls use; else each call evaluates everything.
 
     Attributes:
+        body: links and payload.
+        loops: the drives; references and feed-forwards are set there.
         mass, bias: held, motor coordinates: (n, n) kg m^2; (n,) N m.
         contact: held; None where nothing is near.
+
+    Raises:
+        PlanError: the arm has no bodies, or the extra `dynamics` is missing.
     """
 
-    def __init__(
-        self,
-        model: ArmModel,
-        body: RigidBody,
-        loops: DriveLoops,
-        touching: Touching = lambda theta: None,
-        effects: Effects = Effects(),
-        *,
-        held: bool = True,
-    ) -> None:
-        self.body, self.loops, self.effects, self.held = body, loops, effects, held
-        self.positions = model.n
+    def __init__(self, config: PlantConfig, effects: Effects = Effects(), *, held: bool = True) -> None:
+        assert config.model is not None
+        model, back = config.model, joints_per_motor(config.model)
+        if config.bodies is None:
+            raise PlanError([dynamics_problem(model.name, None) or ""])
+        centre = (model.chain.T_last_flange @ config.T_flange_probe_centre)[:3, 3]
+        payload = ball(config.dynamics.payload, config.radius_m, centre)
+        bodies = *config.bodies[:-1], joined(config.bodies[-1], payload)
+        self.body = RigidBody(model.chain, bodies, GRAVITY_M_S2 if effects.gravity else 0.0)
+        self.effects, self.held, self.positions = effects, held, model.n
         self.contact: HeldContact | None = None
-        self._touching = touching
-        self._joints_per_motor = joints_per_motor(model)
-        self._rotors = np.diag([joint.rotor_inertia for joint in model.joints])
+        self._touching = None if config.object is None else Neighbourhood(config)
+        self._joints_per_motor = back
+        inertia = np.array([joint.rotor_inertia for joint in model.joints])
+        self._rotors = np.diag(inertia)
+        if effects.links:  # a drive is tuned to what its motor moves in the first posture
+            inertia = inertia + np.diag(back.T @ self.body.terms(config.q0, np.zeros(model.n))[0] @ back)
+        self.loops = DriveLoops(config, inertia, friction=effects.friction)
         self._take(self._rotors, np.zeros(model.n))
 
     def hold(self, y: Floats) -> None:
@@ -197,7 +187,7 @@ class ArmEquations:
         if self.effects.links:
             mass, bias = self._driven(theta, rate if self.effects.coriolis else np.zeros(self.positions))
         self._take(mass, bias)
-        if self.effects.contact:
+        if self.effects.contact and self._touching is not None:
             self.contact = self._touching(theta)
 
     def _driven(self, theta: Floats, rate: Floats) -> tuple[Floats, Floats]:
@@ -235,31 +225,10 @@ class ArmEquations:
         wound = loops.integral * drives.error - loops.unwind * (drives.asked - drives.given)
         return np.concatenate((v, self.inverse @ net, wound))
 
-    def drift(self, t: float, y: Floats) -> Floats:
-        """Partial derivative of f by t: the reference moves on."""
-        by_error, _, sum_by_error, _ = self.loops.slopes(y.reshape(3, -1)[1], self.loops.drives(t, y))
-        return self._drift(by_error, sum_by_error)
-
-    def _drift(self, by_error: Floats, sum_by_error: Floats) -> Floats:
-        pull = self.loops.slope * self.loops.position
-        return np.concatenate((np.zeros(self.positions), self.inverse @ (by_error * pull), sum_by_error * pull))
-
     def jacobian(self, t: float, y: Floats) -> Floats:
-        """(3n, 3n) of f by y; mass matrix, bias and contact geometry held."""
-        n, kp = self.positions, self.loops.position
-        x, v, _ = y.reshape(3, -1)
-        drives = self.loops.drives(t, y)
-        by_error, drag, sum_by_error, sum_by_sum = self.loops.slopes(v, drives)
-        by_sum = np.diag((drives.asked == drives.given) * 1.0)
-        theta, rate = np.diag(-kp * by_error), np.diag(-by_error - drag)
-        pushed = self.contact.linearised(x, v) if self.contact is not None else None
-        if pushed is not None:
-            theta, rate = theta - pushed[1], rate - pushed[2]
-        J = np.zeros((3 * n, 3 * n))
-        J[:n, n : 2 * n] = np.eye(n)
-        J[n : 2 * n] = self.inverse @ np.hstack((theta, rate, by_sum))
-        J[2 * n :] = np.hstack((np.diag(-kp * sum_by_error), np.diag(-sum_by_error), np.diag(sum_by_sum)))
-        return J
+        """(3n, 3n) J of f by y, as in `linearised`; mass matrix, bias and contact geometry held."""
+        solve, identity = self.linearised(t, y, 1.0).solve, np.eye(len(y))
+        return identity - np.linalg.inv(np.array([solve(one) for one in identity])).T
 
     def linearised(self, t: float, y: Floats, g: float) -> Linearised:
         """Rate, drift, and the solver of (I - g J) x = r by elimination: one n x n system for the rates."""
@@ -291,4 +260,7 @@ class ArmEquations:
             return np.concatenate((first + g * rates, rates, leak * (third - back * rates)))
 
         rate = self._rate(v, drives, None if pushed is None else pushed[0])
-        return Linearised(rate, self._drift(by_error, sum_by_error), solve)
+        pull = self.loops.slope * kp  # the reference moves on
+        return Linearised(
+            rate, np.concatenate((np.zeros(n), self.inverse @ (by_error * pull), sum_by_error * pull)), solve
+        )

@@ -87,10 +87,7 @@ class _Axis:
         else:
             self.slope = (end - start) / (1e-9 * (t1 - t0))
             self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
-        if self.coming:
-            self.plan_event()
-        else:
-            self.event_ns = self.end_ns
+        self.plan_event()
 
     def plan_event(self) -> None:
         self.event_ns = min(self.end_ns, self.coming[0][0]) if self.coming else self.end_ns
@@ -101,7 +98,7 @@ class _Axis:
             self.begin(self.coming.pop(0))
         else:
             self.r, self.slope, self.end_ns = self.end, 0.0, NEVER
-            self.event_ns = self.coming[0][0] if self.coming else NEVER
+            self.plan_event()
 
 
 class IdealArm:
@@ -159,8 +156,7 @@ class IdealArm:
             return
         states = self._evaluated or self._states()
         a.t_ns, (a.q, a.v, a.r) = self.t_ns, states[axis]
-        if a.coming:
-            a.coming.clear()
+        a.coming.clear()
         a.begin(ramp)
         states[axis] = (a.q, a.v, a.r)  # the other motors know nothing of this ramp
 
@@ -210,8 +206,6 @@ class IdealArm:
         torque = inertia * acceleration + viscous * rate
         torque += coulomb * tanh(rate / STICTION_RATE) - self.push()[axis]
         permille = round(1000.0 * torque / rated)
-        if -PEAK_PERMILLE <= permille <= PEAK_PERMILLE:
-            return permille
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:

@@ -44,9 +44,6 @@ class Problem(Protocol):
     def rate(self, t: float, y: Floats) -> Floats:
         """f(t, y)."""
 
-    def drift(self, t: float, y: Floats) -> Floats:
-        """Partial derivative of f by t."""
-
     def linearised(self, t: float, y: Floats, g: float) -> Linearised:
         """All that a linearly implicit step asks for at one place."""
 

@@ -61,9 +61,9 @@ class Plant:
             if config.fidelity == "ideal":
                 self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
             else:
-                from canprobe.cell.plant.dynamic_arm import make_dynamic_arm
+                from canprobe.cell.plant.dynamic_arm import DynamicArm
 
-                self.arm = make_dynamic_arm(config)
+                self.arm = DynamicArm(config)
             self.motor_counts, self.torque_permille = self.arm.motor_counts, self.arm.torque_permille
             if isinstance(self.arm, IdealArm) and config.object is not None:
                 self.arm.push = lambda: self._solver.torques(self._solution())
@@ -104,6 +104,11 @@ class Plant:
             self._solved = None
             if self.arm is not None:
                 self.arm.advance(t_ns)
+
+    @property
+    def carrier_position(self) -> float:
+        """Position of the object's carrier now, rad or m; 0 without one."""
+        return 1e-9 * self.t_ns * self.config.carrier.speed if self.config.carrier is not None else 0.0
 
     def place(self, shape: PlacedShape | None) -> None:
         """Put another object in the place of the present one; None: nothing is there any more."""
@@ -222,7 +227,7 @@ class Plant:
         return PlantState(self.t_ns, *self.arm.motors())
 
     def truth(self, state: PlantState | None = None) -> Truth:
-        """True values of a state, SI, base frame.
+        """True values of a state, SI, base frame; on a carrier the carrier's frame, in which the object stands still.
 
         Args:
             state: state of this plant; the present one by default.

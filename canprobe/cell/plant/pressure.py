@@ -93,7 +93,7 @@ def _half_axis(depth: float, kappa: float, radius: float) -> float:
 
 
 class PressureField:
-    """Mean pressure of every taxel of a grid under one contact.
+    """Mean pressure of every taxel under one contact. Listed taxels are separate rectangles, without blur.
 
     Args:
         radius_m: probe radius.
@@ -104,19 +104,23 @@ class PressureField:
 
     def __init__(self, radius_m: float, pad: Pad | None = None, *, blur_pitch: float = 0.65, samples: int = 3) -> None:
         pad = pad or Pad()
-        self.radius = radius_m
-        self.shape = pad.shape
-        self._step = pad.pitch_m / samples
-        self._counts = (pad.rows + 2 * _BLUR_MARGIN) * samples, (pad.columns + 2 * _BLUR_MARGIN) * samples
-        v, u = (
-            (np.arange(count) + 0.5) * self._step - (taxels / 2 + _BLUR_MARGIN) * pad.pitch_m
-            for count, taxels in zip(self._counts, pad.shape, strict=True)
-        )
-        u, v = np.meshgrid(u, v)
+        self.radius, self.shape, self._step = radius_m, pad.shape, pad.pitch_m / samples
+        self._rows: Floats | None = None  # of a grid; a row of samples is a listed taxel
+        if pad.is_grid:
+            v, u = (
+                (np.arange((taxels + 2 * _BLUR_MARGIN) * samples) + 0.5) * self._step
+                - (taxels / 2 + _BLUR_MARGIN) * pad.pitch_m
+                for taxels in pad.shape
+            )
+            u, v = np.meshgrid(u, v)
+            self._rows = _averaging_matrix(pad.rows, samples, blur_pitch)
+            self._columns = np.ascontiguousarray(_averaging_matrix(pad.columns, samples, blur_pitch).T)
+        else:
+            inside = (np.arange(samples) + 0.5) / samples - 0.5
+            du, dv = np.meshgrid(*(side * inside for side in pad.cell_m or (pad.pitch_m, pad.pitch_m)))
+            u, v = (pad.uv[:, axis, None] + d.reshape(-1) for axis, d in ((0, du), (1, dv)))
+            self._columns = np.full((samples**2, 1), 1.0 / samples**2)
         self._samples = _sample_rows(u, v, radius_m)
-        self._directions, self._area = self._samples[:3], self._samples[4]
-        self._rows = _averaging_matrix(pad.rows, samples, blur_pitch)
-        self._columns = np.ascontiguousarray(_averaging_matrix(pad.columns, samples, blur_pitch).T)
 
     def _span(self, centre: float, half: float, count: int) -> tuple[int, int]:
         """Sample indices along one axis that cover centre +- half, clipped to the grid."""
@@ -132,7 +136,7 @@ class PressureField:
             centre: (3,) of the probe, m.
             axes: (3, 3) rows: its x, y and z axes.
         """
-        return centre + self.radius * self._directions.reshape(3, -1).T @ axes
+        return centre + self.radius * self._samples[:3].reshape(3, -1).T @ axes
 
     def mean_of(self, compression: Floats) -> Floats:
         """Taxel means of a compression given at all samples, as ``mean_pressure`` gives them.
@@ -140,9 +144,8 @@ class PressureField:
         Args:
             compression: (n,) m, in the order of ``points``; negative for gaps.
         """
-        grid = np.maximum(compression, 0.0).reshape(self._counts) * self._area
-        means: Floats = self._rows @ grid @ self._columns
-        return means
+        area = self._samples[4]
+        return self._means(np.maximum(compression, 0.0).reshape(area.shape) * area)
 
     def mean_pressure(
         self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
@@ -162,55 +165,26 @@ class PressureField:
             return np.zeros(self.shape)
         radius = self.radius
         given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
-        (m11, m12), (m21, m22) = given
-        a, b = _half_axis(depth, kappa[0], radius), _half_axis(depth, kappa[1], radius)
-        r0, r1 = self._span(uv[1], hypot(a * m12, b * m22), self._counts[0])
-        c0, c1 = self._span(uv[0], hypot(a * m11, b * m21), self._counts[1])
+        _, r1, c1 = self._samples.shape
+        r0 = c0 = 0
+        if self._rows is not None:
+            (m11, m12), (m21, m22) = given
+            a, b = _half_axis(depth, kappa[0], radius), _half_axis(depth, kappa[1], radius)
+            r0, r1 = self._span(uv[1], hypot(a * m12, b * m22), r1)
+            c0, c1 = self._span(uv[0], hypot(a * m11, b * m21), c1)
         if r0 >= r1 or c0 >= c1:
             return np.zeros(self.shape)
         samples = self._samples[:, r0:r1, c0:c1].reshape(5, -1)
         squeeze = _compression(samples, uv, depth, kappa, directions=given, radius=radius)
-        means: Floats = self._rows[:, r0:r1].dot(squeeze.reshape(r1 - r0, -1)).dot(self._columns[c0:c1])
+        return self._means(squeeze.reshape(r1 - r0, -1), r0, c0)
+
+    def _means(self, part: Floats, row: int = 0, column: int = 0) -> Floats:
+        """(rows, columns) taxel means of samples of which those from a row and a column on are not zero."""
+        columns = self._columns[column : column + part.shape[1]]
+        if self._rows is not None:
+            part = self._rows[:, row : row + len(part)].dot(part)
+        means: Floats = part.dot(columns).reshape(self.shape)
         return means
-
-
-class ListField:
-    """A `PressureField` of taxels at given places: each is a separate rectangle, without blur.
-
-    Args:
-        radius_m: probe radius.
-        pad: its taxels.
-        samples: samples per taxel and axis.
-    """
-
-    def __init__(self, radius_m: float, pad: Pad, *, samples: int = 3) -> None:
-        self.radius = radius_m
-        self.shape = pad.shape
-        inside = (np.arange(samples) + 0.5) / samples - 0.5
-        du, dv = np.meshgrid(*(side * inside for side in pad.cell_m or (pad.pitch_m, pad.pitch_m)))
-        u, v = (pad.uv[:, axis, None] + d.reshape(-1) for axis, d in ((0, du), (1, dv)))
-        self._samples = _sample_rows(u, v, radius_m).reshape(5, -1)
-        self._each = samples**2
-
-    def points(self, centre: Floats, axes: Floats) -> Floats:
-        """(n, 3) places of all samples on the undeformed probe, base frame."""
-        return centre + self.radius * self._samples[:3].T @ axes
-
-    def mean_of(self, compression: Floats) -> Floats:
-        """Taxel means of a compression given at all samples."""
-        means: Floats = (np.maximum(compression, 0.0) * self._samples[4]).reshape(-1, self._each).mean(axis=1)
-        return means.reshape(self.shape)
-
-    def mean_pressure(
-        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
-    ) -> Floats:
-        """Taxel means of the compression under one contact."""
-        if depth <= 0.0:
-            return np.zeros(self.shape)
-        given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
-        squeeze = _compression(self._samples, uv, depth, kappa, directions=given, radius=self.radius)
-        means: Floats = squeeze.reshape(-1, self._each).mean(axis=1)
-        return means.reshape(self.shape)
 
 
 def _sample_rows(u: Floats, v: Floats, radius: float) -> Floats:

@@ -7,52 +7,39 @@ friction follow from depth and velocities as in ``probe``. Motor coordinates are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.elastic_contact import NEAR_M, force_laws
-from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, posture
-from canprobe.mechanics.touch.shapes import PlacedShape, TouchedPlaces
+from canprobe.mechanics.robot.chain import ending_in, jacobian, posture
+from canprobe.mechanics.robot.model import joints_per_motor
+from canprobe.mechanics.touch.shapes import TouchedPlaces
 from canprobe.mechanics.types import Floats, Vec
 
 SLIP_M_S = 1e-3
 """Sliding speed over which friction grows to its full size."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rubbing:
-    """Damping and friction of the contact.
-
-    Args:
-        damping_s_m: Hunt-Crossley alpha.
-        friction: Coulomb coefficient; 0 for none.
-    """
-
-    damping_s_m: float = 0.3
-    friction: float = 0.3
-
-
 class HeldContact:
     """The object's push on the n motors near a posture, in k places.
 
     Args:
+        config: configuration of the plant, for damping and friction of the contact.
         theta: (n,) posture in motor coordinates.
         depth: (k,) indentations there, m; negative for gaps.
         rows: (3, k, n) velocity of each touched point of the probe per motor rate: along the object's outward normal
             and along two tangents.
-        coefficient, exponent: (k,) of the force laws ``force = coefficient depth^exponent``, N and m.
-        rubbing: damping and friction.
+        laws: coefficients (k,) and exponents (k,) of ``force = coefficient depth^exponent``, N and m.
     """
 
     def __init__(
-        self, theta: Floats, depth: Floats, rows: Floats, *, coefficient: Floats, exponent: Floats, rubbing: Rubbing
+        self, config: PlantConfig, theta: Floats, depth: Floats, rows: Floats, laws: tuple[Floats, Floats]
     ) -> None:
         self.rows, self._flat = rows, rows.reshape(-1, len(theta))
         self._normal, self._s, self._t = rows
         self._offset = depth + self._normal @ theta
-        self._coefficient, self._exponent = coefficient, exponent
-        self._damping, self._friction = 1.5 * rubbing.damping_s_m, rubbing.friction
+        self._coefficient, self._exponent = laws
+        self._damping, self._friction = 1.5 * config.damping_s_m, config.dynamics.friction
 
     def push(self, theta: Floats, rate: Floats) -> Floats | None:
         """(n,) torque (of prismatic joints force) on the motors, N m or N; None where nothing touches.
@@ -100,31 +87,15 @@ class Neighbourhood:
     """Makes the contact near a posture, for ``ArmEquations``.
 
     Args:
-        chain: the arm.
-        joints_per_motor: (n, n) joint positions per motor coordinate.
-        T_flange_probe: (4, 4) probe centre on the flange, m.
-        base_offset: (3,) of the arm's base, m.
-        shape: the object.
-        radius: radius of the probe, m.
-        stiffness_n_m3: stiffness of the layer.
-        rubbing: damping and friction.
+        config: configuration of a plant with an arm and an object.
     """
 
-    def __init__(
-        self,
-        chain: Chain,
-        joints_per_motor: Floats,
-        T_flange_probe: Floats,
-        base_offset: Floats,
-        shape: PlacedShape,
-        *,
-        radius: float,
-        stiffness_n_m3: float,
-        rubbing: Rubbing,
-    ) -> None:
-        self.chain, self.shape, self.radius = ending_in(chain, T_flange_probe), shape, radius
-        self.stiffness_n_m3, self.rubbing = stiffness_n_m3, rubbing
-        self._joints_per_motor, self._base = joints_per_motor, base_offset
+    def __init__(self, config: PlantConfig) -> None:
+        assert config.model is not None
+        assert config.object is not None
+        self._config, self._shape = config, config.object
+        self._chain = ending_in(config.model.chain, config.T_flange_probe_centre)
+        self._joints_per_motor = joints_per_motor(config.model)
 
     def __call__(self, theta: Floats) -> HeldContact | None:
         """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
@@ -132,30 +103,24 @@ class Neighbourhood:
         Args:
             theta: (n,) motor coordinates.
         """
-        at = posture(self.chain, self._joints_per_motor @ theta)
+        at, radius = posture(self._chain, self._joints_per_motor @ theta), self._config.radius_m
         own = np.array(at.flange)  # in the arm's own base
-        centre: Vec = tuple((own + self._base).tolist())
-        foot = self.shape.nearest(centre)
-        if foot.distance - self.radius > NEAR_M:
+        centre: Vec = tuple((own + self._config.base_offset_m).tolist())
+        foot = self._shape.nearest(centre)
+        if foot.distance - radius > NEAR_M:
             return None
-        touches = self.shape.touches(centre, self.radius + NEAR_M)
+        touches = self._shape.touches(centre, radius + NEAR_M)
         if touches is None:
             places = (foot.point,), (foot.normal,), (foot.distance,), (foot.kappa,), (0.0,)
             touches = TouchedPlaces(*map(np.array, places))
-        depth, normals = self.radius - touches.distances, touches.normals
+        normals = touches.normals
         frames = np.array((normals, *_tangents(normals)))
         # The probe's point that touches lies inside the undeformed ball where it is indented.
-        touched = own + np.minimum(touches.distances, self.radius)[:, None] * -normals
+        touched = own + np.minimum(touches.distances, radius)[:, None] * -normals
         J = np.array([jacobian(at, tuple(point))[:3] for point in touched.tolist()])
-        coefficient, exponent = force_laws(touches, self.radius, self.stiffness_n_m3)
-        return HeldContact(
-            theta,
-            depth,
-            (frames[:, :, None] @ J)[:, :, 0] @ self._joints_per_motor,
-            coefficient=coefficient,
-            exponent=exponent,
-            rubbing=self.rubbing,
-        )
+        rows = (frames[:, :, None] @ J)[:, :, 0] @ self._joints_per_motor
+        laws = force_laws(touches, radius, self._config.stiffness_n_m3)
+        return HeldContact(self._config, theta, radius - touches.distances, rows, laws)
 
 
 def _tangents(normals: Floats) -> tuple[Floats, Floats]:

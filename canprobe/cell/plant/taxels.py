@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.cell.plant.pressure import Directions, ListField, PressureField
+from canprobe.cell.plant.pressure import Directions, PressureField
 from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
 from canprobe.mechanics.types import Floats
 
@@ -119,12 +119,8 @@ class TaxelArray:
         self.config = config
         self.pad = pad = pad or Pad()
         self._rng = rng
-        self.field: PressureField | ListField
         samples = max(config.samples, ceil(pad.pitch_m / MAX_SAMPLE_DISTANCE_M))
-        if pad.is_grid:
-            self.field = PressureField(radius_m, pad, blur_pitch=config.blur_pitch, samples=samples)
-        else:
-            self.field = ListField(radius_m, pad, samples=samples)
+        self.field = PressureField(radius_m, pad, blur_pitch=config.blur_pitch, samples=samples)
         self.gains = 1.0 + config.gain_error * rng.uniform(-1.0, 1.0, pad.shape)
         self._scale = self.gains * (stiffness_n_m3 / config.full_scale_pa)
         half = 0.5 * config.hysteresis

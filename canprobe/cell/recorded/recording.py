@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.array import make_tactile
+from canprobe.cell.master.carrier import make_carrier
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.cycle import SYNCS_REMEMBERED, Intake
 from canprobe.cell.master.drives import DriveGroup, make_drives
@@ -224,10 +225,11 @@ class LogCycles:
         overflow = recording.sync_overflow or plan.sync.overflow or SYNCS_REMEMBERED
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan, overflow)
+        carrier = make_carrier(plan)
         self.sync_times_s: list[float] = []
         self.lost_syncs = 0
         self.start_ns = int(recording.sync_stamps[0])
-        self._intake = Intake(self.drives, self.tactile, overflow)
+        self._intake = Intake(self.drives, self.tactile, overflow, carrier)
         self._recording = recording
         self._overflow = overflow
         self._period_ns = plan.sync.period_ns
@@ -334,6 +336,7 @@ class RunFolder:
         )
         torques = log.get("torque_permille", np.zeros((rows, 0)))
         tactile_ages = log.get("tactile_age", np.full(rows, np.nan))
+        carried = log.get("carrier_rad", log.get("carrier_m", np.full(rows, np.nan))).tolist()
         for k, t_ns in enumerate(self.times_ns.tolist()):
             statuswords = tuple(words[k].tolist())
             yield Measurement(
@@ -346,6 +349,7 @@ class RunFolder:
                 enabled=all(known_state(word) is DriveState.OPERATION_ENABLED for word in statuswords),
                 tactile=samples.get(t_ns),
                 tactile_age=int(tactile_ages[k]) if np.isfinite(tactile_ages[k]) else None,
+                carrier=carried[k] if np.isfinite(carried[k]) else None,
             )
 
     def _samples(self) -> dict[int, TactileSample]:

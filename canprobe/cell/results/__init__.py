@@ -14,7 +14,8 @@ refuses to be read before. All files of a run count time from the 0 of its `bus.
     expected       the figures to expect of a packaged scene
     traffic        a recorded bus beside the plan
     run_files      the files of a run's folder, checked when they are read; tables of them with their units
-    surface_file   a surface map as a file
+    surface_file   a surface map as a file, with all of S of the answers of its scan
+    recording      images as a CSV file, with poses of the probe where there are some
     tool_file      a calibrated tool centre as a file
     array_report   text and picture of an array's calibration
     figures, plan_figure, surface_figure   pictures, all in the style of `picture`

@@ -174,7 +174,9 @@ def _draw_force(part: SubFigure, result: RunData) -> None:
         axes.plot(t[:n][every], result.truth["force_n"][:n][every], color=INK, linewidth=0.9, label="true (plant)")
     axes.plot(t[every], result.log["force_n"][every], color=BLUE, linewidth=0.9, label="measured (array)")
     target = result.summary["contact"]["force_target_n"]
-    if target is not None:
+    if "target_force_n" in result.log:
+        axes.plot(t[every], result.log["target_force_n"][every], color=GREEN, linestyle="--", label="target")
+    elif target is not None:
         axes.axhline(target, color=GREEN, linestyle="--", label=f"target {target:g} N")
     axes.set_ylim(bottom=0)
     axes.set(title="contact force", xlabel="time (s)", ylabel="force (N)")

@@ -52,7 +52,8 @@ _Shapes = Mapping[str, tuple[int | str, ...]]
 """By column: the shape of a row; sizes of the cell stand there by name."""
 
 _OF_LOG: _Shapes = {
-    **dict.fromkeys(("t_s", "tactile_age", "phase", "force_n", "force_sigma_n"), ()),
+    **dict.fromkeys(("t_s", "tactile_age", "phase", "force_n", "force_sigma_n", "target_force_n"), ()),
+    **dict.fromkeys(("carrier_rad", "carrier_m"), ()),
     **dict.fromkeys(("q_rad", "q_m", "q_age", "statusword", "torque_permille"), ("joints",)),
     **dict.fromkeys(("contact_mm", "normal"), (3,)),
     "force_sigma_parts_n": (4,),

@@ -36,13 +36,15 @@ def curvature_tensor(kappa: Floats, direction1: Floats, direction2: Floats) -> F
     return tensor
 
 
-def score_contact(truth: Mapping[str, Floats], first: int, last: int, target_n: float) -> dict[str, float | None]:
+def score_contact(
+    truth: Mapping[str, Floats], first: int, last: int, target_n: float | Floats
+) -> dict[str, float | None]:
     """Force, contact and speed over cycles ``first`` ≤ k < ``last``.
 
     Args:
         truth: columns of the plant's truth, one row for each SYNC.
         first, last: SYNC numbers of the scan.
-        target_n: wanted force, N.
+        target_n: wanted force, N, or that of each cycle (last - first,).
     """
     force = truth["force_n"][first:last]
     points = truth["contact_point_m"][first:last]
@@ -50,8 +52,9 @@ def score_contact(truth: Mapping[str, Floats], first: int, last: int, target_n: 
     if len(force) < 2:
         return dict.fromkeys(("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s"))
     travelled = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    off = force - np.broadcast_to(target_n, last - first)[: len(force)]
     return {
-        "force_rms_error_n": float(np.sqrt(np.mean((force - target_n) ** 2))),
+        "force_rms_error_n": float(np.sqrt(np.mean(off**2))),
         "force_max_n": float(truth["force_n"].max()),
         "contact_fraction": float(np.mean(force > 0)),
         "speed_mean_m_s": travelled / float(times[-1] - times[0]),
@@ -198,13 +201,13 @@ def bound_of_scan(
         coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
     from canprobe.mechanics.touch import SurfaceMatrix
-    from canprobe.mechanics.touch.estimate.gate import Gate, PadPathLength
+    from canprobe.mechanics.touch.estimate.gate import Gate
     from canprobe.mechanics.touch.estimate.likelihood import batch_of, osculating_bound
 
     points = np.array([s.p_base for s in samples])
     gate = Gate(1.0, sigma_normal)
-    pad = PadPathLength(float(np.median([gate.sigmas(s)[0] for s in samples])))
-    touches = [pad.measured(s, gate, coupling) for s in samples]
+    gate = Gate(float(np.median([gate.sigmas(s)[0] for s in samples])), sigma_normal)
+    touches = [gate.measured(s, coupling) for s in samples]
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -28,7 +29,7 @@ from canprobe.cell.results.scores import (
 )
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
-from canprobe.cell.scene.setup import Setup
+from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
@@ -148,18 +149,22 @@ def truth_of(session: Session) -> Mapping[str, Floats]:
 def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) -> dict[str, Any]:
     task, scan = session.scene.task, record.scan_cycles if session.options.rows_kept is None else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
-    target = task.force_n if task.kind in ("scan", "press") else None
+    touch = session.plan.setup.task
+    target = touch.force if isinstance(touch, Touch) else math.nan
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
     error: dict[str, Any] = dict.fromkeys(FORCE_ERRORS)
     if scan is not None and scan[1] > scan[0]:
         force = log["force_n"][scan[0] : scan[1]]
-        known = force[np.isfinite(force)]  # a cycle in which the cell held has none
-        measured = float(np.sqrt(np.mean((known - task.force_n) ** 2))) if len(known) else None
+        moved = log.get("target_force_n", np.full(scan[1], np.nan))[scan[0] : scan[1]]  # by a table, or a request
+        targets = np.where(np.isfinite(moved), moved, target)
+        target = round(float(targets.mean()), 12)
+        off = (force - targets)[np.isfinite(force)]  # a cycle in which the cell held has none
+        measured = float(np.sqrt(np.mean(off**2))) if len(off) else None
         if "force_sigma_n" in log:
             error |= state_force_sigma(log, *scan)
         if truth := truth_of(session):
-            figures = score_contact(truth, *scan, task.force_n)
+            figures = score_contact(truth, *scan, targets)
             error |= score_measured_force(log, truth, *scan)
             if task.kind != "scan":
                 figures["speed_mean_m_s"] = None
@@ -334,7 +339,7 @@ def write_files(result: RunData, out: Path) -> None:
     if (surface_map := result.surface_map) is not None:
         from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
 
-        writers.append(lambda: save_surface_map(surface_map, out / SURFACE))
+        writers.append(lambda: save_surface_map(surface_map, out / SURFACE, next(iter(result.estimates.values()), [])))
     failed = []
     for write in writers:
         try:

@@ -1,37 +1,42 @@
-"""A surface map as a file: ``surface.npz``, plain arrays, no pickle.
+"""A surface map as a file, with all of S of the answers of its scan: ``surface.npz``, plain arrays, no pickle.
 
 The file has the nodes of the map (`canprobe.mechanics.touch.map`), from which the surface is solved when it is asked.
-Base frame; n nodes:
+Base frame; n nodes, k answers:
 
-=========================  =========  ================================================================================
-``format_version``         ()         3
-``pad_radius_m``           ()         radius of the probe; NaN where the contacts are points
-``pad_stiffness_n_m3``     ()         stated stiffness of its layer; NaN likewise
-``stiffness_n_m3``         ()         stiffness that the contacts show; NaN likewise
-``stiffness_log_sigma``    ()         standard deviation of its logarithm; NaN likewise
-``sigma_lateral_m``        ()         usual standard deviation of a contact along the surface
-``sigma_height_m``         ()         standard deviation of a height; infinite: not used
-``sigma_normal_rad``       ()         standard deviation of a normal; infinite: not used
-``path_per_sample_m``      (3,)       path per independent height, normal, image; 0: every contact is independent
-``sigma_common``           (4,)       of lag (m), relative scale of the pad, its offsets (m); 0: none
-``sigma_place_m``          ()         of where the whole surface is along its normals, by tool and arm
-``centre_m``               (n, 3)     centre of the probe; the contact point where there is none
-``normal``                 (n, 3)     outward unit normal of the object
-``pad_axes``               (n, 3, 3)  rows: axes x, y, z of the probe
-``heading``                (n, 3)     direction of the path, shorter where passes differ in it
-``root_force_n``           (n,)       mean √force, √N
-``lateral_variance_m2``    (n,)       variance of the error along the surface
-``height_variance_m2``     (n,)       variance of the height
-``normal_variance_rad2``   (n,)       variance of the normal by itself
-``patch_m2``               (n,)       √det of the second moments of the patch; NaN without an image
-``contacts``               (n,)       number of contacts
-``path_m``                 (n,)       path that they stand for
-=========================  =========  ================================================================================
+===========================  ===========  ==============================================================================
+``format_version``           ()           4
+``pad_radius_m``             ()           radius of the probe; NaN where the contacts are points
+``pad_stiffness_n_m3``       ()           stated stiffness of its layer; NaN likewise
+``stiffness_n_m3``           ()           stiffness that the contacts show; NaN likewise
+``stiffness_log_sigma``      ()           standard deviation of its logarithm; NaN likewise
+``sigma_lateral_m``          ()           usual standard deviation of a contact along the surface
+``sigma_height_m``           ()           standard deviation of a height; infinite: not used
+``sigma_normal_rad``         ()           standard deviation of a normal; infinite: not used
+``path_per_sample_m``        (3,)         path per independent height, normal, image; 0: every contact is independent
+``sigma_common``             (4,)         of lag (m), relative scale of the pad, its offsets (m); 0: none
+``sigma_place_m``            ()           of where the whole surface is along its normals, by tool and arm
+``centre_m``                 (n, 3)       centre of the probe; the contact point where there is none
+``normal``                   (n, 3)       outward unit normal of the object
+``pad_axes``                 (n, 3, 3)    rows: axes x, y, z of the probe
+``heading``                  (n, 3)       direction of the path, shorter where passes differ in it
+``root_force_n``             (n,)         mean √force, √N
+``lateral_variance_m2``      (n,)         variance of the error along the surface
+``height_variance_m2``       (n,)         variance of the height
+``normal_variance_rad2``     (n,)         variance of the normal by itself
+``patch_m2``                 (n,)         √det of the second moments of the patch; NaN without an image
+``contacts``                 (n,)         number of contacts
+``path_m``                   (n,)         path that they stand for
+``answer_t_s``               (k,)         time of an answer of the estimator in the loop, on the clock of the log
+``answer_T_base_contact_m``  (k, 4, 4)    its contact frame
+``answer_S``                 (k, 4, 4)    S in that frame; not observed: NaN
+``answer_covariance``        (k, 10, 10)  covariance of the upper triangle of S, row by row; not observed: NaN, infinite
+===========================  ===========  ==============================================================================
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -39,13 +44,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.npz import read_npz, write_npz
+from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch import MapNoise, PadLayer, SurfaceMap
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.stiffness import Stiffness
 from canprobe.mechanics.types import Floats
 
-SURFACE, FORMAT_VERSION = "surface.npz", 3
+SURFACE, FORMAT_VERSION = "surface.npz", 4
 _OF_LAYER = ("pad_radius_m", "pad_stiffness_n_m3", "stiffness_n_m3", "stiffness_log_sigma")
 _OF_NOISE = ("sigma_lateral_m", "sigma_height_m", "sigma_normal_rad")
 _PER_MAP: dict[str, tuple[int, ...]] = {
@@ -70,12 +76,14 @@ _PER_NODE: dict[str, tuple[slice | int, tuple[int, ...]]] = {
 """Columns of a node and their shape, by name."""
 _POSITIVE = (*_OF_NOISE, "lateral_variance_m2", "height_variance_m2", "normal_variance_rad2", "contacts", "path_m")
 _MAY_BE_INFINITE = ("sigma_height_m", "sigma_normal_rad", "height_variance_m2", "normal_variance_rad2")
-_COLUMNS = ("format_version", *_PER_MAP, *_PER_NODE)
+_PER_ANSWER = {"answer_t_s": (), "answer_T_base_contact_m": (4, 4), "answer_S": (4, 4), "answer_covariance": (10, 10)}
+"""Columns of an answer and their shape; form 3 has none of them."""
+_COLUMNS = ("format_version", *_PER_MAP, *_PER_NODE, *_PER_ANSWER)
 _MAX_LENGTH_ERROR = 1e-6
 
 
-def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None:
-    """Write a map to exactly this file (numpy would append ``.npz`` to a name without it)."""
+def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str], answers: Sequence[ShapeRecord] = ()) -> None:
+    """Write a map and all of S of answers to exactly this file (numpy would append ``.npz`` to a name without it)."""
     pad, noise, rows = surface_map.pad, surface_map.noise, surface_map.nodes.rows
     found = surface_map.stiffness if len(rows) else None
     layer = (*(pad or (math.nan, math.nan)), *(found or (math.nan, math.nan)))
@@ -86,6 +94,9 @@ def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None
     columns["path_per_sample_m"] = np.array([noise.height_path, noise.normal_path, noise.image_path])
     columns["sigma_common"], columns["sigma_place_m"] = np.array(noise.common), np.array(noise.place)
     columns |= {name: rows[:, where].reshape(-1, *shape) for name, (where, shape) in _PER_NODE.items()}
+    matrices = [(one.t_s, one.estimate.T_frame_contact, *one.estimate.matrix()) for one in answers]
+    for i, (name, shape) in enumerate(_PER_ANSWER.items()):
+        columns[name] = np.array([one[i] for one in matrices]).reshape(-1, *shape)
     write_npz(Path(path), columns)
 
 
@@ -110,12 +121,13 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
     columns = read_npz(file, "an npz file with a surface map")
     if (version := columns.get("format_version")) is None:
         raise UsageError(f"{file}: expected a surface map, got a file without 'format_version'")
-    if version.shape != () or version != FORMAT_VERSION:
+    if version.shape != () or version not in (FORMAT_VERSION - 1, FORMAT_VERSION):
         raise UsageError(
             f"{file}: expected format_version {FORMAT_VERSION}, got {version} of another canprobe; make the map again"
             f' of the run\'s contacts: canprobe.replay("{file.parent}").surface_map'
         )
-    if missing := [name for name in _COLUMNS if name not in columns]:
+    newer = () if version == FORMAT_VERSION else tuple(_PER_ANSWER)
+    if missing := [name for name in _COLUMNS if name not in columns and name not in newer]:
         raise UsageError(f"{file}: missing {', '.join(missing)}")
     if unknown := [name for name in columns if name not in _COLUMNS]:
         raise UsageError(f"{file}: unknown {', '.join(unknown)}; expected {', '.join(_COLUMNS)}")

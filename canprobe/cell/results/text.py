@@ -79,7 +79,7 @@ def force_lines(contact: Mapping[str, Any]) -> list[str]:
     error, sigma = contact.get("force_true_rms_error_n"), contact.get("force_sigma_n")
     which = "true force" if error is not None else "measured force"
     lines = [
-        f"  force      target {target:g} N, {which} off it by {off:.3f} N RMS ({100 * off / target:.1f} %),"
+        f"  force      target {target:.4g} N, {which} off it by {off:.3f} N RMS ({100 * off / target:.1f} %),"
         f" highest {contact['force_max_n']:.2f} N"
     ]
     if sigma is not None:

@@ -127,7 +127,8 @@ def _converted(value: object, annotation: Any) -> Any:
         converted = tuple(_converted(item, kind) for item, kind in zip(items, kinds, strict=False))
     elif origin is Mapping:
         matches = isinstance(value, dict)
-        converted = {key: _converted(item, parts[1]) for key, item in value.items()} if isinstance(value, dict) else {}
+        table = value if isinstance(value, dict) else {}
+        converted = {_converted(key, parts[0]): _converted(item, parts[1]) for key, item in table.items()}
     else:
         number = annotation is float and type(value) is int
         converted = float(value) if number else value  # type: ignore[arg-type]  # an int here
@@ -164,7 +165,8 @@ def expected(annotation: Any) -> str:
         many = _NAMES[parts[0]][1] if parts[0] in _NAMES else f"items, each {expected(parts[0])}"
         return f"a list of {many}" if parts[-1] is Ellipsis else f"a list of {len(parts)} {many}"
     if origin is Mapping:
-        return f"a table of {_NAMES[parts[1]][1]}"
+        keys = " or ".join(choices_of(parts[0]))
+        return f"a table of {keys}: {expected(parts[1])}" if keys else f"a table of {_NAMES[parts[1]][1]}"
     return _NAMES[annotation][0] if annotation in _NAMES else "true or false"
 
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from canprobe.cell.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Range, ScenePath
+from canprobe.cell.scene.checks import DIRECTION, DISTINCT, Check, OneOf, Only, Pattern, Range, ScenePath
 
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
@@ -30,6 +30,8 @@ MM = 1e-3
 """A millimetre in metres."""
 REVOLUTE_ONLY = Only("kind", ("revolute",))
 PRISMATIC_ONLY = Only("kind", ("prismatic",))
+TURNTABLE = Only("kind", ("turntable",), required=True)
+CONVEYOR = Only("kind", ("conveyor",), required=True)
 HOMING_ONLY = Only("zero", ("homing",))
 DRIVES_ONLY = Only("kind", ("drives",))
 EXTERNAL_ONLY, EXTERNAL_REQUIRED = (Only("kind", ("external",), required=given) for given in (False, True))
@@ -160,7 +162,7 @@ class ArmSettings:
     """EDS of the drives that name none: a packaged name, or a path relative to the file."""
     emulated: bool = True
     """canprobe serves the drives, or emulates the external arm. false: they are real."""
-    missed_syncs: Annotated[int, Range(1, 250), DRIVES_ONLY] = 5
+    missed_syncs: Annotated[int, Range(1, 250)] = 5
     """SYNC periods of silence after which master and drives treat each other as lost."""
     grouped_rpdo: Annotated[bool | Auto, DRIVES_ONLY] = False
     """Put two targets into one RPDO by dummy mapping."""
@@ -308,6 +310,43 @@ class JointSettings:
     """Centre of mass of the link, in the frame of its Denavit-Hartenberg row."""
     inertia_kg_m2: Vec6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """Inertia of the link about its centre of mass: xx, yy, zz, xy, xz, yz."""
+
+
+@dataclass(frozen=True, slots=True)
+class CarrierSettings:
+    """`[carrier]`: what the object stands on and moves with: a turntable or a conveyor with an encoder (CiA 406).
+
+    Where the encoder shows position 0 the object is where the scene places it; start point and path move with it.
+    Positions of the encoder are `zero_counts + counts_per_turn * turns`, or counts_per_m times metres.
+    """
+
+    kind: Literal["turntable", "conveyor"] = "turntable"
+    """Turns about its axis, or moves along it."""
+    axis: Annotated[Vec3, DIRECTION] = (0.0, 0.0, 1.0)
+    """Direction of the axis in the base frame, of any length. Counts grow counter-clockwise about it, or along it."""
+    point_mm: Annotated[Vec3 | None, TURNTABLE] = None
+    """Point of the axis in the base frame."""
+    speed_deg_s: Annotated[float | None, Range(0, 360, open_low=True), TURNTABLE] = None
+    """Speed with which the plan counts from position 0 on, and an emulated one turns. A report of a motion faster than
+    1.5 times that is not believed."""
+    speed_mm_s: Annotated[float | None, Range(0, 1000, open_low=True), CONVEYOR] = None
+    """The same of a conveyor."""
+    counts_per_turn: Annotated[float | None, Range(1, 1e9), TURNTABLE] = None
+    """Units of the position value (6004h) per turn of the table."""
+    counts_per_m: Annotated[float | None, Range(1, 1e12), CONVEYOR] = None
+    """Units of the position value per metre of the conveyor."""
+    zero_counts: int = 0
+    """Position value where the object is where the scene places it."""
+    node_id: NodeId = 17
+    """Node id of the encoder."""
+    channel: Channel | None = None
+    """Channel of the bus that the encoder is on. Left out: `bus.channel`."""
+    eds: Annotated[str, ScenePath()] = "encoder.eds"
+    """EDS of the encoder: a packaged name, or a path relative to the file."""
+    emulated: bool = True
+    """canprobe serves the encoder, and moves the emulated object. false: the encoder is real."""
+    serial_number: SerialNumber | None = None
+    """Serial number (1018h:04) that the encoder must have. Left out: any."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -212,6 +212,8 @@ def _as_toml(value: Any) -> Any:
         return [_as_toml(item) for item in value]
     if isinstance(value, Path):
         return str(value)
+    if callable(value):
+        raise UsageError(f"overrides: got {value!r}; type: canprobe.sample_target, which makes a table of a function")
     return value.tolist() if hasattr(value, "tolist") else value
 
 

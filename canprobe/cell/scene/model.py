@@ -17,6 +17,7 @@ from canprobe.cell.scene.hardware import (
     Auto,
     BringUpSettings,
     BusSettings,
+    CarrierSettings,
     CellInfo,
     Channel,
     EmulateSettings,
@@ -56,6 +57,10 @@ Vec2 = tuple[float, float]
 Row4 = tuple[float, float, float, float]
 Posture = tuple[float, ...]
 """Position of each joint, deg or mm."""
+TargetPoints = Mapping[Literal["path_mm", "time_s"], tuple[Vec2, ...]]
+"""Target over the path or over the time of a scan: points [place, target], with straight lines between them."""
+FORCES, SPEEDS = Range(0, 20, open_low=True), Range(0, 200, open_low=True)
+"""Targets of force, N, and speed, mm/s, that a task may have."""
 
 TOUCH_KINDS: tuple[TaskKind, ...] = ("scan", "press", "calibrate")
 """Tasks that touch an object."""
@@ -301,8 +306,9 @@ class TaskSettings:
     """Length of the scan, press, listen or free phase."""
     start_posture: Annotated[str | None, MOVING_ONLY] = None
     """Name of the posture in `[postures]` that is the start, in the place of the joints' `start_deg` and `start_mm`."""
-    force_n: Annotated[float, Range(0, 20, open_low=True), TOUCH_ONLY] = 2.0
-    """Target of the contact force."""
+    force_n: Annotated[Annotated[float, FORCES] | TargetPoints, TOUCH_ONLY] = 2.0
+    """Target of the contact force. A table has it over the path of a scan, `{path_mm = [[0, 1], [20, 3]]}`, or over the
+    time of a scan or press, `{time_s = [[0, 1], [2, 3]]}`: on straight lines between its points, held beyond them."""
     approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCH_ONLY] = 4.0
     """Speed of the approach."""
     start_mm: Annotated[Vec3, TOUCH_ONLY] = (-120.0, -122.5, 374.0)
@@ -316,8 +322,14 @@ class TaskSettings:
     as long as no image of the array has changed since bring-up, only as far as `limits.force_max_n` presses in."""
     strategy: Annotated[Strategy, SCAN_ONLY] = "weave"
     """Path of the scan. With `explore` it goes where the map of the surface is not sure enough."""
-    speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCAN_ONLY] = 25.0
-    """Speed of the contact over the surface."""
+    speed_mm_s: Annotated[Annotated[float, SPEEDS] | TargetPoints, SCAN_ONLY] = 25.0
+    """Speed of the contact over the surface, a number or a table as of `force_n`."""
+    slow_at_changes: Annotated[bool, SCAN_ONLY] = False
+    """Go slower, down to half of the speed, where the estimated curvature differs from its mean over the last 5 mm of
+    path by more than its standard deviation."""
+    light_below_per_m: Annotated[float | None, Range(0, 1000, open_low=True), SCAN_ONLY] = None
+    """Press less, down to half of the force, where the standard deviation of the estimated curvature is below this:
+    the force falls in proportion. Left out: nowhere."""
     heading_deg: Annotated[float, Range(-360, 360), SCAN_ONLY] = 0.0
     """Heading of the path in the xy plane of the base frame, from x."""
     regain_mm: Annotated[float, Range(0, 20), SCAN_ONLY] = 2.0
@@ -344,6 +356,13 @@ class TaskSettings:
     """Angle of each touch from the pole of the probe."""
     swing_period_s: Annotated[float, Range(0.1, 3600), FREE_ONLY] = 4.0
     """Period of the swing."""
+
+
+def highest(target: float | TargetPoints) -> float:
+    """Highest value of a target: that of a number is the number."""
+    if not isinstance(target, Mapping):
+        return target
+    return max((value for points in target.values() for _, value in points), default=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -503,6 +522,7 @@ class CellFile:
     sensor: SensorSettings | None = None
     wire: WireSettings | None = None
     probe: ProbeSettings | None = None
+    carrier: CarrierSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
     emulate: EmulateSettings | None = None
@@ -547,6 +567,7 @@ class Scene:
     probe: ProbeSettings | None = None
     object: ObjectSettings | None = None
     shape: ShapeSettings | None = None
+    carrier: CarrierSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
     bridge: BridgeSettings | None = None
@@ -571,6 +592,7 @@ class Scene:
     def channels(self) -> tuple[str, ...]:
         """Channels that the scene names, that of `[bus]` first; not one that is left to the plan."""
         named = [joint.channel for joint in self.joints.values()]
+        named += [self.carrier.channel] if self.carrier is not None else []
         named += [self.sensor.channel] if self.sensor is not None and self.sensor.channel != "auto" else []
         return tuple(dict.fromkeys((self.bus.channel, *(name for name in named if name is not None))))
 
@@ -579,7 +601,8 @@ class Scene:
         """The nodes that the scene wants emulated, ascending."""
         drives = [node_id for node_id, emulated in self.drives.items() if emulated]
         sensor = (self.sensor.node_id,) if self.sensor is not None and self.sensor.emulated else ()
-        return tuple(sorted((*drives, *(sensor if self.array_is_node else ()))))
+        carrier = (self.carrier.node_id,) if self.carrier is not None and self.carrier.emulated else ()
+        return tuple(sorted((*drives, *(sensor if self.array_is_node else ()), *carrier)))
 
     @property
     def array_is_node(self) -> bool:

@@ -23,6 +23,7 @@ from canprobe.cell.scene.model import (
     ServoSettings,
     TaskSettings,
     WireSettings,
+    highest,
 )
 from canprobe.cell.scene.rules import START, image_format
 from canprobe.cell.scene.setup import (
@@ -30,6 +31,7 @@ from canprobe.cell.scene.setup import (
     Arm,
     Array,
     Calibrate,
+    Carrier,
     Drive,
     Dynamics,
     Free,
@@ -40,6 +42,7 @@ from canprobe.cell.scene.setup import (
     Scan,
     Setup,
     Shape,
+    TargetTable,
     Task,
     Touch,
     Truth,
@@ -58,6 +61,8 @@ if TYPE_CHECKING:
 
 SEARCH = 8e-3
 """Distance beyond the expected place at which an approach gives up, m."""
+EASED_SHARE = 0.5
+"""Share of speed and force down to which a scan lowers them by what the estimator answers."""
 LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
 ARM_ACCURACY_MM = 0.5
@@ -253,6 +258,19 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
     )
 
 
+def _carrier(scene: Scene) -> Carrier | None:
+    if (settings := scene.carrier) is None:
+        return None
+    from canprobe.mechanics.touch.carrier import CarrierMotion
+
+    s, si, point, units = settings, in_si(settings), None, settings.counts_per_m
+    if s.counts_per_turn is not None:
+        point, units = np.array(si["point"]), s.counts_per_turn / (2.0 * math.pi)
+    motion = CarrierMotion(np.array(s.axis) / np.linalg.norm(s.axis), point)
+    node = s.node_id, s.channel or scene.bus.channel, s.eds, s.emulated, s.serial_number
+    return Carrier(*node, motion, speed=si["speed"], units=units or 1.0, zero=s.zero_counts)
+
+
 def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCalibration) -> RawWire:
     found = calibration.centroid
     sure = settings.calibration is not None and abs(found.latency_s) > LATENCY_SIGMAS * found.latency_sigma_s
@@ -345,9 +363,11 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             search=SEARCH if settings.search_mm is None else settings.search_mm * MM,
             blind_search=min(SEARCH, pressed) if settings.search_mm is None else settings.search_mm * MM,
         ),
-        "force": settings.force_n,
+        "force": highest(settings.force_n),
+        "tables": _target_tables(settings),
         "duration_s": settings.duration_s,
         "lag_s": servo.drive_lag_ms * 1e-3 + arm.delay_s,
+        "carrier": _carrier(scene),
     }
     if settings.kind == "calibrate":
         from canprobe.mechanics.robot.tool_calibration import ball_approaches
@@ -367,7 +387,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
         if (s := scene.shape) is not None:
             shape = Shape(s.method, s.also, s.memory_mm * MM, s.every_ms * 1e-3, s.patch, s.revisit)
     gains = SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz)
-    return Touch(**touching, gains=gains, scan=scan, shape=shape)
+    return Touch(**touching, gains=gains, sigma_wanted=settings.light_below_per_m, scan=scan, shape=shape)
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:
@@ -380,10 +400,24 @@ def _scan(settings: TaskSettings, arm: Arm) -> Scan:
         if settings.strategy == "explore"
         else make_strategy(settings.strategy, length, width, settings.wavelength_mm * MM),
         name=settings.strategy,
-        speed=settings.speed_mm_s * MM,
+        speed=highest(settings.speed_mm_s) * MM,
         rolling_share=1.0 if task_rows(arm.model) == FIXED_POLE else settings.rolling_share,
         regain=settings.regain_mm * MM,
     )
+
+
+def _target_tables(settings: TaskSettings) -> dict[str, TargetTable]:
+    """The targets that are no numbers, or that answers of the estimator lower."""
+    tables = {}
+    for name, target, unit, eased in (
+        ("target_force_n", settings.force_n, 1.0, settings.light_below_per_m is not None),
+        ("speed_m_s", settings.speed_mm_s, MM, settings.slow_at_changes),
+    ):
+        if eased or isinstance(target, Mapping):
+            ((over, points),) = target.items() if isinstance(target, Mapping) else [("time_s", [(0.0, target)])]
+            places, values = np.array(points).T * [[MM if over == "path_mm" else 1.0], [unit]]
+            tables[name] = TargetTable(over == "path_mm", places, values, EASED_SHARE if eased else 1.0)
+    return tables
 
 
 def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel | None, Bodies]:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from canprobe.cell.scene.hardware import JointSettings, Vec3
-from canprobe.cell.scene.model import TOUCH_KINDS, Posture, WireSettings
+from canprobe.cell.scene.model import FORCES, SPEEDS, TOUCH_KINDS, Posture, TargetPoints, WireSettings, highest
+from canprobe.cell.scene.toml_files import toml_value
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageFormat
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE, WINDOW_SIZES
@@ -19,6 +20,7 @@ _USUALLY = {
     "wire": ("default", ""),
     "probe": ("default", ""),
     "object": ("may", ""),
+    "carrier": ("mounted", ""),
     "shape": ("default", ""),
     "servo": ("default", ""),
     "plant": ("default", ""),
@@ -37,12 +39,14 @@ _BESIDES = {
     "calibrate": {
         "arm": ("must", "a calibration moves the probe"),
         "sensor": ("must", "a calibration measures where the ball is touched"),
+        "carrier": ("never", "the ball stands still"),
         "shape": ("never", "the ball's shape is known"),
         "servo": ("never", "no surface is followed"),
     },
     "listen": {
         "arm": ("never", "listening moves nothing"),
         "sensor": ("must", "there is nothing else to listen to"),
+        "carrier": ("never", "listening moves nothing"),
         "shape": ("never", "without motion there is no shape to estimate"),
         "servo": ("never", "listening moves nothing"),
     },
@@ -51,6 +55,7 @@ _BESIDES = {
         "wire": ("may", ""),
         "probe": ("mounted", ""),
         "object": ("never", "free motion touches nothing"),
+        "carrier": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
         "servo": ("never", "there is no touch to control"),
     },
@@ -124,14 +129,18 @@ def _joint_incomplete(joints: Mapping[str, JointSettings], urdf: str | None) -> 
                 yield f"joints.{name}.coupling", f"expected names of other joints ({names}), got {other}"
 
 
-@_across("joints", "sensor.node_id?", "wire.kind?")
-def _duplicate_node(joints: Mapping[str, JointSettings], sensor: int | None, wire: str | None) -> _Complaint:
+@_across("joints", "sensor.node_id?", "wire.kind?", "carrier.node_id?")
+def _duplicate_node(
+    joints: Mapping[str, JointSettings], sensor: int | None, wire: str | None, carrier: int | None
+) -> _Complaint:
     owners = {sensor: "sensor"} if sensor is not None and wire != "frames" else {}
+    if carrier is not None and owners.setdefault(carrier, "carrier") == "sensor":
+        yield "carrier.node_id", f"expected another node id than sensor.node_id, got {carrier}"
     for number, (name, joint) in enumerate(joints.items(), start=1):
         node_id = joint.node_id or number
         other = owners.setdefault(node_id, name)
-        if other == "sensor":
-            yield "sensor.node_id", f"expected a node id that no joint has, got {node_id}, as joints.{name}"
+        if other in ("sensor", "carrier"):
+            yield f"{other}.node_id", f"expected a node id that no joint has, got {node_id}, as joints.{name}"
         elif other != name:
             yield f"joints.{name}.node_id", f"expected node ids all different, got {node_id}, as joints.{other} has"
 
@@ -170,6 +179,21 @@ def _heading_along_normal(kind: str, normal: tuple[float, ...], heading: float) 
         yield "task.heading_deg", why
 
 
+@_across("carrier.emulated", "arm.emulated")
+def _half_moved(carrier: bool, arm: bool) -> _Complaint:
+    if carrier != arm:
+        why = "an emulated carrier moves an emulated object, a real one a real object"
+        yield "carrier.emulated", f"expected {toml_value(arm)}, as arm.emulated: {why}"
+
+
+@_across("carrier", "joints", "plant.fidelity", "task.strategy?")
+def _moved_object(carrier: object, joints: Mapping[str, JointSettings], fidelity: str, strategy: str) -> _Complaint:
+    if strategy == "explore":
+        yield "task.strategy", "expected a path that can be planned in time with a [carrier], got explore"
+    if fidelity == "dynamic" or any(joint.stiffness_nm_rad or joint.stiffness_n_m for joint in joints.values()):
+        yield "plant.fidelity", "expected an ideal arm with rigid joints with a [carrier]: no other is emulated"
+
+
 @_across("joints", "plant.fidelity")
 def _compliant_dynamic(joints: Mapping[str, JointSettings], fidelity: str) -> _Complaint:
     for name, joint in joints.items():
@@ -201,9 +225,30 @@ def _torus_radii(kind: str, ring: float, tube: float) -> _Complaint:
 
 
 @_across("task.kind", "task.force_n", "limits.force_max_n")
-def _force_target(kind: str, force: float, limit: float) -> _Complaint:
-    if kind in TOUCH_KINDS and force >= limit:
-        yield "task.force_n", f"expected less than limits.force_max_n = {limit:g}, got {force:g}"
+def _force_target(kind: str, force: float | TargetPoints, limit: float) -> _Complaint:
+    if kind in TOUCH_KINDS and highest(force) >= limit:
+        yield "task.force_n", f"expected less than limits.force_max_n = {limit:g}, got {highest(force):g}"
+
+
+@_across("task.kind", "task.force_n", "task.speed_mm_s")
+def _target_tables(kind: str, force: float | TargetPoints, speed: float | TargetPoints) -> _Complaint:
+    for key, target, allowed in (("force_n", force, FORCES), ("speed_mm_s", speed, SPEEDS)):
+        if not isinstance(target, Mapping):
+            continue
+        bad = kind == "calibrate" or (kind == "press" and "path_mm" in target)
+        if bad or len(target) != 1 or not all(target.values()):
+            wanted = {"calibrate": "a number", "press": "points over time_s, as there is no path"}
+            expects = f'expected {wanted.get(kind, "points over path_mm or over time_s")} with task.kind = "{kind}"'
+            got = ", ".join(f"{len(points)} points over {over}" for over, points in target.items())
+            yield f"task.{key}", f"{expects}, got {got or 'an empty table'}"
+        for over, points in target.items():
+            last = 0.0
+            for number, (place, value) in enumerate(points, 1):
+                if place < last or not allowed.accepts(value):
+                    expects = f"expected {over} from {last:g} on and a number {allowed.text} in point {number}"
+                    yield f"task.{key}.{over}", f"{expects}, got [{place:g}, {value:g}]"
+                    break
+                last = place
 
 
 @_across("cycle.rate_hz", "sensor.rate_hz")

@@ -12,10 +12,13 @@ scene whose values are SI already (`[bus]`, `[bring_up]`, `[bridge]`) are taken 
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName, WhenDisabled
 from canprobe.cell.scene.model import BridgeSettings, OutputSettings, Scene, ShapeMethod, TaskKind
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.model import ArmModel, Body
     from canprobe.mechanics.robot.tool_calibration import BallApproach
     from canprobe.mechanics.touch import ArrayCalibration, Pad
+    from canprobe.mechanics.touch.carrier import CarrierMotion
     from canprobe.mechanics.touch.servo import SurfaceGains
     from canprobe.mechanics.touch.shapes import PlacedShape
     from canprobe.mechanics.touch.strategies import Rectangle, Strategy
@@ -233,6 +237,32 @@ class Array(Node):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Carrier(Node):
+    """The turntable or conveyor that the object stands on, with the encoder that is its node.
+
+    Attributes:
+        motion: its axis.
+        speed: speed that the plan counts with, rad/s or m/s.
+        units: units of the position value per rad or m.
+        zero: position value at position 0.
+    """
+
+    motion: CarrierMotion
+    speed: float
+    units: float
+    zero: int
+
+    @property
+    def column(self) -> str:
+        """Column of its position in the log."""
+        return "carrier_m" if self.motion.point is None else "carrier_rad"
+
+    def text(self, way: float) -> str:
+        """A way of it, rad or m, for people."""
+        return f"{1e3 * way:.3g} mm" if self.motion.point is None else f"{math.degrees(way):.3g} deg"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Probe:
     """The sphere that carries the array, with its elastic layer; the middle of the flange where the arm carries none.
 
@@ -331,6 +361,32 @@ class Approach:
         return normal
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetTable:
+    """A target over the path or the time of a scan: on straight lines between its points, held beyond them.
+
+    Attributes:
+        over_path: over the path of the contact; False: over the time since the scan or the hold began.
+        places: where its points are (n,), ascending, m or s; a place that stands twice is a jump.
+        values: target there (n,), N or m/s.
+        least_share: share of itself down to which answers of the estimator lower it; 1: they do not.
+    """
+
+    over_path: bool
+    places: Floats
+    values: Floats
+    least_share: float = 1.0
+
+    @property
+    def lowest(self) -> float:
+        """Lowest target, N or m/s."""
+        return self.least_share * float(self.values.min())
+
+    def at(self, path: float, time: float) -> float:
+        """The target at a path, m, and time, s."""
+        return float(np.interp(path if self.over_path else time, self.places, self.values))
+
+
 @dataclass(frozen=True, slots=True)
 class Scan:
     """The path of a scan.
@@ -338,7 +394,7 @@ class Scan:
     Attributes:
         strategy: closed curve in the scan plane, or the rectangle that is explored.
         name: name of the strategy.
-        speed: speed of the contact, m/s.
+        speed: speed of the contact, m/s; of a table the highest.
         rolling_share: 0: the pad follows the normal, 1: it keeps its orientation.
         regain: distance towards the object that is searched for a lost contact, m; 0: none.
     """
@@ -355,9 +411,11 @@ class Touching:
     """What the tasks have in common that touch an object.
 
     Attributes:
-        force: target of the contact force, N.
+        force: target of the contact force, N; of a table the highest.
+        tables: targets that vary, `target_force_n` in N and `speed_m_s` in m/s; of the others there is one value.
         duration_s: duration of the scan or of the hold; of a calibration, the duration that the plan expects.
         lag_s: lag of the drives behind a ramp, with the dead time of an external arm.
+        carrier: what the object moves with; None: it stands still.
     """
 
     arm: Arm
@@ -365,8 +423,15 @@ class Touching:
     probe: Probe
     approach: Approach
     force: float
+    tables: Mapping[str, TargetTable]
     duration_s: float
     lag_s: float
+    carrier: Carrier | None = field(default=None, kw_only=True)
+
+    @property
+    def least_force(self) -> float:
+        """Lowest target of the contact force, N."""
+        return self.tables["target_force_n"].lowest if "target_force_n" in self.tables else self.force
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -375,10 +440,12 @@ class Touch(Touching):
 
     Attributes:
         gains: gains of the servo's surface.
+        sigma_wanted: standard deviation of the curvature below which the force is lowered, 1/m; None: never.
         shape: the estimator; None where no shape is estimated.
     """
 
     gains: SurfaceGains
+    sigma_wanted: float | None
     scan: Scan | None
     shape: Shape | None
 
@@ -569,6 +636,11 @@ class Setup:
     def tares(self) -> bool:
         """Whether bring-up tares the array: a cell that only listens knows no moment at which nothing touches it."""
         return self.array is not None and self.arm is not None
+
+    @property
+    def carrier(self) -> Carrier | None:
+        """What the object moves with; None: it stands still."""
+        return self.task.carrier if isinstance(self.task, Touching) else None
 
     @property
     def scan(self) -> Scan | None:

@@ -37,6 +37,7 @@ from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 
 if TYPE_CHECKING:
     from canprobe.cell.master.array import TactileReceiver
+    from canprobe.cell.master.carrier import CarrierReceiver
     from canprobe.cell.master.drives import DriveGroup
     from canprobe.fieldbus.drive.drive import DriveApplication
 
@@ -111,20 +112,23 @@ class DirectCycle(Cycle):
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
         watch: NodeWatch,
+        carrier: CarrierReceiver | None = None,
         **more: Any,
     ) -> None:
         port.clock.sleep_until_ns(port.clock.now_ns() + round(SECOND_ANSWER_S * 1e9))  # as bring-up for second boot-ups
-        super().__init__(port, plan, drives=drives, tactile=tactile, watch=watch, **more)
+        super().__init__(port, plan, drives=drives, tactile=tactile, watch=watch, carrier=carrier, **more)
         self._clock, self._first_look_ns = port.clock, plan.budget.looks_ns[0]
         self._counter = 0
         self._commands = drives.targets.commands if drives is not None else tuple
-        self._take = drives.take if drives is not None else nothing
+        takes = {} if drives is None else dict.fromkeys((drive.node_id for drive in plan.setup.drives), drives.take)
+        if carrier is not None and plan.setup.carrier is not None:
+            takes[plan.setup.carrier.node_id] = carrier.take
         self._see = tactile.put if tactile is not None else nothing
         self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
         self._nodes, self._recorder = world.nodes, world.recorder
         by_id, of_drives = {node.node_id: node for node in self._nodes}, [drive.node_id for drive in plan.setup.drives]
         self._start({setup.node_id: setup for setup in plan.nodes}, of_drives, port.clock.now_ns())
-        self._stations = [(node.core, node.pdos.exchange, node.node_id in of_drives) for node in self._nodes]
+        self._stations = [(node.core, node.pdos.exchange, takes.get(node.node_id)) for node in self._nodes]
         self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
         for node_id in of_drives:
             for pdo in plan.pdos_of(node_id, "rpdo"):
@@ -154,12 +158,12 @@ class DirectCycle(Cycle):
         self._counter = counter or 0
 
     def collect(self) -> None:
-        """Every node latches its targets and samples, and the drives send their TPDOs."""
-        t_ns, counter, take = self.sync_ns, self._counter, self._take
-        for core, exchange, of_drive in self._stations:
+        """Every node latches its targets and samples; the drives, and the encoder of the carrier, send their TPDOs."""
+        t_ns, counter = self.sync_ns, self._counter
+        for core, exchange, take in self._stations:
             core.now_ns = t_ns
             filled = exchange(t_ns, counter)
-            if of_drive:
+            if take is not None:
                 for cob_id, values in filled:
                     take(cob_id, values, t_ns)
             if core.out:

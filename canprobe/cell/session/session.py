@@ -228,8 +228,8 @@ class Session:
         """The arm that is not on the bus, stopped on every way out; None with drives, or without an arm."""
         from canprobe.cell.master.external_arm import stopping
 
-        arm, external = self.options.arm, self.plan.setup.arm and self.plan.setup.arm.external
-        if external is None:
+        arm, its = self.options.arm, self.plan.setup.arm
+        if its is None or (external := its.external) is None:
             if arm is not None:
                 raise UsageError('arm: expected a scene with arm.kind = "external", got one without')
             return None

@@ -324,7 +324,7 @@ class RollTask(TouchSeries):
             self._number = number
             yield self._at(-self._approach_of.clearance)
             for t in np.linspace(0.0, press.seconds, ROLL_SAMPLES):
-                yield self._pose(press.way(float(t)), 0.0)
+                yield self._pressing(press.way(float(t)), 0.0)
         self._number = 0
 
     def _set_axes(self, x: Floats) -> None:
@@ -333,7 +333,7 @@ class RollTask(TouchSeries):
         x = x / np.linalg.norm(x)
         self._axes = np.array([x, np.cross(inward, x), inward])
 
-    def _pose(self, way: tuple[float, float], gone: float) -> ProbePose:
+    def _pressing(self, way: tuple[float, float], gone: float) -> ProbePose:
         """Rolled by a way over the pad (m), its surface a way beyond the object's, both as they are expected."""
         press = self.presses[min(self._number, len(self.presses) - 1)]
         x_axis, y_axis, inward = self._axes
@@ -355,7 +355,7 @@ class RollTask(TouchSeries):
         return ProbePose(foot + normal * (self.sensing.radius - gone), pole)
 
     def _at(self, gone: float) -> ProbePose:
-        return self._pose((0.0, 0.0), gone)
+        return self._pressing((0.0, 0.0), gone)
 
     def _begin(self, pose: ProbePose) -> None:
         if self._number == 0:
@@ -388,7 +388,7 @@ class RollTask(TouchSeries):
             self._number += 1
             self._let_go()
             return self._retreat()
-        return self._pose(press.way(self._t), self._gone)
+        return self._pressing(press.way(self._t), self._gone)
 
     def _let_go(self) -> None:
         self._draw_back(-self._axes[2] * (self._approach_of.clearance + 2e-3))

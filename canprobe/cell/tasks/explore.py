@@ -18,7 +18,7 @@ import numpy as np
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.tasks.task import Phase, TaskRecord
-from canprobe.cell.tasks.touch import RAMP_S, SEARCH_SPEED, Search, TouchTask
+from canprobe.cell.tasks.touch import SEARCH_SPEED, Search, TouchTask
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.explore.explorer import BACK_M, Explorer
 from canprobe.mechanics.touch.explore.ground import UNKNOWN_M, GroundCells
@@ -27,7 +27,7 @@ from canprobe.mechanics.touch.explore.stretches import STEP_M
 from canprobe.mechanics.touch.map.cells import STATED_STIFFNESS_SIGMA
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S
-from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.servo import RAMP_S, ProbePose
 from canprobe.mechanics.touch.strategies import Rectangle, turn_radius
 from canprobe.mechanics.types import Floats
 

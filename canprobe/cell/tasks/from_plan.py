@@ -38,7 +38,7 @@ def make_sensing(task: Touch | Calibrate) -> ContactSensing:
     from canprobe.cell.tasks.sensing import ContactSensing
 
     moments = isinstance(task, Touch) and _uses_patch(task)
-    return ContactSensing(task.arm, task.probe, task.array, moments=moments)
+    return ContactSensing(task.arm, task.probe, task.array, moments=moments, carrier=task.carrier)
 
 
 def centroid_coupling(probe: Probe) -> float:
@@ -61,7 +61,8 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
 
     assert task.shape is not None and task.scan is not None
     memory = task.shape.memory
-    window = max(8, round(memory / task.scan.speed * task.array.rate_hz))
+    slowest = task.tables["speed_m_s"].lowest if "speed_m_s" in task.tables else task.scan.speed
+    window = max(8, round(memory / slowest * task.array.rate_hz))
     settings: dict[str, Any] = {
         "sigma_point": _typical_sigma(task),
         "sigma_normal": SIGMA_NORMAL_RAD,
@@ -92,11 +93,11 @@ def _stages(task: Touch, memory: float, rolling_share: float) -> Iterator[Answer
 
 
 def _typical_sigma(task: Touch) -> float:
-    """Standard deviation of a contact at the wanted force on a plane, m, for contacts that state none."""
+    """Standard deviation of a contact at the lowest wanted force on a plane, m, for contacts that state none."""
     from canprobe.mechanics.touch import indentation_from_force
 
     probe = task.probe
-    depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
+    depth = indentation_from_force(task.least_force, probe.stiffness, probe.radius, (0.0, 0.0))
     return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
 
 

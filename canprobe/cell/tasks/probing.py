@@ -177,6 +177,7 @@ class ProbingTask(Task):
             Phase.RETREAT: self._retreat,
             Phase.DONE: lambda: self._motion.pose,
         }
+        self._T = self._T_next = np.eye(4)  # T_base_carrier where the pose of the motion, and the last command, act
 
     def record(self) -> TaskRecord:
         slowed = self._motion.slowed if self._begun else 0
@@ -192,23 +193,42 @@ class ProbingTask(Task):
     def step(self, measurement: Measurement) -> Command:
         self._cycle = measurement.cycle
         self._dt = self._time.step(measurement.t_ns) * 1e-9
+        patch, track = self.sensing.step(measurement), self.sensing.track
+        if track is not None:
+            if not self._begun and measurement.carrier is None:
+                return Command(columns=self._columns)
+            T_base_carrier = track.T_base_carrier(measurement.t_ns + round(self._lead_s * 1e9))
         if not self._begun:
             setup = self._setup
             assert measurement.q is not None
             self._motion = ProbeMotion(setup.needed_arm(), setup.probe, setup.limits, self._period_s, measurement.q)
             self._begun = True
-            self._begin(self._motion.pose)
+            if track is not None:
+                self._T = self._T_next = T_base_carrier
+            self._begin(self._pose)
         self._measured = measurement.q
-        if self.phase in COMING:
+        if self.phase in COMING and track is None:  # where it came along there is something else by now
             self._way_here.add(measurement.q, measurement.q_age)
-        patch = self.sensing.step(measurement)
         if patch is not None and measurement.tactile is not None:
             self._witness(measurement.tactile, patch, self._feel(measurement.tactile, patch))
         self._touch.tactile_age = measurement.tactile_age
         self._watch()
+        at_rest = self.phase is Phase.DONE
         pose = self._phases[self.phase]()
         self._t += self._dt
+        if track is not None and not at_rest:
+            self._T, self._T_next = self._T_next, T_base_carrier
+            pose = pose.moved(T_base_carrier)
         return self._command(pose)
+
+    @property
+    def _pose(self) -> ProbePose:
+        """The commanded pose in the frame of the contacts."""
+        return (
+            self._motion.pose
+            if self.sensing.track is None
+            else self._motion.pose.moved(np.asarray(np.linalg.inv(self._T)))
+        )
 
     def retreat(self, reason: str) -> None:
         if self._begun and self.reason is None and self.phase is not Phase.DONE:
@@ -316,7 +336,7 @@ class ProbingTask(Task):
         """
         if self._measured is not None and self.phase in COMING:
             self._retrace = self._way_here.back(self._measured, self._motion.step_max)
-        pose = self._motion.pose
+        pose = self._pose
         self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED_M_S, at_once=True)
         self._growing = GrowingForce(self._touch.limits.cycles_to_turn)
         self._enter(Phase.RETREAT)
@@ -327,7 +347,7 @@ class ProbingTask(Task):
             grows = f"the force grows on the way back, to {touch.force:.2f} N: the probe was stopped there"
             self.reason = grows if self.reason is None else f"{self.reason}; {grows}"
             self._enter(Phase.DONE)
-            return self._motion.pose
+            return self._pose
         pose = self._line.at(self._t)
         over = self._t >= self._line.duration + self._lead_s
         if over if self._retrace is None else self._retrace.step(self._dt) is None:

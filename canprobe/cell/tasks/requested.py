@@ -16,9 +16,10 @@ from canprobe.cell.master.trail import TakenWay
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.task import MotionTime
-from canprobe.cell.tasks.touch import TouchTask
+from canprobe.cell.tasks.touch import TouchTask, target_column, towards
 from canprobe.cell.tasks.trajectory import Trajectory
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.servo import TARGET_RATES
 from canprobe.mechanics.types import Floats
 
 
@@ -65,12 +66,6 @@ class Request:
             raise UsageError(f"request: expected one of {kinds}, each with a value of its type, got {got}")
 
 
-FORCE_RATE = 2.0
-"""Rate at which a requested force is approached, N/s."""
-SPEED_RATE = 0.1
-"""Rate at which a requested speed is approached, m/s²."""
-
-
 class RequestedTask(WrappingController):
     """Steps a task, and lets requests change it.
 
@@ -98,7 +93,6 @@ class RequestedTask(WrappingController):
         self._targets: list[Floats] = []
         self._make = make
         self._requests = requests
-        self._steps = {"target_force_n": FORCE_RATE * period_s, "speed_m_s": SPEED_RATE * period_s}
         self._asked: dict[str, float] = {}
         self._stopping = False
 
@@ -184,8 +178,11 @@ class RequestedTask(WrappingController):
         return last + qd * self._period_s, qd
 
     def _approach(self, task: TouchTask) -> dict[str, float]:
-        """Move the task's targets towards what was asked for; what they are now, once anything was asked for."""
+        """Move the task's targets towards what was asked for; what they are now, once anything was asked for.
+
+        A request takes the place of a table.
+        """
         for kind, wanted in self._asked.items():
-            now, step = task.targets[kind], self._steps[kind]
-            task.targets[kind] = now + min(max(wanted - now, -step), step)
-        return {f"target_{kind.removeprefix('target_')}": task.targets[kind] for kind in self._asked}
+            task.tables.pop(kind, None)
+            task.targets[kind] = towards(wanted, task.targets[kind], TARGET_RATES[kind] * self._period_s)
+        return {target_column(kind): task.targets[kind] for kind in self._asked}

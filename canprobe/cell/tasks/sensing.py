@@ -13,10 +13,11 @@ import numpy as np
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.patch_reader import PatchReader
 from canprobe.cell.master.tactile_frame import TactileSample
-from canprobe.cell.scene.setup import Arm, Array, Probe
+from canprobe.cell.scene.setup import Arm, Array, Carrier, Probe
 from canprobe.mechanics.robot.chain import ending_in, forward
 from canprobe.mechanics.robot.model import ArmModel, position_sigma
 from canprobe.mechanics.touch import MomentImage, contact_sample, indentation_from_force, make_patch_calibration
+from canprobe.mechanics.touch.carrier import CarrierTrack
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE
 from canprobe.mechanics.touch.image.moments import Moments
 from canprobe.mechanics.touch.image.pad_lag import PadLag
@@ -75,11 +76,12 @@ def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
 
 
 class ContactSensing:
-    """Turns tactile samples into contacts in the base frame.
+    """Turns tactile samples into contacts in the frame in which the object stands still: base, or that of its carrier.
 
     Args:
         arm, probe, array: the arm, and what it touches with.
         moments: the contacts have the second moments of their images.
+        carrier: what the object moves with; None: it stands still.
 
     Attributes:
         model: the arm.
@@ -87,9 +89,10 @@ class ContactSensing:
         radius: radius of the probe, m.
         stiffness: K/h of the layer, N/m³.
         slope: slope that the last touch showed; None before.
+        track: where the carrier is in time; None without one.
     """
 
-    def __init__(self, arm: Arm, probe: Probe, array: Array, *, moments: bool) -> None:
+    def __init__(self, arm: Arm, probe: Probe, array: Array, *, moments: bool, carrier: Carrier | None = None) -> None:
         calibration = make_patch_calibration(array.calibration, array.pad)
         self.model: ArmModel = arm.model
         self.flange_probe: Floats = probe.T_flange_probe
@@ -111,11 +114,14 @@ class ContactSensing:
         lag = array.calibration.centroid.lag
         self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
+        self.track = None if carrier is None else CarrierTrack(carrier.motion)
 
     def step(self, measurement: Measurement) -> Patch | None:
         """Take one measurement; the patch of a new tactile sample, or None without one."""
         if measurement.q is not None:
             self._history.add(measurement.t_ns, measurement.q)
+        if self.track is not None and measurement.carrier is not None:
+            self.track.add(measurement.t_ns, measurement.carrier)
         if measurement.tactile is None:
             return None
         self.patch = self.reader.read(measurement.tactile)
@@ -158,12 +164,16 @@ class ContactSensing:
         return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
 
     def probe_at(self, t_ns: int) -> Floats | None:
-        """The probe (4, 4) in base at a time of the last cycles; None where the joints of that time are unknown."""
-        q = self._history.at(t_ns)
-        return None if q is None else forward(self._chain, q)
+        """The probe (4, 4) at a time of the last cycles; None where the joints of that time are unknown."""
+        if (q := self._history.at(t_ns)) is None:
+            return None
+        T_base_probe = forward(self._chain, q)
+        if self.track is None:
+            return T_base_probe
+        return np.asarray(np.linalg.inv(self.track.T_base_carrier(t_ns)) @ T_base_probe)
 
     def probe_centre(self, t_ns: int) -> Floats | None:
-        """Centre (3,) of the probe in base at a time of the last cycles, m; None where it is unknown."""
+        """Centre (3,) of the probe at a time of the last cycles, m; None where it is unknown."""
         pose = self.probe_at(t_ns)
         return None if pose is None else pose[:3, 3]
 
@@ -199,10 +209,9 @@ class ContactSensing:
 
     def _speed(self, t_ns: int, contact: ContactSample) -> float:
         """Speed of the probe at the contact, m/s: errors of the instant displace a contact by it; 0 without a past."""
-        before = self._history.at(t_ns - SPEED_OVER_NS)
-        if before is None:
+        earlier = self.probe_at(t_ns - SPEED_OVER_NS)
+        if earlier is None:
             return 0.0
-        earlier = forward(self._chain, before)
         point = np.append(contact.r_probe, 1.0)
         way = ((contact.T_base_probe - earlier) @ point)[:3]
         return float(np.linalg.norm(way)) / (1e-9 * SPEED_OVER_NS)

@@ -24,8 +24,16 @@ from canprobe.cell.tasks.task import Loss, Phase, TaskRecord
 from canprobe.mechanics.robot.motion_profile import smooth_step
 from canprobe.mechanics.touch import CalibrationCheck, ContactSample, Patch, Slope, SurfaceEstimate
 from canprobe.mechanics.touch.layer_stiffness import PushFit
-from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, SETTLE_S, LineMotion
-from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
+from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, LineMotion
+from canprobe.mechanics.touch.servo import (
+    RAMP_S,
+    SETTLE_S,
+    TARGET_RATES,
+    LocalSurface,
+    ProbePose,
+    Sinking,
+    TactileServo,
+)
 from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
 from canprobe.mechanics.touch.strategies import PathFollower, Rectangle
 from canprobe.mechanics.types import Floats
@@ -33,22 +41,31 @@ from canprobe.mechanics.types import Floats
 MAX_SLOPE_SIGMA_SHARE = 0.12
 """Share of itself to which the slope of √F over the push must be known (1σ) before it is used."""
 CALIBRATE = "type `canprobe calibrate array CELL` and name its file as sensor.calibration"
-LONGEST_GAP_S = 0.02
-"""Longest gap between two contacts for the servo's surface: after a longer gap it does not rest on one sample alone."""
 REST_SHARE = 0.7
 """Share of the settling time after which force and depth are constant."""
 LOST_FORCE_SHARE = 0.1
 """Share of the wanted force below which a scan or a hold has lost its contact: the hysteresis of the array."""
 RETREAT_WAY = 6e-3
 """Way off the object, m."""
-RAMP_S = 0.05
-"""Time to reach the scan's speed, at its begin and where its path has turned back."""
 SEARCH_SPEED = 2e-3
 """Speed of the search, m/s: until the first sample of the new touch takes effect, 27 ms, the layer sinks in 0.05 mm."""
 BRAKE_S = 0.02
 """Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
 REST_S = 0.25
 """Time at rest on the surface that was found, until the wanted force is reached and the scan goes on."""
+
+CHANGE_M = 5e-3
+"""Path over which a curvature is compared with those before, m: on a cylinder answers differ by less than σ."""
+
+
+def towards(wanted: float, now: float, step: float) -> float:
+    """A target that is one step, at most, nearer to the wanted one."""
+    return now + min(max(wanted - now, -step), step)
+
+
+def target_column(target: str) -> str:
+    """Column of the log with one of `TouchTask.targets`."""
+    return f"target_{target.removeprefix('target_')}"
 
 
 class ContactLearning:
@@ -151,36 +168,6 @@ class Search:
         return SEARCH_SPEED * t
 
 
-class Sinking:
-    """The way from a first touch to the wanted depth, without a bump: it begins as deep and with the pole as it was.
-
-    Args:
-        contact: the first contact.
-        pose: pose of the probe then.
-        radius: radius of the probe, m.
-
-    Attributes:
-        depth: depth at which it begins, m.
-    """
-
-    def __init__(self, contact: ContactSample, pose: ProbePose, radius: float) -> None:
-        self.depth = radius - float(contact.n_base @ (pose.centre - contact.p_base))
-        self._pole = pose.pole
-
-    def share(self, t: float, depth: float, speed: float) -> float:
-        """Share of the way to a depth, m, after a time, s. Out of a touch that went too deep it is as fast as in."""
-        too_deep = self.depth - depth
-        if too_deep <= 0.0:
-            return smooth_step(t / (0.6 * SETTLE_S))
-        return min(1.0, t * speed / too_deep)
-
-    def pose(self, servo: TactileServo, share: float, depth: float, dt: float) -> ProbePose:
-        """At rest on the surface, with a share of the way to a depth, m, gone."""
-        pose = servo.step(0.0, self.depth + share * (depth - self.depth), dt)
-        pole = self._pole + share * (pose.pole - self._pole)
-        return ProbePose(pose.centre, pole / np.linalg.norm(pole))
-
-
 def above(approach: Approach, distance: float) -> ProbePose:
     """Pose of a probe whose centre is at a distance, m, above the place that an approach leads to."""
     up = approach.axes[2]
@@ -199,6 +186,7 @@ class TouchTask(ProbingTask):
 
     Attributes:
         targets: what the servo aims at, `target_force_n` and `speed_m_s`; it follows a small step at once.
+        tables: tables over path or time that these follow, by the same names; each has a column of the log.
         learned: what the contact has taught, by the same sensing.
     """
 
@@ -220,10 +208,13 @@ class TouchTask(ProbingTask):
         self._scan_end: int | None = None
         self._task = task
         self.targets = {"target_force_n": task.force, "speed_m_s": task.scan.speed if task.scan is not None else 0.0}
+        self.tables = dict(task.tables)
+        self.targets |= {name: table.at(0.0, 0.0) for name, table in self.tables.items()}
+        self._shares = dict.fromkeys(self.tables, 1.0)
+        self._answered: tuple[Floats, float] = np.zeros(2), -math.inf  # fading mean of κ, and the path up to it
         self._touched = False
         self._servo: TactileServo  # from the first touch on, as the next
         self._sinking: Sinking
-        self._sample_t: float | None = None
         self.losses: list[Loss] = []
         self._search: Search | None = None
         self._asked: ProbePose | None = None
@@ -256,6 +247,11 @@ class TouchTask(ProbingTask):
         command = super().step(measurement)
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
+            for name, table in self.tables.items():
+                now = self.targets[name]
+                wanted = self._shares[name] * table.at(self._servo.travelled, self._scan_t)
+                self._columns[target_column(name)] = now
+                self.targets[name] = towards(wanted, now, TARGET_RATES[name] * self._dt)
         return command
 
     def update(self) -> None:
@@ -275,8 +271,21 @@ class TouchTask(ProbingTask):
             if contact is not None and self._touched:
                 all_observed = learned.follow(estimate, contact, self._servo.surface)
                 self._columns = self._columns | learned.columns
+                if all_observed:
+                    self._ease(estimate)
                 if all_observed and self.phase not in LEAVING and is_too_hollow(estimate, self.sensing.radius):
                     self._at_hollow(-1.0 / float(estimate.kappa[1]))
+
+    def _ease(self, estimate: SurfaceEstimate) -> None:
+        """Lower the targets by an answer: the speed where the curvature changes, the force where it is known well."""
+        kappa, C, path = np.array(estimate.kappa), estimate.covariance, self._servo.travelled
+        sigma = math.sqrt(max(0.0, C[0, 0] + 2.0 * C[1, 1] + C[2, 2]))
+        before, till = self._answered
+        mean = kappa + (before - kappa) * math.exp((till - path) / CHANGE_M)
+        self._answered, change = (mean, path), max(float(np.linalg.norm(kappa - mean)), 1e-9)
+        eased = {"speed_m_s": sigma / change, "target_force_n": sigma / (self._task.sigma_wanted or 1.0)}
+        for name, table in self.tables.items():
+            self._shares[name] = max(table.least_share, min(1.0, eased[name]))
 
     # sensing and supervision
 
@@ -286,14 +295,12 @@ class TouchTask(ProbingTask):
             self.taxels = sample.frame.taxels
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
         contact = self.sensing.contact(sample, patch) if patch.force > TOUCH_FORCE / 2 else None
-        if contact is not None and self._sample_t is not None and contact.t_s <= self._sample_t:
+        if contact is not None and self._touched and contact.t_s <= self._servo.taken_s:
             self.sensing.dropped += 1  # it says that it is older than the one before
             contact = None
         self._contact = contact
         if contact is not None and self._touched:
-            elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._period_s
-            self._servo.surface.correct(contact.p_base, contact.n_base, min(elapsed, LONGEST_GAP_S))
-            self._sample_t = contact.t_s
+            self._servo.take(contact, 2 * self._period_s)
             if self.phase is Phase.SETTLE:
                 self._sinking.depth += self.learned.push(contact, self._servo.surface)
                 if self._t > REST_SHARE * SETTLE_S:
@@ -338,7 +345,7 @@ class TouchTask(ProbingTask):
     def _let_go(self) -> None:
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
-        self._draw_back(-RETREAT_WAY * self._motion.pose.pole)
+        self._draw_back(-RETREAT_WAY * self._pose.pole)
 
     # phases: each returns the pose for this cycle
 
@@ -395,7 +402,7 @@ class TouchTask(ProbingTask):
 
     def _scan(self) -> ProbePose:
         left = self._task.duration_s - self._scan_t
-        pose = self._servo.step(self.targets["speed_m_s"] * self._pace(left), self._target_depth(), self._dt)
+        pose = self._servo.next_pose(self.targets["speed_m_s"] * self._pace(left), self._target_depth(), self._dt)
         if self._asked is not None:
             self._velocity = (pose.centre - self._asked.centre) / self._dt
         self._asked = pose
@@ -411,7 +418,7 @@ class TouchTask(ProbingTask):
         """Leave the path for where the object should be."""
         if self.phase is Phase.SCAN:
             self.losses.append(Loss(self._cycle))
-        self._search = Search(self._motion.pose, self._velocity)
+        self._search = Search(self._pose, self._velocity)
         self._floor = self._touch.force
         self._asked, self._velocity = None, np.zeros(3)
         self._searched_before = self.losses[-1].searched

@@ -68,6 +68,7 @@ class LedTask(TouchTask):
         self._heading = _Heading()
         self._change = 0.0, 0.0, 0.0
         self._left = 0
+        self.tables.clear()
         self.targets["speed_m_s"] = 0.0
         self._newest: ContactSample | None = None
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.results.scores import RUN_IN_M, curvature_tensor
+from canprobe.cell.scene.model import highest
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord
@@ -121,7 +122,7 @@ def as_scan(drawn: DrawnScene, ended: str, late: list[list[float]], behind: list
     assert scene.sensor is not None and scene.plant is not None
     return ScoredScan(
         scene.seed, SceneSeed.of(scene.seed).kind, drawn.kind, scene.cell.name, drawn.group, scene.task.strategy,
-        scene.task.speed_mm_s, scene.task.force_n, scene.sensor.full_scale_kpa,
+        highest(scene.task.speed_mm_s), highest(scene.task.force_n), scene.sensor.full_scale_kpa,
         float(np.linalg.norm(scene.plant.tool_error_mm)), ended,
         len(late), np.array([row for row in late if row]).reshape(-1, 5),
         len(behind), np.array([row for row in behind if row]).reshape(-1, 5),

@@ -25,7 +25,7 @@ from matplotlib.lines import Line2D
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, ORANGE, legend, picture
 from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import ProbeSettings, Scene
+from canprobe.cell.scene.model import ProbeSettings, Scene, highest
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -219,7 +219,7 @@ def measure(case: ExtremeCase) -> Row:
     if case.extreme == "jitter of the period":
         jitter_ns = 1e-2 * case.value * 1e9 / scene.cycle.rate_hz
         delay(world, {SYNC_ID}, partial(sync_delay_ns, jitter_ns))
-    row |= run_touch(session, task, scene.task.force_n)
+    row |= run_touch(session, task, highest(scene.task.force_n))
     late, behind = scores_of(session, task.shape.records if task.shape is not None else [])
     if scores := [one for one in (*late, *behind) if one]:
         _, errors, variances, squares, _ = np.array(scores).T

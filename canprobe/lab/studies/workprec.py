@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
@@ -25,8 +25,9 @@ from scipy.integrate import solve_ivp
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.contact import PlantState
-from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping, make_equations
+from canprobe.cell.plant.dynamic_arm import DynamicArm
 from canprobe.cell.plant.elastic_contact import depth_for_force
+from canprobe.cell.plant.equations import ArmEquations
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, log_scale, picture
 from canprobe.cell.scene.arms import Bodies, arm_model
@@ -81,9 +82,9 @@ class IntegrationCase:
     repeats: int
 
     @property
-    def stepping(self) -> Stepping:
+    def dynamics(self) -> Dynamics:
         """Method and step, as the plant takes them."""
-        return Stepping(self.method, round(1000.0 * self.step_us))
+        return Dynamics(integrator=self.method, step_ns=round(1000.0 * self.step_us))
 
 
 def cases(quick: bool) -> list[IntegrationCase]:
@@ -160,10 +161,10 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Floats]:
     ), counts
 
 
-def integrated(stiffness_n_m3: float, targets: Floats, stepping: Stepping, *, held: bool = True) -> Floats | None:
+def integrated(stiffness_n_m3: float, targets: Floats, dynamics: Dynamics, *, held: bool = True) -> Floats | None:
     """Motor counts and rates at the ends of the cycles between targets (cycles, 12); None where it broke down."""
     config, _ = trial(stiffness_n_m3, 1)
-    arm = DynamicArm(_arm()[0], config.q0, make_equations(config, held=held), stepping)
+    arm = DynamicArm(replace(config, dynamics=dynamics), held=held)
     seen: list[Any] = []
     with np.errstate(all="ignore"):
         for k, (begin, end) in enumerate(zip(targets[:-1].tolist(), targets[1:].tolist(), strict=True)):
@@ -185,7 +186,7 @@ def measure(case: IntegrationCase) -> dict[str, Any]:
     states: Floats | None = None
     for _ in range(1 + case.repeats):
         begun = process_time()
-        states = integrated(case.stiffness_n_m3, targets, case.stepping, held=case.held)
+        states = integrated(case.stiffness_n_m3, targets, case.dynamics, held=case.held)
         costs.append(1e6 * (process_time() - begun) / case.cycles)
     return {"states": None if states is None else states.tolist(), "cost_us": min(costs[1:])}
 
@@ -194,14 +195,14 @@ def stands(case: IntegrationCase) -> bool:
     """Whether the arm comes to rest in contact after a nudge of one motor, as a real one does."""
     targets = np.repeat(trial(case.stiffness_n_m3, 1)[1][:1], case.cycles + 1, axis=0)
     targets[1:, 0] += NUDGE_COUNTS
-    found = integrated(case.stiffness_n_m3, targets, case.stepping)
+    found = integrated(case.stiffness_n_m3, targets, case.dynamics)
     return found is not None and bool(np.abs(found[-case.cycles // 4 :, 6:]).max() < AT_REST_COUNTS_S)
 
 
 def solve(case: IntegrationCase) -> Any:
     """Motor counts and rates by scipy's Radau, cycle by cycle, nothing held."""
     config, targets = trial(case.stiffness_n_m3, case.cycles)
-    equations, scale = make_equations(config, held=False), units_per_motor(_arm()[0])
+    equations, scale = ArmEquations(config, held=False), units_per_motor(_arm()[0])
     h, seen, rtol = CYCLE_NS * 1e-9, [], case.step_us
     y = equations.resting(targets[0] / scale)
     for k in range(case.cycles):

@@ -163,22 +163,21 @@ def _turn(R: Floats, R_aim: Floats) -> Floats:
     """(3,) rotation vector from one orientation to another, base frame."""
     E = R_aim @ R.T
     axis = 0.5 * np.array((E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]))
-    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (float(np.trace(E)) - 1.0)
-    if sine > 1e-8:
-        return np.array(axis * (atan2(sine, cosine) / sine))
-    if cosine > 0.0:
-        return axis
     column = (E + np.eye(3))[:, int(np.argmax(np.diag(E)))]  # half a turn: any sign of its axis
-    return np.array(column * (pi / float(np.linalg.norm(column))))
+    return _rotation_vector(axis, 0.5 * (float(np.trace(E)) - 1.0), column / np.linalg.norm(column))
 
 
 def _turn_of_pole(R: Floats, pole: Floats) -> Floats:
     """(3,) shortest rotation vector that brings z to a direction, base frame."""
-    axis = np.cross(R[:, 2], pole)
-    sine, cosine = float(np.linalg.norm(axis)), float(R[:, 2] @ pole)
+    return _rotation_vector(np.cross(R[:, 2], pole), float(R[:, 2] @ pole), R[:, 0])
+
+
+def _rotation_vector(axis: Floats, cosine: float, half: Floats) -> Floats:
+    """(3,) rotation vector by its axis times the sine, the cosine, and the unit axis of half a turn."""
+    sine = float(np.linalg.norm(axis))
     if sine > 1e-8:
         return np.array(axis * (atan2(sine, cosine) / sine))
-    return axis if cosine > 0.0 else np.array(pi * R[:, 0])
+    return axis if cosine > 0.0 else np.array(pi * half)
 
 
 def _reach(pose: _PosedTool, near: Floats) -> tuple[Floats, Floats]:
@@ -206,11 +205,10 @@ def _reach(pose: _PosedTool, near: Floats) -> tuple[Floats, Floats]:
     return q, left
 
 
-def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float) -> Floats:
-    """A damped step of the free joints, of at most `_MAX_STEP_RAD`, rad."""
-    A = J[:, free]
-    step = np.zeros(len(free))
-    step[free] = A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(left)), left)
+def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float, wish: Floats | float = 0.0) -> Floats:
+    """The damped step of the free joints that is nearest to a wish, of at most `_MAX_STEP_RAD`, rad."""
+    A, step = J[:, free], np.where(free, wish, 0.0)
+    step[free] += A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(left)), left - A @ step[free])
     step /= max(1.0, float(np.abs(step).max()) / _MAX_STEP_RAD)
     return step
 
@@ -226,13 +224,7 @@ def _rest(pose: _PosedTool, reached: Floats, error: Floats, rest: Floats) -> tup
         left, J = pose.error(q)
         wish = (rest - q) / model.radian
         free = ~(((q <= model.q_min) & (wish < 0.0)) | ((q >= model.q_max) & (wish > 0.0)))
-        A = J[:, free]
-        step = np.zeros(model.n)
-        # wish + A'(AA')^-1 (left - A wish): the nearest to the wish that makes up for what is left
-        damped = A @ A.T + 1e-12 * np.eye(pose.rows)
-        step[free] = wish[free] + A.T @ np.linalg.solve(damped, left - A @ wish[free])
-        step /= max(1.0, float(np.abs(step).max()) / _MAX_STEP_RAD)
-        moved = np.clip(q + step * model.radian, model.q_min, model.q_max)
+        moved = np.clip(q + _step(J, left, free, 1e-12, wish) * model.radian, model.q_min, model.q_max)
         settled, q = float(np.abs(moved - q).max()) < _ROUNDING_ERROR, moved
         if settled:
             break

@@ -169,21 +169,21 @@ class UrdfTree:
         if edge.kind != "continuous":
             if limit is None:
                 raise self.wrong(edge.name, "a <limit> with lower, upper and velocity", "none")
-            low, high = self.number(edge.name, limit, "lower", 0.0), self.number(edge.name, limit, "upper", 0.0)
+            low, high = self.number(edge.name, limit, "lower"), self.number(edge.name, limit, "upper")
             if low > high:
                 raise self.wrong(edge.name, "lower below upper in its <limit>", f"{low:g} and {high:g}")
         low, high = self._softened(edge, low, high)
         given = {
-            "rated_torque": 0.0 if limit is None else self.number(edge.name, limit, "effort", 0.0),
-            "coulomb": 0.0 if dynamics is None else self.number(edge.name, dynamics, "friction", 0.0),
-            "viscous": 0.0 if dynamics is None else self.number(edge.name, dynamics, "damping", 0.0),
+            "rated_torque": self.number(edge.name, limit, "effort"),
+            "coulomb": self.number(edge.name, dynamics, "friction"),
+            "viscous": self.number(edge.name, dynamics, "damping"),
         }
         return Joint(
             name=edge.name,
             prismatic=edge.kind == "prismatic",
             q_min=low,
             q_max=high,
-            qd_max=0.0 if limit is None else self.number(edge.name, limit, "velocity", 0.0),
+            qd_max=self.number(edge.name, limit, "velocity"),
             **{key: value for key, value in given.items() if value > 0.0},
         )
 
@@ -192,7 +192,7 @@ class UrdfTree:
         safety = edge.element.find("safety_controller")
         if safety is None:
             return low, high
-        soft = [self.number(edge.name, safety, f"soft_{end}_limit", 0.0) for end in ("lower", "upper")]
+        soft = [self.number(edge.name, safety, f"soft_{end}_limit") for end in ("lower", "upper")]
         if soft == [0.0, 0.0]:
             return low, high
         inside = max(low, soft[0]), min(high, soft[1])
@@ -204,7 +204,7 @@ class UrdfTree:
     def axis(self, edge: UrdfEdge) -> Floats:
         """(3,) unit vector of the joint's axis in its frame."""
         element = edge.element.find("axis")
-        axis = np.array((1.0, 0.0, 0.0) if element is None else self.three_numbers(edge.name, element, "xyz"))
+        axis = np.array((1.0, 0.0, 0.0) if element is None else self.numbers(edge.name, element, "xyz"))
         length = float(np.linalg.norm(axis))
         if length < 1e-6:
             raise self.wrong(edge.name, "an axis that is not zero", str(axis.tolist()))
@@ -239,8 +239,8 @@ class UrdfTree:
         if mass is None or inertia is None:
             raise self.wrong(f"link {link}", "<mass> and <inertia> in its <inertial>", "one of them is missing")
         names = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
-        tensor = np.array([self.number(f"link {link}", inertia, name, 0.0) for name in names]).reshape(3, 3)
-        body = Body(self.number(f"link {link}", mass, "value", 0.0), np.zeros(3), tensor)
+        tensor = np.array([self.number(f"link {link}", inertia, name) for name in names]).reshape(3, 3)
+        body = Body(self.number(f"link {link}", mass, "value"), np.zeros(3), tensor)
         if body.mass < 0.0:
             raise self.wrong(f"link {link}", "a value in <mass> that is not negative", f"{body.mass:g}")
         return body.moved(T @ self.origin(f"link {link}", element.find("origin")))
@@ -250,31 +250,26 @@ class UrdfTree:
         T = np.eye(4)
         if element is None:
             return T
-        T[:3, :3] = rotation_rpy(*self.three_numbers(name, element, "rpy", "0 0 0"))
-        T[:3, 3] = self.three_numbers(name, element, "xyz", "0 0 0")
+        T[:3, :3] = rotation_rpy(*self.numbers(name, element, "rpy", "0 0 0"))
+        T[:3, 3] = self.numbers(name, element, "xyz", "0 0 0")
         return T
 
-    def three_numbers(self, name: str, element: ElementTree.Element, key: str, default: str = "") -> list[float]:
-        """Three numbers of an attribute."""
+    def numbers(
+        self, name: str, element: ElementTree.Element, key: str, default: str = "", count: str = "three numbers"
+    ) -> list[float]:
+        """Three numbers of an attribute, or "a number"; `default` where it is missing."""
         text = element.get(key, default)
         try:
             values = [float(word) for word in text.split()]
         except ValueError:
             values = []
-        if len(values) != 3 or not all(map(math.isfinite, values)):
-            raise self.wrong(name, f"three numbers in {key} of <{element.tag}>", repr(text))
+        if len(values) != (3 if count == "three numbers" else 1) or not all(map(math.isfinite, values)):
+            raise self.wrong(name, f"{count} in {key} of <{element.tag}>", repr(text or None))
         return values
 
-    def number(self, name: str, element: ElementTree.Element, key: str, default: float) -> float:
-        """A number of an attribute; `default` where it is missing."""
-        text = element.get(key)
-        try:
-            value = default if text is None else float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise self.wrong(name, f"a number in {key} of <{element.tag}>", repr(text))
-        return value
+    def number(self, name: str, element: ElementTree.Element | None, key: str, default: str = "0") -> float:
+        """A number of an attribute; `default` where it or the element is missing."""
+        return 0.0 if element is None else self.numbers(name, element, key, default, "a number")[0]
 
 
 def source_name(source: str | Path) -> str:

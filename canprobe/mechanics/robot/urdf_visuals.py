@@ -5,10 +5,10 @@ Source: URDF specification (wiki.ros.org/urdf/XML, link, visual, collision).
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from urllib.parse import unquote
 from xml.etree import ElementTree
@@ -78,10 +78,11 @@ def _visuals(tree: UrdfTree, tag: str, joint: int, carried: Iterable[tuple[str, 
 
 
 def _size(tree: UrdfTree, name: str, solid: ElementTree.Element) -> tuple[float, ...]:
-    keys = {"mesh": "scale", "box": "size", "cylinder": "radius length", "sphere": "radius"}.get(solid.tag, "")
     if solid.tag in ("mesh", "box"):
-        return tuple(tree.three_numbers(name, solid, keys, "1 1 1" if solid.tag == "mesh" else ""))
-    return tuple(tree.number(name, solid, key, math.nan) for key in keys.split())
+        key, usual = ("scale", "1 1 1") if solid.tag == "mesh" else ("size", "")
+        return tuple(tree.numbers(name, solid, key, usual))
+    keys = {"cylinder": ("radius", "length"), "sphere": ("radius",)}.get(solid.tag, ())
+    return tuple(tree.number(name, solid, key, "") for key in keys)
 
 
 def find_mesh(urdf: Path, name: str) -> Path | None:
@@ -99,14 +100,7 @@ def find_mesh(urdf: Path, name: str) -> Path | None:
         places = [above / part for above in (folder, *folder.parents) for part in (rest, inside)]
     else:
         places = [folder / (unquote(rest) if scheme == "file" else rest)] if scheme in ("", "file") else []
-    return next(filter(_is_file, places), None)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that the system refuses
-        return False
+    return next(filter(isfile, places), None)  # unlike Path.is_file, false for a name that the system refuses
 
 
 def with_meshes_found(urdf: Path) -> bytes:

@@ -36,8 +36,8 @@ name, and the quadrics), `heights` (a spline over a grid), `mesh_fit` (such a sp
 Invariants: SI units, base frame unless a name says otherwise. z of a contact frame is the inward normal; in its own
 contact frame a surface has c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [[c11, c12], [c12, c22]] is the curvature;
 κ > 0 is convex. Source: Chen, Rink, Zhang, "Local Object Shape From Tactile Sensing", with the corrections that the
-docstrings name. The names in `__all__` are for a stranger, from an image to a contact to a shape; docs/mechanics.md
-shows the way. Start reading at `contact`, then `estimate/` and `online/`.
+docstrings name. The names in `__all__` are for a stranger, from an image to a contact to a shape and to the next pose;
+docs/mechanics.md shows the way. Start reading at `contact`, then `estimate/` and `online/`.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.estimator import Estimator
     from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
     from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+    from canprobe.mechanics.touch.estimate.matrix import UncertainMatrix
     from canprobe.mechanics.touch.estimate.noise import Correlation
     from canprobe.mechanics.touch.estimate.prior import Prior
     from canprobe.mechanics.touch.image.calibration import ArrayCalibration
@@ -74,6 +75,8 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.online.patch_fusion import PatchFusion
     from canprobe.mechanics.touch.online.systematic_errors import SystematicErrors
     from canprobe.mechanics.touch.pad import Pad
+    from canprobe.mechanics.touch.servo import TactileServo
+    from canprobe.mechanics.touch.strategies import Circle, Straight, Strategy, Weave
     from canprobe.mechanics.touch.surface import SurfaceMatrix
 
 __getattr__, __dir__, _ = door(
@@ -86,6 +89,7 @@ __getattr__, __dir__, _ = door(
         "touch.estimate.fit": ("fit_surface", "make_estimator"),
         "touch.estimate.estimator": ("Estimator",),
         "touch.estimate.likelihood": ("cramer_rao",),
+        "touch.estimate.matrix": ("UncertainMatrix",),
         "touch.estimate.noise": ("Correlation",),
         "touch.estimate.prior": ("Prior",),
         "touch.image.calibration": ("ArrayCalibration",),
@@ -106,10 +110,13 @@ __getattr__, __dir__, _ = door(
         "touch.online.patch_fusion": ("PatchFusion",),
         "touch.online.systematic_errors": ("SystematicErrors",),
         "touch.pad": ("Pad",),
+        "touch.servo": ("TactileServo",),
+        "touch.strategies": ("Circle", "Straight", "Strategy", "Weave"),
         "touch.surface": ("SurfaceMatrix",),
     },
 )
 __all__ = ["ContactSample", "Doubt", "Pad", "Slope", "contact_sample", "indentation_from_force"]
+__all__ += ["Circle", "Straight", "Strategy", "TactileServo", "UncertainMatrix", "Weave"]
 __all__ += ["ForceReading", "ImageModel", "MomentImage", "Patch", "PatchCalibration", "compute_patch"]
 __all__ += ["ArrayCalibration", "CalibrationCheck", "calibrate_array", "make_image_model", "make_patch_calibration"]
 __all__ += ["Correlation", "Estimator", "Prior", "SurfaceEstimate", "cramer_rao", "fit_surface", "make_estimator"]

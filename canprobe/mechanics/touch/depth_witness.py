@@ -247,7 +247,7 @@ class DepthWitness:
         fitted = covariance @ (A.T @ b)
         residual = A @ fitted - b
         scatter2 = max(1.0, float(residual @ residual) / max(3 * len(rx) - 6, 1))  # contacts that contradict each other
-        a, bx, by, hxx, hxy, hyy = fitted.tolist()
+        _, bx, by, hxx, hxy, hyy = fitted.tolist()
         # the foot of the sphere: where its slope is that of the surface
         stiff_xx, stiff_yy = 1.0 / self._radius - hxx, 1.0 / self._radius - hyy
         determinant = stiff_xx * stiff_yy - hxy * hxy
@@ -257,9 +257,8 @@ class DepthWitness:
         inside = self._radius**2 - fx * fx - fy * fy
         if inside <= 0.0:
             return
-        surface = a + bx * fx + by * fy + 0.5 * hxx * fx * fx + hxy * fx * fy + 0.5 * hyy * fy * fy
         row = np.array([1.0, fx, fy, 0.5 * fx * fx, fx * fy, 0.5 * fy * fy])
-        self.depth = surface - height + math.sqrt(inside)
+        self.depth = float(row @ fitted) - height + math.sqrt(inside)
         ahead2 = float(np.min((rx - fx) ** 2 + (ry - fy) ** 2))
         new = 0.5 * CURVATURE_CHANGE * ahead2
         self.sigma = math.sqrt(scatter2 * (float(row @ covariance @ row) + new * new))

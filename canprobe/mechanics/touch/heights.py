@@ -13,6 +13,7 @@ Source: de Boor, A Practical Guide to Splines (cubic B-splines on equal knots, n
 from __future__ import annotations
 
 from math import atan2, ceil, cos, hypot, inf, sin, sqrt
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -69,19 +70,9 @@ class Spline:
         s, t = (x - self.corner[0]) * scale, (y - self.corner[1]) * scale
         i, j = min(max(int(s), 0), m - 2), min(max(int(t), 0), n - 2)
         s, t = s - i, t - j
-        r, p = 1.0 - s, 1.0 - t
-        b0, b3 = p * p * p / 6.0, t * t * t / 6.0
-        b1, b2 = 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - p * p * (1.0 - 0.5 * p)
-        d0, d1, d2, d3 = -0.5 * p * p, t * (1.5 * t - 2.0), p * (2.0 - 1.5 * p), 0.5 * t * t
-        e1, e2 = 3.0 * t - 2.0, 3.0 * p - 2.0
+        (b0, b1, b2, b3), (d0, d1, d2, d3), (e0, e1, e2, e3) = b_splines(t)
         z = zx = zy = zxx = zxy = zyy = 0.0
-        weights = (
-            (r * r * r / 6.0, -0.5 * r * r, r),
-            (2.0 / 3.0 - s * s * (1.0 - 0.5 * s), s * (1.5 * s - 2.0), 3.0 * s - 2.0),
-            (2.0 / 3.0 - r * r * (1.0 - 0.5 * r), r * (2.0 - 1.5 * r), 3.0 * r - 2.0),
-            (s * s * s / 6.0, 0.5 * s * s, s),
-        )
-        for row, (b, d, e) in zip(self._rows[i : i + 4], weights, strict=True):
+        for row, b, d, e in zip(self._rows[i : i + 4], *b_splines(s), strict=True):
             c0, c1, c2, c3 = row[j : j + 4]
             value, slope = b0 * c0 + b1 * c1 + b2 * c2 + b3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
             z += b * value
@@ -89,7 +80,7 @@ class Spline:
             zxx += e * value
             zy += b * slope
             zxy += d * slope
-            zyy += b * (p * c0 + e1 * c1 + e2 * c2 + t * c3)
+            zyy += b * (e0 * c0 + e1 * c1 + e2 * c2 + e3 * c3)
         square = scale * scale
         return z, zx * scale, zy * scale, zxx * square, zxy * square, zyy * square
 
@@ -98,7 +89,7 @@ class Spline:
         m, n = self.shape
         s, t = (x - self.corner[0]) / self.spacing, (y - self.corner[1]) / self.spacing
         i, j = np.clip(s.astype(np.intp), 0, m - 2), np.clip(t.astype(np.intp), 0, n - 2)
-        (b, d), (bt, dt) = b_splines(s - i), b_splines(t - j)
+        (b, d, _), (bt, dt, _) = b_splines(s - i), b_splines(t - j)
         first = i * (n + 2) + j
         z, zx, zy = np.zeros((3, len(s)))
         for k in range(4):
@@ -110,37 +101,26 @@ class Spline:
         return z, zx / self.spacing, zy / self.spacing
 
 
-def b_splines(t: Floats) -> tuple[list[Floats], list[Floats]]:
-    """The four cubic B-splines over a cell at t in 0 … 1, and their slopes."""
+def b_splines(t: Any) -> tuple[tuple[Any, Any, Any, Any], ...]:
+    """The four cubic B-splines over a cell at t in 0 … 1, their slopes and second derivatives, in the form of t."""
     p = 1.0 - t
-    inner = (2.0 / 3.0 - one * one * (1.0 - 0.5 * one) for one in (t, p))
-    return [p * p * p / 6.0, *inner, t * t * t / 6.0], [
-        -0.5 * p * p,
-        t * (1.5 * t - 2.0),
-        p * (2.0 - 1.5 * p),
-        0.5 * t * t,
-    ]
+    return (
+        (p * p * p / 6.0, 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - p * p * (1.0 - 0.5 * p), t * t * t / 6.0),
+        (-0.5 * p * p, t * (1.5 * t - 2.0), p * (2.0 - 1.5 * p), 0.5 * t * t),
+        (p, 3.0 * t - 2.0, 3.0 * p - 2.0, t),
+    )
 
 
 def _coefficients(f: Floats) -> Floats:
     """(n + 2, …) B-spline coefficients of the cubic spline through (n, …) values, along the first axis."""
-    # with not-a-knot ends the second coefficient from each end follows from three values, and the rest from ``c[i-1] +
-    # 4 c[i] + c[i+1] = 6 f[i]``, by elimination without pivots, as the diagonal dominates
-    n = len(f)
-    c = np.zeros((n + 2, *f.shape[1:]))
-    c[2] = (8.0 * f[1] - f[0] - f[2]) / 6.0
-    c[n - 1] = (8.0 * f[n - 2] - f[n - 1] - f[n - 3]) / 6.0
-    pivots = np.zeros(n + 2)
-    for i in range(3, n - 1):  # forwards: c[i] = right side − pivot c[i+1]
-        pivots[i] = 1.0 / (4.0 - pivots[i - 1])
-        c[i] = (6.0 * f[i - 1] - c[i - 1]) * pivots[i]
-    for i in range(n - 2, 2, -1):
-        c[i] -= pivots[i] * c[i + 1]
-    c[1] = 6.0 * f[1] - 4.0 * c[2] - c[3]
-    c[0] = 6.0 * f[0] - 4.0 * c[1] - c[2]
-    c[n] = 6.0 * f[n - 2] - 4.0 * c[n - 1] - c[n - 2]
-    c[n + 1] = 6.0 * f[n - 1] - 4.0 * c[n] - c[n - 1]
-    return c
+    from scipy.linalg import solve_banded  # only where there are heights
+
+    bands = np.zeros((9, len(f) + 2))
+    bands[3, 2:], bands[4, 1:-1], bands[5, :-2] = 1.0, 4.0, 1.0  # c[i-1] + 4 c[i] + c[i+1] = 6 f[i]
+    for k, jump in enumerate((1.0, -4.0, 6.0, -4.0, 1.0)):  # none in the third derivative: not-a-knot ends
+        bands[4 - k, k] = bands[4 + k, -1 - k] = jump
+    found: Floats = solve_banded((4, 4), bands, np.pad(6.0 * f, ((1, 1), (0, 0))))
+    return found
 
 
 class Heights(PlacedShape):
@@ -332,10 +312,7 @@ class Heights(PlacedShape):
         """Every local minimum of the distance within reach, where there are several, as on the edges of a groove."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [place for place in self._minima(x, y, z, reach) if place[0] < reach * reach]
-        if len(near) < 2:
-            return None
-        feet = np.array([self._foot_at(place, x, y, z) for place in near])
-        return self._placed(feet[:, :3], feet[:, 3:6], feet[:, 6], feet[:, 7:9], np.zeros(len(feet)))
+        return self._several([self._foot_at(place, x, y, z) for place in near])
 
     def gaps(self, points_base: Floats) -> Floats:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface.
@@ -357,10 +334,10 @@ class Heights(PlacedShape):
         if self._cells is not None:
             (x0, y0), (m, n) = self.spline.corner, self._cells.shape
             s, t = (x[inside] - x0) / self.spline.spacing, (y[inside] - y0) / self.spline.spacing
-            rows = [
-                (s + side).astype(np.intp).clip(0, m - 1) for side in (-_BORDER_SPACINGS, _BORDER_SPACINGS)
-            ]  # of both cells on a border
-            columns = [(t + side).astype(np.intp).clip(0, n - 1) for side in (-_BORDER_SPACINGS, _BORDER_SPACINGS)]
+            rows, columns = (  # of both cells on a border
+                [(at + side).astype(np.intp).clip(0, count - 1) for side in (-_BORDER_SPACINGS, _BORDER_SPACINGS)]
+                for at, count in ((s, m), (t, n))
+            )
             inside[inside] = np.any([self._cells[i, j] for i in rows for j in columns], axis=0)
         return inside
 

@@ -12,6 +12,7 @@ from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
 from canprobe.mechanics.touch.shapes import (
     Bowl,
+    Cylinder,
     Fillet,
     Foot,
     PlacedShape,
@@ -41,18 +42,6 @@ class Sphere(RoundShape):
         nx, ny, nz = (x / rho, y / rho, zc / rho) if rho > 0.0 else (0.0, 0.0, 1.0)
         k = 1.0 / radius
         return (radius * nx, radius * ny, radius * (nz - 1.0), nx, ny, nz, rho - radius, k, k, *tangent_of(nx, ny, nz))
-
-
-class Cylinder(RoundShape):
-    """Endless round cylinder along the object's x axis, centre line at z = -radius."""
-
-    def _foot(self, x: float, y: float, z: float) -> Foot:
-        radius = self.radius
-        zc = z + radius
-        rho = hypot(y, zc)
-        ny, nz = (y / rho, zc / rho) if rho > 0.0 else (0.0, 1.0)
-        # Round the circumference first: d1 = (0, nz, -ny), d2 = n x d1 = -x.
-        return x, radius * ny, radius * (nz - 1.0), 0.0, ny, nz, rho - radius, 1.0 / radius, 0.0, 0.0, nz, -ny
 
 
 class Quadric(PlacedShape):

@@ -109,8 +109,6 @@ class Pad:
     @property
     def reach_m(self) -> float:
         """Distance from the middle to the nearest edge, m."""
-        if self.positions is None:
-            return 0.5 * min(self.shape) * self.pitch_m
         return float(self.half_sides_m.min())
 
     @property
@@ -143,16 +141,12 @@ class Pad:
         A taxel of a grid on a sphere has `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R. A listed taxel has the part of its
         area across z, so that pressure times area is the force along z; on a sphere without normals that of a grid.
         """
-        if self.positions is not None:
-            if self.normals is not None:
-                tilt = np.asarray(self.normals, dtype=np.float64)[:, 2]
-            elif self.is_flat:
-                tilt = np.ones(self.taxels)
-            else:
-                tilt = np.sinc(np.hypot(*self.uv.T) / self.radius_m / math.pi)
-            return _read_only(np.full(self.taxels, self.pitch_m**2) * tilt)
-        angle = np.hypot(*self.uv.T) / self.radius_m
-        return _read_only(self.pitch_m**2 * np.sinc(angle / math.pi))
+        tilt: Floats = np.sinc(np.hypot(*self.uv.T) / self.radius_m / math.pi)
+        if self.positions is not None and self.normals is not None:
+            tilt = np.asarray(self.normals, dtype=np.float64)[:, 2]
+        elif self.positions is not None and self.is_flat:
+            tilt = np.ones(self.taxels)
+        return _read_only(self.pitch_m**2 * tilt)
 
 
 def _centred(count: int) -> Floats:

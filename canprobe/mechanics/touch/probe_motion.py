@@ -26,8 +26,6 @@ MOVE_SPEED_M_S, ROUND_SPEED_M_S, RETREAT_SPEED_M_S = 30e-3, 40e-3, 20e-3
 """Mean speeds of the way to an object, round a ball, and off an object, m/s."""
 EXTRA_CLEARANCE_M = 2e-3
 """Distance by which a probe draws back farther from a ball than the clearance from which it came, m."""
-SETTLE_S = 0.5
-"""Time at rest in contact before a scan, s."""
 MAX_EXACT_STEP_RAD = 0.01
 """Largest joint step of the exact inverse that is taken undamped, rad: 230 deg/s in a cycle of 400 Hz."""
 REST_RETURN_HZ = 1.0

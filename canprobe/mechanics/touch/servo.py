@@ -20,13 +20,34 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.strategies import PathFollower
+from canprobe.mechanics.robot.motion_profile import smooth_step
+from canprobe.mechanics.touch.checks import checked, positive
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.strategies import PathFollower, Strategy
+from canprobe.mechanics.touch.tangent_frames import homogeneous, transported
 from canprobe.mechanics.types import Floats
 
 MIN_SLOPE_COSINE = 0.2
 """Least cosine between surface normal and approach direction, 78 degrees: a steeper slope is taken as this steep."""
+LONGEST_GAP_S = 0.02
+"""Longest gap between two contacts for the servo's surface: after a longer gap it does not rest on one sample alone."""
+BLIND_S = 0.1
+"""Time without a contact after which `TactileServo.step` holds the contact where it is, s."""
+SETTLE_S = 0.5
+"""Time at rest in contact before a scan, s."""
+RAMP_S = 0.05
+"""Time to reach the scan's speed, at its begin and where its path has turned back."""
+BRAKE_M = 1e-3
+"""Way on which `TactileServo.step` brakes before a path that turns back at once, m."""
+SINK_SPEED = 4e-3
+"""Speed of `TactileServo.step` out of a first touch that went too deep, m/s."""
+
+TARGET_RATES = {"target_force_n": 2.0, "speed_m_s": 0.1}
+"""Highest rates at which targets change, N/s and m/s²: a jump is a ramp in time. At 2 N/s the delay of 27 ms leaves the
+force 0.05 N behind, as much as the servo errs at rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +172,26 @@ class ProbePose:
     centre: Floats
     pole: Floats
 
+    def moved(self, T: Floats) -> ProbePose:
+        """The pose that a transform (4, 4) makes of this one."""
+        return ProbePose(T[:3, :3] @ self.centre + T[:3, 3], T[:3, :3] @ self.pole)
+
 
 class TactileServo:
     """Marches a reference contact over the local surface and gives the pose of the probe that holds it.
 
     The reference is carried from cycle to cycle and does not start from the measured contact. Why not from that one:
     its noise and its delay would enter the speed, and each cycle would step back by the path of the delay.
+
+    Alone, for any arm that takes poses, it begins on a first contact, and a cycle is one step:
+
+        weave = Weave(0.030, 0.008, 0.012)
+        servo = TactileServo.on(contact, weave, (1.0, 0.0, 0.0), radius=0.040, depth=0.4e-3)
+        servo.speed = 0.020
+        T_base_flange = servo.step(contact, dt) @ np.linalg.inv(T_flange_probe)
+
+    A cell has phases of its own round `take` and `next_pose`, of which a step is made. Limits of force, way and joints
+    are the caller's, and so is the way off the object.
 
     Args:
         surface: the local surface, corrected by the caller with every tactile sample.
@@ -166,7 +201,17 @@ class TactileServo:
         probe_radius: radius of the undeformed probe, m.
         rolling_share: 0 if the pad follows the normal, 1 if it keeps its first orientation, or between. Why not always
             0: to follow the normal takes joint speeds that an arm may not have.
+
+    Attributes:
+        taken_s: time of the last contact that was taken, s; −∞ before.
+        depth: indentation that `step` holds, m; of a force (N) it is `indentation_from_force`.
+        speed: speed of the contact over the surface in `step`, m/s; 0 at first. It counts from `SETTLE_S` after the
+            first step on.
+        travelled: path of the reference contact over the surface, m.
     """
+
+    depth = speed = _t = _blind = 0.0
+    _first: ContactSample
 
     def __init__(
         self,
@@ -176,9 +221,10 @@ class TactileServo:
         axes: Floats,
         origin: Floats,
         probe_radius: float,
-        rolling_share: float,
+        rolling_share: float = 0.0,
     ) -> None:
         self.surface = surface
+        self.travelled = 0.0
         self._follower = follower
         self._heading, self._across, self._up = axes.tolist()
         self._origin = origin.tolist()
@@ -186,13 +232,74 @@ class TactileServo:
         self._share = rolling_share
         self._reference: Sequence[float] = tuple(surface.point.tolist())
         self._first_pole = (-surface.normal).tolist()
+        self.taken_s = -math.inf
+
+    @classmethod
+    def on(
+        cls, contact: ContactSample, strategy: Strategy | None, along: ArrayLike, *, radius: float, depth: float
+    ) -> TactileServo:
+        """A servo that begins on a first contact, for `step`; the pad follows the normal.
+
+        Args:
+            contact: the contact; its plane is the scan plane, its place the origin of the curve.
+            strategy: curve to follow (`Weave`, `Circle`, `Straight`, or your own); None holds the contact.
+            along: (3,) direction in base of the curve's heading; it is laid on the scan plane.
+            radius: radius of the undeformed probe, m.
+            depth: indentation to hold, m; it is reached 0.3 s after the first step.
+
+        Raises:
+            UsageError: a value is no finite number, or the radius is not above 0.
+        """
+        point, normal = checked("contact.p_base", contact.p_base, (3,)), checked("contact.n_base", contact.n_base, (3,))
+        axes = np.array([*transported(checked("along", along, (3,)).tolist(), normal.tolist()), normal])
+        surface = LocalSurface(point, normal, SurfaceGains())
+        follower = None if strategy is None else PathFollower(strategy, BRAKE_M)
+        servo = cls(surface, follower, axes=axes, origin=point, probe_radius=positive("radius", radius))
+        servo.depth, servo._first = positive("depth", depth), contact
+        return servo
+
+    def step(self, contact: ContactSample | None, dt: float) -> Floats:
+        """The pose of the probe for the next command, from a servo that was made by `on`.
+
+        Feed-forward of the curvature is `surface.set_curvature(estimate.curvature_tensor_base())`, with an estimate
+        that has observed all of it.
+
+        Args:
+            contact: the newest contact, in base; None in a cycle without one. One that is not newer than the last, or
+                that an image without a patch gave (NaN), counts as none. After `BLIND_S` without any the contact is
+                held where it is.
+            dt: time since the last step, s.
+
+        Returns:
+            T_base_probe (4, 4), m: origin at the sphere's centre, z through the pole of the pad, x as near to that of
+            the first contact as z allows.
+
+        Raises:
+            UsageError: dt is not above 0.
+        """
+        self._t, self._blind = self._t + positive("dt", dt), self._blind + dt
+        if contact is not None and contact.t_s > self.taken_s and np.isfinite((contact.p_base, contact.n_base)).all():
+            self.take(contact, dt)
+            self._blind = 0.0
+        pace = min(max(self._t - SETTLE_S, 0.0) / RAMP_S, 1.0) if self._blind < BLIND_S else 0.0
+        x_axis, _, pole, centre = self._first.T_base_probe[:3].T
+        sinking = Sinking(self._first, ProbePose(centre, pole), self._radius)
+        share = sinking.share(self._t, self.depth, SINK_SPEED)
+        pose = sinking.pose(self, share, self.depth, dt, self.speed * pace)
+        return homogeneous(np.array([*transported(x_axis.tolist(), pose.pole.tolist()), pose.pole]).T, pose.centre)
+
+    def take(self, contact: ContactSample, first_s: float) -> None:
+        """Correct the surface by a contact, of which the first counts for a time, s, and none for more than a gap."""
+        elapsed = contact.t_s - self.taken_s if self.taken_s > -math.inf else first_s
+        self.surface.correct(contact.p_base, contact.n_base, min(elapsed, LONGEST_GAP_S))
+        self.taken_s = contact.t_s
 
     def rest_on(self, point: Floats, normal: Floats) -> None:
         """Continue from another contact: its point (3,), m, and outward unit normal (3,); the curvature is kept."""
         self.surface.move_to(point, normal)
         self._reference = tuple(point.tolist())
 
-    def step(self, speed: float, depth: float, dt: float) -> ProbePose:
+    def next_pose(self, speed: float, depth: float, dt: float) -> ProbePose:
         """The pose that the probe must have when this cycle's command takes effect.
 
         Args:
@@ -202,7 +309,9 @@ class TactileServo:
         """
         foot, normal = self.surface.foot(self._reference)
         if speed > 0 and self._follower is not None:
-            foot, normal = self._march(self._follower, foot, normal, speed * self._follower.pace * dt)
+            distance = speed * self._follower.pace * dt
+            foot, normal = self._march(self._follower, foot, normal, distance)
+            self.travelled += distance
         self._reference = foot
         reach, share = self._radius - depth, self._share
         (f0, f1, f2), (n0, n1, n2), (p0, p1, p2), flat = foot, normal, self._first_pole, 1 - share
@@ -230,6 +339,36 @@ class TactileServo:
         out = n0 * x + n1 * y + n2 * z
         x, y, z = _unit((x - out * n0, y - out * n1, z - out * n2))
         return self.surface.foot((f0 + distance * x, f1 + distance * y, f2 + distance * z))
+
+
+class Sinking:
+    """The way from a first touch to the wanted depth, without a bump: it begins as deep and with the pole as it was.
+
+    Args:
+        contact: the first contact.
+        pose: pose of the probe then.
+        radius: radius of the probe, m.
+
+    Attributes:
+        depth: depth at which it begins, m.
+    """
+
+    def __init__(self, contact: ContactSample, pose: ProbePose, radius: float) -> None:
+        self.depth = radius - float(contact.n_base @ (pose.centre - contact.p_base))
+        self._pole = pose.pole
+
+    def share(self, t: float, depth: float, speed: float) -> float:
+        """Share of the way to a depth, m, after a time, s. Out of a touch that went too deep it is as fast as in."""
+        too_deep = self.depth - depth
+        if too_deep <= 0.0:
+            return smooth_step(t / (0.6 * SETTLE_S))
+        return min(1.0, t * speed / too_deep)
+
+    def pose(self, servo: TactileServo, share: float, depth: float, dt: float, speed: float = 0.0) -> ProbePose:
+        """The servo's next pose at a speed, m/s, with a share of the way to a depth, m, gone."""
+        pose = servo.next_pose(speed, self.depth + share * (depth - self.depth), dt)
+        pole = self._pole + share * (pose.pole - self._pole)
+        return ProbePose(pose.centre, pole / np.linalg.norm(pole))
 
 
 def _unit(v: Sequence[float]) -> Sequence[float]:

@@ -1,4 +1,4 @@
-"""The base class of all touchable surfaces, a shape at a pose, and shapes beyond quadrics: bowl, wave, fillet, torus.
+"""The base class of all touchable surfaces, a shape at a pose, and some shapes: bowl, wave, cylinder, fillet, torus.
 
 Every shape has a frame: its origin lies ON the surface at the reference (top-most) point, and z is the outward normal
 there. A scene thus places a surface by one of its points. Bodies are solid below the origin; curvature is positive for
@@ -151,6 +151,11 @@ class PlacedShape:
         """Places in the object's frame, carried to the base frame."""
         turn = self._rotation_t
         return TouchedPlaces(points @ turn + self._pose[:3, 3], normals @ turn, distances, kappa, edge_m)
+
+    def _several(self, feet: list[Foot]) -> TouchedPlaces | None:
+        """Feet on a smooth surface as places, where there are several."""
+        at = np.array(feet)
+        return None if len(at) < 2 else self._placed(at[:, :3], at[:, 3:6], at[:, 6], at[:, 7:9], np.zeros(len(at)))
 
     def tightest_concave_radius(self, region: npt.ArrayLike | None = None) -> float:
         """Smallest radius of a hollow of the surface; a probe must be smaller to touch in one point.
@@ -350,11 +355,7 @@ class Wave(PlacedShape):
     def touches(self, point_base: npt.ArrayLike, reach: float) -> TouchedPlaces | None:
         """Both walls where a trough is too tight for the ball."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
-        near = [v for square, v in self._minima(y, z) if square < reach * reach]
-        if len(near) < 2:
-            return None
-        feet = np.array([self._foot_at(v, x, y, z) for v in near])
-        return self._placed(feet[:, :3], feet[:, 3:6], feet[:, 6], feet[:, 7:9], np.zeros(len(feet)))
+        return self._several([self._foot_at(v, x, y, z) for square, v in self._minima(y, z) if square < reach * reach])
 
     def gaps(self, points_base: Floats) -> Floats:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface."""
@@ -367,7 +368,19 @@ class Wave(PlacedShape):
         return 1.0 / (self.amplitude * self._k**2)
 
 
-class Fillet(RoundShape):
+class Cylinder(RoundShape):
+    """Endless round cylinder along the object's x axis, centre line at z = -radius."""
+
+    def _foot(self, x: float, y: float, z: float) -> Foot:
+        radius = self.radius
+        zc = z + radius
+        rho = hypot(y, zc)
+        ny, nz = (y / rho, zc / rho) if rho > 0.0 else (0.0, 1.0)
+        # Round the circumference first: d1 = (0, nz, -ny), d2 = n x d1 = -x.
+        return x, radius * ny, radius * (nz - 1.0), 0.0, ny, nz, rho - radius, 1.0 / radius, 0.0, 0.0, nz, -ny
+
+
+class Fillet(Cylinder):
     """Rounded edge along x: plane, cylinder, plane; the curvature jumps twice. The origin is the middle of the arc.
 
     Args:
@@ -385,11 +398,8 @@ class Fillet(RoundShape):
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
         radius, zc = self.radius, z + self.radius
-        along = atan2(y, zc)
-        if abs(along) <= self._half:
-            rho = hypot(y, zc)
-            ny, nz = (y / rho, zc / rho) if rho > 0.0 else (0.0, 1.0)
-            return x, radius * ny, radius * (nz - 1.0), 0.0, ny, nz, rho - radius, 1.0 / radius, 0.0, 0.0, nz, -ny
+        if abs(atan2(y, zc)) <= self._half:
+            return super()._foot(x, y, z)
         ny, nz = (self._sin if y > 0.0 else -self._sin), self._cos
         distance = y * ny + zc * nz - radius
         return x, y - distance * ny, z - distance * nz, 0.0, ny, nz, distance, 0.0, 0.0, 0.0, nz, -ny

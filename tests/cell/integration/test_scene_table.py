@@ -12,6 +12,7 @@ from canprobe.errors import PlanError
 # scene: force RMS error and curvature RMS error that it stays below, percent
 TABLE = {
     "ellipsoid": (5.0, 3.0),
+    "turntable": (5.0, 3.0),
     "torus": (5.0, 13.0),  # the second curvature changes its sign within the estimator's memory
     "fillet": (11.0, 90.0),  # no quadric fits over a jump of curvature
     "bowl": (8.0, 1.5),

@@ -71,6 +71,10 @@ def moved(data, counts):
     return data[:2] + pack("<i", unpack("<i", data[2:6])[0] + counts) + data[6:]
 
 
+def turned(data, counts):
+    return pack("<I", unpack("<I", data)[0] + counts)
+
+
 PASSIVE = in_state(ControllerState.PASSIVE)
 FOREIGN = "another master is on the bus: an NMT command from another master"
 NO_STATE = "node 3: (joint 3) left operation enabled: in no CiA 402 state (statusword 0x0601)"
@@ -94,6 +98,8 @@ UNHEARD = "lost: no usable TPDO for 6 cycles"
         ("sensor_stale", "press", says(16, 0x511), "no tactile frame for 7 cycles", SafetyStop, {}),
         ("error_passive_long", "press", PASSIVE, "error-passive for 1.0 s", CanprobeError, {"until": 1500}),
         ("bus_off", "free", in_state(ControllerState.BUS_OFF), "bus-off", InterfaceError, {}),
+        ("carrier", "turntable", says(17, 0x191), "node 17: (carrier) lost: no usable position for", NodeError, {}),
+        ("carrier", "turntable", says(17, 0x191, lambda d: turned(d, 100)), "a jump by 0.15 deg", NodeError, {}),
         ("force_fell", "press", vanish, "the measured force fell from", SafetyStop, {}),
         ("force_fell", "cylinder", vanish, "or the object was taken away", SafetyStop, {"task": {"regain_mm": 0.0}}),
         ("interrupt", "free", raising(KeyboardInterrupt), "", KeyboardInterrupt, {}),
@@ -101,15 +107,15 @@ UNHEARD = "lost: no usable TPDO for 6 cycles"
     ],
 )
 def test_a_cause_is_answered_within_its_time_and_told(key, scene, action, told, error, more):  # noqa: PLR0917
-    run = Injected(scene, {"free": FREE_CYCLE, "press": HOLD_CYCLE, "cylinder": SCAN_CYCLE}[scene], action, **more)
+    run = Injected(scene, {"free": FREE_CYCLE, "press": HOLD_CYCLE}.get(scene, SCAN_CYCLE), action, **more)
     run.assert_within(key).assert_drives_off()
     assert isinstance(run.error, error) and told in str(run.error)
     assert told not in (FOREIGN, NO_STATE) or str(run.error) == told
     if told == NO_STATE:
         assert run.session.cell.notes.lines() == ["while stopping: node 3 did not confirm that it is disabled"]
-    if scene == "press":
+    if scene in ("press", "turntable"):
         assert run.session.buses.truth["force_n"][-1] == 0.0
-    else:
+    if scene != "press":
         assert np.abs(np.diff(run.session.buses.truth["q_rad"], axis=0)).max() < 0.01, "no joint jumps"
 
 

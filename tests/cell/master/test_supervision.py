@@ -165,7 +165,7 @@ def test_what_is_counted():
 def test_what_ends_the_enabling_of_the_drives_already():
     """All that is wrong with nodes, bus, array or log; the rest needs a drive in operation, or a controller."""
     assert {condition.key for condition in CONDITIONS if condition.enabling} == {
-        *("foreign_master", "heartbeat", "nmt_state", "emcy"),
+        *("foreign_master", "heartbeat", "nmt_state", "emcy", "carrier"),
         *("error_passive", "bus_off", "preload", "joint_speed", "log"),
     }
 

@@ -8,9 +8,8 @@ import pytest
 from puma_arm import BODIES, ELBOW_FORM, UPENN
 
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import make_equations
 from canprobe.cell.plant.elastic_contact import elastic_contact, force_laws, total_force
-from canprobe.cell.plant.equations import Effects
+from canprobe.cell.plant.equations import ArmEquations, Effects
 from canprobe.cell.plant.integrators import rosenbrock2
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
@@ -119,7 +118,7 @@ def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
 
 
 def equations_of(config, held=False):
-    found = make_equations(config, Effects(gravity=False, coriolis=True, friction=False), held=held)
+    found = ArmEquations(config, Effects(gravity=False, coriolis=True, friction=False), held=held)
     found.loops.gain, found.loops.integral, found.loops.unwind = np.zeros(6), np.zeros(6), 0.0
     return found
 
@@ -185,7 +184,7 @@ def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, h
     """Each touch: elastic force, its damping against the speed there, friction against the slip there."""
     shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
     config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((2e-4, 1e-4, height)), damping_s_m=5.0)
-    e, back = make_equations(config), joints_per_motor(UPENN)
+    e, back = ArmEquations(config), joints_per_motor(UPENN)
     theta = np.linalg.solve(back, config.q0)
     rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
     e.hold(e.resting(theta))
@@ -211,7 +210,7 @@ def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, h
 def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
     shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
     config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((0.0, 0.0, height)), damping_s_m=5.0)
-    e, back = make_equations(config), joints_per_motor(UPENN)
+    e, back = ArmEquations(config), joints_per_motor(UPENN)
     theta = np.linalg.solve(back, config.q0)
     e.hold(e.resting(theta))
     up = np.linalg.solve(forward_jacobian(UPENN.chain, config.q0, TOOL)[1] @ back, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
@@ -221,7 +220,7 @@ def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
 
 def test_slopes_of_several_touches_are_those_of_their_push():
     top = POINT + np.array((2e-4, 1e-4, RESTS_AT - R))
-    e = make_equations(arm_over(TIGHT_BOWL, 3e-4, point=top, damping_s_m=5.0))
+    e = ArmEquations(arm_over(TIGHT_BOWL, 3e-4, point=top, damping_s_m=5.0))
     theta = joints_to_units(UPENN, arm_over(TIGHT_BOWL, 3e-4, point=top).q0) / np.diag(UPENN.units_per_q)
     rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
     e.hold(e.resting(theta))

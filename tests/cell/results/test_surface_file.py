@@ -7,7 +7,9 @@ import pytest
 
 import canprobe
 from canprobe.cell.results.surface_file import FORMAT_VERSION, load_surface_map, save_surface_map
+from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch import UncertainMatrix, fit_surface
 from canprobe.mechanics.touch.map import nodes
 from canprobe.mechanics.touch.map.fit import fit_map
 from canprobe.mechanics.touch.map.local_fits import PadLayer
@@ -72,6 +74,36 @@ def test_columns_can_be_read_without_canprobe(surface_map, tmp_path):
         assert np.isnan(columns["patch_m2"][1])
 
 
+def test_all_of_s_of_the_answers_is_in_the_file(surface_map, tmp_path):
+    rng = np.random.default_rng(0)
+    grid = [[x, y, 0.0] for x in (-5e-3, 0.0, 5e-3) for y in (-5e-3, 0.0, 5e-3)]
+    points = np.array(grid) + 1e-5 * rng.normal(size=(9, 3))
+    some = fit_surface(points, [[0.0, 0.0, 1.0]] * 9, sigma_point=1e-5, sigma_normal=1e-3)
+    few = fit_surface(points[:3], [[0.0, 0.0, 1.0]] * 3, sigma_point=1e-5, sigma_normal=1e-3)
+    answers = [ShapeRecord(0.1 * i, 0.0, answer, 0.0) for i, answer in enumerate((few, some))]
+    path = tmp_path / "surface.npz"
+    save_surface_map(surface_map, path, answers)
+    with np.load(path) as saved:
+        assert saved["answer_t_s"].tolist() == [0.0, 0.1]
+        assert np.isnan(saved["answer_S"][0, 0, 0]) and np.isinf(saved["answer_covariance"][0, 0, 0])
+        again = UncertainMatrix(saved["answer_S"][1], saved["answer_covariance"][1])
+        in_base = again.transformed(np.linalg.inv(saved["answer_T_base_contact_m"][1]))
+    for got, wanted in zip(in_base, some.matrix(np.eye(4)), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-6, atol=1e-9)
+    assert len(load_surface_map(path)) == len(surface_map)
+
+
+def test_a_file_of_the_form_before_is_read(surface_map, tmp_path):
+    path = tmp_path / "surface.npz"
+    save_surface_map(surface_map, path)
+    answers = [name for name in np.load(path).files if name.startswith("answer_")]
+    _rewrite(path, format_version=lambda _: np.array(3), **dict.fromkeys(answers))
+    np.testing.assert_array_equal(load_surface_map(path).nodes.rows, surface_map.nodes.rows)
+    _rewrite(path, format_version=lambda _: np.array(4))
+    with pytest.raises(UsageError, match="missing answer_t_s"):
+        load_surface_map(path)
+
+
 def _rewrite(path, **changes):
     """Change columns of a file: a function of the old one, or None to leave it out."""
     with np.load(path) as saved:
@@ -89,7 +121,7 @@ def _rewrite(path, **changes):
     [
         (
             {"format_version": lambda _: 1},
-            r'expected format_version 3, got 1 of another canprobe; .*canprobe\.replay\(".*"\)\.surface_map',
+            r'expected format_version 4, got 1 of another canprobe; .*canprobe\.replay\(".*"\)\.surface_map',
         ),
         ({"format_version": None}, "without 'format_version'"),
         ({"normal": None, "path_m": None}, "missing normal, path_m"),

@@ -47,8 +47,8 @@ def test_all_that_was_measured_is_on_a_page():
 
 
 def test_a_key_has_its_value_unit_default_condition_and_meaning():
-    row = next(line for line in scene_keys.scene_keys().splitlines() if line.startswith("| `speed_mm_s`"))
+    row = next(line for line in scene_keys.scene_keys().splitlines() if line.startswith("| `approach_mm_s`"))
     assert row == (
-        "| `speed_mm_s` | a number above 0 up to 200 | mm/s | `25.0` | Speed of the contact over the surface."
-        ' *Only with `kind` = `"scan"`.* |'
+        "| `approach_mm_s` | a number above 0 up to 4 | mm/s | `4.0` | Speed of the approach."
+        ' *Only with `kind` = `"scan"` or `"press"` or `"calibrate"`.* |'
     )

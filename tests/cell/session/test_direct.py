@@ -50,6 +50,7 @@ def assert_same(direct, lockstep):
         ),
         pytest.param(loaded("listen", sensor={"mode": "image", "rate_hz": 100.0}), id="listen"),
         pytest.param(loaded("free", "prbt"), id="free of another make"),
+        pytest.param(loaded("turntable", task={"clearance_mm": 0.2}, shape={"also": ()}), id="turntable"),
     ],
 )
 def test_log_and_truth_are_those_of_an_untimed_lockstep_bus_to_the_last_bit(scene):

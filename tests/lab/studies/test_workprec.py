@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from canprobe.cell.plant.dynamic_arm import Stepping
+from canprobe.cell.scene.setup import Dynamics
 from canprobe.cli import main
 from canprobe.lab.studies import workprec
 from canprobe.lab.studies.workprec import (
@@ -34,7 +34,9 @@ def truth():
 
 
 def errors_of(truth, method, step_us, held):
-    found = integrated(PAD, trial(PAD, CYCLES)[1], Stepping(method, round(1000 * step_us)), held=held)
+    found = integrated(
+        PAD, trial(PAD, CYCLES)[1], Dynamics(integrator=method, step_ns=round(1000 * step_us)), held=held
+    )
     return errors(truth, observed(PAD, found))
 
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.servo import LocalSurface, SurfaceGains, TactileServo
+from canprobe.mechanics.touch import Circle, TactileServo, contact_sample, indentation_from_force
+from canprobe.mechanics.touch.contact import direction_to_pad
+from canprobe.mechanics.touch.servo import BLIND_S, SETTLE_S, LocalSurface, SurfaceGains
 from canprobe.mechanics.touch.strategies import PathFollower, make_strategy
 
 RADIUS_P = 0.040
@@ -75,7 +77,7 @@ def follow(surface, *, know_curvature=True, seconds=3.0, delay=10, stiffness_err
             local.correct(centre - n * (RADIUS_P - felt), n, 2 * DT)
             if know_curvature:
                 local.set_curvature(curvature_of(surface, n))
-        line.append(servo.step(25e-3, DEPTH, DT).centre)
+        line.append(servo.next_pose(25e-3, DEPTH, DT).centre)
     return np.array(depths), np.array(points)
 
 
@@ -112,7 +114,7 @@ def test_a_wrong_stiffness_leaves_no_steady_error(error):
         if k % 2 == 0:
             felt = DEPTH + (depth - DEPTH) * (1 + error)
             local.correct(line[0] - n * (RADIUS_P - felt), n, 2 * DT)
-        line.append(servo.step(0.0, DEPTH, DT).centre)
+        line.append(servo.next_pose(0.0, DEPTH, DT).centre)
     assert depth == pytest.approx(DEPTH, abs=1e-7)
 
 
@@ -142,7 +144,7 @@ def test_rolling_share_turns_the_pole_with_the_normal_or_not(share, tilt):
     local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), SurfaceGains())
     servo = TactileServo(local, None, axes=AXES, origin=np.zeros(3), probe_radius=RADIUS_P, rolling_share=share)
     local.correct(np.zeros(3), np.array((np.sin(0.1), 0.0, np.cos(0.1))), dt=1e6)
-    pole = servo.step(0.0, DEPTH, DT).pole
+    pole = servo.next_pose(0.0, DEPTH, DT).pole
     assert pole == pytest.approx((-np.sin(tilt), 0.0, -np.cos(tilt)))
 
 
@@ -183,7 +185,7 @@ def test_a_path_over_a_slope_is_the_one_in_the_scan_plane(name, n):
         probe_radius=RADIUS_P,
         rolling_share=0.0,
     )
-    contacts = np.array([servo.step(0.025, 0.0, DT).centre - RADIUS_P * n for _ in range(3000)])
+    contacts = np.array([servo.next_pose(0.025, 0.0, DT).centre - RADIUS_P * n for _ in range(3000)])
     assert off_curve(contacts, strategy) < 0.15e-3
     along = contacts @ AXES[0]
     assert (along.max(), along.min()) == pytest.approx((0.015, -0.015), abs=0.15e-3) or name == "circle"
@@ -213,6 +215,81 @@ def test_time_does_not_run_backwards():
     with pytest.raises(UsageError, match=r"dt: expected a time that has passed, got -0\.06 s"):
         local.correct(np.array([0.0, 0.0, 1e-3]), np.array([0.0, 0.0, 1.0]), -0.06)
     assert local.point.tolist() == [0.0, 0.0, 0.0]
+
+
+class Layer:
+    """A flat plate under a probe with an elastic layer (Winkler), felt with another stiffness than it has."""
+
+    def __init__(self, normal, stiffness, believed):
+        self.n, self.stiffness, self.believed = np.array(normal) / np.linalg.norm(normal), stiffness, believed
+
+    def force(self, T):
+        depth = RADIUS_P - float(self.n @ T[:3, 3])
+        return math.pi * self.stiffness * RADIUS_P * max(depth, 0.0) ** 2
+
+    def felt(self, T, t_s):
+        force = self.force(T)
+        if force == 0.0:
+            return contact_sample(t_s=t_s, T_base_probe=T, uv=(math.nan,) * 2, depth=0.0, radius=RADIUS_P, force_n=0.0)
+        uv = direction_to_pad(T[:3, :3].T @ -self.n, RADIUS_P)
+        return contact_sample(
+            t_s=t_s, T_base_probe=T, uv=uv, depth=depth_of(force, self.believed), radius=RADIUS_P, force_n=force
+        )
+
+
+def depth_of(force, stiffness):
+    return indentation_from_force(force, stiffness, RADIUS_P, (0.0, 0.0))
+
+
+@pytest.mark.parametrize("believed", [0.7, 1.0, 1.4])
+def test_a_step_from_contact_to_pose_holds_the_force_on_a_flat_layer(believed):
+    """Poses 20 ms late, a plate 9° off the pole, and a stiffness that is not known: no cell, no arm."""
+    layer = Layer((0.15, 0.0, 1.0), 1.2e8, believed * 1.2e8)
+    T = np.diag((1.0, -1.0, -1.0, 1.0))
+    T[:3, 3] = layer.n * (RADIUS_P - 0.05e-3)
+    servo = TactileServo.on(
+        layer.felt(T, 0.0), Circle(0.02), (0.0, 1.0, 0.0), radius=RADIUS_P, depth=depth_of(2.0, layer.believed)
+    )
+    line, forces, places, poses = deque([T] * 8, maxlen=8), [], [], []
+    servo.speed = 0.02
+    for k in range(1, 1200):
+        contact = layer.felt(line[0], DT * k) if k % 2 else None
+        forces.append(layer.force(line[0]))
+        places.append(line[0][:3, 3] @ (np.eye(3) - np.outer(layer.n, layer.n)))
+        line.append(servo.step(contact, DT))
+        poses.append(line[-1])
+    assert forces[-600:] == pytest.approx([2.0] * 600, rel=0.01)
+    assert max(forces) < 2.2
+    still, moving = np.diff(places, axis=0)[: round(SETTLE_S / DT) - 2], np.diff(places, axis=0)[300:]
+    assert np.linalg.norm(moving, axis=1) == pytest.approx(0.02 * DT, rel=0.02)
+    assert np.linalg.norm(still, axis=1).max() < 1e-5
+    R = np.array(poses)[:, :3, :3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    turns = np.arccos(np.clip((np.trace(R[1:] @ R[:-1].transpose(0, 2, 1), axis1=1, axis2=2) - 1) / 2, -1, 1))
+    assert turns.max() < 0.02  # without a jump from the pole of the first touch to the normal
+
+
+def test_without_contacts_a_step_holds_still_and_what_is_no_contact_counts_as_none():
+    layer = Layer((0.0, 0.0, 1.0), 1.2e8, 1.2e8)
+    T = np.diag((1.0, -1.0, -1.0, 1.0))
+    T[2, 3] = RADIUS_P - 0.3e-3
+    first = layer.felt(T, 0.0)
+    servo = TactileServo.on(first, Circle(0.02), (1.0, 0.0, 0.0), radius=RADIUS_P, depth=0.3e-3)
+    servo.speed = 0.02
+    for k in range(1, 400):
+        T = servo.step(layer.felt(T, DT * k), DT)
+    at_loss = T
+    lifted = np.array(T)
+    lifted[2, 3] += 1e-3
+    for k in range(400):
+        old = layer.felt(T, 0.1)
+        T = servo.step((None, old, layer.felt(lifted, 1.0 + DT * k))[k % 3], DT)
+    assert np.isfinite(T).all()
+    assert 0.9 * BLIND_S * 0.02 < np.linalg.norm((T - at_loss)[:3, 3]) < 1.1 * BLIND_S * 0.02
+    with pytest.raises(UsageError, match="dt: expected a number above 0, got 0"):
+        servo.step(None, 0.0)
+    with pytest.raises(UsageError, match=r"depth: expected finite numbers.*got nan"):
+        TactileServo.on(first, None, (1.0, 0.0, 0.0), radius=RADIUS_P, depth=math.nan)
 
 
 # Strategies: constant speed along the curve, inside their region, from the origin.

@@ -66,9 +66,9 @@ def fit_parameters(
         parameters = _as_parameters(z[:5], plain.pad.pitch_m)
         force = np.exp(z[5:])
         depth = np.sqrt(2.0 * force * np.sqrt(a * b) / (math.pi * parameters.stiffness))
-        whole = ImageModel.of(parameters, NO_ERRORS, plain, seen=side)
+        whole = ImageModel(parameters, NO_ERRORS, plain.pad)
         image = whole.shown(depth, a, b)
-        part = whole if seen == side else ImageModel.of(parameters, NO_ERRORS, plain, seen=seen)
+        part = whole if seen == side else ImageModel(parameters, NO_ERRORS, plain.pad, seen)
         M = np.array(part.moments_of(image if part is whole else part.shown(depth, a, b)))
         own = (V - parameters.memory * D)[:, [0, 2]]
         return np.concatenate(

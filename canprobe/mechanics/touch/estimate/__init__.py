@@ -35,6 +35,7 @@ Answers:
 
     observed            what one source says about curvature, and which combinations of it count as observed
     answer              a solution carried to the contact frame: the estimate
+    matrix              all ten unknowns of S of an estimate with their covariance, in any frame
     fit                 the entry: `fit_surface` for recorded points, `make_estimator` by name
 
 An answer takes 0.4 ms. In the loop the stages of `touch.online` refine it, and the work is cut into steps, of which a

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from canprobe.mechanics.touch.checks import checked, read_only
+from canprobe.mechanics.touch.estimate.matrix import MAX_HIDDEN_ENTRY, UncertainMatrix, linear_map, matrix_behind
 from canprobe.mechanics.touch.estimate.observed import CurvatureInformation, Decision, outside, tensor
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, TO_Q_SQUARED, matrix_of, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import transport
@@ -17,8 +19,6 @@ from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats, Vec
 
-_MAX_HIDDEN_ENTRY = 0.02
-"""Largest unobserved part of an entry of K that is still given as a number."""
 _MAX_HIDDEN_DIRECTION = 0.05
 """Largest unobserved part of the normal curvature along a direction that still counts as observed."""
 _UMBILIC_CHI2 = 5.99
@@ -148,6 +148,31 @@ class SurfaceEstimate:
         result: Floats = P.dot(2.0 * self.S[:2, :2]).dot(P.T)
         return result
 
+    def matrix(self, T_base_frame: ArrayLike | None = None) -> UncertainMatrix:
+        """All ten unknowns of S with their covariance, in a frame of your choice.
+
+        The covariance holds what the region of K holds (as stated in `covariance`), and the errors of normal, place and
+        c13, c23, c33, of which a short path knows hardly more than the `prior`. It does not hold what displaces the
+        whole surface: errors of tool and arm. The scale of S is that of the contact frame, c34 = −½ there, without an
+        error. From the methods of differences, `of` and a patch alone, only the covariance of K is known.
+
+        Args:
+            T_base_frame: (4, 4) the frame, to the frame of the points (online the base), m; None: the contact frame.
+
+        Returns:
+            S and covariance; what was not observed is NaN, with an infinite variance.
+
+        Raises:
+            UsageError: T_base_frame is no finite (4, 4).
+        """
+        T_contact_frame: Floats = np.eye(4)
+        if T_base_frame is not None:
+            T_frame = checked("T_base_frame", T_base_frame, (4, 4))
+            T_contact_frame = np.asarray(np.linalg.solve(self.T_frame_contact, T_frame))
+        return matrix_behind(
+            linear_map(T_contact_frame), self.S, (self.covariance, self.combinations, self.information), self.model_root
+        )
+
     def predict(self, point: Floats) -> tuple[Floats, Floats]:
         """Point and outward normal of the estimated surface where a line along the contact normal meets it.
 
@@ -252,7 +277,7 @@ def _partly(
     local = np.array([t, [-t[1], t[0]]])
     seen = decision.rank > 0 and outside(decision, _projector(t)) < _MAX_HIDDEN_DIRECTION
     kappa = np.array([float(t @ K @ t) if seen else math.nan, math.nan])
-    hidden = np.array([outside(decision, e) >= _MAX_HIDDEN_ENTRY for e in np.eye(3)])
+    hidden = np.array([outside(decision, e) >= MAX_HIDDEN_ENTRY for e in np.eye(3)])
     K = np.where(hidden[[[0, 1], [1, 2]]], math.nan, K)
     V, passed = decision.vectors, decision.passed
     covariance = partial_covariance(V[:, passed], decision.information[passed], hidden) / length**2

@@ -42,21 +42,11 @@ class Pairs(NamedTuple):
     normals: Floats
 
 
-def chord_pairs(touches: ContactBatch) -> Pairs:
-    """Differences of every sample and the last."""
-    n = len(touches.points)
-    return _pairs(touches, np.full(n - 1, n - 1), np.arange(n - 1))
-
-
-def lag_pairs(touches: ContactBatch, lag: int) -> Pairs:
-    """Differences of every sample and the one `lag` before it."""
-    newer = np.arange(lag, len(touches.points))
-    return _pairs(touches, newer, newer - lag)
-
-
-def _pairs(touches: ContactBatch, newer: NDArray[np.intp], older: NDArray[np.intp]) -> Pairs:
-    R = working_frame(touches)[:3, :3]
-    p, n = touches.points, touches.normals
+def pairs_of(touches: ContactBatch, lag: int | None = None) -> Pairs:
+    """Differences of every sample and the one `lag` before it; None: of the last and every other."""
+    older = np.arange(len(touches.points) - (lag or 1))
+    newer = np.full_like(older, len(older)) if lag is None else older + lag
+    p, n, R = touches.points, touches.normals, working_frame(touches)[:3, :3]
     return Pairs(newer, older, (p[newer] - p[older]) @ R / touches.extent, (n[newer] - n[older]) @ R)
 
 

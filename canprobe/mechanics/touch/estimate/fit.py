@@ -14,7 +14,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.checks import whole
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.differences import chord_pairs, lag_pairs, solve_pairs, usable_lag
+from canprobe.mechanics.touch.estimate.differences import pairs_of, solve_pairs, usable_lag
 from canprobe.mechanics.touch.estimate.estimator import Estimator
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, checked_arrays, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
@@ -141,10 +141,10 @@ def fit_surface(
     if correlation is not None:
         raise UsageError(f"correlation: expected none for {method!r}, which has no noise model, got {correlation}")
     if method == "chord":
-        return solve_pairs(touches, chord_pairs(touches), "chord")
+        return solve_pairs(touches, pairs_of(touches), "chord")
     if method == "chen1996":
         apart = usable_lag(len(p), whole("lag", lag, 1, "sample"))
-        return solve_pairs(touches, lag_pairs(touches, apart), "chen1996")
+        return solve_pairs(touches, pairs_of(touches, apart), "chen1996")
     raise unknown_method(method)
 
 

@@ -45,7 +45,9 @@ DOUBT_WINDOW_SAMPLES = 160
 
 
 class Gate:
-    """Passes the samples that an estimator can use, and counts the rest.
+    """Passes the samples that an estimator can use, counts the rest, and states the errors of each that passed.
+
+    It follows the contacts over the pad, along whose way their slow errors change.
 
     Args:
         sigma_point: standard deviation of a point that states none, m.
@@ -58,13 +60,14 @@ class Gate:
     def __init__(self, sigma_point: float, sigma_normal: float) -> None:
         self.sigma_point = positive("sigma_point", sigma_point)
         self.sigma_normal = positive("sigma_normal", sigma_normal)
-        self._last_t = -math.inf
         self._doubts: deque[tuple[Doubt, ...]] = deque(maxlen=DOUBT_WINDOW_SAMPLES)
+        self.reset()
 
     def reset(self) -> None:
-        """Accept any time again."""
+        """Accept any time and place again."""
         self._last_t = -math.inf
         self._doubts.clear()
+        self._path_length = PathLength(self.sigma_point)  # noise at rest makes no way
 
     def notes(self) -> tuple[str, ...]:
         """Notes on the doubts about the images of the last contacts."""
@@ -106,6 +109,14 @@ class Gate:
             wider * (self.sigma_normal if sample.sigma_normal is None else sample.sigma_normal),
         )
 
+    def measured(self, sample: ContactSample, coupling: float = 0.0) -> MeasuredContact:
+        """The next contact with its errors, and their coupling, 1/m."""
+        self._path_length.add(sample.r_probe)
+        point, height, normal = self.sigmas(sample)
+        slow = min(_widening(sample) * sample.sigma_slow / point, 1.0)
+        way = self._path_length.total
+        return MeasuredContact(sample.p_base, sample.n_base, point, height, normal, coupling, slow, way)
+
 
 class MeasuredContact(NamedTuple):
     """A contact with its errors, as estimators take it.
@@ -119,6 +130,7 @@ class MeasuredContact(NamedTuple):
         coupling: coupling of their errors (`Noise.coupling`), 1/m.
         slow: share of its slow errors (`SlowErrors.share`).
         way: way over the pad up to this contact, m.
+        weight: weight by its place alone (`PathLength`).
     """
 
     point: Floats
@@ -129,6 +141,7 @@ class MeasuredContact(NamedTuple):
     coupling: float = 0.0
     slow: float = 0.0
     way: float = 0.0
+    weight: float = 1.0
 
     def widened(self, factor: float) -> MeasuredContact:
         """The contact with standard deviations that are `factor` times as large."""
@@ -146,25 +159,6 @@ def slow_errors(touches: Sequence[MeasuredContact]) -> SlowErrors:
     """Slow errors of contacts."""
     share, way = np.array([(t.slow, t.way) for t in touches]).T
     return SlowErrors(share, way)
-
-
-class PadPathLength:
-    """Follows contacts over the pad, along whose way their slow errors change.
-
-    Args:
-        sigma_point: standard deviation of a point, m: noise at rest makes no way.
-    """
-
-    def __init__(self, sigma_point: float) -> None:
-        self._path_length = PathLength(sigma_point)
-
-    def measured(self, sample: ContactSample, gate: Gate, coupling: float = 0.0) -> MeasuredContact:
-        """The next contact with its errors: standard deviations by the gate, and the coupling of its errors, 1/m."""
-        self._path_length.add(sample.r_probe)
-        point, height, normal = gate.sigmas(sample)
-        slow = min(_widening(sample) * sample.sigma_slow / point, 1.0)
-        way = self._path_length.total
-        return MeasuredContact(sample.p_base, sample.n_base, point, height, normal, coupling, slow, way)
 
 
 def _widening(sample: ContactSample) -> float:

@@ -145,12 +145,12 @@ def fit_ml(touches: ContactBatch, prior: Prior | None, quadric: bool = False) ->
     if result.decision.rank > 0 and not quadric:
         root = result.root if result.decision.rank == 3 else result.free_root
         observed = result.decision.vectors[:, result.decision.passed]
-        corrected = correct(result.c, root, d, independent, observed)
-        trusted = corrected.trusted and (result.converged or corrected.misfit <= MENTIONED_PROBABILITY)
-        notes += misfit_notes(corrected.misfit, trusted=trusted)
+        found, root = correct(result.c, root, d, independent, observed)
+        trusted = found.trusted and (result.converged or found.misfit <= MENTIONED_PROBABILITY)
+        notes += misfit_notes(found.misfit, trusted=trusted)
         if trusted:
-            c, root = result.c + corrected.shift, corrected.root
-            free = c if result.decision.rank == 3 else result.free + corrected.shift
+            c = result.c + found.shift
+            free = c if result.decision.rank == 3 else result.free + found.shift
             result = result._replace(c=c, root=root, free=free, free_root=root)
         else:
             c, root = result.c.copy(), upper_root(np.concatenate([prior_rows[0], DIFFUSE_INFORMATION * np.eye(9)]))

@@ -79,21 +79,6 @@ _CAUTIOUS_WEIGHTS = np.repeat(
 )
 
 
-class Corrected(NamedTuple):
-    """What corrects a fit for what it leaves out.
-
-    Attributes:
-        shift: (9,) correction to add to the parameters.
-        root: (9, 9) upper triangular root of the information about the corrected ones.
-        misfit, trusted: as in `Averaged`.
-    """
-
-    shift: Floats
-    root: Floats
-    misfit: float
-    trusted: bool
-
-
 class Averaged(NamedTuple):
     """The parameters of a quadric, averaged over what it leaves out.
 
@@ -162,7 +147,9 @@ def _prior(blur: float) -> Floats:
     return result
 
 
-def correct(c: Floats, root: Floats, d: Design, independent: Floats | None, observed: Floats) -> Corrected:
+def correct(
+    c: Floats, root: Floats, d: Design, independent: Floats | None, observed: Floats
+) -> tuple[Averaged, Floats]:
     """Average a converged fit over its misfit.
 
     Args:
@@ -170,6 +157,9 @@ def correct(c: Floats, root: Floats, d: Design, independent: Floats | None, obse
         root: (9, 9) root of their information, regular.
         d, independent: as for `nonlinear.fit`.
         observed: (3, k) columns: the observed combinations of q. The others are held at what they are.
+
+    Returns:
+        The average, and the (9, 9) upper triangular root of the information about the corrected parameters.
     """
     J, E, r, slack = _rows(c, d, independent)
     curvature = float(np.linalg.norm(c[6:] / C_PER_Q))
@@ -184,7 +174,7 @@ def correct(c: Floats, root: Floats, d: Design, independent: Floats | None, obse
     found = averaged(np.maximum(m, 0.0), s, carried @ U, curvature, blur, observed)
     whole = inverted(root)
     lower = np.asarray(np.linalg.cholesky(whole @ whole.T + found.spread), dtype=np.float64)
-    return Corrected(found.shift, upper_root(inverted(lower)), found.misfit, found.trusted)
+    return found, upper_root(inverted(lower))
 
 
 def _rows(c: Floats, d: Design, independent: Floats | None) -> tuple[Floats, Floats, Floats, Floats]:

@@ -28,15 +28,14 @@ class Amended(NamedTuple):
     """An answer of a filter, averaged over what its quadric leaves out.
 
     Attributes:
-        c: (9,) parameters.
+        average: the average over the terms.
         covariance: (9, 9) covariance that the terms add to that of the noise; symmetric, not definite by itself.
-        misfit, trusted: as in `misfit.Averaged`.
+        terms: (9,) most likely terms.
     """
 
-    c: Floats
+    average: Averaged
     covariance: Floats
-    misfit: float
-    trusted: bool
+    terms: Floats
 
 
 class ExpectedMisfit(NamedTuple):
@@ -52,24 +51,6 @@ class ExpectedMisfit(NamedTuple):
     noise: float = 1.0
     curvature: float = 0.0
     sigma_point: float = 0.0
-
-
-class _Along(NamedTuple):
-    """The average over the terms, in directions in which the samples' information about them is diagonal.
-
-    Attributes:
-        found: the average.
-        off: (9, 9) change of the parameters by a unit along each direction.
-        terms: (9, 9) the terms of such a unit.
-        shared: (18, 9) covariance of the whole score with the part of the terms.
-        weighted: (9, 9) weights of the terms' score.
-    """
-
-    found: Averaged
-    off: Floats
-    terms: Floats
-    shared: Floats
-    weighted: Floats
 
 
 class OmittedTerms:
@@ -134,16 +115,6 @@ class OmittedTerms:
             expected: what is assumed.
             observed: (3, k) columns: the observed combinations of q in the working frame.
         """
-        a = self._along(c, H, expected, place, observed)
-        both = H.dot(a.shared[:9]).dot(a.weighted * a.found.share).dot(a.off.T)
-        return Amended(c + a.found.shift, a.found.spread + both + both.T, a.found.misfit, a.found.trusted)
-
-    def explanation(self, c: Floats, H: Floats, expected: ExpectedMisfit) -> Floats:
-        """(18,) most likely terms: their part in the filter's parameters, then the terms themselves."""
-        a = self._along(c, H, expected, (0.0, 0.0, 0.0), np.eye(3))
-        return np.concatenate([a.found.shift, a.terms @ a.found.terms])
-
-    def _along(self, c: Floats, H: Floats, expected: ExpectedMisfit, place: Vec, observed: Floats) -> _Along:
         if observed.shape[1] < 3:
             c = c.copy()
             c[6:] = C_PER_Q * observed.dot(observed.T.dot(c[6:] / C_PER_Q))
@@ -157,11 +128,12 @@ class OmittedTerms:
         V.flat[::10] += _REGULARISATION_SHARE * V.trace()
         m = D[:, None] * self._information[9:].dot(X)
         weighted = solved(V, m)
-        values, U = eigen(m.dot(weighted))
+        values, U = eigen(m.dot(weighted))  # directions in which the samples' information about the terms is diagonal
         information = np.maximum(values, 0.0) / expected.noise
         s = U.T.dot(weighted.T.dot(D * self._slope)) / expected.noise
         blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
-        off, terms = X[:9].dot(U), D[:, None] * U
+        off, terms = X[:9].dot(U), D[:, None] * U  # what a unit along each does to the parameters, and its terms
         off[6:] += shifted(place[0], place[1])[1][6:].dot(terms)
         found = averaged(information, s, -off, curvature, blur, observed)
-        return _Along(found, off, terms, shared, weighted.dot(U))
+        both = H.dot(shared[:9]).dot(weighted.dot(U) * found.share).dot(off.T)
+        return Amended(found, found.spread + both + both.T, terms @ found.terms)

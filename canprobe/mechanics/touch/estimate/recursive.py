@@ -21,7 +21,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps
-from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength, slow_errors
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, slow_errors
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
@@ -52,13 +52,6 @@ MIN_BELIEVED_INNOVATION = 0.5
 """Usual innovation below which the stated noise is replaced by the observed one when a misfit is looked for."""
 
 CHANGING_NOTE = "the surface may be changing: nothing is observed"
-
-
-class _Pending(NamedTuple):
-    """A contact that waits for the end of its step, and its weight by its place alone (`PathLength`)."""
-
-    touch: MeasuredContact
-    weight: float
 
 
 class _Compared(NamedTuple):
@@ -124,9 +117,8 @@ class RecursiveEstimator(Estimator):
         """Forget everything but the settings."""
         self._gate.reset()
         self._last: MeasuredContact | None = None
-        self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
+        self._pending: deque[MeasuredContact] = deque(maxlen=MAX_PENDING)
         self._path_length = PathLength(max(UPDATE_TRAVEL_SHARE * self._memory, 3.0 * self._gate.sigma_point))
-        self._pad = PadPathLength(self._gate.sigma_point)
         self._spread = Spread()
         self._change = ChangeTest()
         self._start: Start | None = Start(self._memory, self._prior)
@@ -136,11 +128,11 @@ class RecursiveEstimator(Estimator):
     def adding(self, sample: ContactSample) -> Steps[None]:
         if not self._gate.passes(sample, self.dropped):
             return
-        touch = self._pad.measured(sample, self._gate, self._coupling)
-        touch = touch._replace(sigma_height=self._taller * touch.sigma_height)
+        touch = self._gate.measured(sample, self._coupling)
         moved = self._path_length.add(sample.p_base)
-        self._pending.append(_Pending(touch, self._path_length.weight))
-        if self._last is None or self._path_length.weight == 1.0:
+        touch = touch._replace(sigma_height=self._taller * touch.sigma_height, weight=self._path_length.weight)
+        self._pending.append(touch)
+        if self._last is None or touch.weight == 1.0:
             self._last = touch
         if moved > 0.0:
             yield
@@ -165,10 +157,10 @@ class RecursiveEstimator(Estimator):
             observed = decision.turned(-a.turn).vectors[:, decision.passed]
             H = state.inverse.dot(state.inverse.T)
             amended = state.omitted.amend(state.c, H, place, self._expected(), observed)
-            notes += misfit_notes(amended.misfit, trusted=amended.trusted)
-            believed = amended.trusted
+            believed = amended.average.trusted
+            notes += misfit_notes(amended.average.misfit, trusted=believed)
             if believed:
-                before, a = a, anchor(amended.c, state.T, place, state.length)
+                before, a = a, anchor(state.c + amended.average.shift, state.T, place, state.length)
                 flat, decision = self._flat(a), decision.turned(a.turn - before.turn)
                 noise += state.root.dot(amended.covariance).dot(state.root.T)
             else:
@@ -233,7 +225,7 @@ class RecursiveEstimator(Estimator):
         if self._start is not None:
             yield from self._beginning(self._start, moved)
         elif compared:
-            slow = slow_errors([p.touch for p in self._pending])
+            slow = slow_errors(self._pending)
             root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
             self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved, slow)
             if self._last is not None:
@@ -250,7 +242,7 @@ class RecursiveEstimator(Estimator):
         self._start, self._steady = Start(self._memory, self._prior), False
 
     def _compared(self) -> _Compared:
-        rows, residuals = self._filter.equations([p.touch for p in self._pending])
+        rows, residuals = self._filter.equations(self._pending)
         return self._judged(rows, residuals, residuals)
 
     def _explained(self, found: _Compared) -> _Compared | None:
@@ -258,8 +250,9 @@ class RecursiveEstimator(Estimator):
         if self._quadric:
             return None
         f = self._filter
-        terms = f.omitted.explanation(f.c, f.inverse.dot(f.inverse.T), self._expected())
-        left = self._judged(found.rows, found.residuals, found.residuals - found.rows @ terms)
+        likely = f.omitted.amend(f.c, f.inverse.dot(f.inverse.T), (0.0, 0.0, 0.0), self._expected(), np.eye(3))
+        explained = found.rows @ np.concatenate([likely.average.shift, likely.terms])
+        left = self._judged(found.rows, found.residuals, found.residuals - explained)
         return left if self._change.usual_again(left.squares) else None
 
     def _judged(self, rows: Floats, residuals: Floats, unexplained: Floats) -> _Compared:
@@ -267,18 +260,18 @@ class RecursiveEstimator(Estimator):
         # the limit is the 99.9 % point of χ² times the running innovation: where all samples disagree, none is wrong
         squares = self._filter.squared_innovations(rows, unexplained)
         limit = CHI2_999 * max(1.0, self._change.innovation)
-        weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
+        weights = np.array([touch.weight for touch in self._pending]) * np.square(limit / np.maximum(squares, limit))
         return _Compared(rows, residuals, squares, weights)
 
     def _beginning(self, start: Start, moved: float) -> Steps[None]:
         """Add a step (m) to the solution of the first stretch, and give the filter the solution so far."""
         wider = 1.0 / math.sqrt(self._weigh(moved, np.ones(len(self._pending))))
-        touches = [p.touch for p in self._pending]
-        yield from start.adding([touch.widened(wider) for touch in touches], moved)
+        yield from start.adding([touch.widened(wider) for touch in self._pending], moved)
         self._steady = start.steady
         found = start.solution
         if found is None:
-            self._filter.begin(homogeneous(tangent_rotation(-touches[-1].normal), touches[-1].point))
+            last = self._pending[-1]
+            self._filter.begin(homogeneous(tangent_rotation(-last.normal), last.point))
             return
         c = found.target if start.steady else found.c
         self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled, start.slow)
@@ -292,5 +285,5 @@ class RecursiveEstimator(Estimator):
         kept = math.exp(-moved / self._memory)
         self._doubtful = kept * self._doubtful + np.count_nonzero(weight < 1.0)
         self._spread.fade(kept)
-        self._spread.add(np.array([p.touch.point for p in self._pending]), thinned * weight)
+        self._spread.add(np.array([touch.point for touch in self._pending]), thinned * weight)
         return thinned

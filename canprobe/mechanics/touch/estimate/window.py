@@ -16,9 +16,9 @@ from canprobe.mechanics.touch.checks import whole
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
-from canprobe.mechanics.touch.estimate.differences import Pairs, chord_pairs, solve_pairs, usable_lag
+from canprobe.mechanics.touch.estimate.differences import Pairs, pairs_of, solve_pairs, usable_lag
 from canprobe.mechanics.touch.estimate.estimator import Estimator
-from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact, PadPathLength
+from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContact
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, batch_of, fit_ml, working_frame
 from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.prior import Prior
@@ -56,13 +56,12 @@ class WindowEstimator(Estimator):
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
         self._kept: deque[tuple[ContactSample, MeasuredContact]] = deque(maxlen=kept)
-        self._pad = PadPathLength(sigma_point)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._gate.passes(sample, self.dropped):
-            self._kept.append((sample, self._pad.measured(sample, self._gate, self._coupling)))
+            self._kept.append((sample, self._gate.measured(sample, self._coupling)))
             self._answer = None
 
     def estimate(self) -> SurfaceEstimate | None:
@@ -123,7 +122,7 @@ class ChordEstimator(WindowEstimator):
     """`n_i − n_0 = 2 S₃ (p_i − p_0)` over a window, p_0 the last sample."""
 
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
-        return solve_pairs(touches, chord_pairs(touches), "chord")
+        return solve_pairs(touches, pairs_of(touches), "chord")
 
 
 class Chen1996Estimator(WindowEstimator):
@@ -164,16 +163,21 @@ class Chen1996Estimator(WindowEstimator):
         return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 
 
-def paper_rates(T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int) -> tuple[Floats, Floats]:
-    """x (28) and y (29), each (n − lag, 3), times the time between samples `lag` apart; the object stands still.
+def paper_rates(
+    T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int, object_twist: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """x (28) and y (29), each (n − lag, 3), times the time between samples `lag` apart.
 
-    `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, in base axes, all taken half-way between the samples; K_f = 1/|r_probe|.
+    `x = (ω_f − ω_o) × n_f + K_f v_f`, `y = V_f − V_o + v_f` (16)–(19), in base axes, all taken half-way between the
+    samples; K_f = 1/|r_probe|. In the frame of the object ω_o and V_o are 0, and x and y are the same vectors.
 
     Args:
         T_base_probe: (n, 3 or 4, 4) poses of the probe, m.
         r_probe: (n, 3) contact points in its frame, m.
         n_base: (n, 3) outward unit normals of the object there.
         lag: number of samples between the two of a difference.
+        object_twist: (6,) rotation, rad, and displacement of the object's point at the base's origin, m, in the time
+            between those two; None: it stands still.
     """
     R, r = T_base_probe[:, :3, :3], r_probe[:, :, None]
     Ra, Rb, ra, rb = R[:-lag], R[lag:], r[:-lag], r[lag:]
@@ -182,4 +186,8 @@ def paper_rates(T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int)
     arm = (0.5 * (Ra @ ra + Rb @ rb))[:, :, 0]
     slide = (0.5 * (Ra + Rb) @ (rb - ra))[:, :, 0]
     V = T_base_probe[lag:, :3, 3] - T_base_probe[:-lag, :3, 3] + np.cross(turn, arm)
+    if object_twist is not None:
+        contact = 0.5 * (T_base_probe[lag:, :3, 3] + T_base_probe[:-lag, :3, 3]) + arm
+        V = V - object_twist[3:] - np.cross(object_twist[:3], contact)
+        turn = turn - object_twist[:3]
     return slide / np.linalg.norm(rb, axis=1) - np.cross(turn, n), V + slide

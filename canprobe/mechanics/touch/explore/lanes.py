@@ -31,7 +31,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.explore.stretches import Heading
 from canprobe.mechanics.touch.map.noise import MapNoise
-from canprobe.mechanics.touch.map.quartic import CURVATURE_SIGMA, HEIGHT_SIGMA_M, SLOPE_SIGMA, USUAL_CHANGE
+from canprobe.mechanics.touch.map.quartic import CURVATURE_SIGMA, HEIGHT_SIGMA_M, SLOPE_SIGMA, USUAL_CHANGE, terms
 from canprobe.mechanics.touch.map.surface_map import REACH_M
 from canprobe.mechanics.types import Floats
 
@@ -76,18 +76,12 @@ class LaneForecast:
             change: usual change of the curvature, 1/m².
         """
         x, y = (one.ravel() for one in np.meshgrid(_ALONG, lanes, indexing="ij"))
-        r2, c, zero, one = x * x + y * y, self._coupling, np.zeros_like(x), np.ones_like(x)
-        height = np.stack([one, x, y, 0.5 * x * x + c, x * y, 0.5 * y * y + c], axis=1)
-        slope_x, slope_y = (
-            np.stack([zero, one, zero, x, y, zero], axis=1),
-            np.stack([zero, zero, one, zero, x, y], axis=1),
-        )
-        height /= np.sqrt(self._height2 + (change / 6.0) ** 2 * r2**3)[:, None]
-        rows = (
-            np.concatenate([slope_x, slope_y])
-            / np.sqrt(self._slope2 + (change / 2.0) ** 2 * np.tile(r2, 2) ** 2)[:, None]
-        )
-        information = _PRIOR + height.T @ height + rows.T @ rows
+        rows = np.stack(terms(x, y, (0, 0), (1, 0), (0, 1)))[..., : len(_PRIOR)]
+        rows[0][:, [3, 5]] += self._coupling
+        r2 = x * x + y * y
+        slope2 = self._slope2 + (change / 2.0) ** 2 * r2**2
+        rows /= np.sqrt([self._height2 + (change / 6.0) ** 2 * r2**3, slope2, slope2])[..., None]
+        information = _PRIOR + np.einsum("kni,knj->ij", rows, rows)
         return float(np.sqrt(np.linalg.inv(information)[0, 0]))
 
     def spacing(self, sigma: float, change: float) -> Spacing:

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
-from canprobe.mechanics.touch.checks import positive, read_only
 from canprobe.mechanics.touch.image.calibration import ArrayCalibration, ImageParameters, MomentErrors
 from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, Moments
@@ -57,75 +57,52 @@ GAIN_CURVATURES = ((0.0, 0.0), (0.8, 0.8), (1.6, 1.6), (1.2, 0.0), (0.6, -0.5))
 saddle."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class ImageModel:
     """The images of one array on one probe.
 
-    Attributes:
+    Args:
         parameters: parameters of the array.
+        errors: errors of the moments.
+        pad: its taxels.
+        seen: number of taxels along a side of the window that moments are taken of; None for all.
+
+    Attributes:
+        parameters, errors, seen: as given.
         radius: radius R_p of the probe, m.
         pitch: distance of neighbouring taxels, m.
         level: pressure that is subtracted from every taxel before moments are taken (`MomentImage`), Pa: the first
             count above the array's threshold.
         count: pressure of one count, Pa.
         side: number of taxels along a side of the array.
-        seen: number of taxels along a side of the window that moments are taken of.
-        errors: errors of the moments.
     """
 
-    parameters: ImageParameters
-    radius: float
-    pitch: float
-    level: float
-    count: float
-    side: int
-    seen: int
-    errors: MomentErrors
-    _squares: Floats = field(init=False, repr=False)
-    _blur: Floats = field(init=False, repr=False)
-    _turned_blur: Floats = field(init=False, repr=False)
-    _moments: Floats = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        for name in ("radius", "pitch", "level"):
-            positive(name, getattr(self, name))
+    def __init__(self, parameters: ImageParameters, errors: MomentErrors, pad: Pad, seen: int | None = None) -> None:
+        self.parameters, self.errors, self.radius, self.pitch = parameters, errors, pad.radius_m, pad.pitch_m
+        self.count, self.side = pad.full_scale_pa / COUNTS_MAX, max(pad.shape)
+        self.level, self.seen = LEVEL_COUNTS * self.count, self.side if seen is None else seen
         half = 0.5 * self.seen
-        source = (
+        source: Floats = (
             np.arange(math.ceil(math.sqrt(6.0 * MAX_MOMENT_SHARE) * half * STEPS_PER_PITCH) + 1) + 0.5
         ) / STEPS_PER_PITCH
         x = (np.arange(math.ceil(half * STEPS_PER_PITCH)) + 0.5) / STEPS_PER_PITCH
         width = self.parameters.blur / self.pitch
         far = np.arange(-20 * STEPS_PER_PITCH, 20 * STEPS_PER_PITCH + 1) / STEPS_PER_PITCH
         folded = [np.exp(-0.5 * ((x[:, None] - sign * source) / width) ** 2) for sign in (1.0, -1.0)]
-        blur = (folded[0] + folded[1]) / np.exp(-0.5 * (far / width) ** 2).sum()
+        blur: Floats = (folded[0] + folded[1]) / np.exp(-0.5 * (far / width) ** 2).sum()
         # crosstalk is linear in rows and columns as the blur is: a row spreads its sum, which the blur leaves as it is
         share = self.parameters.crosstalk / (self.side - 1)
         blur = (1.0 - self.side * share) * blur + share * 2.0 / STEPS_PER_PITCH
         weight = np.ones((len(x), len(x)))
-        sums = np.stack([weight, weight * (x * x)[:, None], weight * x * x], axis=-1).reshape(-1, 3)
-        object.__setattr__(self, "_squares", read_only(source * source))
-        object.__setattr__(self, "_blur", read_only(blur))
-        object.__setattr__(self, "_turned_blur", read_only(np.ascontiguousarray(blur.T)))
-        object.__setattr__(self, "_moments", read_only(sums))
-
-    @classmethod
-    def of(
-        cls, parameters: ImageParameters, errors: MomentErrors, patch: PatchCalibration, *, seen: int | None
-    ) -> ImageModel:
-        """The model of the taxels of a calibration; `seen` is the side of the window in taxels, None for all."""
-        count, side = patch.pad.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
-        seen = side if seen is None else seen
-        return cls(parameters, patch.pad.radius_m, patch.pad.pitch_m, LEVEL_COUNTS * count, count, side, seen, errors)
+        self._moments = np.stack([weight, weight * (x * x)[:, None], weight * x * x], axis=-1).reshape(-1, 3)
+        self._squares, self._blur, self._turned_blur = source * source, blur, np.ascontiguousarray(blur.T)
 
     def with_stiffness(self, stiffness: float) -> ImageModel:
         """The same array on a layer of another stiffness (N/m³).
 
-        Why not `replace`: the blur matrices do not depend on the stiffness and are kept; this runs in the loop.
+        The blur matrices do not depend on the stiffness and are kept; this runs in the loop.
         """
-        other, p = object.__new__(ImageModel), self.parameters
-        for name in self.__slots__:
-            object.__setattr__(other, name, getattr(self, name))
-        object.__setattr__(other, "parameters", ImageParameters(stiffness, p.scale, p.blur, p.crosstalk, p.memory))
+        other, p = copy(self), self.parameters
+        other.parameters = ImageParameters(stiffness, p.scale, p.blur, p.crosstalk, p.memory)
         return other
 
     # the forward model
@@ -323,4 +300,4 @@ def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCali
 
 def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:
     """The image model of an array; `seen` is the number of taxels along the side of the window, None for all."""
-    return ImageModel.of(calibration.image, calibration.moments, patch, seen=seen)
+    return ImageModel(calibration.image, calibration.moments, patch.pad, seen)

@@ -219,13 +219,8 @@ class PatchCalibration:
 
 def _moment_weights(pad: Pad) -> Floats:
     """(n, 6): columns area × (1, u, v, uu, uv, vv), lengths in pitches but the area in m²."""
-    if pad.is_grid:
-        k, m = (np.arange(taxels) - (taxels - 1) / 2 for taxels in pad.shape)
-        v, u = np.meshgrid(k, m, indexing="ij")
-        area = pad.pitch_m**2 * np.sinc(np.hypot(u, v) * pad.pitch_m / pad.radius_m / np.pi)
-    else:
-        (u, v), area = pad.uv.T / pad.pitch_m, pad.areas
-    return np.stack([area * moment for moment in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1).reshape(-1, 6)
+    u, v = pad.uv.T / pad.pitch_m
+    return np.stack([pad.areas * moment for moment in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1)
 
 
 def compute_patch(

@@ -136,13 +136,8 @@ class SilentTaxels:
 
     def _changed_beside(self, part: tuple[slice, slice], now: Image) -> _Mask:
         """Where a taxel beside, in any direction, is pressed by `MIN_COUNTS` more than it was once."""
-        rise = now - self._low[part] >= MIN_COUNTS
-        near: _Mask = np.zeros_like(rise)
-        near[1:] |= rise[:-1]
-        near[:-1] |= rise[1:]
-        near[:, 1:] |= rise[:, :-1]
-        near[:, :-1] |= rise[:, 1:]
-        return near
+        rise: _Mask = np.pad(now - self._low[part] >= MIN_COUNTS, 1)
+        return rise[:-2, 1:-1] | rise[2:, 1:-1] | rise[1:-1, :-2] | rise[1:-1, 2:]
 
     def _find(self) -> None:
         """Put together what is bridged from now on."""

@@ -21,12 +21,13 @@ from scipy.spatial import cKDTree
 from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, Slope
 from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD
 from canprobe.mechanics.touch.image.image_model import ImageModel
+from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs
 from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs, stiffness_error
 from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND
-from canprobe.mechanics.touch.map.stiffness import MAX_IMAGES, Stiffness, fused_stiffness, log_of_images, log_of_slope
+from canprobe.mechanics.touch.map.stiffness import MAX_IMAGES, Stiffness, fused_stiffness, log_of_images
 from canprobe.mechanics.types import Floats
 
 ROBUST_CHI2 = 6.0
@@ -67,7 +68,7 @@ class LayerEvidence:
         slope = images = None
         if self.touch is not None:
             of_touch, place = self.touch
-            slope = log_of_slope(of_touch, pad.radius, kappa[tree.query(place)[1]])
+            slope = math.log(stiffness_from_slope(of_touch.value, pad.radius, kappa[tree.query(place)[1]]))
         shown = np.flatnonzero(np.isfinite(rows[:, column.PATCH]))
         if self.model is not None and len(shown):
             shown = shown[np.linspace(0, len(shown) - 1, min(len(shown), MAX_IMAGES)).round().astype(int)]

@@ -13,9 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.mechanics.touch.contact import Slope
 from canprobe.mechanics.touch.image.image_model import ImageModel
-from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.types import Floats
 
 SOURCE_SIGMA = 0.031
@@ -44,11 +42,6 @@ def fused_stiffness(slope: float | None, images: float | None, stated: Stiffness
     of_slope = 1.0 / max(SOURCE_SIGMA**2, (slope - images) ** 2 - SOURCE_SIGMA**2)
     mean = (of_images * images + of_slope * slope) / (of_images + of_slope)
     return Stiffness(math.exp(mean), (of_images + of_slope) ** -0.5)
-
-
-def log_of_slope(slope: Slope, radius: float, kappa: Floats) -> float:
-    """ln k of the slope of a touch at a place of curvature (2,), 1/m."""
-    return math.log(stiffness_from_slope(slope.value, radius, kappa))
 
 
 def log_of_images(model: ImageModel, patches: Floats, forces: Floats, kappa: Floats) -> float | None:

@@ -90,11 +90,8 @@ class Fused(NamedTuple):
         return self.cost > CHI2_999
 
 
-class _Seen(NamedTuple):
-    """Moments in their principal axes, and errors of unknown sign: a change along the path, traces of the past, m²."""
-
-    moments: Moments
-    errors: tuple[Moments, Moments]
+_Seen = tuple[Moments, tuple[Moments, Moments]]
+"""Moments in their principal axes, and errors of unknown sign: a change along the path, traces of the past, m²."""
 
 
 class _Mean:
@@ -242,7 +239,7 @@ class PatchCurvature:
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
         known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
         known = CurvatureInformation(turn.dot(known.q), turn.dot(known.information).dot(turn.T))
-        found = self._solve(_Seen((mean + half, 0.0, mean - half), (drift, traces)), known)
+        found = self._solve(((mean + half, 0.0, mean - half), (drift, traces)), known)
         if found is None:
             return None
         q, patch = turn.T.dot(found.q), turn.T.dot(found.patch).dot(turn)
@@ -253,7 +250,7 @@ class PatchCurvature:
         last, self._last = self._last, None
         found = None if last is None else self._iterated(last, seen, motion)
         for guess in self._guesses():
-            start = None if found is not None else self._model(guess).start(seen.moments, self.force)
+            start = None if found is not None else self._model(guess).start(seen[0], self.force)
             if start is not None:
                 found = self._iterated(np.array([*(TO_Q * start), guess]), seen, motion)
         if found is None:
@@ -269,8 +266,8 @@ class PatchCurvature:
         """Gauss–Newton from x (4,) = (q, ln of the stiffness): its last x, and the answer; None without an end."""
         known, mean = np.zeros((4, 4)), np.array([*motion.q, self.stiffness.log])
         known[:3, :3], known[3, 3] = motion.information, self.stiffness.information
-        J = np.empty((3, 4))
-        xx, _, yy = seen.moments
+        J, (moments, errors) = np.empty((3, 4)), seen
+        xx, _, yy = moments
         scale = np.array([xx, math.sqrt(xx * yy), yy])
         step = math.inf
         try:
@@ -278,13 +275,13 @@ class PatchCurvature:
                 q1, q2, q3, log_stiffness = x.tolist()
                 k: Moments = q1, q2 / _ROOT2, q3
                 model = self._model(log_stiffness)
-                J[:, :3], r, W = model.linearised(seen.moments, self.force, self.frames, k)
+                J[:, :3], r, W = model.linearised(moments, self.force, self.frames, k)
                 if round_ == 0:  # it hardly changes from step to step
-                    here = np.array(seen.moments) - scale * r
+                    here = np.array(moments) - scale * r
                     there = self._model(log_stiffness + _STIFFNESS_STEP).moments(k, self.force)
                     J[:, 3] = (there - here) / scale / _STIFFNESS_STEP
-                for error in seen.errors:
-                    W = _less_certain(W, seen.moments, error)
+                for error in errors:
+                    W = _less_certain(W, moments, error)
                 W *= model.trust(k, self.force)
                 JW = J.T.dot(W)
                 information, pull, cost = JW.dot(J), JW.dot(r), float(r.dot(W).dot(r))

@@ -176,9 +176,8 @@ def test_without_forgetting_an_answer_is_that_of_a_batch():
     sums, flat, H, residuals = sums_of(4, 0.3)
     found = sums.amend(QUADRIC, H, np.zeros(3), ExpectedMisfit(), np.eye(3))
     both = np.linalg.lstsq(flat, residuals, rcond=None)[0]  # terms that show: those that fit best
-    assert found.misfit > 0.999
-    assert np.allclose(found.c - QUADRIC, both[:9], atol=0.02)
-    assert np.allclose(sums.explanation(QUADRIC, H, ExpectedMisfit()), both, atol=0.02)
+    assert found.average.misfit > 0.999
+    assert np.allclose(np.concatenate([found.average.shift, found.terms]), both, atol=0.02)
     wide = np.linalg.inv(flat.T @ flat)[:9, :9]
     spread = np.diag(H + found.covariance) / np.diag(wide)
     assert np.all(spread[:6] > 0.9)
@@ -205,8 +204,8 @@ def test_generous_noise_does_not_hide_a_misfit():
     stated, known = (
         sums.amend(QUADRIC, H, np.zeros(3), ExpectedMisfit(noise), np.eye(3)) for noise in (1.0, 1.0 / 9.0)
     )
-    assert stated.misfit < 0.5
-    assert known.misfit > 0.99
+    assert stated.average.misfit < 0.5
+    assert known.average.misfit > 0.99
 
 
 # The running covariance of the score is the one of all rows at once.

@@ -22,6 +22,7 @@ from canprobe.mechanics.touch.image.calibration import ImageParameters, MomentEr
 from canprobe.mechanics.touch.map import discs, local_fits, nodes, surface_map
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND_DERIVATIVES, fourth_of, heights_and_slopes, terms
 from canprobe.mechanics.touch.map.stiffness import SOURCE_SIGMA
+from canprobe.mechanics.touch.pad import Pad
 
 SIGMA_POINT, SIGMA_NORMAL = 30e-6, 1e-3
 LINE = np.arange(-100, 100) * 0.125e-3
@@ -297,7 +298,8 @@ def of_scan(seen, true_share=1.0, larger=1.0):
     radius = 0.04
     parameters = ImageParameters(stiffness=1.24e8, scale=1.0, blur=1.5e-3, crosstalk=0.0, memory=0.0)
     errors = MomentErrors(moment=1e-3, both=5e-4, shear=1e-3, frame_sigma=0.01)
-    model = ImageModel(parameters, radius, 1.6e-3, level=1e3, count=500.0, side=16, seen=seen, errors=errors)
+    model = ImageModel(parameters, errors, Pad(pitch_m=1.6e-3, full_scale_pa=255 * 500.0, mount_radius_m=radius), seen)
+    model.level = 1e3
     found = SurfaceMap(PadLayer(radius, model.parameters.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
     samples = pad_samples(radius, model.parameters.stiffness, true_share * model.parameters.stiffness, model)
     found.add_samples([replace(s, moments=tuple(larger * moment for moment in s.moments)) for s in samples])
