@@ -279,12 +279,13 @@ def carried(task: Touch, carrier: Carrier, path: SurfacePath) -> Iterator[tuple[
 
     The path goes round until the run, or one turn of the carrier, is over. A very long run is gone through faster.
     """
-    poses, scan = contact_poses(task, path), task.scan
+    poses = contact_poses(task, path)
     resting = poses[0], CARRIED_STEP_S
-    steps = [] if scan is not None else [resting]
+    speed = 0.0 if task.scan is None else task.scan.speed
+    steps = [] if speed else [resting]
     ways = np.linalg.norm(np.roll(path.points, -1, axis=0) - path.points, axis=1).tolist()
-    for last, here, way in zip(poses, [*poses[1:], poses[0]], ways, strict=True) if scan is not None else ():
-        seconds = max(way / scan.speed, 1e-3)
+    for last, here, way in zip(poses, [*poses[1:], poses[0]], ways, strict=True) if speed else ():
+        seconds = max(way / speed, 1e-3)
         count = math.ceil(seconds / CARRIED_STEP_S)
         for share in (np.arange(count) + 1) / count:
             pole = last.pole + share * (here.pole - last.pole)
