@@ -282,9 +282,11 @@ def carried(task: Touch, carrier: Carrier, path: SurfacePath) -> Iterator[tuple[
     """
     poses, scan = contact_poses(task, path), task.scan
     resting = poses[0], CARRIED_STEP_S
-    steps = [] if scan is not None else [resting]
+    steps = [resting] if scan is None else []
     ways = np.linalg.norm(np.roll(path.points, -1, axis=0) - path.points, axis=1).tolist()
-    for last, here, way in zip(poses, [*poses[1:], poses[0]], ways, strict=True) if scan is not None else ():
+    for last, here, way in zip(poses, [*poses[1:], poses[0]], ways, strict=True):
+        if scan is None:
+            break
         seconds = max(way / scan.speed, 1e-3)
         count = math.ceil(seconds / CARRIED_STEP_S)
         for share in (np.arange(count) + 1) / count:
