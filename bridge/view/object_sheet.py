@@ -62,7 +62,7 @@ def object_lines(shape: PlacedShape) -> Floats:
     rows, columns = (np.linspace(0, n - 1, LINES).round().astype(int) for n in points.shape[:2])
     along = [np.stack([points[i, :-1], points[i, 1:]], axis=1) for i in rows]
     across = [np.stack([points[:-1, j], points[1:, j]], axis=1) for j in columns]
-    lines = np.concatenate([*along, *across])
+    lines: Floats = np.concatenate([*along, *across])
     return lines[np.isfinite(lines).all(axis=(1, 2))]
 
 

@@ -57,7 +57,7 @@ def soak(seconds: float) -> tuple[list[Row], str]:
     samples: list[Row] = []
     with watched() as monitor_pid, served(scene, truth=False) as nodes:
         session = Session(with_real_nodes(patient(scene)), RunOptions(rows_kept=ROWS_OF_UP))
-        pids = {"master_mib": os.getpid(), "nodes_mib": nodes.pid, "monitor_mib": monitor_pid}
+        pids = {"master_mib": os.getpid(), "nodes_mib": nodes.process.pid, "monitor_mib": monitor_pid}
 
         def hold(measurement: Measurement) -> Command:
             t_s = measurement.t_ns * 1e-9
