@@ -54,10 +54,7 @@ class BridgeProcess(ChildProcess):
         self._virtual = virtual
         self._takes_requests = name == "ros2" and bool(plan.scene.bridge and plan.scene.bridge.ros2_commands)
         self._epoch: bytes | None = None
-        self._where: str | None = None
-        self._error: str | None = None
-        self._unwritten = False
-        self._received: int | None = None
+        self._told: dict[str, Any] = {}  # what the process's lines say, the newest of each kind
         self._ends_by_ns: int | None = None
         self._text = b""
         self._poll_in = self._batch = max(1, round(LATENCY_S * plan.scene.cycle.rate_hz))
@@ -78,15 +75,16 @@ class BridgeProcess(ChildProcess):
             ResultsError: when it could not write its file.
         """
         deadline = elapsed_ns() + round(READY_TIMEOUT_S * 1e9)
-        while self._where is None and self._error is None:
+        while "ready" not in self._told and "error" not in self._told:
             left = _left_s(deadline)
             if left <= 0:
-                self._error = f"not ready after {READY_TIMEOUT_S:g} s"
+                self._told["error"] = f"not ready after {READY_TIMEOUT_S:g} s"
             elif not self._listen(left):
-                self._error = self.last_words() or "ended before it began"
-        if self._where is None:
-            raise (ResultsError if self._unwritten else UsageError)(f"bridge {self.name}: {self._error}")
-        return self._where
+                self._told["error"] = self.last_words() or "ended before it began"
+        if "ready" not in self._told:
+            kind = ResultsError if self._told.get("unwritten") else UsageError
+            raise kind(f"bridge {self.name}: {self._told['error']}")
+        return str(self._told["ready"])
 
     def observe(self, observation: Observation) -> None:
         """Hand one observation over, or drop it; where commands are allowed, look for one from time to time."""
@@ -115,25 +113,22 @@ class BridgeProcess(ChildProcess):
         return bool(data)
 
     def _take(self, document: dict[str, Any]) -> None:
-        self._where = document.get("ready", self._where)
-        self._error = document.get("error", self._error)
-        self._unwritten = document.get("unwritten", self._unwritten)
+        self._told |= document
         if "done" in document:
-            self._received = document["done"]
             self._ends_by_ns = elapsed_ns() + round(CLOSE_TIMEOUT_S * 1e9)
         if "request" in document and self._takes_requests:
             try:
                 self.requests.append(Request(**document["request"]))
             except (UsageError, TypeError) as error:  # it is not carried out, and the cell goes on
-                self._error = f"refused: {error}"
+                self._told["error"] = f"refused: {error}"
 
     # the end
 
     def status(self) -> dict[str, Any]:
         """Entry of the summary: samples handed over and dropped, the place of the output, and an error."""
-        feed = self._feed
-        dropped = feed.dropped if self._received is None else feed.taken - self._received
-        return {"samples": feed.taken, "dropped": dropped, "where": self._where, "error": self._error}
+        feed, told = self._feed, self._told
+        dropped = feed.taken - told["done"] if "done" in told else feed.dropped
+        return {"samples": feed.taken, "dropped": dropped, "where": told.get("ready"), "error": told.get("error")}
 
     def end(self, summary: str | None) -> dict[str, Any]:
         """Hand over the last samples and the summary, and wait for the process, within bounds.
@@ -164,9 +159,9 @@ class BridgeProcess(ChildProcess):
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self.process.wait(max(left, 0.1))
                 break
-        if self._received is None and self._error is None:
+        if "done" not in self._told and "error" not in self._told:
             code = self.process.poll()
-            self._error = self.last_words() or (
+            self._told["error"] = self.last_words() or (
                 f"did not end within {END_TIMEOUT_S:g} s" if code is None else f"ended with status {code}"
             )
 

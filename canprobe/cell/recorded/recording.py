@@ -20,7 +20,7 @@ from canprobe.cell.master.array import make_tactile
 from canprobe.cell.master.carrier import make_carrier
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.cycle import SYNCS_REMEMBERED, Intake
-from canprobe.cell.master.drives import DriveGroup, make_drives
+from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_files import LOG, TACTILE, is_recorded, needed, read_log, read_summary, read_tactile
@@ -234,8 +234,10 @@ class LogCycles:
             intake.route(frames[first + 1 : end])
             intake.end()
             measurement = intake.measure(counter)
-            if self.drives is not None and not measurement.enabled:
-                _check_states(self.drives)
+            if self.drives is not None and not measurement.enabled:  # another mapping, or a faulty drive
+                for axis, word in zip(self.drives.axes, self.drives.statuswords, strict=True):
+                    if known_state(word) is None:
+                        raise ProtocolError(f"node {axis.node_id}: statusword {word:#06x} is no CiA 402 state")
             yield measurement
 
     def _begin(self, stamp_ns: int) -> None:
@@ -247,13 +249,6 @@ class LogCycles:
         """Number of SYNCs missing in the log between two counters; they get a number and a time too."""
         lost = (counter - before - 1) % self._overflow if before and counter else 0
         return lost if lost <= MAX_LOST_SYNCS else 0
-
-
-def _check_states(drives: DriveGroup) -> None:
-    """Refuse a statusword without a state, which comes from another mapping or a faulty drive."""
-    for axis, word in zip(drives.axes, drives.statuswords, strict=True):
-        if known_state(word) is None:
-            raise ProtocolError(f"node {axis.node_id}: statusword {word:#06x} is no CiA 402 state")
 
 
 def replay_contacts(plan: Plan, measurements: Iterable[Measurement]) -> tuple[ShapeTracker, int]:

@@ -112,31 +112,6 @@ def _from_log(plan: Plan, path: Path) -> RecordedContacts:
     return RecordedContacts(tracker, "other", cycles.start_ns * 1e-9, times_s, counts, recording.channel, recording.bus)
 
 
-def _summarise(
-    plan: Plan, source: Path, contacts: RecordedContacts, estimates: dict[str, list[ShapeRecord]], folder: Path | None
-) -> dict[str, Any]:
-    """The summary of a `ReplayResult`; a value that does not apply is None. `folder` has the run's truth and log."""
-    truth = _truth(folder / TRUTH, plan.setup) if folder is not None else {}
-    tracker = contacts.tracker
-    shape = plan.setup.truth.object if truth else None
-    map_summary = None if tracker.surface_map is None else summarise_map(tracker.surface_map, shape)
-    return {
-        "schema": SCHEMA,
-        "scene": plan.scene.name,
-        "log": str(source),
-        "channel": contacts.channel,
-        "notes": [] if contacts.bus is None else contacts.bus.notes(),
-        "driven_by": contacts.driven_by,
-        "cycle": contacts.counts,
-        "contacts": len(tracker.samples),
-        "estimates": {name: _last(records, contacts.start_s) for name, records in estimates.items()},
-        "shape": summarise_shape(plan.setup, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
-        "online": _online(folder, plan.setup, tracker.records)
-        if folder is not None and contacts.driven_by == "task"
-        else None,
-    }
-
-
 def _truth(file: Path, setup: Setup) -> Mapping[str, Floats]:
     """The plant's truth, one row per SYNC; empty without the file, or where nothing happened."""
     columns = read_truth(file, setup) if is_recorded(file) else {}
@@ -277,11 +252,29 @@ def replay(
     source = path if folder is None or run is None else folder
     if not contacts.tracker.samples:
         raise UsageError(f"{source}: nothing was touched in it: no contact to estimate from")
-    tracker = contacts.tracker
-    estimates = estimates_of(plan.setup, tracker.records, tracker.settled(plan.setup.probe.radius), methods)
-    summary = _summarise(plan, source, contacts, estimates, folder)
+    tracker, setup = contacts.tracker, plan.setup
+    estimates = estimates_of(setup, tracker.records, tracker.settled(setup.probe.radius), methods)
+    truth = _truth(folder / TRUTH, setup) if folder is not None else {}
+    map_summary = None
+    if tracker.surface_map is not None:
+        map_summary = summarise_map(tracker.surface_map, setup.truth.object if truth else None)
+    summary = {
+        "schema": SCHEMA,
+        "scene": plan.scene.name,
+        "log": str(source),
+        "channel": contacts.channel,
+        "notes": [] if contacts.bus is None else contacts.bus.notes(),
+        "driven_by": contacts.driven_by,
+        "cycle": contacts.counts,
+        "contacts": len(tracker.samples),
+        "estimates": {name: _last(records, contacts.start_s) for name, records in estimates.items()},
+        "shape": summarise_shape(setup, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
+        "online": None,
+    }
+    if folder is not None and contacts.driven_by == "task":
+        summary["online"] = _online(folder, setup, tracker.records)
     on_clock = {name: on_run_clock(records, contacts.start_s) for name, records in estimates.items()}
-    return ReplayResult(plan, summary, on_clock, contacts.tracker)
+    return ReplayResult(plan, summary, on_clock, tracker)
 
 
 def find_log(log: Path) -> tuple[Path, Path | None]:
