@@ -1,4 +1,4 @@
-"""Show what the array measures: force, place and the taxels. No drive is touched.
+"""Show what the array measures: force, place and the taxels. No drive is touched, no arm is commanded.
 
 On a terminal the image is renewed ten times a second. Elsewhere each line is one image, with --json a JSON document.
 """
@@ -40,21 +40,28 @@ def add_arguments(parser: Parser) -> None:
     parser.add_shared("SCENE", "BUS", "--realtime", "--patient")
     parser.add_option("--duration S", "end after S seconds [10]", seconds, default=10.0)
     parser.add_option("--every S", "time between two images [0.1]", seconds, default=0.1)
-    parser.add_option("--record FILE.csv", "write each image with its time into this file, one a line", Path)
+    parser.add_option(
+        "--record FILE.csv",
+        "write each image with its time into this file, one a line; with the pose of the probe where the arm has an"
+        " address (arm.address)",
+        Path,
+    )
     parser.add_option("--json", "print one JSON document a line")
     parser.add_shared("-v")
 
 
 def array_only(scene: Scene) -> Scene:
-    """The scene with its array alone.
+    """The scene with its array alone, and with an arm whose poses come over a socket.
 
     Raises:
         UsageError: it has none.
     """
     if scene.sensor is None:
         raise UsageError(f"{scene.name}: has no array ([sensor])")
-    alone = replace(scene, arm=None, joints={}, postures={}, keep_out=None, object=None, shape=None, servo=None)
-    return replace(alone, task=replace(scene.task, kind="listen"))
+    alone = replace(scene, keep_out=None, carrier=None, object=None, shape=None, servo=None)
+    if scene.arm is not None and scene.arm.address is not None and not scene.arm.emulated:
+        return replace(alone, task=replace(scene.task, kind="free"))
+    return replace(alone, arm=None, joints={}, postures={}, task=replace(scene.task, kind="listen"))
 
 
 def run(args: argparse.Namespace) -> None:
@@ -67,12 +74,22 @@ def run(args: argparse.Namespace) -> None:
     next_s, pace = 0.0, Pace()
     file = contextlib.nullcontext() if args.record is None else recording(args.record)
     with file as record, opened(args, prepared=array_only) as cell:
+        setup = cell.plan.setup
+        sensing = None
+        if setup.arm is not None and setup.array is not None:
+            from canprobe.cell.tasks.sensing import ContactSensing
+
+            sensing = ContactSensing(setup.arm, setup.probe, setup.array, moments=False)
 
         def step(measurement: Measurement) -> Command:
             nonlocal next_s
             t_s = 1e-9 * measurement.t_ns
+            if sensing is not None:
+                sensing.step(measurement)
             if record is not None and (sample := measurement.tactile) is not None:
-                record(1e-9 * sample.t_sample_ns, sample.frame.taxels)
+                pose = None if sensing is None else sensing.probe_at(sample.t_sample_ns)
+                if sensing is None or pose is not None:
+                    record(1e-9 * sample.t_sample_ns, sample.frame.taxels, pose)
             if measurement.tactile is not None and t_s >= next_s:
                 next_s = t_s + args.every
                 if args.json:
@@ -84,7 +101,11 @@ def run(args: argparse.Namespace) -> None:
                     pace.keep(measurement.t_ns)
             return Command(done=t_s >= duration_s)
 
-        cell.run(step)
+        if sensing is None:
+            cell.run(step)
+        else:
+            while not step(cell.cell.idle(0.0)).done:  # it is never enabled
+                pass
 
 
 def array_values(cell: OpenCell, measurement: Measurement) -> dict[str, Any]:

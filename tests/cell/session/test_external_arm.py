@@ -1,15 +1,21 @@
 """A cell with an external arm: touches without a bus, what ends them, and the socket with its programs."""
 
+import csv
+import json
+import select
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from network_buses import group  # noqa: F401
 
 import canprobe
 from canprobe.cell.emulated import flange_arm
@@ -18,6 +24,7 @@ from canprobe.cell.scene.setup import External
 from canprobe.cell.session.arm_socket import SocketArm
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cli import main
 from canprobe.errors import ArmError, PlanError, SafetyStop, SceneError
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "example" / "arm"
@@ -213,3 +220,47 @@ def follows(arm, T, longest_s=20.0):
             return t_ns
         time.sleep(0.001)
     raise AssertionError("the pose was not reached")
+
+
+MM_S = 10.0
+
+
+@pytest.fixture
+def led_by_hand():
+    """Address of an arm that somebody leads along x, and what it has got."""
+    pose, got = [1, 0, 0, 0, 0, -1, 0, -0.1225, 0, 0, -1, 0.504, 0, 0, 0, 1], []
+
+    def serve(server):
+        with suppress(OSError), server.accept()[0] as canprobe:
+            canprobe.sendall(b'{"canprobe_arm": 1, "stop_after_ms": 100}\n')
+            begun_ns = time.monotonic_ns()
+            while True:
+                t_ns = time.monotonic_ns()
+                pose[3] = -0.12 + 1e-12 * MM_S * (t_ns - begun_ns)
+                canprobe.sendall(json.dumps({"t_ns": t_ns, "T": pose}).encode() + b"\n")
+                if select.select([canprobe], [], [], 0.002)[0]:
+                    got.append(canprobe.recv(4096))
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=serve, args=(server,), daemon=True).start()
+        yield f"127.0.0.1:{server.getsockname()[1]}", got
+
+
+@pytest.mark.realtime
+@pytest.mark.slow(reason="an array in real time, with a process of its own")
+def test_listen_records_the_pose_of_the_probe_and_commands_nothing(led_by_hand, group, tmp_path):
+    address, got = led_by_hand
+    text = packaged_files("cells")["external"].read_text(encoding="utf-8")
+    cell, path = tmp_path / "cell.toml", tmp_path / "touch.csv"
+    named = f'kind = "external"\nemulated = false\naddress = "{address}"'
+    cell.write_text(text.replace('kind = "external"', named), encoding="utf-8")
+    bus = ["--bus", "udp_multicast", "--channel", group]
+    assert main(["listen", str(cell), *bus, "--duration", "1.5", "--record", str(path), "-q"]) == 0
+    with path.open(encoding="ascii") as file:
+        rows = list(csv.DictReader(file))
+    t_s, x = (np.array([float(row[name]) for row in rows]) for name in ("t_s", "T03"))
+    slope, at = np.polyfit(t_s, 1e3 * x, 1)
+    assert len(rows) > 50
+    assert slope == pytest.approx(MM_S, rel=0.1), "poses are those of the instants of the images"
+    assert np.median(np.abs(1e3 * x - slope * t_s - at)) < 0.3
+    assert b'"T"' not in b"".join(got), "it was commanded"
