@@ -141,7 +141,7 @@ def eds_files(command: str, args: argparse.Namespace) -> list[tuple[str | Path, 
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:
-    known = {*scene.drives, *([scene.sensor.node_id] if scene.sensor else ())}
+    known = {*scene.drives, *(one.node_id for one in (scene.sensor, scene.carrier) if one is not None)}
     if wanted is None:
         wanted = scene.emulated_node_ids
     if missing := sorted(set(wanted) - known):

@@ -176,7 +176,8 @@ def _server(args: argparse.Namespace, bench: MasterBench, nodes: Nodes) -> tuple
 
     scene = loaded(args)
     target = scene_target(args, scene)
-    node_ids = (*scene.drives, *([scene.sensor.node_id] if scene.sensor and scene.array_is_node else ()))
+    others = (scene.sensor if scene.array_is_node else None, scene.carrier)
+    node_ids = (*scene.drives, *(one.node_id for one in others if one is not None))
     return target, lambda: api.emulate(scene, target, node_ids=node_ids, observer=bench, say=args.report.say)
 
 

@@ -52,6 +52,18 @@ def test_a_touch_in_two_processes(bench: Any) -> None:
     assert np.median(np.abs(sent[: len(due)] - due)) < 2e-3, "and for every file"
 
 
+@pytest.mark.slow(reason="the encoder of a carrier on a real bus; the default has it on the lockstep bus")
+def test_the_encoder_of_a_turntable_is_a_node_like_the_others(bench: Any) -> None:
+    scene = bench.scene("turntable", rate_hz=200, missed_syncs=40)
+    command = bench.start("run", scene, *ON_VCAN0, "--duration", 0.3, "--out", "results")
+    assert command.end(0) == []
+    results = bench.results("results")
+    bench.assert_left_safe(results.last, *NODES, 17)
+    with np.load(bench.folder / "results" / "log.npz") as log:
+        turned = log["carrier_rad"]
+        assert np.polyfit(log["t_s"], turned, 1)[0] == pytest.approx(np.radians(5.0), rel=0.05)
+
+
 def full_scan(bench: Any) -> Any:
     """The results of a scan that the machine did not interrupt; a few attempts are allowed.
 
