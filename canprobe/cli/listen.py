@@ -67,6 +67,7 @@ def array_only(scene: Scene) -> Scene:
 def run(args: argparse.Namespace) -> None:
     """Print images until the time is over, or Ctrl-C."""
     from canprobe.cell.master.controller import Command
+    from canprobe.cell.master.monitor import image_lines
     from canprobe.cell.results.recording import recording
 
     duration_s, args.duration = args.duration, None
@@ -96,7 +97,8 @@ def run(args: argparse.Namespace) -> None:
                     print(json.dumps({"t_s": round(t_s, 6), **array_values(cell, measurement)}), flush=True)
                 else:
                     text = f"{t_s:7.2f} s  {array_line(cell, measurement)}"
-                    print(_CLEAR + text + "\n" + _picture(measurement) if on_terminal else text, flush=True)
+                    image = "\n".join(image_lines(measurement.tactile.frame.taxels))
+                    print(f"{_CLEAR}{text}\n{image}" if on_terminal else text, flush=True)
                 if cell.session.virtual and on_terminal:
                     pace.keep(measurement.t_ns)
             return Command(done=t_s >= duration_s)
@@ -132,10 +134,3 @@ def array_line(cell: OpenCell, measurement: Measurement) -> str:
     sigma = "unknown error" if at["force_sigma_n"] is None else f"± {at['force_sigma_n']:.3f} N"
     place = "no contact" if at["u_mm"] is None else f"at u {at['u_mm']:+.1f}, v {at['v_mm']:+.1f} mm"
     return f"{at['force_n']:.3f} N {sigma}, {place}, highest taxel {at['highest_count']} of 255"
-
-
-def _picture(measurement: Measurement) -> str:
-    from canprobe.cell.master.monitor import image_lines
-
-    assert measurement.tactile is not None
-    return "\n".join(image_lines(measurement.tactile.frame.taxels))

@@ -138,9 +138,8 @@ class Monitor:
         self._view = CellView("+".join(channels))
         roles = {node.node_id: node.name for node in plan.nodes} | {MASTER_NODE_ID: "master"}
         self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
-        arm = plan.setup.arm
-        self._model = arm.model if arm is not None else None
         axes = drive_axes(plan)
+        self._model = plan.setup.needed_arm().model if axes else None
         self._feedback = {one.layout.cob_id: (axes[one.axis].node_id, one) for one in feedback_frames(axes)}
         self._counts: list[int | None] = [None] * len(axes)
         self._tactile = make_tactile(plan)

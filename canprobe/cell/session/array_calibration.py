@@ -364,6 +364,8 @@ def _plan(scene: Scene, visit: Visit) -> Plan:
 def _turned(scene: Scene) -> Scene | None:
     """The scene with the last joint half a turn further; None where it cannot go there."""
     last = resolve(scene).needed_arm().model.joints[-1]
+    if not scene.joints:  # the flange of an external arm turns by less
+        return None
     name, joint = list(scene.joints.items())[-1]
     for turn in (180.0, -180.0):
         q = math.radians(joint.start_deg + turn)
