@@ -12,6 +12,7 @@ from puma_arm import ELBOW_FORM, UPENN
 
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement
+from canprobe.cell.master.drives import DriveAxis
 from canprobe.cell.master.supervision import CycleState, Limits
 from canprobe.cell.master.supervisor import JointGuard, PressDetector, Supervisor, outside_workspace
 from canprobe.cell.master.watch import NodeWatch
@@ -141,7 +142,7 @@ def test_the_preload_is_the_highest_force_before_the_drives_are_enabled():
 def test_something_worse_comes_before_a_hold_and_the_first_hold_before_the_second():
     run = Run()
     run.step(q_age=(0, 4), state=ControllerState.PASSIVE)
-    axes, targets = [SimpleNamespace(node_id=1), SimpleNamespace(node_id=2)], SimpleNamespace(beyond_lag=dict)
+    axes, targets = [DriveAxis(1, (), ()), DriveAxis(2, (), ())], SimpleNamespace(beyond_lag=dict)
     run.seen.drives = SimpleNamespace(axes=axes, targets=targets)
     run.seen.measurement = Measurement(9, 0, q_age=(0, 4), enabled=True)
     found = run.supervisor.finding
