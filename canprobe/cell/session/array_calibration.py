@@ -364,14 +364,12 @@ def _plan(scene: Scene, visit: Visit) -> Plan:
 def _turned(scene: Scene) -> Scene | None:
     """The scene with the last joint half a turn further; None where it cannot go there."""
     last = resolve(scene).needed_arm().model.joints[-1]
-    if not scene.joints:  # the flange of an external arm turns by less
-        return None
-    name, joint = list(scene.joints.items())[-1]
-    for turn in (180.0, -180.0):
-        q = math.radians(joint.start_deg + turn)
-        if not last.prismatic and last.q_min + 0.3 < q < last.q_max - 0.3:
-            joints = {**scene.joints, name: replace(joint, start_deg=joint.start_deg + turn)}
-            return replace(scene, joints=joints)
+    for name, joint in list(scene.joints.items())[-1:]:  # an external arm has none: its flange turns by less
+        for turn in (180.0, -180.0):
+            q = math.radians(joint.start_deg + turn)
+            if not last.prismatic and last.q_min + 0.3 < q < last.q_max - 0.3:
+                joints = {**scene.joints, name: replace(joint, start_deg=joint.start_deg + turn)}
+                return replace(scene, joints=joints)
     return None
 
 

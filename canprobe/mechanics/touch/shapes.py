@@ -372,15 +372,19 @@ class Cylinder(RoundShape):
     """Endless round cylinder along the object's x axis, centre line at z = -radius."""
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
-        radius = self.radius
-        zc = z + radius
-        rho = hypot(y, zc)
-        ny, nz = (y / rho, zc / rho) if rho > 0.0 else (0.0, 1.0)
-        # Round the circumference first: d1 = (0, nz, -ny), d2 = n x d1 = -x.
-        return x, radius * ny, radius * (nz - 1.0), 0.0, ny, nz, rho - radius, 1.0 / radius, 0.0, 0.0, nz, -ny
+        return _arc_foot(self.radius, x, y, z)
 
 
-class Fillet(Cylinder):
+def _arc_foot(radius: float, x: float, y: float, z: float) -> Foot:
+    """The foot on a cylinder along x."""
+    zc = z + radius
+    rho = hypot(y, zc)
+    ny, nz = (y / rho, zc / rho) if rho > 0.0 else (0.0, 1.0)
+    # Round the circumference first: d1 = (0, nz, -ny), d2 = n x d1 = -x.
+    return x, radius * ny, radius * (nz - 1.0), 0.0, ny, nz, rho - radius, 1.0 / radius, 0.0, 0.0, nz, -ny
+
+
+class Fillet(RoundShape):
     """Rounded edge along x: plane, cylinder, plane; the curvature jumps twice. The origin is the middle of the arc.
 
     Args:
@@ -399,7 +403,7 @@ class Fillet(Cylinder):
     def _foot(self, x: float, y: float, z: float) -> Foot:
         radius, zc = self.radius, z + self.radius
         if abs(atan2(y, zc)) <= self._half:
-            return super()._foot(x, y, z)
+            return _arc_foot(radius, x, y, z)
         ny, nz = (self._sin if y > 0.0 else -self._sin), self._cos
         distance = y * ny + zc * nz - radius
         return x, y - distance * ny, z - distance * nz, 0.0, ny, nz, distance, 0.0, 0.0, 0.0, nz, -ny
