@@ -309,7 +309,7 @@ def test_what_an_encoding_does_not_have_is_printed_escaped(name, tmp_path, in_ut
     ("words", "status", "out"),
     [
         ("eds list >&-", 0, ""),
-        ("eds list <&- 2>&-", 0, "prbt_joint\npuma260_joint\ntactile_array\ntactile_array_fd\n"),
+        ("eds list <&- 2>&-", 0, "encoder\nprbt_joint\npuma260_joint\ntactile_array\ntactile_array_fd\n"),
         ("plan cylindre 2>&-", 2, ""),  # a complaint does not go to stdout instead
     ],
 )
