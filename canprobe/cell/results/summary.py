@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.master.external_arm import FlangeGroup
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
@@ -109,7 +108,10 @@ def summarise(
     }
     if record.explored is not None:
         summary["explore"] = record.explored
-    if isinstance(cell.drives, FlangeGroup):
+    if scene.arm is not None and scene.arm.kind == "external":
+        from canprobe.cell.master.external_arm import FlangeGroup
+
+        assert isinstance(cell.drives, FlangeGroup)
         summary["external_arm"] = cell.drives.figures()
     if scene.task.kind == "listen":
         summary["listen"] = _listened(log)

@@ -18,7 +18,6 @@ from canprobe.cell.scene.setup import Arm, External, HomingParameters
 from canprobe.cell.scene.units import in_si
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
-from canprobe.mechanics.robot.flange import flange_model
 from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
 from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
 from canprobe.mechanics.types import Floats
@@ -104,6 +103,8 @@ def external_arm(name: str, arm: ArmSettings, rate_hz: float) -> Arm:
         arm: the section `[arm]`.
         rate_hz: rate of the cycle.
     """
+    from canprobe.mechanics.robot.flange import flange_model
+
     mount, home = transform(arm.mount_mm, arm.mount_deg), transform((0.0, 0.0, 0.0), arm.flange_deg)
     reach, speed = (
         np.array((*(length * MM,) * 3, *(math.radians(angle),) * 3))

@@ -226,13 +226,13 @@ class Session:
 
     def _external_arm(self, port: Port) -> ExternalArm | None:
         """The arm that is not on the bus, stopped on every way out; None with drives, or without an arm."""
-        from canprobe.cell.master.external_arm import stopping
-
         arm, its = self.options.arm, self.plan.setup.arm
         if its is None or (external := its.external) is None:
             if arm is not None:
                 raise UsageError('arm: expected a scene with arm.kind = "external", got one without')
             return None
+        from canprobe.cell.master.external_arm import stopping
+
         if arm is None and external.emulated:
             from canprobe.cell.emulated.flange_arm import EmulatedArm
 
