@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from canprobe.cell.planning.contact import blind_s
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.errors import at_most
 
@@ -38,6 +37,8 @@ def external_problems(setup: Setup) -> Iterator[str]:
 
 def loop_delay_s(setup: Setup, task: Touch) -> float:
     """Longest time from a motion to the one that answers the image of it, s."""
+    from canprobe.cell.planning.contact import blind_s
+
     return blind_s(setup.rate_hz, task.array, task.lag_s)
 
 
