@@ -75,22 +75,21 @@ def run(args: argparse.Namespace) -> None:
     next_s, pace = 0.0, Pace()
     file = contextlib.nullcontext() if args.record is None else recording(args.record)
     with file as record, opened(args, prepared=array_only) as cell:
-        setup = cell.plan.setup
-        sensing = None
-        if setup.arm is not None and setup.array is not None:
-            from canprobe.cell.tasks.sensing import ContactSensing
+        history = None
+        if cell.plan.setup.arm is not None:
+            from canprobe.cell.tasks.sensing import JointHistory
 
-            sensing = ContactSensing(setup.arm, setup.probe, setup.array, moments=False)
+            history = JointHistory()
 
         def step(measurement: Measurement) -> Command:
             nonlocal next_s
             t_s = 1e-9 * measurement.t_ns
-            if sensing is not None:
-                sensing.step(measurement)
+            if history is not None and measurement.q is not None:
+                history.add(measurement.t_ns, measurement.q)
             if record is not None and (sample := measurement.tactile) is not None:
-                pose = None if sensing is None else sensing.probe_at(sample.t_sample_ns)
-                if sensing is None or pose is not None:
-                    record(1e-9 * sample.t_sample_ns, sample.frame.taxels, pose)
+                q = None if history is None else history.at(sample.t_sample_ns)
+                if history is None or q is not None:
+                    record(1e-9 * sample.t_sample_ns, sample.frame.taxels, None if q is None else cell.probe(q)[0])
             if measurement.tactile is not None and t_s >= next_s:
                 next_s = t_s + args.every
                 if args.json:
@@ -103,7 +102,7 @@ def run(args: argparse.Namespace) -> None:
                     pace.keep(measurement.t_ns)
             return Command(done=t_s >= duration_s)
 
-        if sensing is None:
+        if history is None:
             cell.run(step)
         else:
             while not step(cell.cell.idle(0.0)).done:  # it is never enabled
