@@ -429,10 +429,11 @@ def _draw(data: RunData, path: Path) -> str | None:
     """Draw one picture; returns why that failed. Whatever a drawing library raises, the results are written."""
     try:
         with interrupts_repeated():
-            from canprobe.cell.results.figures import draw_run
-            from canprobe.cell.results.surface_figure import draw_surface
-
-            (draw_run if path.name == REPORT else draw_surface)(data, path)
+            if path.name == REPORT:
+                from canprobe.cell.results.figures import draw_run as draw
+            else:
+                from canprobe.cell.results.surface_figure import draw_surface as draw
+            draw(data, path)
     except (CanprobeError, OSError) as error:
         return str(error)
     except Exception as error:
