@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from canprobe.cell.planning.pdos import ENCODER_POSITION
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Carrier
 from canprobe.fieldbus.node.slave_node import Application, SlaveNode
-
-POSITION = 0x6004
 
 
 class EncoderApplication(Application):
@@ -23,10 +22,10 @@ class EncoderApplication(Application):
 
     def attach(self, node: SlaveNode) -> None:
         self._node = node
-        node.pdos.on_trigger(POSITION, self._sample)
+        node.pdos.on_trigger(ENCODER_POSITION[0], self._sample)
 
     def _sample(self, t_ns: int) -> None:
         self._plant.begin(t_ns)
         self._plant.advance(t_ns)
         counts = self._carrier.zero + round(self._carrier.units * self._plant.carrier_position)
-        self._node.dictionary.put(POSITION, 0, counts % self._range)
+        self._node.dictionary.put(*ENCODER_POSITION, counts % self._range)
