@@ -254,22 +254,21 @@ class UrdfTree:
         T[:3, 3] = self.numbers(name, element, "xyz", "0 0 0")
         return T
 
-    def numbers(
-        self, name: str, element: ElementTree.Element, key: str, default: str = "", count: str = "three numbers"
-    ) -> list[float]:
-        """Three numbers of an attribute, or "a number"; `default` where it is missing."""
+    def numbers(self, name: str, element: ElementTree.Element, key: str, default: str = "", n: int = 3) -> list[float]:
+        """Three numbers of an attribute, or one; `default` where it is missing."""
         text = element.get(key, default)
         try:
             values = [float(word) for word in text.split()]
         except ValueError:
             values = []
-        if len(values) != (3 if count == "three numbers" else 1) or not all(map(math.isfinite, values)):
-            raise self.wrong(name, f"{count} in {key} of <{element.tag}>", repr(text or None))
+        if len(values) != n or not all(map(math.isfinite, values)):
+            expected = "a number" if n == 1 else "three numbers"
+            raise self.wrong(name, f"{expected} in {key} of <{element.tag}>", repr(text or None))
         return values
 
     def number(self, name: str, element: ElementTree.Element | None, key: str, default: str = "0") -> float:
         """A number of an attribute; `default` where it or the element is missing."""
-        return 0.0 if element is None else self.numbers(name, element, key, default, "a number")[0]
+        return 0.0 if element is None else self.numbers(name, element, key, default, n=1)[0]
 
 
 def source_name(source: str | Path) -> str:
