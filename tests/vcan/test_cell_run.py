@@ -60,8 +60,10 @@ def test_the_encoder_of_a_turntable_is_a_node_like_the_others(bench: Any) -> Non
     results = bench.results("results")
     bench.assert_left_safe(results.last, *NODES, 17)
     with np.load(bench.folder / "results" / "log.npz") as log:
-        turned = log["carrier_rad"]
-        assert np.polyfit(log["t_s"], turned, 1)[0] == pytest.approx(np.radians(5.0), rel=0.05)
+        known = np.isfinite(log["carrier_rad"])  # a cycle whose TPDO came late has no position
+        assert known.sum() > 100
+        slope = np.polyfit(log["t_s"][known], log["carrier_rad"][known], 1)[0]
+        assert slope == pytest.approx(np.radians(5.0), rel=0.05)
 
 
 def full_scan(bench: Any) -> Any:
