@@ -39,5 +39,6 @@ def test_cells_come_back_on_a_real_bus(tmp_path, capsys):
     type_as_root("ip", "link", "set", "vcan0", "up")
     assert main(["study", "faults", "--recover", "--vcan", "--quick", "--json", "--out", str(tmp_path)]) == 0
     every = json.loads(capsys.readouterr().out)["rows"][-1]
-    assert every["runs"] == 2 and every["lost"] == every["back"] >= 2
+    # a node without power for 2.6 s cannot be missed; 0.17 s without heartbeats are, where the guest stood still
+    assert every["runs"] == 2 and every["lost"] == every["back"] >= 1
     assert every["failures"] == every["refused"] == 0 and every["jump_counts"] <= 1

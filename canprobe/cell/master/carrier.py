@@ -12,8 +12,6 @@ MAX_SPEED_SHARE = 1.5
 """Share of the stated speed above which a motion is not believed; SYNCs may be late by a period."""
 TOLERANCE_COUNTS = 2
 """Counts by which two readings may differ at rest."""
-SILENT_CYCLES = 3
-"""Cycles without a position after which the carrier is lost: until then its motion is carried on."""
 
 
 class CarrierReceiver:
@@ -24,13 +22,17 @@ class CarrierReceiver:
         carrier: the carrier.
         counts_range: range of the counts.
         period_ns: period of the cycle.
+        silent_cycles: cycles without a position after which the carrier is lost: until then its motion is carried on.
 
     Attributes:
         cob_id: COB-ID of the TPDO.
     """
 
-    def __init__(self, layout: PdoLayout, carrier: Carrier, counts_range: int, period_ns: int) -> None:
+    def __init__(
+        self, layout: PdoLayout, carrier: Carrier, counts_range: int, period_ns: int, silent_cycles: int
+    ) -> None:
         self.cob_id, self._layout, self._carrier = layout.cob_id, layout, carrier
+        self._silent_ns = silent_cycles * period_ns
         self._place = [(entry.index, entry.subindex) for entry in layout.signals].index(ENCODER_POSITION)
         self._range, self._period_ns = counts_range, period_ns
         self._sync_ns = self._t_ns = self._total = 0
@@ -77,7 +79,7 @@ class CarrierReceiver:
         if self._jump is not None:
             most = f"{MAX_SPEED_SHARE:g} × {carrier.text(carrier.speed)}/s, its speed in [carrier]"
             return NodeError(carrier.node_id, f"(carrier) reports a jump by {self._jump}, faster than {most}")
-        if silent_ns < SILENT_CYCLES * self._period_ns:
+        if silent_ns < self._silent_ns:
             return None
         return NodeError(carrier.node_id, f"(carrier) lost: no usable position for {silent_ns * 1e-6:g} ms")
 
@@ -88,4 +90,6 @@ def make_carrier(plan: Plan) -> CarrierReceiver | None:
         return None
     node = next(node for node in plan.nodes if node.node_id == carrier.node_id)
     (layout,) = [pdo.layout for pdo in plan.pdos_of(carrier.node_id, "tpdo")]
-    return CarrierReceiver(layout, carrier, node.counts_range, plan.sync.period_ns)
+    assert plan.setup.arm is not None  # nothing else feels a moving object
+    missed = plan.setup.arm.missed_syncs
+    return CarrierReceiver(layout, carrier, node.counts_range, plan.sync.period_ns, missed + 1)

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
-from canprobe.cell.master.carrier import SILENT_CYCLES
 from canprobe.cell.master.image_witness import UNSTATED_NS
 from canprobe.cell.master.supervision import (
     TORQUE_MEAN_NS,
@@ -197,7 +196,12 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> BusError | None:
     return axis.error(f"{word}no usable TPDO for {ages[i]} cycles")
 
 
-@_checked("position of the carrier lost, or a jump of it", Reaction.RETREAT, _cycles(SILENT_CYCLES + 1), enabling=True)
+@_checked(
+    "position of the carrier lost, or a jump of it",
+    Reaction.RETREAT,
+    lambda limits: (limits.missed_cycles + 2) * limits.period_ns,
+    enabling=True,
+)
 def _carrier(seen: CycleState) -> NodeError | None:
     return seen.carrier.lost if seen.carrier is not None else None
 
