@@ -24,6 +24,7 @@ examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
   canprobe study regions --dask tcp://10.0.0.1:8786
+  canprobe study faults --draw 1
   canprobe study faults --seed 4711
   canprobe study faults --recover --seed 17
   canprobe study regions --draw 2 --against earlier/regions.json
@@ -33,7 +34,7 @@ examples:
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
 STUDIES_WITH: Mapping[str, tuple[str, ...]] = {
-    "draw": ("calibration", "realtime --link", "regions", "surfaces"),
+    "draw": ("calibration", "faults", "realtime --link", "regions", "surfaces"),
     "against": ("regions",),
     "seed": ("faults", "faults --recover", "regions"),
 }
@@ -52,8 +53,8 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_option(
         "--draw N",
-        "calibration, realtime --link, regions, surfaces: number that all cases follow from; others than those of"
-        " the published figures",
+        "calibration, faults, realtime --link, regions, surfaces: number that all cases follow from; others than those"
+        " of the published figures",
         whole(0, 9999),
     )
     parser.add_option("--against FILE", "regions: regions.json of an earlier run, to compare with", Path)

@@ -1,6 +1,6 @@
 """Cases of study `faults`: each kind of fault in each task, phase and plant, and files that are wrong.
 
-The number of a case counts through kinds, tasks, phases, plants and repeats, and seeds what is left to chance: which
+The number of a case counts through kinds, tasks, phases, plants and draws, and seeds what is left to chance: which
 node has the fault, when in the phase it begins, how long it lasts, and its values.
 """
 
@@ -30,7 +30,6 @@ from canprobe.mechanics.types import Floats
 KINDS = tuple(CELL_FAULTS.values())
 PHASES = ("start", "approach", "contact", "lift-off")
 PLANTS = ("ideal", "dynamic")
-REPEATS = 5
 TASKS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "press": ("press", {"task.force_n": 3.0, "task.duration_s": 0.6}),
     "weave": ("cylinder", {"task.duration_s": 4.0, "shape.also": ()}),
@@ -120,7 +119,7 @@ class FaultCase:
 
 
 CASES = len(KINDS) * len(TASKS) * len(PHASES) * len(PLANTS)
-"""Number of cases of one repeat."""
+"""Number of cases of one draw."""
 
 
 @cache

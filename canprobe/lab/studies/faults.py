@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, legend, log_scale, parts, picture
-from canprobe.lab.studies.fault_cases import CASES, KINDS, REPEATS, TASKS, FaultCase, WrongFile, wrong_files
+from canprobe.lab.studies.fault_cases import CASES, KINDS, TASKS, FaultCase, WrongFile, wrong_files
 from canprobe.lab.studies.fault_runs import FORCE_SHARE, PRESSED_N, USUAL_SHARE, run_case, run_wrong_file
 from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name
 from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
@@ -53,16 +53,16 @@ def quick_numbers() -> list[int]:
     ]
 
 
-def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Carry out the campaign."""
-    numbers = quick_numbers() if quick else range(REPEATS * CASES)
+def run(*, quick: bool, sweep: Sweep, draw: int = 0) -> StudyResult:
+    """Carry out the campaign; each draw has every case, with other nodes, times and values."""
+    numbers = quick_numbers() if quick else range(draw * CASES, (draw + 1) * CASES)
     runs = sweep.map(measure, numbers)
     touches = sweep.map(run_wrong_file, QUICK_FILES if quick else wrong_files(JOINTS))
-    facts = measuring_facts(quick, len(numbers))
+    facts = measuring_facts(quick, len(numbers)) | {"draw": draw}
     title = "Highest true force of a first touch with a wrong file"
     drawn = partial(draw_by_name, touches, "file", FORCE_AXIS, title=title, by="plant")
     files = StudyResult("faults_files", touches, file_findings(touches), facts, drawn, FILE_COLUMNS)
-    return StudyResult("faults", table_rows(runs), findings(runs), facts, partial(draw, runs), more=(files,))
+    return StudyResult("faults", table_rows(runs), findings(runs), facts, partial(draw_runs, runs), more=(files,))
 
 
 def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
@@ -140,7 +140,7 @@ def file_findings(touches: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
+def draw_runs(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw how the runs with each kind of fault ended, and the true forces of each."""
     failed = sum(bool(one["failures"]) for one in runs)
     title = (
