@@ -119,7 +119,7 @@ def faults(count):
          "force_share": rng.lognormal(-0.7, 0.3)}
         for i in range(count)
     ]  # fmt: skip
-    return lambda path: faults_study.draw(runs, path)
+    return lambda path: faults_study.draw_runs(runs, path)
 
 
 def wrong_files(path):
