@@ -212,7 +212,7 @@ def _following(seen: CycleState) -> BusError | None:
     if drives is None or seen.compares_motion or not (beyond := drives.targets.beyond_lag()):
         return None
     i, model = max(beyond, key=beyond.__getitem__), drives.model
-    motion = model.joints[i].text(abs(beyond[i] / float(model.units_per_q[i, i])), ".2f")
+    motion = model.joints[i].text(abs(beyond[i] / float(model.units_per_q[i, i])), ".2g")
     lag_ms = seen.limits.lag_ns * 1e-6
     lag = f"a lag of {lag_ms:.3g} ms (servo.drive_lag_ms)" if lag_ms else "its lag"
     return drives.axes[i].error(
