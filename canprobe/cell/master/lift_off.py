@@ -45,13 +45,13 @@ class WayBack:
 
     Args:
         model: the arm's geometry.
-        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
+        flange_point: transform (4, 4) from that point, z = pole, to the flange.
         period_s: period of the cycle.
         free: drives (n,) that may move.
     """
 
-    def __init__(self, model: ArmModel, flange_probe: Floats, period_s: float, free: NDArray[np.bool_]) -> None:
-        self._model, self._flange_probe, self._period_s, self._free = model, flange_probe, period_s, free
+    def __init__(self, model: ArmModel, flange_point: Floats, period_s: float, free: NDArray[np.bool_]) -> None:
+        self._model, self._flange_point, self._period_s, self._free = model, flange_point, period_s, free
         self._leap = np.abs(units_per_motor(model)) * model.radian * LEAP_RAD
         self._targets: Floats | None = None
         self._away: Floats | None = None
@@ -64,7 +64,7 @@ class WayBack:
             measured: joint positions (n,), rad or m.
             targets: targets (n,) of the motors, counts, at which the way begins.
         """
-        T, J = forward_jacobian(self._model.chain, measured, self._flange_probe)
+        T, J = forward_jacobian(self._model.chain, measured, self._flange_point)
         if self._away is None or self._targets is None:
             here, far = joints_to_units(self._model, measured), self._leap
             self._away, self._targets = -T[:3, 2], np.where(np.abs(targets - here) <= far, targets, here)
@@ -100,7 +100,7 @@ class LiftOff:
         ages = drives.ages()
         heard = zip(drives.axes, ages, drives.enabled_ones(), strict=True)
         self._free = np.array([age == 0 and on and _obeys(watch, axis.node_id, error) for axis, age, on in heard])
-        self._way = WayBack(model, plan.setup.probe.T_flange_probe, self._period_s, self._free)
+        self._way = WayBack(model, plan.setup.probe.T_flange_point, self._period_s, self._free)
         self._trail = trail if self._free.all() else None  # with a drive at rest the others do not go where they were
         self._step_max: Floats = model.qd_max * plan.setup.limits.speed_share * self._period_s
         self._retrace: Retrace | None = None

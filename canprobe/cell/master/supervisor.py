@@ -65,8 +65,7 @@ class JointGuard:
         self._si = "angles, rad" if slides == {False} else "positions, m" if slides == {True} else "positions, rad or m"
         self.slowed = 0
         self.model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
-        self._tip, self.T_flange_tip = probe.tip, probe.T_flange_probe.copy()
-        self.T_flange_tip[:3, 3] += probe.radius * self.T_flange_tip[:3, 2]
+        self._tip, self.T_flange_tip = probe.tip, probe.T_flange_tip
         # plain floats: a handful is compared before numpy has begun
         self._speed: list[float] = (model.qd_max * safety.speed_share).tolist()
         self._counts: list[float] = self.count.tolist()

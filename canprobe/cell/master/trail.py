@@ -42,11 +42,11 @@ class TakenWay:
 
     Args:
         model: the arm's geometry.
-        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
+        flange_point: transform (4, 4) from the point whose way counts to the flange.
     """
 
-    def __init__(self, model: ArmModel, flange_probe: Floats) -> None:
-        self._model, self._flange_probe = model, flange_probe
+    def __init__(self, model: ArmModel, flange_point: Floats) -> None:
+        self._model, self._flange_point = model, flange_point
         self._knots: deque[tuple[list[float], Floats, float]] = deque(maxlen=MAX_KNOTS)
         self._least: list[float] = (KNOT_RAD * model.radian).tolist()
 
@@ -61,7 +61,7 @@ class TakenWay:
         q, knots = measured.tolist(), self._knots
         if knots and all([abs(a - b) < least for a, b, least in zip(q, knots[-1][0], self._least, strict=True)]):
             return
-        place = (forward(self._model.chain, measured) @ self._flange_probe)[:3, 3]
+        place = (forward(self._model.chain, measured) @ self._flange_point)[:3, 3]
         gone = knots[-1][2] + float(np.linalg.norm(place - knots[-1][1])) if knots else 0.0
         knots.append((q, place, gone))
         while len(knots) > 2 and gone - knots[1][2] > WAY_BACK:
@@ -76,7 +76,7 @@ class TakenWay:
         """
         if not self._knots:
             return None
-        place = (forward(self._model.chain, q) @ self._flange_probe)[:3, 3]
+        place = (forward(self._model.chain, q) @ self._flange_point)[:3, 3]
         gone = self._knots[-1][2] + float(np.linalg.norm(place - self._knots[-1][1]))
         ways = gone - np.array([gone, *(knot[2] for knot in reversed(self._knots))])
         joints = np.array([q, *(knot[0] for knot in reversed(self._knots))])

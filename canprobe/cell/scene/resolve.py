@@ -90,7 +90,8 @@ def resolve(scene: Scene) -> Setup:
     settings = scene.probe or ProbeSettings()
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
     T, radius = T_flange_probe(settings), settings.radius_mm * MM
-    if array is not None and array.pad.is_flat:  # it is a sphere of a very large radius; the point of its pole stays
+    is_flat = array is not None and array.pad.is_flat
+    if is_flat:  # it is a sphere of a very large radius; the point of its pole stays
         from canprobe.mechanics.touch.pad import FLAT_RADIUS_M
 
         T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
@@ -103,7 +104,7 @@ def resolve(scene: Scene) -> Setup:
     probe = Probe(np.eye(4), 0.0, stiffness, 0.0)
     if not bare:
         sd = settings.position_sd_mm * MM
-        probe = Probe(T, radius, stiffness, settings.mass_kg, sd, math.hypot(sd, _arm_accuracy(scene.arm)))
+        probe = Probe(T, radius, stiffness, settings.mass_kg, sd, math.hypot(sd, _arm_accuracy(scene.arm)), is_flat)
     return Setup(
         scene=scene,
         saved=saved,

@@ -273,6 +273,7 @@ class Probe:
         mass: mass of the probe, kg.
         position_sd: standard deviation of its centre on the flange, per axis, m.
         place_sd: standard deviation of its centre in base, per axis, m: on the flange, and of the flange by the arm.
+        is_flat: whether it is a flat pad, which is taken for a sphere of `FLAT_RADIUS_M`.
     """
 
     T_flange_probe: Floats
@@ -281,6 +282,20 @@ class Probe:
     mass: float
     position_sd: float = 0.0
     place_sd: float = 0.0
+    is_flat: bool = False
+
+    @property
+    def T_flange_tip(self) -> Floats:
+        """(4, 4) of the point of its pole on the flange; z is the pole."""
+        T = self.T_flange_probe.copy()
+        T[:3, 3] += self.radius * T[:3, 2]
+        return T
+
+    @property
+    def T_flange_point(self) -> Floats:
+        """(4, 4) of the point whose ways count: its centre. A flat pad has its tip, as a count of an encoder moves its
+        centre, 10 m away, by a millimetre."""
+        return self.T_flange_tip if self.is_flat else self.T_flange_probe
 
     @property
     def tip(self) -> str:

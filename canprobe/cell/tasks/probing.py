@@ -26,7 +26,6 @@ from canprobe.cell.tasks.task import MotionTime, Phase, Task, TaskRecord
 from canprobe.mechanics.robot.chain import pose_of
 from canprobe.mechanics.touch import ContactSample, Patch
 from canprobe.mechanics.touch.depth_witness import DepthWitness
-from canprobe.mechanics.touch.pad import FLAT_RADIUS_M
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S, ArcMotion, LineMotion, PoseSteps
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats
@@ -156,14 +155,16 @@ class ProbingTask(Task):
         self._touch = TouchState(limits_of(plan))
         self.depth = self._touch.depth = DepthWitness(sensing.radius, holds=holds)
         self._drives_witness = reports_torque(plan)
-        self._follows_depth = plan.setup.probe.radius < FLAT_RADIUS_M  # a flat pad has no foot on the object
+        probe = plan.setup.probe
+        self._follows_depth = not probe.is_flat  # a flat pad has no foot on the object
+        self._reach = probe.radius if probe.is_flat else 0.0  # from its centre to the point whose ways count
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
         self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
         self._begun = False
         self._motion: ProbeMotion  # from the first cycle on
         self._line: LineMotion | ArcMotion
-        self._way_here = TakenWay(plan.setup.needed_arm().model, plan.setup.probe.T_flange_probe)
+        self._way_here = TakenWay(plan.setup.needed_arm().model, probe.T_flange_point)
         self._retrace: Retrace | None = None
         self._growing: GrowingForce  # on the way back
         self._measured: Floats | None = None
@@ -253,7 +254,8 @@ class ProbingTask(Task):
     def _witness(self, sample: TactileSample, patch: Patch, contact: ContactSample | None) -> None:
         """Ask what else knows of the force: whether the images live, and how deep the probe is."""
         touch, sensing = self._touch, self.sensing
-        centre = contact.T_base_probe[:3, 3] if contact is not None else sensing.probe_centre(sample.t_sample_ns)
+        T = contact.T_base_probe if contact is not None else sensing.probe_at(sample.t_sample_ns)
+        centre = None if T is None else T[:3, 3] + self._reach * T[:3, 2]
         normal = contact.n_base if contact is not None else None
         touch.images.look(sample, patch, centre, sensing.image_sigma if contact is not None else None)
         if not self._follows_depth or self.phase not in _IN_CONTACT:

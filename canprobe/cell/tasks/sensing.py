@@ -172,11 +172,6 @@ class ContactSensing:
             return T_base_probe
         return np.asarray(np.linalg.inv(self.track.T_base_carrier(t_ns)) @ T_base_probe)
 
-    def probe_centre(self, t_ns: int) -> Floats | None:
-        """Centre (3,) of the probe at a time of the last cycles, m; None where it is unknown."""
-        pose = self.probe_at(t_ns)
-        return None if pose is None else pose[:3, 3]
-
     def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""
         T_base_probe = self.probe_at(sample.t_sample_ns)

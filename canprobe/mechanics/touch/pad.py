@@ -21,7 +21,7 @@ COUNTS_MAX = 255
 """Counts of an image at full scale; 0 is no pressure. What a device counts instead its wire converts."""
 THRESHOLD_COUNTS = 5
 """Least count of an image that is not taken as 0."""
-_RIM_DIRECTIONS = 32
+_SIDES = 32
 FLAT_RADIUS_M = 10.0
 """Radius of the sphere that a flat pad is taken for where a radius is needed: 8 µm deep over one inch."""
 
@@ -120,11 +120,16 @@ class Pad:
         return half
 
     @cached_property
-    def rim(self) -> NDArray[np.intp]:
-        """Numbers of the listed taxels at the edge: none lies more than half a pitch beyond them in some direction."""
-        angles = np.arange(_RIM_DIRECTIONS) * (2.0 * math.pi / _RIM_DIRECTIONS)
-        along = self.uv @ np.stack((np.cos(angles), np.sin(angles)))
-        return np.flatnonzero((along >= along.max(axis=0) - 0.5 * self.pitch_m).any(axis=1))
+    def sides(self) -> NDArray[np.bool_]:
+        """(directions, taxels) whether a listed taxel is outermost in a direction, to half a pitch.
+
+        The direction opposite to the i-th of n is the (i + n/2)-th. There is none where all taxels are outermost:
+        such a list does not show where a contact ends.
+        """
+        angles = np.arange(_SIDES) * (2.0 * math.pi / _SIDES)
+        along = np.stack((np.cos(angles), np.sin(angles)), axis=1) @ self.uv.T
+        outermost: NDArray[np.bool_] = along >= along.max(axis=1, keepdims=True) - 0.5 * self.pitch_m
+        return outermost[:0] if outermost.any(axis=0).all() else outermost
 
     @cached_property
     def uv(self) -> Floats:

@@ -348,14 +348,16 @@ class Sinking:
         contact: the first contact.
         pose: pose of the probe then.
         radius: radius of the probe, m.
+        lever: distance from the probe's centre to the point that its pole turns about, m: a sphere turns about its
+            centre. A flat pad turns about its tip: about a centre 10 m away a count of an encoder is a millimetre.
 
     Attributes:
         depth: depth at which it begins, m.
     """
 
-    def __init__(self, contact: ContactSample, pose: ProbePose, radius: float) -> None:
+    def __init__(self, contact: ContactSample, pose: ProbePose, radius: float, lever: float = 0.0) -> None:
         self.depth = radius - float(contact.n_base @ (pose.centre - contact.p_base))
-        self._pole = pose.pole
+        self._pole, self._lever = pose.pole, lever
 
     def share(self, t: float, depth: float, speed: float) -> float:
         """Share of the way to a depth, m, after a time, s. Out of a touch that went too deep it is as fast as in."""
@@ -368,7 +370,8 @@ class Sinking:
         """The servo's next pose at a speed, m/s, with a share of the way to a depth, m, gone."""
         pose = servo.next_pose(speed, self.depth + share * (depth - self.depth), dt)
         pole = self._pole + share * (pose.pole - self._pole)
-        return ProbePose(pose.centre, pole / np.linalg.norm(pole))
+        pole /= np.linalg.norm(pole)
+        return ProbePose(pose.centre + self._lever * (pose.pole - pole), pole)
 
 
 def _unit(v: Sequence[float]) -> Sequence[float]:

@@ -246,10 +246,7 @@ def compute_patch(
     active = counts.translate(None, _ALL_COUNTS[: max(calibration.threshold_counts, 1)])
     if not active:
         return _nothing(0.0)._replace(dead=dead)
-    if pad.is_grid:
-        edges = _edges(counts, pad.shape, window)
-    else:  # a flat list has no contact that may leave it
-        edges = (0 if pad.is_flat else int(taxels.reshape(-1)[pad.rim].max()), 0, 0)
+    edges = _edges(counts, pad.shape, window) if pad.is_grid else (*_rim(taxels, pad), 0)
     n_active, peak = len(active), max(active)
     pascals = calibration.pascals
     peak_pa, at_pad, across, at_window = [pascals.item(count) for count in (peak, *edges)]
@@ -300,6 +297,13 @@ def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) 
         if 0 < column < width - 1:
             inside += counts[column::width]
     return at_pad, across, max(inside, default=0)
+
+
+def _rim(taxels: NDArray[np.uint8], pad: Pad) -> tuple[int, int]:
+    """Highest count at the edge of a list of taxels, and what two opposite sides of it both have."""
+    sides = np.where(pad.sides, taxels.reshape(-1), 0).max(axis=1)
+    half = len(sides) // 2
+    return int(sides.max(initial=0)), int(np.minimum(sides[:half], sides[half:]).max(initial=0))
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:
