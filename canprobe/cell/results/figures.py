@@ -162,7 +162,8 @@ def _draw_trajectory(part: SubFigure, result: RunData) -> None:
             shown.append("grey: true one")
             near = 1e3 * true_surface(shape, points, plane)
             axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.3, linewidth=0, shade=True, zorder=1)
-    title = f"contact in the base frame\n{' · '.join(shown)}"
+    frame = "base frame" if result.plan.setup.carrier is None else "frame of its carrier"
+    title = f"contact in the {frame}\n{' · '.join(shown)}"
     box(part, axes, title, ("x (mm)", "y (mm)", "z (mm)"), elev=40, azim=azimuth, beside_in=1.8)
 
 
