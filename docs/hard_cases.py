@@ -36,9 +36,10 @@ def from_phase(scene: str, changes: Mapping[str, Any], phase: Phase, after_s: fl
     return FaultRun(plan, (Fault(CELL_FAULTS[kind], start_ns=begin_ns, **fault),)).result()
 
 
-def press(clearance_mm: float, phase: Phase, kind: str, **fault: Any) -> Score:
+def press(clearance_mm: float, phase: Phase, kind: str, speed_mm_s: float = 4.0, **fault: Any) -> Score:
     """A press of 3 N whose array has a fault from the beginning of a phase on."""
     changes = {"task.clearance_mm": clearance_mm, "task.force_n": 3.0, "task.duration_s": 0.5}
+    changes["task.approach_mm_s"] = speed_mm_s
     return from_phase("press", changes, phase, 0.0, kind, node_id=16, **fault)
 
 
@@ -75,6 +76,13 @@ CASES: Mapping[str, tuple[str, Callable[[], Score]]] = {
             partial(press, mm, Phase.APPROACH, "stuck-image"),
         )
         for mm in (4.0, 1.0, 0.5, 0.1)
+    },
+    **{
+        f"blind-{speed:g}mm_s": (
+            f"array keeps its image from the beginning of an approach of 1 mm at {speed:g} mm/s on: press",
+            partial(press, 1.0, Phase.APPROACH, "stuck-image", speed),
+        )
+        for speed in (2.0, 1.0, 0.5)
     },
     **{
         f"stuck-{scene}-{joint}-{after_s:g}s": (

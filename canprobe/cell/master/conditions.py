@@ -13,21 +13,14 @@ from functools import partial
 from typing import Any, TypeVar
 
 from canprobe.cell.master.image_witness import UNSTATED_NS
-from canprobe.cell.master.supervision import (
-    TORQUE_MEAN_NS,
-    Condition,
-    CycleState,
-    Finding,
-    Limits,
-    Reaction,
-    TouchState,
-)
+from canprobe.cell.master.supervision import Condition, CycleState, Finding, Limits, Reaction, TouchState
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS
 from canprobe.errors import BusError, InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.touch.depth_witness import CONTRADICTED_S
+from canprobe.mechanics.touch.stops import TORQUE_MEAN_NS
 
 NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
 HOLD_CYCLES = 3

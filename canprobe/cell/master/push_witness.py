@@ -8,24 +8,24 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from canprobe.cell.master.controller import Measurement
-from canprobe.cell.master.supervision import TORQUE_MEAN_NS
 from canprobe.mechanics.robot.model import ArmModel, units_per_motor
 from canprobe.mechanics.robot.tool_push import PushGeometry, TorqueMean, push_since
+from canprobe.mechanics.touch.stops import LEAST_PUSH_SHARE, PUSH_SIGMAS, TORQUE_MEAN_NS
 from canprobe.mechanics.types import Floats
 
 LATEST, OLDEST = 4, 20
 """Ages of the means that the present one is compared with, in means: 0.1 to 0.5 s."""
+EARLY_EVERY, EARLY = 4, 80
+"""One mean in so many is kept for longer, and how many: 8 s. The force of a slow approach grows so little in half a
+second that its growth looks like noise of the torques, until hundreds of newtons press."""
 LEAST_LIKE, MOST_LIKE, LIKE_SHARE, LIKE_COUNTS = 3, 8, 0.3, 1.5
 """Number of means from which on only those count in which the motors turned as they do now, the last of them; and by
 how much their way in `LATEST` means may differ: relative, and in counts of the drive. Friction differs elsewhere."""
-CERTAIN_SIGMAS = 4.0
-"""Standard deviations from which on a push is none by chance: it is looked for forty times a second."""
-SHARE_OF_LIMIT = 0.5
-"""Share of the force limit below which no push counts, however well the torques are known."""
 
 
 class PushWitness:
@@ -43,9 +43,11 @@ class PushWitness:
 
     def __init__(self, model: ArmModel, flange_tip: Floats, force_max: float) -> None:
         self._geometry = PushGeometry(model, flange_tip)
-        self._least = SHARE_OF_LIMIT * force_max
+        self._least = LEAST_PUSH_SHARE * force_max
         self._least_way = LIKE_COUNTS / np.abs(units_per_motor(model))
         self._means: deque[TorqueMean] = deque(maxlen=OLDEST + 1)
+        self._early: deque[TorqueMean] = deque(maxlen=EARLY)
+        self._count = 0
         self.sigma = float("inf")
         self.unfelt: float | None = None
         self._showed = False
@@ -84,6 +86,9 @@ class PushWitness:
         self._restart(measurement)
         if len(self._means) > 2 * LATEST + LEAST_LIKE:
             self._compare()
+        self._count += 1
+        if self._count % EARLY_EVERY == 0:
+            self._early.append(self._means[-1])
 
     def _restart(self, measurement: Measurement | None) -> None:
         self._since = measurement
@@ -92,13 +97,28 @@ class PushWitness:
 
     def _compare(self) -> None:
         means = list(self._means)
-        now, before = means[-1], [one for one in means[:-LATEST] if math.isfinite(one.way[0])]
-        differs = np.abs(np.array([one.way for one in before]) - now.way)
-        alike = np.all(differs <= LIKE_SHARE * np.abs(now.way) + self._least_way, axis=1)
-        like = [one for one, is_alike in zip(before, alike.tolist(), strict=True) if is_alike]
-        before = like[-MOST_LIKE:] if len(like) >= LEAST_LIKE else before
-        push, self.sigma = push_since(self._geometry, now, before)
-        unfelt = push - (now.force - float(np.mean([one.force for one in before])))
-        shows = unfelt > max(CERTAIN_SIGMAS * self.sigma, self._least)
+        now, recent = means[-1], [one for one in means[:-LATEST] if math.isfinite(one.way[0])]
+        like, early = self._alike(recent, now), self._alike(self._early, now)
+        unfelt, self.sigma = self._unfelt(now, like[-MOST_LIKE:] if len(like) >= LEAST_LIKE else recent)
+        if len(early) >= LEAST_LIKE and not unfelt > self._certain(self.sigma):
+            unfelt, self.sigma = self._unfelt(now, early[:MOST_LIKE])
+        shows = unfelt > self._certain(self.sigma)
         self.unfelt = unfelt if shows and self._showed else None
         self._showed = shows
+
+    def _alike(self, before: Collection[TorqueMean], now: TorqueMean) -> list[TorqueMean]:
+        """Those before now in which the motors turned as they do now."""
+        if not before:
+            return []
+        differs = np.abs(np.array([one.way for one in before]) - now.way)
+        alike = np.all(differs <= LIKE_SHARE * np.abs(now.way) + self._least_way, axis=1)
+        return [one for one, is_alike in zip(before, alike.tolist(), strict=True) if is_alike]
+
+    def _unfelt(self, now: TorqueMean, before: Sequence[TorqueMean]) -> tuple[float, float]:
+        """Growth of the push that the array has not measured since a moment before, and its standard deviation, N."""
+        push, sigma = push_since(self._geometry, now, before)
+        return push - (now.force - float(np.mean([one.force for one in before]))), sigma
+
+    def _certain(self, sigma: float) -> float:
+        """Least push that is none by chance, N."""
+        return max(PUSH_SIGMAS * sigma, self._least)

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch import Patch
     from canprobe.mechanics.touch.depth_witness import DepthWitness
 
-TORQUE_MEAN_NS = 25_000_000
-"""Time over which torques are averaged for the push that they show; two in a row must show a push."""
 TACTILE_TIMEOUT_PERIODS = 6
 """Periods of the array without a sample after which it counts as silent."""
 

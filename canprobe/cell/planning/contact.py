@@ -35,17 +35,21 @@ from canprobe.cell.planning.pdos import TORQUE
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
 from canprobe.errors import at_least, at_most
-from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import position_per_unit
+from canprobe.mechanics.robot.tool_push import PushGeometry, steady_sigma
 from canprobe.mechanics.touch.depth_witness import CERTAIN_SIGMAS, SUSPECT_S, sigma_ahead
 from canprobe.mechanics.touch.image.force_creep import decades_after, late_decades_after
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS
 from canprobe.mechanics.touch.stops import (
+    LEAST_PUSH_SHARE,
     MAX_FORCE_SPREAD,
     OFF_PAD_EDGE_SHARE,
     OFF_PAD_SIGMAS,
+    PUSH_SIGMAS,
+    TORQUE_MEAN_NS,
     TOUCH_FORCE,
     depth_on_plane,
 )
@@ -434,13 +438,31 @@ def _torques(plan: Plan, touch: Touch | Calibrate) -> str:
             f"none, as {why}: a blind array would let the search press with up to"
             f" {blind:.0f} N, {unseen:.0f} N as long as no image has changed since bring-up"
         )
-    steady_s = approach.clearance / approach.speed
-    if steady_s < STEADY_S:
+    if (push := certain_push(plan)) == math.inf:
+        steady_s = approach.clearance / approach.speed
         return (
             f"silent at the first contact, as {steady_s:.2f} s of approach are too short to know the torques without"
             f" it: raise task.clearance_mm to {math.ceil(STEADY_S * approach.speed * 1e4) / 10:g}"
         )
-    return "a push that the array does not measure, beyond 4σ of what friction may hide"
+    slow = f" at task.approach_mm_s = {1e3 * approach.speed:g}" if push > plan.setup.limits.force_max else ""
+    return f"a push of {push:.1f} N that the array does not measure: beyond 4σ of what friction may hide{slow}"
+
+
+def certain_push(plan: Plan) -> float:
+    """Least push that the torques of the drives show for certain on the approach of a touch, N; infinite where none.
+
+    The slower motors turn, the more of a push their friction may hide.
+    """
+    setup, touch = plan.setup, plan.setup.touch
+    if touch is None or not reports_torque(plan) or touch.approach.clearance < STEADY_S * touch.approach.speed:
+        return math.inf
+    arm, flange_tip = setup.needed_arm(), setup.probe.T_flange_tip
+    T, J = forward_jacobian(arm.model.chain, arm.q_start, flange_tip)
+    down = np.concatenate((touch.approach.speed * T[:3, 2], np.zeros(3)))
+    rates = np.asarray(np.linalg.lstsq(J, down, rcond=None)[0], dtype=np.float64)
+    geometry = PushGeometry(arm.model, flange_tip)
+    sigma = steady_sigma(geometry, arm.q_start, geometry.motors(rates), TORQUE_MEAN_NS * 1e-9)
+    return max(PUSH_SIGMAS * sigma, LEAST_PUSH_SHARE * setup.limits.force_max)
 
 
 def _force(probe: Probe, depth: float) -> float:

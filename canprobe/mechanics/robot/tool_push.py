@@ -114,6 +114,21 @@ def push_sigma(geometry: PushGeometry, noise: Floats, now: TorqueMean, before: S
     return sigma
 
 
+def steady_sigma(geometry: PushGeometry, q: Floats, rates: Floats, mean_s: float) -> float:
+    """Standard deviation, N, of a push on motors that turn steadily.
+
+    Args:
+        geometry: the arm.
+        q: joints (n,), rad or m.
+        rates: rates (n,) of the motor coordinates, per second; those that are measured err by half a count a mean.
+        mean_s: length of a mean, s.
+    """
+    count = 0.5 / np.abs(units_per_motor(geometry.model)) / mean_s
+    low, high = (np.tanh((np.abs(rates) + sign * count) / STICTION_RATE) for sign in (-1.0, 1.0))
+    sigma = np.hypot(geometry.coulomb * (high - low + 1.0 - np.maximum(low, 0.0)), RESOLUTION * geometry.rated)
+    return 1.0 / float(np.linalg.norm(geometry.per_newton(q) / sigma))
+
+
 def push_since(geometry: PushGeometry, now: TorqueMean, before: Sequence[TorqueMean]) -> tuple[float, float]:
     """Growth of the push against the pole since a moment before, N, and its standard deviation.
 

@@ -7,6 +7,12 @@ from __future__ import annotations
 
 import math
 
+TORQUE_MEAN_NS = 25_000_000
+"""Time over which torques are averaged for the push that they show; two in a row must show a push."""
+PUSH_SIGMAS = 4.0
+"""Standard deviations from which on a push in the torques is none by chance: it is looked for forty times a second."""
+LEAST_PUSH_SHARE = 0.5
+"""Share of the force limit below which no push counts, however well the torques are known."""
 OFF_PAD_EDGE_SHARE = 0.95
 """Pressure at the pad's edge over the highest pressure from which on a contact counts as off the pad: a paraboloid has
 lost a sixth of its force by then."""

@@ -85,6 +85,19 @@ def test_an_approach_without_torques_goes_as_far_as_the_limit_presses_until_the_
     assert highest < 1.5 * LIMIT_N
 
 
+@pytest.mark.parametrize(("search_mm", "words", "most_n"), [(None, "up to 0.6 mm", 6.0), (8.0, "the torques of", 20.0)])
+def test_a_slow_approach_presses_no_harder_though_it_adds_little_force_at_a_time(search_mm, words, most_n):
+    """Turning slowly, the motors' friction may hide 13 N, so that the default search is as if no torque was reported.
+
+    A torque of half a second before tells nothing of a force that grows for seconds: it was 437 N.
+    """
+    highest, stop, _ = run(
+        *("press", "node 16: dead-rows first=0 rows=16", Phase.APPROACH, 0.05),
+        task__approach_mm_s=1.0, task__search_mm=search_mm,
+    )  # fmt: skip
+    assert words in stop.reason and highest < most_n
+
+
 def test_a_person_may_widen_the_search():
     plan = canprobe.plan("press", {"task.search_mm": 3.0, "arm.torque": False})
     assert plan.setup.task.approach.search == plan.setup.task.approach.blind_search == pytest.approx(3e-3)

@@ -25,6 +25,14 @@ def test_a_short_approach_leaves_no_time_to_know_the_torques():
     assert "silent" not in dict(witness_rows(canprobe.plan("press", {"task.clearance_mm": 1.0})))["torques"]
 
 
+def test_a_slow_approach_shows_a_push_less_surely_and_says_how_much():
+    push = {
+        speed: dict(witness_rows(canprobe.plan("press", {"task.approach_mm_s": speed})))["torques"] for speed in (4, 1)
+    }
+    assert push[4].startswith("a push of 2.5 N") and "approach_mm_s" not in push[4]
+    assert push[1].startswith("a push of 13.0 N") and push[1].endswith("at task.approach_mm_s = 1")
+
+
 def test_a_scene_without_a_touch_has_none_and_the_others_show_them():
     assert witness_rows(canprobe.plan("free")) == []
     plan = canprobe.plan("calibrate")
