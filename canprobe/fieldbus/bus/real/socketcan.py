@@ -26,7 +26,15 @@ from operator import itemgetter
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import Clock
-from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, PortCounters, Reports, TimedFrame, state_after
+from canprobe.fieldbus.bus.port import (
+    ERR_FLAG,
+    ControllerState,
+    PlainPort,
+    PortCounters,
+    Reports,
+    TimedFrame,
+    state_after,
+)
 from canprobe.fieldbus.bus.real import link
 from canprobe.fieldbus.bus.real.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.fieldbus.bus.system import system
@@ -126,7 +134,7 @@ class StampClock:
         return offset_ns, doubt_ns
 
 
-class SocketCanPort:
+class SocketCanPort(PlainPort):
     """One raw socket on one interface; it does not hear itself, but it hears every other socket of this machine.
 
     Args:
