@@ -94,18 +94,6 @@ class Reorder(FrameFault):
         return ()
 
 
-class Mute(FrameFault):
-    """The node sends nothing."""
-
-    name = "mute"
-
-
-class Deaf(FrameFault):
-    """The node hears nothing."""
-
-    name = "deaf"
-
-
 class Reboot(Effect):
     """The power fails for the duration; the node boots when it is back."""
 
@@ -216,12 +204,6 @@ class Long(FrameFault):
         return ((frame[0], frame[1] + b"\0"),) if len(frame[1]) < frames.CLASSIC_BYTES else None
 
 
-class Burst(Duplicate):
-    """Frames come many times."""
-
-    name = "burst"
-
-
 class WrongId(FrameFault):
     """PDOs come under another identifier."""
 
@@ -249,12 +231,6 @@ class SyncJitter(Delay):
 
     def delay_ms(self) -> float:
         return 1e-3 * self.rng.uniform(0.0, self.fault.value("us"))
-
-
-class SyncLost(FrameFault):
-    """SYNC does not reach the node."""
-
-    name = "sync-lost"
 
 
 class SyncDouble(FrameFault):
