@@ -181,8 +181,7 @@ class WrongData(Effect):
         else:
             header = replace(header, sample_age_us=self.rng.randrange(0x10000))
         body = b"".join(parts[can_id] for can_id in ids[1:])
-        first = replace(header, crc=0).pack()
-        packed = replace(header, crc=crc16_ccitt(body, crc16_ccitt(first[:6]))).pack()
+        packed = replace(header, crc=crc16_ccitt(body, crc16_ccitt(header.start()))).pack()
         return [(can_id, packed if can_id == ids[0] else data) for can_id, data in sent]
 
 
