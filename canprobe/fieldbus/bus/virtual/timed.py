@@ -69,7 +69,6 @@ class TimedBus(LockstepBus):
     ) -> None:
         super().__init__(clock, channel, max_frames=max_frames)
         self.bitrate = bitrate
-        self._bit_ns = 0 if NS_PER_S % bitrate else NS_PER_S // bitrate  # 0: no whole number
         self._gap_ns = self._bits_ns(INTERMISSION_BITS)
         self.frames = self.error_frames = self.busy_ns = 0
         self._fifo = queue == "fifo"
@@ -158,7 +157,7 @@ class TimedBus(LockstepBus):
         return min(dues) if dues else None
 
     def _bits_ns(self, bits: int) -> int:
-        return bits * self._bit_ns if self._bit_ns else -(-bits * NS_PER_S // self.bitrate)
+        return -(-bits * NS_PER_S // self.bitrate)
 
     def _queue(self, node: Attachment, frames: Sequence[Frame]) -> None:
         if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
