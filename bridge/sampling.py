@@ -57,8 +57,7 @@ class SampleSource:
             return sample
         patch = received.patch
         if patch is not None and self._sensing is not None and all(patch.observed):  # before the contact, as the task
-            low, high = np.linalg.eigvalsh(patch.K).tolist()
-            self._sensing.set_kappa(np.array([high, low]))
+            self._sensing.set_kappa(np.array(patch.kappa))
         if received.depth is not None and self._sensing is not None:
             self._sensing.set_depth_at_1_n(received.depth * 1e-3)
         return replace(

@@ -13,7 +13,6 @@ from canprobe.cell.master.tactile_frame import TactileFrame, TactileSample, deco
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Array, RawWire, Setup
 from canprobe.errors import BusError, UsageError
-from canprobe.fieldbus.bus.joined import send_on
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.frames import Frame
@@ -233,7 +232,7 @@ class RawReceiver(ArrayReceiver):
         wire, port, clock = self.wire, network.port, network.port.clock
         say(f"start the array on {self.channel}")
         self._started = True
-        send_on(port, self.channel, wire.start)
+        port.send_on(self.channel, wire.start)
         if wire.sampling == "sync":
             return  # its images begin with the cycle
         if wire.tare_images:
@@ -250,14 +249,14 @@ class RawReceiver(ArrayReceiver):
                     " wire.frames and wire.start of its array file"
                 )
             if wire.poll:
-                send_on(port, self.channel, wire.poll)
+                port.send_on(self.channel, wire.poll)
             network.pump_until(lambda: self.assembler.frames > came, 1.5 * period_s)
 
     def stop(self, port: Port) -> None:
         """Stop the array if it was started."""
         if self._started:
             self._started = False
-            send_on(port, self.channel, self.wire.stop)
+            port.send_on(self.channel, self.wire.stop)
 
     def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
         """Take one frame; the image that it completes, once the array is tared."""

@@ -11,7 +11,6 @@ from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.fieldbus.bus.clock import elapsed_ns
-from canprobe.fieldbus.bus.joined import send_on
 from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.protocol.frames import NmtState, SyncCounter, pack_heartbeat, pack_sync
 
@@ -279,7 +278,7 @@ class Cycle:
         if frames:
             self._port.send_batch(frames)
         if self._tactile is not None and (requests := self._tactile.requests(self.number)):
-            send_on(self._port, self._tactile.channel, requests)
+            self._port.send_on(self._tactile.channel, requests)
 
     def count_work(self) -> None:
         """Take the computing time: the work of the controller in this cycle is done."""

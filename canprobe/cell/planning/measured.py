@@ -279,12 +279,8 @@ class TrafficMeter:
         self._named_ns = _NEVER
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take one frame."""
-        self.take(((can_id, data, t_ns),))
-
-    def take(self, frames: Sequence[_Frame]) -> None:
-        """Take frames; they are counted after the next SYNC, with many others."""
-        self._taken += frames
+        """Take a frame; it is counted after the next SYNC, with many others."""
+        self._taken.append((can_id, data, t_ns))
         if len(self._taken) >= self._enough:
             self._count()
             self._enough = len(self._taken) + _AT_ONCE

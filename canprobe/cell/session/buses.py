@@ -6,7 +6,7 @@ Their traffic is counted, written into ``bus.log`` and shown to the observers.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import cached_property, partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
 from canprobe.fieldbus.bus.clock import Clock, MonotonicClock, VirtualClock
 from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.bus.joined import JoinedPort
-from canprobe.fieldbus.bus.port import Port, Reports, TimedFrame, is_bus_error
+from canprobe.fieldbus.bus.port import Port, Reports, is_bus_error
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frame_bits import exact_bits
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
@@ -71,11 +71,6 @@ class TrafficCounter:
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame."""
         self._by_length[len(data)] += 1
-
-    def take(self, frames: Sequence[TimedFrame]) -> None:
-        """Count several frames."""
-        for _, data, _ in frames:
-            self._by_length[len(data)] += 1
 
 
 class BusRecord:
@@ -131,7 +126,7 @@ class BusRecord:
                 self._candump = self._stack.enter_context(log)
             prepare_folder(self._plan, self._out)
         if self._candump is not None:
-            write = self._candump.on(channel, self.traffic[channel].take)
+            write = self._candump.on(channel, write)
         if self._observers is not None:
             self._observers.origin_ns = self.origin_ns
             write = self._observers.tap(write)

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from gzip import GzipFile
 from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
-from itertools import starmap
 from pathlib import Path
 from types import TracebackType
 
@@ -60,14 +59,8 @@ _ENCODINGS = {
 """Encodings by the first two bytes; anything else is ASCII."""
 
 
-_BUFFERED_FRAMES = 32
-"""Frames that are kept before they become lines together, which is quicker."""
 _BUFFERED_LINES = 256
 """Lines that are kept before they are joined and go to the file."""
-
-
-Take = Callable[[Sequence[TimedFrame]], None]
-"""Called with some frames at a time."""
 
 
 class CandumpWriter:
@@ -96,44 +89,28 @@ class CandumpWriter:
         with writing(Path(path)):
             self._file = _opened_alone(path)
         self._size = 0
-        self._frames: list[TimedFrame] = []  # of the channel that takes them
-        self._take: Take = nothing
         self._lines: list[str] = []
         self.write = self.on(channel)
 
-    def on(self, channel: str, also: Take = nothing) -> Callable[[int, bytes, int], None]:
+    def on(self, channel: str, also: Callable[[int, bytes, int], None] = nothing) -> Callable[[int, bytes, int], None]:
         """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file.
 
         Args:
             channel: name in its lines.
-            also: function that takes the same frames.
+            also: function that is called with the same frames.
         """
         form = _line_maker(channel, self._t0_ns)
 
-        def take(frames: Sequence[TimedFrame]) -> None:
-            self._lines += starmap(form, frames)
-            also(frames)
-
         def write(can_id: int, data: bytes, t_ns: int) -> None:
-            if self._take is not take:
-                self._form_lines()
-                self._take = take
-            frames = self._frames
-            frames.append((can_id, data, t_ns))
-            if len(frames) >= _BUFFERED_FRAMES:
-                self._form_lines()
-                if len(self._lines) >= _BUFFERED_LINES:
-                    self.flush()
+            self._lines.append(form(can_id, data, t_ns))
+            also(can_id, data, t_ns)
+            if len(self._lines) >= _BUFFERED_LINES:
+                self.flush()
 
         return write
 
-    def _form_lines(self) -> None:
-        frames, self._frames = self._frames, []
-        self._take(frames)
-
     def flush(self) -> None:
         """Write to the file what was recorded so far."""
-        self._form_lines()
         data = "".join(self._lines).encode("ascii")
         self._lines.clear()
         if self.failure is not None:

@@ -6,16 +6,10 @@ sleep is a jump that runs everything due on the way, so a simulated second lasts
 
 from __future__ import annotations
 
-import ctypes
-import errno
-import os
 import time
 from typing import Protocol
 
 from canprobe.fieldbus.bus.system import system
-
-_CLOCK_MONOTONIC = 1
-_TIMER_ABSTIME = 1
 
 
 class Clock(Protocol):
@@ -116,20 +110,8 @@ class VirtualClock:
                 self.step(t_ns)
 
 
-class Timespec(ctypes.Structure):
-    """struct timespec of the C library."""
-
-    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
-
-
 class MonotonicClock:
-    """CLOCK_MONOTONIC, with sleeps on absolute deadlines so that periods do not drift."""
-
-    __slots__ = ("_clock_nanosleep", "_request")
-
-    def __init__(self) -> None:
-        self._request = Timespec()
-        self._clock_nanosleep = getattr(system.c_library(), "clock_nanosleep", None)
+    """CLOCK_MONOTONIC. Whoever sleeps names an absolute deadline, so that periods do not drift."""
 
     def now_ns(self) -> int:
         """Return CLOCK_MONOTONIC in ns."""
@@ -140,18 +122,9 @@ class MonotonicClock:
 
         A time that is past costs one reading of the clock; the system call would cost five in a virtual machine.
         """
-        now_ns = system.monotonic_ns()
-        if now_ns >= t_ns:
-            return
-        clock_nanosleep = self._clock_nanosleep
-        if clock_nanosleep is None:
-            time.sleep((t_ns - now_ns) * 1e-9)
-            return
-        request = self._request
-        request.tv_sec, request.tv_nsec = divmod(t_ns, 1_000_000_000)
-        while status := clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(request), None):
-            if status != errno.EINTR:
-                raise OSError(status, os.strerror(status))
+        # On Linux `time.sleep` is clock_nanosleep until an absolute time, so that a signal makes it no longer.
+        if (left_ns := t_ns - system.monotonic_ns()) > 0:
+            time.sleep(left_ns * 1e-9)
 
 
 class Pace:

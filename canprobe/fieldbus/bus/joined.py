@@ -139,11 +139,3 @@ class JoinedPort(PlainPort):
             raise news
         if failed and len(self._lost) == len(self._ports):
             raise last
-
-
-def send_on(port: Port, channel: str, frames: Sequence[Frame]) -> None:
-    """Send frames on the bus of a channel, whether the port is on that bus alone or on several."""
-    if isinstance(port, JoinedPort):
-        port.send_on(channel, frames)
-    else:
-        port.send_batch(frames)

@@ -158,6 +158,13 @@ class Port(Protocol):
             InterfaceError: the interface is down, closed, lost or stays full.
         """
 
+    def send_on(self, channel: str, frames: Sequence[Frame]) -> None:
+        """Send frames on the bus of a channel, whatever their identifiers, where the port is on several buses.
+
+        Raises:
+            InterfaceError: as for `send_batch`.
+        """
+
     def drain(self) -> list[TimedFrame]:
         """Return every frame that has arrived, in order, without waiting; the next call starts empty.
 
@@ -203,12 +210,16 @@ def stamps_text(port: Port, late_ns: int) -> str:
 
 
 class PlainPort:
-    """Base class of ports that wait and drain in two calls, and are woken by every frame."""
+    """Base class of ports: on one bus, they wait and drain in two calls, and are woken by every frame."""
 
     @property
     def descriptor(self) -> int | None:
         """None, as only the port itself can wait for its frames."""
         return None
+
+    def send_on(self: Port, channel: str, frames: Sequence[Frame]) -> None:
+        """Send frames on the only bus."""
+        self.send_batch(frames)
 
     def wait_and_drain(self: Port, until_ns: int) -> list[TimedFrame]:
         """Wait for frames, until `until_ns` at the latest, and return them."""

@@ -52,6 +52,12 @@ class TappedPort(OuterPort, ABC):
         self._port.send_batch(frames, t_ns)
         self.hear_sent(frames, sent_ns)
 
+    def send_on(self, channel: str, frames: Sequence[Frame]) -> None:
+        """Send frames on the bus of a channel, which are heard with the time before they are sent."""
+        sent_ns = self.clock.now_ns()
+        self._port.send_on(channel, frames)
+        self.hear_sent(frames, sent_ns)
+
     def drain(self) -> list[TimedFrame]:
         """Return what arrived, which is heard."""
         frames = self._port.drain()

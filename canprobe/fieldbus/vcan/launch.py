@@ -8,14 +8,13 @@ CANPROBE_VCAN shows the command which way was taken: `here`, `namespace`, `link`
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from canprobe.errors import InterfaceError
@@ -64,8 +63,12 @@ def run_with_vcan(
                     return _supervise(job, signals, timeout_s)
         if (status := _check_guest(install)) != 0:
             return status
-        boot = functools.partial(GuestJob, command, {**os.environ, WAY_VARIABLE: "guest"}, realtime, shell)
-        return _run_in_guest(boot, signals, timeout_s)
+        try:
+            with GuestJob(command, {**os.environ, WAY_VARIABLE: "guest"}, realtime, shell) as guest:
+                return _supervise_guest(guest, signals, timeout_s)
+        except GuestError as error:
+            _say(str(error))
+            return GUEST_LOST_STATUS if error.started else NO_VCAN_STATUS
 
 
 def _check_guest(install: bool) -> int:
@@ -84,17 +87,6 @@ def _check_guest(install: bool) -> int:
         if not _install(line):
             return _no_vcan(f"this failed:  {line}")
     return 0
-
-
-def _run_in_guest(boot: Callable[[], GuestJob], signals: list[int], timeout_s: float | None) -> int:
-    try:
-        with boot() as job:
-            return _supervise_guest(job, signals, timeout_s)
-    except GuestError as error:
-        if not error.started:
-            return _no_vcan(str(error))
-        _say(str(error))
-        return GUEST_LOST_STATUS
 
 
 def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None) -> int:

@@ -163,6 +163,9 @@ class Written(Port):
         super().send_batch(frames, t_ns)
         self.sent += [(self._now, *frame) for frame in frames]
 
+    def send_on(self, channel, frames):
+        self.send_batch(frames)
+
 
 def cycled(cycle, number, *, work=False):
     for _ in range(number):

@@ -163,12 +163,12 @@ def test_the_same_seed_does_the_same():
 
 
 SERVICES = ("PDO", "SYNC", "heartbeat", "boot-up", "SDO request", "SDO answer")
-FACTS = {"what", "clause", "reaction", "trips", "fails", "frames", "direction", "parameters", "lasts_ms"}
+FACTS = {"does", "what", "clause", "reaction", "trips", "fails", "frames", "direction", "parameters", "lasts_ms"}
 
 
 def test_the_table_of_kinds_has_only_words_that_are_known():
     kinds = tomllib.loads(Path(faults.__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
     for name, facts in kinds.items():
-        assert set(facts) <= FACTS, name
+        assert set(facts) <= FACTS and facts.get("does", "drop") in BUS_FAULTS, name
         assert facts.get("frames", "PDO") in SERVICES and facts.get("direction", "in") in ("in", "either"), name
         assert all(one["low"] <= one["default"] <= one["high"] for one in facts.get("parameters", {}).values()), name

@@ -8,6 +8,7 @@ from random import Random
 import pytest
 
 from canprobe.fieldbus import LockstepBus, VirtualClock
+from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.tools.link import AnswerFigures, Fitness, LinkFigures, LinkLimits, LinkMeter, judge_link
 from canprobe.fieldbus.tools.link.machine import NOT_AVAILABLE, machine_facts
 
@@ -164,6 +165,19 @@ def test_a_meter_takes_an_answer_for_the_sync_before_it():
     assert (two.expected, two.late, two.absent, two.rows) == (4, 0, 1, (1,))
     assert one.times_ns == (400_000, 1_600_000) and meter.foreign == 1
     assert meter.load(1_000_000) == pytest.approx((6 * 55 + 10 * 111) / (meter.seconds * 1e6), rel=0.03)
+
+
+def test_a_meter_over_several_buses_sends_on_the_named_one_alone():
+    """As the requests to an array of raw frames, whose identifiers no route has."""
+    clock = VirtualClock()
+    buses = {channel: LockstepBus(clock, channel) for channel in ("can0", "can1")}
+    others = [bus.port() for bus in buses.values()]
+    joined = JoinedPort({channel: bus.port() for channel, bus in buses.items()}, {})
+    meter = LinkMeter(joined, wait_ns=WAIT_NS, answers={}, known={})
+    meter.begin()
+    meter.send_on("can1", [(0x101, b"\1")])
+    assert [port.drain() for port in others] == [[], [(0x101, b"\1", 0)]]
+    assert meter.bits > 0
 
 
 def test_what_a_machine_does_not_say_is_not_available():

@@ -13,7 +13,6 @@ full) and, counted in bytes, the socket's send buffer (about 277 frames; EAGAIN)
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import os
 import select
@@ -26,8 +25,16 @@ from itertools import accumulate
 from operator import itemgetter
 
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.clock import Clock, Timespec
-from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, PortCounters, Reports, TimedFrame, state_after
+from canprobe.fieldbus.bus.clock import Clock
+from canprobe.fieldbus.bus.port import (
+    ERR_FLAG,
+    ControllerState,
+    PlainPort,
+    PortCounters,
+    Reports,
+    TimedFrame,
+    state_after,
+)
 from canprobe.fieldbus.bus.real import link
 from canprobe.fieldbus.bus.real.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.fieldbus.bus.system import system
@@ -127,7 +134,7 @@ class StampClock:
         return offset_ns, doubt_ns
 
 
-class SocketCanPort:
+class SocketCanPort(PlainPort):
     """One raw socket on one interface; it does not hear itself, but it hears every other socket of this machine.
 
     Args:
@@ -171,7 +178,6 @@ class SocketCanPort:
         self._patient: socket.socket | None = None
         self._patient_frames: FrameSocket | None = None
         self._dropped = [0, 0]
-        self._poll = _Poll(self._socket.fileno())
         self._blocks = False
         self._stamps = StampClock(monotonic_ns=clock.now_ns)
         self._told_ns = 0
@@ -244,9 +250,8 @@ class SocketCanPort:
     def wait(self, until_ns: int) -> None:
         """Sleep until a frame is there, at `until_ns` at the latest."""
         self._check_open()
-        while (left_ns := until_ns - self.clock.now_ns()) > 0:
-            if self._poll(left_ns):
-                return
+        if (left_ns := until_ns - self.clock.now_ns()) > 0:
+            select.select([self._socket], (), (), left_ns * 1e-9)
 
     def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
         """Do `wait` and `drain` with one system call instead of three. It waits 2 ms, whatever `until_ns` is."""
@@ -492,21 +497,3 @@ def _enlarge_buffer(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
     except PermissionError:  # needs CAP_NET_ADMIN; without it the kernel caps the size at net.core.rmem_max
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
-
-
-class _PollFd(ctypes.Structure):
-    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
-
-
-class _Poll:
-    """ppoll on one descriptor: a wait in ns with one system call."""
-
-    def __init__(self, fd: int) -> None:
-        self._ppoll = ctypes.CDLL(None, use_errno=True).ppoll
-        self._pollfd = _PollFd(fd, select.POLLIN, 0)
-        self._timeout = Timespec()
-
-    def __call__(self, timeout_ns: int) -> bool:
-        """Return whether something is there; a signal ends the wait early with False."""
-        self._timeout.tv_sec, self._timeout.tv_nsec = divmod(timeout_ns, 1_000_000_000)
-        return bool(self._ppoll(ctypes.byref(self._pollfd), 1, ctypes.byref(self._timeout), None) > 0)

@@ -69,7 +69,6 @@ class TimedBus(LockstepBus):
     ) -> None:
         super().__init__(clock, channel, max_frames=max_frames)
         self.bitrate = bitrate
-        self._bit_ns = 0 if NS_PER_S % bitrate else NS_PER_S // bitrate  # 0: no whole number
         self._gap_ns = self._bits_ns(INTERMISSION_BITS)
         self.frames = self.error_frames = self.busy_ns = 0
         self._fifo = queue == "fifo"
@@ -135,52 +134,11 @@ class TimedBus(LockstepBus):
             self._settling = False
 
     def run_until_ns(self, until_ns: int) -> None:
-        """Do everything due up to and including `until_ns`: in one pass while no bit can fail, else instant by instant.
+        self._stale = True  # somebody else may have changed a participant meanwhile
+        super().run_until_ns(until_ns)
 
-        Raises:
-            BusError: the deadline of a participant never moves on, or too many frames wait.
-        """
-        if len(self._nodes) < 2 or self._settling or self._controllers.troubled or not self._glide(until_ns):
-            super().run_until_ns(until_ns)
-
-    def _glide(self, until_ns: int) -> bool:
-        """Carry frames without errors, in the order of `settle`; return False where errors come before the end."""
-        self._first_due = super().next_deadline_ns()
-        self._stale, self._settling = False, True
-        move_ns, controllers, length = self.clock.move_ns, self._controllers, self._length
-        bit_ns, gap_ns = self._bit_ns, self._gap_ns
-        try:
-            while self.errors is None and not controllers.troubled:
-                due, entry = self._first_due, self._flying
-                if entry is None and self._ready:
-                    start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
-                    if start <= until_ns and (due is None or start < due):
-                        entry, self._hit = heappop(self._ready), False  # as `_start` does, for speed
-                        bits = length(*entry[3]) - INTERMISSION_BITS
-                        self._end_ns = end_ns = start + (bits * bit_ns or self._bits_ns(bits))
-                        self._free_ns = end_ns + gap_ns
-                        self.busy_ns += end_ns + gap_ns - start
-                        self._flying = entry
-                if entry is not None and (due is None or self._end_ns <= due):
-                    if self._end_ns > until_ns:
-                        return True
-                    move_ns(self._end_ns)
-                    if self._hit:
-                        return False
-                    self._flying = None
-                    self._deliver_frame(entry[2], entry[3], self._end_ns)
-                elif due is None or due > until_ns:
-                    return True
-                else:
-                    self._serve(due)
-            return False
-        finally:
-            self._settling = False
-
-    def _serve(self, due_ns: int) -> None:
+    def _serve(self, t_ns: int) -> None:
         """Serve everybody whose deadline has come."""
-        self.clock.move_ns(due_ns)
-        t_ns = self.clock.now_ns()
         for _ in range(self._max_frames):
             self._advance_due(t_ns)
             self._first_due = self._earliest()
@@ -199,7 +157,7 @@ class TimedBus(LockstepBus):
         return min(dues) if dues else None
 
     def _bits_ns(self, bits: int) -> int:
-        return bits * self._bit_ns if self._bit_ns else -(-bits * NS_PER_S // self.bitrate)
+        return -(-bits * NS_PER_S // self.bitrate)
 
     def _queue(self, node: Attachment, frames: Sequence[Frame]) -> None:
         if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
@@ -273,10 +231,13 @@ class TimedBus(LockstepBus):
         return start
 
     def _finish(self) -> None:
-        """End the frame on the wire: deliver it, or count its error and let it compete again."""
+        """End the frame on the wire, or count its error and let it compete again.
+
+        Everybody hears it but its sender and the nodes that are bus off; their answers are queued.
+        """
         entry = self._flying
         assert entry is not None
-        _, _, sender, frame = entry
+        _, _, sender, (can_id, data) = entry
         t_ns, self._flying = self._end_ns, None
         if self._hit:
             self._fail(entry, t_ns)
@@ -285,14 +246,9 @@ class TimedBus(LockstepBus):
         if self._controllers.troubled:
             self._controllers.succeed(sender, t_ns)
             off = self._controllers.off()
-        self._deliver_frame(sender, frame, t_ns, off)
-
-    def _deliver_frame(self, sender: Attachment, frame: Frame, t_ns: int, off: Sequence[Attachment] = ()) -> None:
-        """Give a frame to everybody but its sender and the nodes that are bus off; queue the answers."""
         self.frames += 1
         if self._fifo and sender.outbox:
             self._compete(sender, (sender.outbox.popleft(),))
-        can_id, data = frame
         if self.recorder is not None:
             self.recorder(can_id, data, t_ns)
         moved = False

@@ -19,7 +19,8 @@ FOREVER_NS = 1 << 62
 ENDLESS_HITS = 1 << 62
 DIRECTIONS = {"in": True, "out": False}
 """Whether a fault hits the frames that the node receives, by its direction."""
-_FACTS = tomllib.loads(Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
+FACTS = tomllib.loads(Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
+"""Facts of the kinds of faults by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +190,7 @@ class Effect:
     due_ns: int | None = None
 
     def __init_subclass__(cls) -> None:
-        facts = _FACTS.get(vars(cls).get("name", ""))
+        facts = FACTS.get(vars(cls).get("name", ""))
         if facts is None:
             return
         cls.what, cls.clause, cls.reaction = facts["what"], facts["clause"], facts["reaction"]

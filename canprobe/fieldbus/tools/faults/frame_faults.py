@@ -94,18 +94,6 @@ class Reorder(FrameFault):
         return ()
 
 
-class Mute(FrameFault):
-    """The node sends nothing."""
-
-    name = "mute"
-
-
-class Deaf(FrameFault):
-    """The node hears nothing."""
-
-    name = "deaf"
-
-
 class Reboot(Effect):
     """The power fails for the duration; the node boots when it is back."""
 
@@ -193,8 +181,7 @@ class WrongData(Effect):
         else:
             header = replace(header, sample_age_us=self.rng.randrange(0x10000))
         body = b"".join(parts[can_id] for can_id in ids[1:])
-        first = replace(header, crc=0).pack()
-        packed = replace(header, crc=crc16_ccitt(body, crc16_ccitt(first[:6]))).pack()
+        packed = replace(header, crc=crc16_ccitt(body, crc16_ccitt(header.start()))).pack()
         return [(can_id, packed if can_id == ids[0] else data) for can_id, data in sent]
 
 
@@ -214,12 +201,6 @@ class Long(FrameFault):
 
     def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
         return ((frame[0], frame[1] + b"\0"),) if len(frame[1]) < frames.CLASSIC_BYTES else None
-
-
-class Burst(Duplicate):
-    """Frames come many times."""
-
-    name = "burst"
 
 
 class WrongId(FrameFault):
@@ -249,12 +230,6 @@ class SyncJitter(Delay):
 
     def delay_ms(self) -> float:
         return 1e-3 * self.rng.uniform(0.0, self.fault.value("us"))
-
-
-class SyncLost(FrameFault):
-    """SYNC does not reach the node."""
-
-    name = "sync-lost"
 
 
 class SyncDouble(FrameFault):

@@ -14,7 +14,7 @@ from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Fault, FaultKind, F
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
 from canprobe.fieldbus.tools.faults.frame_faults import HEADER_INDEX
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
-from canprobe.fieldbus.tools.faults.text import FORM, parse_fault
+from canprobe.fieldbus.tools.faults.text import node_of, parse_fault
 
 
 class FaultyNodes:
@@ -162,10 +162,7 @@ class PlannedFaults:
             fault = " ".join(words)
         if "seed=" not in fault:
             fault = re.sub(r"(:\s*[\w-]+)", rf"\1 seed={self._seed}", fault, count=1)
-        match = re.match(r"\s*node\s+(\d+)\s*:", fault)
-        if match is None:
-            raise UsageError(f"fault {fault!r}: expected {FORM}")
-        if (node_id := int(match[1])) in self._throw:
+        if (node_id := node_of(fault)) in self._throw:
             self._thrown.append((self._throw[node_id][0](fault), fault))
         else:
             parse_fault(fault, self._kinds)

@@ -9,19 +9,13 @@ from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.sdo import pack_abort, place_of
 from canprobe.fieldbus.tools.faults.fault import Effect
-from canprobe.fieldbus.tools.faults.frame_faults import Babble, Delay, FrameFault
+from canprobe.fieldbus.tools.faults.frame_faults import Babble, FrameFault
 
 _TOGGLE_FLAG = 0x10
 _SEGMENT_ANSWERS = (0, 1)  # server command specifiers: upload segment, download segment
 _INITIATE_ANSWERS = (2, 3)  # initiate upload, initiate download
 _INITIATE_REQUESTS = (1, 2, 5, 6)  # client command specifiers: download, upload, block upload, block download
 _EXPEDITED_FLAGS = 0x43
-
-
-class HeartbeatOff(FrameFault):
-    """The heartbeat is not sent; the boot-up message is."""
-
-    name = "heartbeat-off"
 
 
 class HeartbeatState(FrameFault):
@@ -31,12 +25,6 @@ class HeartbeatState(FrameFault):
 
     def changed(self, frame: Frame, t_ns: int) -> Sequence[Frame]:
         return ((frame[0], bytes((int(self.fault.value("state")),))),)
-
-
-class NoBootUp(FrameFault):
-    """The boot-up message is not sent."""
-
-    name = "no-boot-up"
 
 
 class Nmt(Effect):
@@ -69,18 +57,6 @@ class ObjectAborted(FrameFault):
     def code(self) -> int:
         """Abort code."""
         return int(self.fault.value("code"))
-
-
-class SdoSilent(FrameFault):
-    """SDO requests are not answered."""
-
-    name = "sdo-silent"
-
-
-class SdoSlow(Delay):
-    """SDO answers come late."""
-
-    name = "sdo-slow"
 
 
 class SdoToggle(FrameFault):

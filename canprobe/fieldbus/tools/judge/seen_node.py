@@ -97,7 +97,6 @@ class SeenNode:
         heartbeats_ns: times of the last heartbeats.
         addressed: whether the master has sent anything to this node.
         configured: whether the master has written an object by SDO.
-        word, status: last controlword and statusword.
         rpdos, tpdos: valid PDOs by COB-ID.
         rpdo_counts: number of frames by number of the RPDO since the last boot-up.
     """
@@ -270,12 +269,12 @@ class SeenNode:
         return speed if 0 < speed < _UNLIMITED and not self.value(_SPEED_UNIT) else 0
 
     def step_limit(self, period_ns: int) -> float | None:
-        """Way in a period at the largest speed, user units; None where it is not known."""
+        """Way in a period at the largest speed, user units; None where the one or the other is not known."""
         return self._speed_limit() * period_ns * 1e-9 or None
 
     def tolerance(self, period_ns: int) -> float:
         """Difference of positions that is not a jump: the way of a period, or 0.1 % of the range."""
-        limit = self.step_limit(period_ns) if period_ns else None
+        limit = self.step_limit(period_ns)
         return max(limit, _NOISE) if limit is not None else 0.001 * self._range()
 
     def soft_limits(self) -> tuple[int, int] | None:

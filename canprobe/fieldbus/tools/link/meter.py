@@ -73,10 +73,6 @@ class LinkMeter(TappedPort):
     def defer(self, can_ids: Collection[int]) -> None:
         self._port.defer(can_ids)
 
-    def send_on(self, channel: str, frames: Sequence[Frame]) -> None:
-        """Send frames on one of several buses."""
-        self._port.send_on(channel, frames)  # type: ignore[attr-defined]  # a `JoinedPort` has it
-
     def hear_sent(self, frames: Sequence[Frame], t_ns: int) -> None:
         """Note frames of the master; a SYNC begins a cycle."""
         if not self._measures:

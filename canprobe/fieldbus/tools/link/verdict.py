@@ -204,9 +204,7 @@ def _answers(figures: LinkFigures, limits: LinkLimits, wait_ns: int) -> Fitness:
     """Fitness by the answers, for a cell that waits for them until `wait_ns`."""
     stops, missed, tail_ns = 0.0, 0, 0.0
     for one in figures.answers:
-        late = sum(time > wait_ns for time in one.times_ns) if wait_ns != figures.wait_ns else one.late
-        bad = late + one.absent
-        missed += bad
+        missed += sum(time > wait_ns for time in one.times_ns) + one.absent
         stops += _rows_expected(one.rows, limits.missed_cycles + 1) / figures.seconds * MINUTE_S
         tail_ns = max(tail_ns, _longest_in_a_minute(one.times_ns, figures.seconds))
     if stops > STOPS_EXPECTED:
