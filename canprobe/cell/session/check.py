@@ -165,13 +165,14 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
             failure = str(error)
         meter.end()
         counters, load = meter.counters, meter.load(plan.setup.bus.bitrate)
+        age = cell.cycles.recorded.tactile_age
         figures = LinkFigures(
             period_ns=plan.sync.period_ns,
             lateness_ns=sorted(list(lateness_ns)[first:]),
             wait_ns=plan.budget.looks_ns[-1],
             answers=meter.answers(),
             torn=None if cell.tactile is None else _torn(cell) - torn,
-            array_silent=_is_silent(cell),
+            array_silent=age is not None and age > cell.supervisor.seen.limits.tactile_timeout,
             load=None if load is None else load / len(plan.buses),
             planned_load=max(bus.load for bus in plan.buses),
             foreign_hz=meter.foreign / max(meter.seconds, 1e-9),
@@ -225,11 +226,3 @@ def _traffic(plan: Plan) -> dict[str, Any]:
 def _torn(cell: Cell) -> int:
     """Images that did not come, or not whole."""
     return cell.tactile.unusable + cell.tactile.lost if cell.tactile is not None else 0
-
-
-def _is_silent(cell: Cell) -> bool:
-    """Whether the array sends no images any more."""
-    if cell.tactile is None or cell.cycle is None:
-        return False
-    age = cell.cycle.number - (cell.tactile.newest_cycle or 0)
-    return age > cell.supervisor.seen.limits.tactile_timeout
