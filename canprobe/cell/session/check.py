@@ -211,12 +211,7 @@ def _controller(plan: Plan) -> str:
 
 def _traffic(plan: Plan) -> dict[str, Any]:
     """What a meter has to know of a plan."""
-    answers = {
-        pdo.cob_id: pdo.node_id
-        for drive in plan.setup.drives
-        for pdo in plan.pdos_of(drive.node_id, "tpdo")
-        if pdo.transmission_type == 1
-    }
+    answers = {pdo.cob_id: pdo.node_id for pdo in plan.pdos if pdo.part == "feedback" and pdo.transmission_type == 1}
     bases = (EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE)
     known = {pdo.cob_id for pdo in plan.pdos} | {frames.can_id for frames in plan.raw}
     known |= {base + node_id for base in bases for node_id in (*plan.node_ids, MASTER_NODE_ID)}
