@@ -294,8 +294,6 @@ def dump_calibration(calibration: ArrayCalibration) -> str:
 
 
 def _value(value: object) -> str:
-    rows = isinstance(value, tuple) and value and isinstance(value[0], tuple) and len(value) > 4
-    if not rows:
-        return toml_value(value)
-    assert isinstance(value, tuple)
-    return "[\n" + "".join(f"    {toml_value(row)},\n" for row in value) + "]"
+    if isinstance(value, tuple) and len(value) > 4 and isinstance(value[0], tuple):
+        return "[\n" + "".join(f"    {toml_value(row)},\n" for row in value) + "]"
+    return toml_value(value)

@@ -153,8 +153,7 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     machine = {} if session.virtual else machine_facts(plan.buses[0].channel)
     with session:
         cell, meter = session.cell, meters[0]
-        assert cell.cycle is not None
-        lateness_ns, first, full, torn = cell.cycle.statistics.period_error_ns, 0, 0, 0
+        lateness_ns, first, full, torn = cell.cycles.cycle.statistics.period_error_ns, 0, 0, 0
         session.options.say(f"measure for {seconds:g} s, with the drives disabled")
         try:
             cell.idle(SETTLE_S)

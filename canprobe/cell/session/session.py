@@ -351,9 +351,8 @@ class FirstSecond:
             return
         self._left = None
         cell, period_ns = self._cell, self._plan.sync.period_ns
-        assert cell.cycle is not None
         missed, late, full = (now - then for now, then in zip(self._counts(), self._begin, strict=True))
-        lateness = sorted(list(cell.cycle.statistics.period_error_ns)[-round(1e9 / period_ns) :])
+        lateness = sorted(list(cell.cycles.cycle.statistics.period_error_ns)[-round(1e9 / period_ns) :])
         answers: tuple[AnswerFigures, ...] = ()
         if cell.drives is not None:
             number = len(lateness) * len(cell.drives.axes)
