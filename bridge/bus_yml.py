@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cell.planning.configuration import SYNC_START_VALUE
-from canprobe.cell.planning.device_capabilities import INVALID, MAPPING
+from canprobe.cell.planning.device_capabilities import MAPPING
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
 from canprobe.cell.planning.node_configuration import Direction, NodeConfiguration, Write
 from canprobe.cell.scene.toml_files import MAX_BYTES
@@ -28,7 +28,7 @@ from canprobe.fieldbus.eds.device_info import commissioned_node
 from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import decode, split_sections
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS
 
 _NEED = "a bus.yml needs yaml; type:"
@@ -169,7 +169,7 @@ def _by_hand(pdo: PlannedPdo) -> bool:
 
 
 def _pdos(plan: Plan, node: NodeConfiguration, direction: Direction) -> dict[int, Any]:
-    off = {n: {"enabled": False, "cob_id": _Hex(INVALID)} for way, n in node.switched_off if way == direction}
+    off = {n: {"enabled": False, "cob_id": _Hex(INVALID_FLAG)} for way, n in node.switched_off if way == direction}
     written = {write.index for write in node.writes}
     on = {pdo.number: _pdo(pdo, written) for pdo in plan.pdos_of(node.node_id, direction) if not _by_hand(pdo)}
     return dict(sorted((off | on).items()))

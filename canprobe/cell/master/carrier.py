@@ -90,6 +90,5 @@ def make_carrier(plan: Plan) -> CarrierReceiver | None:
         return None
     node = next(node for node in plan.nodes if node.node_id == carrier.node_id)
     (layout,) = [pdo.layout for pdo in plan.pdos_of(carrier.node_id, "tpdo")]
-    assert plan.setup.arm is not None  # nothing else feels a moving object
-    missed = plan.setup.arm.missed_syncs
+    missed = plan.setup.needed_arm().missed_syncs  # nothing else feels a moving object
     return CarrierReceiver(layout, carrier, node.counts_range, plan.sync.period_ns, missed + 1)

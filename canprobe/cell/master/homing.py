@@ -27,7 +27,7 @@ from canprobe.cell.master.bringup import NodeAccess
 from canprobe.cell.master.node_bringup import IDENTITY, read_entry, write_entry
 from canprobe.cell.master.node_record import NodeRecord
 from canprobe.cell.master.supervisor import JointGuard
-from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE
+from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.cell.planning.units import PROFILE_SPEED
@@ -125,7 +125,7 @@ class LedDrive:
 
     def enable(self, mode: OperationMode) -> None:
         """Enable the drive in a mode."""
-        self.write(Write(MODE, 0, mode, "mode of operation"))
+        self.write(Write(cia402.MODE, 0, mode, "mode of operation"))
         timeout_s, late = self._link.times.enable_s, f"is not in mode {mode} (6061h) after it was written to 6060h"
         self.wait_for(cia402.MODE_DISPLAY, lambda held: held == mode, timeout_s, late)
         enabled = DriveState.OPERATION_ENABLED
@@ -187,7 +187,7 @@ class LedDrive:
                     self._lead(DriveState.QUICK_STOP_ACTIVE, cia402.UNPOWERED_STATES, stop_s, supervised=False)
                 self._lead(DriveState.SWITCH_ON_DISABLED, cia402.DISABLED_STATES, stop_s, supervised=False)
                 if self.setup.mode is not None:
-                    self.write(Write(MODE, 0, self.setup.mode, "mode of operation"))
+                    self.write(Write(cia402.MODE, 0, self.setup.mode, "mode of operation"))
             except KeyboardInterrupt:
                 continue
             except CanprobeError as error:

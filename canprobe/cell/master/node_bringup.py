@@ -15,9 +15,9 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
-from canprobe.cell.planning.sync import INTERPOLATION_TIME
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.sdo import Dialogue, SdoTimeoutError, decode_text, download, read_value, upload
+from canprobe.fieldbus.protocol.cia402 import INTERPOLATION_TIME
 from canprobe.fieldbus.protocol.emcy import describe, is_no_error
 from canprobe.fieldbus.protocol.pdo import PDO_OBJECTS
 

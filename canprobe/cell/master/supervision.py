@@ -18,7 +18,7 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.planning.units import lag_s
-from canprobe.cell.scene.setup import SafetyLimits, Touch
+from canprobe.cell.scene.setup import SafetyLimits
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.touch.image.force_errors import upper_end
@@ -75,14 +75,13 @@ def limits_of(plan: Plan) -> Limits:
     """The limits of a plan, and how fast the cell notices that they are exceeded."""
     setup = plan.setup
     ratio = setup.rate_hz / setup.array.rate_hz if setup.array is not None else 1.0
-    scan = setup.task.scan if isinstance(setup.task, Touch) else None
     return Limits(
         setup.limits,
         plan.sync.period_ns,
         missed_cycles=setup.arm.missed_syncs if setup.arm is not None else 5,
         tactile_cycles=round(ratio),
         tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
-        regain=scan.regain if scan is not None else 0.0,
+        regain=setup.scan.regain if setup.scan is not None else 0.0,
         tares=setup.tares,
         lag_ns=round(lag_s(setup) * 1e9),
     )

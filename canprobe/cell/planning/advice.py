@@ -10,17 +10,12 @@ from canprobe.cell.planning.bridges import bridge_outputs
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.scene.geometry import mesh_warnings
+from canprobe.cell.scene.rules import SECTIONS_OF_TASK
 from canprobe.cell.scene.setup import Arm, Array, Calibrate, Setup, Touch, Touching
 from canprobe.errors import install_line
 from canprobe.fieldbus.bus.real.adapters import bus_open_to_others
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 
-_NO_SHAPE = {
-    "press": "one touch without motion shows no shape",
-    "calibrate": "the ball is known",
-    "listen": "nothing moves",
-    "free": "nothing is touched",
-}
 _NO_STRATEGY = {
     "press": "the probe holds still",
     "calibrate": "no surface is followed",
@@ -77,7 +72,7 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
 def _not_computed(setup: Setup) -> Iterator[tuple[str, str]]:
     array, shape, kind = setup.array, setup.shape, setup.kind
     if shape is None:
-        yield ESTIMATOR, _NO_SHAPE.get(kind, "no [shape]")
+        yield ESTIMATOR, SECTIONS_OF_TASK[kind]["shape"][1] or "no [shape]"
     elif not shape.patch or (array is not None and array.mode == "features"):
         support = support_of(setup)
         lacking = support is not None and not support.curvature

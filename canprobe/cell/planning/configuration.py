@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, DeviceCapabilities
+from canprobe.cell.planning.device_capabilities import COMMUNICATION, MAPPING, OWN_BITS, DeviceCapabilities
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -32,7 +32,6 @@ from canprobe.cell.planning.node_configuration import (
 )
 from canprobe.cell.planning.pdos import BusPlan
 from canprobe.cell.planning.sync import (
-    INTERPOLATION_TIME,
     SYNC_PERIOD,
     choose_mode,
     follows_sync_period,
@@ -55,8 +54,8 @@ from canprobe.cell.scene.setup import Array, Carrier, Drive, HomingParameters, N
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, LONG_PDOS, MISSED_SYNCS, WINDOW_SIZE, has_known
 from canprobe.fieldbus.eds.values import name_of
-from canprobe.fieldbus.protocol.cia402 import OperationMode
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
+from canprobe.fieldbus.protocol.cia402 import INTERPOLATION_TIME, MODE, OperationMode
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import MAX_SYNC_TYPE
 from canprobe.fieldbus.protocol.si_unit import ACCELERATION_UNIT_INDEX, VELOCITY_UNIT_INDEX
 from canprobe.fieldbus.protocol.tactile import TactileMode
@@ -65,7 +64,7 @@ from canprobe.mechanics.robot.model import coupled_joints, drive_position_at, jo
 SYNC_START_VALUE = 1
 EMCY_INHIBIT_100US = 1000
 """At most ten emergencies a second from a node: one for every late SYNC would make the next SYNC late too."""
-MODE, PROFILE_TYPE = 0x6060, 0x6086
+PROFILE_TYPE = 0x6086
 HOME_OFFSET = 0x607C
 HOMES_HERE = frozenset({35, 37})
 """Homing methods that take the present position."""
@@ -190,7 +189,7 @@ def _pdo_writes(
         yield Write(LONG_PDOS, 0, int(long), "PDOs of up to 64 bytes")
     for direction, number in switched_off:
         index, name = COMMUNICATION[direction] + number - 1, f"{direction.upper()} {number}"
-        cob_id = (device.number(index, 1) or 0) | INVALID
+        cob_id = (device.number(index, 1) or 0) | INVALID_FLAG
         absence = "it is sent besides" if direction == "tpdo" else "it listens besides"
         yield Write(index, 1, cob_id, f"{name} is not used", absence, own_bits=OWN_BITS)
     for pdo in used:
@@ -203,7 +202,7 @@ def _one_pdo(pdo: PlannedPdo, device: DeviceCapabilities) -> Iterator[Write]:
     name, cob_id = f"{pdo.direction.upper()} {pdo.number}", pdo.cob_id | device.own_bits(pdo.direction, pdo.number)
     if not pdo.fixed_id:
         off = f"{name} off while it is changed"
-        yield Write(communication, 1, cob_id | INVALID, off, "it stays on", own_bits=OWN_BITS)
+        yield Write(communication, 1, cob_id | INVALID_FLAG, off, "it stays on", own_bits=OWN_BITS)
     yield Write(communication, 2, pdo.transmission_type, f"transmission type of {name}")
     if pdo.event_timer_ms:
         absence = "the device does not notice that its controlword stays away"

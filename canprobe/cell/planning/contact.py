@@ -413,7 +413,7 @@ def witness_rows(plan: Plan) -> list[tuple[str, str]]:
     within = "0.4 s, on the move only" if touch.array.calibration.noise.assumed else "0.2 s"
     most, held = (depth_on_plane(force, probe.stiffness, probe.radius) for force in (limits.force_max, touch.force))
     margin = most - held
-    speed = touch.scan.speed if isinstance(touch, Touch) and touch.scan is not None else 0.0
+    speed = plan.setup.scan.speed if plan.setup.scan is not None else 0.0
     error = _depth_error(speed)
     known = f"{touch.force:g} to {limits.force_max:g} N are {margin * 1e3:.2f} mm, known to {error * 1e3:.2f} mm"
     if speed:

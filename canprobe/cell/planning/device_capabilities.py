@@ -12,12 +12,11 @@ from canprobe.cell.planning.node_configuration import Direction, Identity, NodeK
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import PdoEntry
 
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
 MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
-INVALID = 1 << 31
-"""Bit 31 of a COB-ID: the PDO is off."""
 OWN_BITS = 0x6000_0000
 """Bits 29 and 30 of a COB-ID, which the device sets: the frame format, and that it answers no remote frame (RTR)."""
 MOST_ENTRIES = 64
@@ -70,6 +69,11 @@ class DeviceCapabilities:
         entry = self.description.entry(index, subindex)
         return entry.initial if entry is not None and isinstance(entry.initial, int) else None
 
+    def takes(self, index: int, subindex: int, value: int) -> bool:
+        """Whether the entry holds a value at boot, or can be given it."""
+        entry = self.description.entry(index, subindex)
+        return entry is not None and (entry.initial == value or (entry.writable and entry.allows(value)))
+
     def entry(self, index: int, subindex: int, direction: Direction) -> PdoEntry | None:
         """The object as a mapping entry, None where the device cannot map it in this direction."""
         entry = self.description.entry(index, subindex)
@@ -114,17 +118,15 @@ class DeviceCapabilities:
     def can_cycle(self, direction: Direction, number: int) -> bool:
         """Whether a PDO exists or can be switched on, and follows every SYNC or can be made to."""
         index = COMMUNICATION[direction] + number - 1
-        cob_id, kind = self.description.entry(index, 1), self.description.entry(index, 2)
-        off = cob_id is None or (not cob_id.writable and (self.number(index, 1) or INVALID) & INVALID)
-        return (
-            not off and kind is not None and (kind.initial == EVERY_SYNC or (kind.writable and kind.allows(EVERY_SYNC)))
-        )
+        cob_id = self.description.entry(index, 1)
+        off = cob_id is None or (not cob_id.writable and (self.number(index, 1) or INVALID_FLAG) & INVALID_FLAG)
+        return not off and self.takes(index, 2, EVERY_SYNC)
 
     def fixed_cob_id(self, direction: Direction, number: int) -> int | None:
         """The identifier of a PDO that exists and whose COB-ID cannot be changed; None where it can."""
         index = COMMUNICATION[direction] + number - 1
         entry, value = self.description.entry(index, 1), self.number(index, 1)
-        if entry is None or entry.writable or value is None or value & INVALID:
+        if entry is None or entry.writable or value is None or value & INVALID_FLAG:
             return None
         return value & _IDENTIFIER
 

@@ -67,7 +67,7 @@ def _channels(setup: Setup) -> list[tuple[str, str]]:
 
 def free_channel(setup: Setup) -> str:
     """The next channel that no node is on."""
-    nodes = (*setup.drives, *((setup.array,) if setup.array is not None else ()))
+    nodes = (*setup.drives, *(one for one in (setup.array, setup.carrier) if one is not None))
     channel, taken = setup.bus.channel, {setup.bus.channel, *(node.channel for node in nodes)}
     while channel in taken:
         channel = second_channel(channel)

@@ -188,7 +188,8 @@ def _plan_bus(setup: Setup, devices: Mapping[int, DeviceCapabilities], choices: 
     unset, periods = period_problem(setup.rate_hz, sync.period_us, exact, drives)
     ratio, untimed, image_rates = plan_ratio(setup)
     bus = BusPlan(setup, devices, sync, _channels(setup), choices)
-    if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if not _counts_syncs(device)]:
+    nodes = sorted(devices.items())
+    if uncounted := [f"node {id_}" for id_, device in nodes if not device.takes(SYNC_COUNTER, 0, SYNC_OVERFLOW)]:
         bus.sync = replace(sync, overflow=0)
         bus.not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
     if unset is not None:
@@ -243,12 +244,6 @@ def _with_rates(problem: str, bus: BusPlan) -> str:
 def _keys(problems: Sequence[str]) -> set[str]:
     """The keys that problems begin with: another rate changes the figures behind them."""
     return {problem.partition(" ")[0] for problem in problems}
-
-
-def _counts_syncs(device: DeviceCapabilities) -> bool:
-    """Whether a device can take a SYNC with our counter."""
-    entry = device.description.entry(SYNC_COUNTER)
-    return entry is not None and (entry.initial == SYNC_OVERFLOW or (entry.writable and entry.allows(SYNC_OVERFLOW)))
 
 
 def _unused_axes(setup: Setup, devices: Mapping[int, DeviceCapabilities]) -> list[tuple[str, str]]:

@@ -293,9 +293,7 @@ class Plan:
 
     def with_seed(self, seed: int) -> Plan:
         """The plan with another seed of the emulation, on which nothing else in it depends."""
-        setup = self.setup
-        scene, saved = (replace(one, scene=replace(one.scene, seed=seed)) for one in (setup.scene, setup.saved))
-        return replace(self, setup=replace(setup, scene=scene, saved=saved, seed=seed))
+        return replace(self, setup=replace(self.setup.with_choices({"scene.seed": seed}), seed=seed))
 
     @property
     def files(self) -> dict[str, bytes]:

@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from canprobe.cell.planning.device_capabilities import COMMUNICATION, INVALID, DeviceCapabilities
+from canprobe.cell.planning.device_capabilities import COMMUNICATION, DeviceCapabilities
 from canprobe.cell.planning.model import (
     EVERY_SYNC,
     Choice,
@@ -27,7 +27,7 @@ from canprobe.cell.planning.units import PlannedAxis, profile_values
 from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, WINDOW_SIZE, has_known
-from canprobe.fieldbus.protocol.frames import is_restricted
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, is_restricted
 from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, MAX_SYNC_TYPE, PdoEntry, PdoLayout
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW, image_words, window_words
 
@@ -392,7 +392,7 @@ def _tactile_cob_ids(bus: BusPlan, count: int) -> list[int]:
     taken = {pdo.cob_id for pdo in bus.pdos}
     for device in bus.devices.values():
         words = [device.number(COMMUNICATION["rpdo"] + number - 1, 1) for number in device.pdo_numbers("rpdo")]
-        taken |= {word & 0x7FF for word in words if word is not None and not word & INVALID}
+        taken |= {word & 0x7FF for word in words if word is not None and not word & INVALID_FLAG}
     places = (*range(TACTILE_TPDO1, _LAST_COB_ID + 1), *range(TACTILE_TPDO1 - 1, _FIRST_COB_ID - 1, -1))
     free = (cob_id for cob_id in places if cob_id not in taken and not is_restricted(cob_id))
     return sorted(itertools.islice(free, count))

@@ -252,13 +252,19 @@ def joints_on_way(arm: Arm, probe: Probe, q_start: Floats, way: Callable[[ProbeP
         moved = float(np.linalg.norm(pose.centre - before.centre)) / _MAX_STEP_M
         turned = float(np.linalg.norm(pose.pole - before.pole)) / _MAX_STEP_RAD
         count = max(_MIN_STEPS, math.ceil(max(moved, turned, seconds / _MAX_STEP_S)))
-        for share in (np.arange(count) + 1) / count:
-            pole = before.pole + share * (pose.pole - before.pole)
-            between = ProbePose(before.centre + share * (pose.centre - before.centre), pole / np.linalg.norm(pole))
-            q = [a + step for a, step in zip(q, steps.step(q, between, seconds / count), strict=True)]
+        for between, step_s in _between(before, pose, seconds, count):
+            q = [a + step for a, step in zip(q, steps.step(q, between, step_s), strict=True)]
             found.append(q)
         before = pose
     return np.array(found)
+
+
+def _between(before: ProbePose, after: ProbePose, seconds: float, count: int) -> Iterator[TimedPose]:
+    """Poses in equal steps from one, which is left out, to another."""
+    for share in (np.arange(count) + 1) / count:
+        pole = before.pole + share * (after.pole - before.pole)
+        centre = before.centre + share * (after.centre - before.centre)
+        yield ProbePose(centre, pole / np.linalg.norm(pole)), seconds / count
 
 
 def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[TimedPose]:
@@ -286,11 +292,7 @@ def carried(task: Touch, carrier: Carrier, path: SurfacePath) -> Iterator[tuple[
     ways = np.linalg.norm(np.roll(path.points, -1, axis=0) - path.points, axis=1).tolist()
     for last, here, way in zip(poses, [*poses[1:], poses[0]], ways, strict=True) if speed else ():
         seconds = max(way / speed, 1e-3)
-        count = math.ceil(seconds / CARRIED_STEP_S)
-        for share in (np.arange(count) + 1) / count:
-            pole = last.pole + share * (here.pole - last.pole)
-            centre = last.centre + share * (here.centre - last.centre)
-            steps.append((ProbePose(centre, pole / np.linalg.norm(pole)), seconds / count))
+        steps += _between(last, here, seconds, math.ceil(seconds / CARRIED_STEP_S))
     turn_s = 2.0 * math.pi / carrier.speed if carrier.motion.point is not None else math.inf
     end_s, t = TASK_OVERHEAD_S + min(task.duration_s, turn_s), 0.0
     pace = max(1.0, end_s * len(steps) / sum(seconds for _, seconds in steps) / MAX_CARRIED_STEPS)

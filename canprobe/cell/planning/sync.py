@@ -19,7 +19,7 @@ from canprobe.cell.planning.node_configuration import Interpolation
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.eds.description import DescribedEntry
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, sync_patience
-from canprobe.fieldbus.protocol.cia402 import OperationMode
+from canprobe.fieldbus.protocol.cia402 import INTERPOLATION_TIME, OperationMode
 
 Place = tuple[int, int]
 
@@ -29,7 +29,6 @@ TARGETS: Mapping[OperationMode, Place] = {
     OperationMode.PROFILE_POSITION: (0x607A, 0),
 }
 """Modes in which the cell can drive, the best first, with the object of their target."""
-INTERPOLATION_TIME = 0x60C2
 SYNC_PERIOD = 0x1006
 _MODE_NAMES: Mapping[int, str] = {
     1: "profile position",

@@ -20,7 +20,7 @@ import numpy as np
 from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.node_configuration import TurnUnits
 from canprobe.cell.planning.sync import Place, is_profiled
-from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
+from canprobe.cell.scene.setup import Arm, Drive, Setup
 from canprobe.fieldbus.protocol.si_unit import ACCELERATION_UNIT_INDEX, VELOCITY_UNIT_INDEX, rate_unit
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
@@ -258,7 +258,7 @@ def stated_lag_s(setup: Setup) -> float:
 
     That of an external arm has its dead time.
     """
-    believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
+    believed = setup.touch.lag_s if setup.touch is not None else 0.0
     delay_s = setup.arm.delay_s if setup.arm is not None else 0.0
     return max(believed, (LAG_BANDWIDTH / setup.truth.bandwidth_hz if setup.emulates_arm else 0.0) + delay_s)
 

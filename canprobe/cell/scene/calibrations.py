@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from canprobe.cell.scene.checks import OneOf, Range
+from canprobe.cell.scene.checks import OneOf, Range, annotations_of, values_of
 from canprobe.cell.scene.load import find_file
 from canprobe.cell.scene.reader import Reader
 from canprobe.cell.scene.toml_files import read_toml, toml_value, with_writer, written_by_line
@@ -253,59 +255,45 @@ def dump_calibration(calibration: ArrayCalibration) -> str:
     """The calibration as a TOML document; `load_calibration` reads it back, to the digits that it shows."""
     c, whole = calibration, dataclasses.asdict(calibration)
     moments, centroid, stiffness = c.moments, c.centroid, c.stiffness
-    values = CalibrationFile(
-        in_units(About, {"schema": SCHEMA, **whole}),
-        in_units(ImageKeys, whole["image"]),
-        in_units(
-            MomentKeys,
-            {
-                "sigma": math.sqrt(moments.moment),
-                "both": moments.both / moments.moment,
-                "shear": math.sqrt(moments.shear),
-                "frame": moments.frame_sigma,
-            },
-        ),
-        in_units(
-            CentroidKeys,
-            {
-                "sigma": c.noise.scale,
-                "power": c.noise.power,
-                "correlation": c.noise.slow_way,
-                "latency": centroid.latency_s,
-                "latency_sigma": min(centroid.latency_sigma_s, MAX_LATENCY_SIGMA_S),
-                "lag": centroid.lag.most,
-                "lag_way": centroid.lag.reach,
-                "slow": c.noise.slow,
-                "height": c.noise.height,
-            },
-        ),
-        in_units(
-            StiffnessKeys,
-            {
-                **whole["stiffness"],
-                "moments_sigma": stiffness.moments_sigma / stiffness.moments,
-                "depth_sigma": stiffness.depth_sigma / stiffness.depth,
-            },
-        ),
-        in_units(ResidualKeys, whole["residuals"]),
-        in_units(TaxelKeys, whole),
-        in_units(ForceKeys, whole["force"]),
-    )
+    quantities: dict[str, Mapping[str, Any]] = {
+        **whole,
+        "calibration": {"schema": SCHEMA, **whole},
+        "moments": {
+            "sigma": math.sqrt(moments.moment),
+            "both": moments.both / moments.moment,
+            "shear": math.sqrt(moments.shear),
+            "frame": moments.frame_sigma,
+        },
+        "centroid": {
+            "sigma": c.noise.scale,
+            "power": c.noise.power,
+            "correlation": c.noise.slow_way,
+            "latency": centroid.latency_s,
+            "latency_sigma": min(centroid.latency_sigma_s, MAX_LATENCY_SIGMA_S),
+            "lag": centroid.lag.most,
+            "lag_way": centroid.lag.reach,
+            "slow": c.noise.slow,
+            "height": c.noise.height,
+        },
+        "stiffness": {
+            **whole["stiffness"],
+            "moments_sigma": stiffness.moments_sigma / stiffness.moments,
+            "depth_sigma": stiffness.depth_sigma / stiffness.depth,
+        },
+        "taxels": whole,
+    }
     sections = []
-    for section in dataclasses.fields(values):
-        part = getattr(values, section.name)
-        given = {key.name: getattr(part, key.name) for key in dataclasses.fields(part)}
-        lines = [f"{key} = {_value(value)}" for key, value in given.items() if value not in (None, ())]
+    for name, hint in annotations_of(CalibrationFile).items():
+        section = in_units(next(iter(typing.get_args(hint)), hint), quantities[name])
+        lines = [f"{key} = {_value(value)}" for key, value in values_of(section).items() if value != ()]
         if lines:
-            sections.append("\n".join([f"[{section.name}]", *lines]) + "\n")
+            sections.append("\n".join([f"[{name}]", *lines]) + "\n")
     newtons = "# Forces and stiffness are in nominal newtons: there was no force reference.\n" if c.nominal else ""
     head = written_by_line()
     return f"# Made by `canprobe calibrate array`; see docs/calibration.md.\n{newtons}{head}\n" + "\n".join(sections)
 
 
 def _value(value: object) -> str:
-    rows = isinstance(value, tuple) and value and isinstance(value[0], tuple) and len(value) > 4
-    if not rows:
-        return toml_value(value)
-    assert isinstance(value, tuple)
-    return "[\n" + "".join(f"    {toml_value(row)},\n" for row in value) + "]"
+    if isinstance(value, tuple) and len(value) > 4 and isinstance(value[0], tuple):
+        return "[\n" + "".join(f"    {toml_value(row)},\n" for row in value) + "]"
+    return toml_value(value)

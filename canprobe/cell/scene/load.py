@@ -65,17 +65,18 @@ def dump_scene(scene: Scene | CellFile) -> str:
 
 def _document(scene: Scene | CellFile) -> dict[str, Any]:
     """The scene as `tomllib` reads what `dump_scene` writes."""
-    parts = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
-    document: dict[str, Any] = _as_toml(
-        {
-            name: {key: values_of(section) for key, section in part.items()}
-            if isinstance(part, Mapping)
-            else values_of(part)
-            for name, part in parts.items()
-            if part is not None and part != {}
-        }
-    )
-    return document
+    document: dict[str, Any] = _as_toml(_of_sections(scene, values_of))
+    return {name: table for name, table in document.items() if table}
+
+
+def _of_sections(whole: Scene | CellFile, take: Callable[[Any], Any]) -> dict[str, Any]:
+    """What a function makes of each section that is there, by name; of named tables it takes each table."""
+    parts = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
+    return {
+        name: {key: take(section) for key, section in part.items()} if isinstance(part, Mapping) else take(part)
+        for name, part in parts.items()
+        if part is not None
+    }
 
 
 def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
@@ -106,7 +107,8 @@ def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
                 name = f"{path.stem}-{number}{path.suffix}"
             names[key] = name
             if key == "true_cell":  # the plant of a true cell has no say
-                cell = moved(dataclasses.replace(read_cell(path), plant=None))
+                cell = dataclasses.replace(read_cell(path), plant=None)
+                cell = dataclasses.replace(cell, **_of_sections(cell, beside))
                 files[name] = f"{written_by_line()}\n{dump_scene(cell)}".encode()
                 continue
             from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
@@ -117,16 +119,7 @@ def with_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
                 raise SceneError([f"{path}: cannot be read: {error.strerror}"]) from error
         return dataclasses.replace(section, **names) if names else section
 
-    def moved(whole: Any) -> Any:
-        parts = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
-        changed: dict[str, Any] = {
-            name: {key: beside(section) for key, section in part.items()} if isinstance(part, Mapping) else beside(part)
-            for name, part in parts.items()
-            if part is not None
-        }
-        return dataclasses.replace(whole, **changed)
-
-    return moved(scene), files
+    return dataclasses.replace(scene, **_of_sections(scene, beside)), files
 
 
 def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:

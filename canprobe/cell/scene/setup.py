@@ -610,7 +610,7 @@ class Setup:
     truth: Truth
 
     def with_choices(self, choices: Mapping[str, object]) -> Setup:
-        """The setup of the scene in which the choices of the plan stand in the place of "auto".
+        """The setup with values in the place of the scene's, such as the choices of the plan in the place of "auto".
 
         Args:
             choices: value by key path of the scene: `{"sensor.mode": "window"}`.

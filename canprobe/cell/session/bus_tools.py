@@ -215,7 +215,7 @@ def emulate(
 
 def _where_served(scene: Scene) -> str:
     """What to type where another process serves the nodes that a run was about to serve itself."""
-    keys = [f"{part}.emulated=false" for part in ("arm", "sensor") if getattr(scene, part) is not None]
+    keys = [f"{part}.emulated=false" for part in ("arm", "sensor", "carrier") if getattr(scene, part) is not None]
     patient = scene.limits.late_cycles_max_percent == ALL_CYCLES_PERCENT
     if patient and scene.arm is not None:  # the values of --patient, which real nodes refuse
         keys += [f"arm.missed_syncs={scene.arm.missed_syncs}", f"limits.late_cycles_max_percent={ALL_CYCLES_PERCENT}"]

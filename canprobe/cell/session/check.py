@@ -153,8 +153,7 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
     machine = {} if session.virtual else machine_facts(plan.buses[0].channel)
     with session:
         cell, meter = session.cell, meters[0]
-        assert cell.cycle is not None
-        lateness_ns, first, full, torn = cell.cycle.statistics.period_error_ns, 0, 0, 0
+        lateness_ns, first, full, torn = cell.cycles.cycle.statistics.period_error_ns, 0, 0, 0
         session.options.say(f"measure for {seconds:g} s, with the drives disabled")
         try:
             cell.idle(SETTLE_S)
@@ -165,13 +164,14 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
             failure = str(error)
         meter.end()
         counters, load = meter.counters, meter.load(plan.setup.bus.bitrate)
+        age = cell.cycles.recorded.tactile_age
         figures = LinkFigures(
             period_ns=plan.sync.period_ns,
             lateness_ns=sorted(list(lateness_ns)[first:]),
             wait_ns=plan.budget.looks_ns[-1],
             answers=meter.answers(),
             torn=None if cell.tactile is None else _torn(cell) - torn,
-            array_silent=_is_silent(cell),
+            array_silent=age is not None and age > cell.supervisor.seen.limits.tactile_timeout,
             load=None if load is None else load / len(plan.buses),
             planned_load=max(bus.load for bus in plan.buses),
             foreign_hz=meter.foreign / max(meter.seconds, 1e-9),
@@ -210,12 +210,7 @@ def _controller(plan: Plan) -> str:
 
 def _traffic(plan: Plan) -> dict[str, Any]:
     """What a meter has to know of a plan."""
-    answers = {
-        pdo.cob_id: pdo.node_id
-        for drive in plan.setup.drives
-        for pdo in plan.pdos_of(drive.node_id, "tpdo")
-        if pdo.transmission_type == 1
-    }
+    answers = {pdo.cob_id: pdo.node_id for pdo in plan.pdos if pdo.part == "feedback" and pdo.transmission_type == 1}
     bases = (EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE)
     known = {pdo.cob_id for pdo in plan.pdos} | {frames.can_id for frames in plan.raw}
     known |= {base + node_id for base in bases for node_id in (*plan.node_ids, MASTER_NODE_ID)}
@@ -225,11 +220,3 @@ def _traffic(plan: Plan) -> dict[str, Any]:
 def _torn(cell: Cell) -> int:
     """Images that did not come, or not whole."""
     return cell.tactile.unusable + cell.tactile.lost if cell.tactile is not None else 0
-
-
-def _is_silent(cell: Cell) -> bool:
-    """Whether the array sends no images any more."""
-    if cell.tactile is None or cell.cycle is None:
-        return False
-    age = cell.cycle.number - (cell.tactile.newest_cycle or 0)
-    return age > cell.supervisor.seen.limits.tactile_timeout

@@ -19,18 +19,19 @@ from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.emulated.world import World
+from canprobe.cell.master.bringup import HEARTBEAT_CONSUMER
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
-from canprobe.cell.planning.sync import INTERPOLATION_TIME
 from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
 from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.rpdo import Rpdo
 from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol.cia402 import INTERPOLATION_TIME
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
 from canprobe.fieldbus.protocol.sdo import SdoAbort
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
     from canprobe.cell.master.carrier import CarrierReceiver
     from canprobe.cell.master.drives import DriveGroup
     from canprobe.fieldbus.drive.drive import DriveApplication
-
-HEARTBEAT_CONSUMER = 0x1016
 
 
 def tactile_frame(

@@ -97,10 +97,9 @@ def write_scene(plan: Plan, folder: Path) -> None:
 
 def zeros_file(plan: Plan) -> Path | None:
     """File of the zeros of a cell's real drives; None where no drive is homed."""
-    arm = plan.setup.arm
-    if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
+    if all(drive.zero is None or drive.emulated for drive in plan.setup.drives):
         return None
-    return record_file("zeros", arm)
+    return record_file("zeros", plan.setup.needed_arm())
 
 
 def record_file(kind: str, arm: Arm) -> Path:

@@ -45,11 +45,10 @@ class JointRecord:
     """
 
     def __init__(self, plan: Plan) -> None:
-        arm = plan.setup.arm
         self._plan = plan
         self._axes = {drive.node_id: axis for axis, drive in enumerate(plan.setup.drives) if not drive.emulated}
         self.node_ids = tuple(self._axes)
-        self.path = record_file("joints", arm) if arm is not None and self._axes else None
+        self.path = record_file("joints", plan.setup.needed_arm()) if self._axes else None
         self._record = NodeRecord(self.path, "check the joints again")
 
     def changes(self, serials: Mapping[int, int]) -> dict[int, str]:

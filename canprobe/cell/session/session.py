@@ -311,13 +311,13 @@ def shortened(scene: Scene) -> Scene:
         clearance_mm=min(scene.task.clearance_mm, CLEARANCE_MM),
         touches=min(scene.task.touches, MAX_TOUCHES),
     )
+    devices = {name: getattr(scene, name) for name in ("arm", "sensor", "carrier")}
     return replace(
         scene,
         bus=replace(scene.bus, interface=LOCKSTEP, timed=False, bit_error_rate=0.0),
         task=task,
-        arm=replace(scene.arm, emulated=True) if scene.arm is not None else None,
         joints={name: replace(joint, emulated=None) for name, joint in scene.joints.items()},
-        sensor=replace(scene.sensor, emulated=True) if scene.sensor is not None else None,
+        **{name: replace(one, emulated=True) for name, one in devices.items() if one is not None},
     )
 
 
@@ -351,9 +351,8 @@ class FirstSecond:
             return
         self._left = None
         cell, period_ns = self._cell, self._plan.sync.period_ns
-        assert cell.cycle is not None
         missed, late, full = (now - then for now, then in zip(self._counts(), self._begin, strict=True))
-        lateness = sorted(list(cell.cycle.statistics.period_error_ns)[-round(1e9 / period_ns) :])
+        lateness = sorted(list(cell.cycles.cycle.statistics.period_error_ns)[-round(1e9 / period_ns) :])
         answers: tuple[AnswerFigures, ...] = ()
         if cell.drives is not None:
             number = len(lateness) * len(cell.drives.axes)

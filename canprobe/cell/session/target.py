@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.session.links import ExpectedLink, check_links, need_controllers
 from canprobe.errors import BusError, UsageError
@@ -74,12 +74,12 @@ class Target:
         bus = replace(scene.bus, interface=self.interface, channel=self.channel, bitrate=self.bitrate)
         names: dict[str | None, str] = {scene.bus.channel: self.channel}
         names.update(self.others.items())
-        joints = {
-            name: replace(joint, channel=names.get(joint.channel, joint.channel))
-            for name, joint in scene.joints.items()
-        }
-        sensor = scene.sensor and replace(scene.sensor, channel=names.get(scene.sensor.channel, scene.sensor.channel))
-        return replace(scene, bus=bus, joints=joints, sensor=sensor)
+
+        def placed(part: Any) -> Any:
+            return part and replace(part, channel=names.get(part.channel, part.channel))
+
+        joints = {name: placed(joint) for name, joint in scene.joints.items()}
+        return replace(scene, bus=bus, joints=joints, sensor=placed(scene.sensor), carrier=placed(scene.carrier))
 
 
 def refuse_virtual(interface: str, command: str) -> None:

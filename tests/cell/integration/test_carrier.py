@@ -8,6 +8,12 @@ from scenes import reasons
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.cell.planning.free_parameters import free_channel
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.bus_tools import _where_served
+from canprobe.cell.session.check import measure_link, options_of_check
+from canprobe.cell.session.session import Session, run_beginning
+from canprobe.cell.session.target import Target
 from canprobe.fieldbus.eds.packaged import eds_path
 
 KEYS = {"task.duration_s": 2.5, "task.clearance_mm": 0.5, "shape.also": []}
@@ -81,3 +87,31 @@ def test_an_encoder_that_cannot_send_its_position_is_refused(tmp_path):
 def test_what_does_not_go_with_a_carrier_is_told(keys, told):
     with pytest.raises(canprobe.SceneError, match=told):
         canprobe.load_scene("turntable", keys)
+
+
+REAL = {f"{section}.emulated": False for section in ("arm", "sensor", "carrier")}
+
+
+def test_a_real_encoder_is_emulated_in_the_rehearsal():
+    session = run_beginning(canprobe.plan("turntable", REAL | {"bus.interface": "socketcan", "cycle.rate_hz": 200.0}))
+    assert session.opened and not session.cell.notes.lines()
+
+
+def test_the_bus_of_the_encoder_may_have_another_name_and_is_not_free():
+    scene = canprobe.load_scene("turntable", {"carrier.channel": "can1"})
+    assert Target.over(scene, "socketcan", {"can1": "b"}).applied_to(scene).channels == ("can0", "b")
+    assert free_channel(resolve(scene)) == "can2"
+
+
+def test_the_line_that_takes_served_nodes_as_real_ones_names_the_encoder():
+    line = _where_served(canprobe.load_scene("turntable"))
+    keys = dict(word.split("=") for word in line.split() if word.endswith("emulated=false"))
+    assert {f"{section}.emulated" for section in ("arm", "sensor", "carrier")} == set(keys)
+    canprobe.load_scene("turntable", dict.fromkeys(keys, False))
+
+
+def test_a_check_measures_the_answers_of_the_encoder():
+    plan = canprobe.plan("turntable", {"bus.timed": True})
+    report = measure_link(Session(plan, options_of_check()), 0.5)
+    assert report.fit and [one.node_id for one in report.figures.answers] == [1, 2, 3, 4, 5, 6, 17]
+    assert not any(one.missed for one in report.figures.answers)
