@@ -38,7 +38,6 @@ from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import position_per_unit
-from canprobe.mechanics.robot.tool_push import PushGeometry, steady_sigma
 from canprobe.mechanics.touch.depth_witness import CERTAIN_SIGMAS, SUSPECT_S, sigma_ahead
 from canprobe.mechanics.touch.image.force_creep import decades_after, late_decades_after
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
@@ -456,6 +455,8 @@ def certain_push(plan: Plan) -> float:
     setup, touch = plan.setup, plan.setup.touch
     if touch is None or not reports_torque(plan) or touch.approach.clearance < STEADY_S * touch.approach.speed:
         return math.inf
+    from canprobe.mechanics.robot.tool_push import PushGeometry, steady_sigma  # a scene that touches nothing has none
+
     arm, flange_tip = setup.needed_arm(), setup.probe.T_flange_tip
     T, J = forward_jacobian(arm.model.chain, arm.q_start, flange_tip)
     down = np.concatenate((touch.approach.speed * T[:3, 2], np.zeros(3)))
