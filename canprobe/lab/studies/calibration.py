@@ -111,8 +111,8 @@ def measure(seed: int) -> Row:
         if not shown.usable or model.trust((dwell.kappa[0], 0.0, dwell.kappa[1]), force) < 1.0:
             continue
         forces.append(force / dwell.force - 1.0)
-        curvatures.append(curvature_errors(model, [(dwell, shown)], [force])[0])
-        moments.append(moment_errors(model, [(dwell, shown)], [force])[0, :2])
+        curvatures.append(curvature_errors(model, [shown], [force])[0])
+        moments.append(moment_errors(model, [shown], [force])[0, :2])
     return {
         "array": seed,
         "full_scale_kpa": 1e-3 * config.full_scale_pa,

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from canprobe.mechanics.touch.array_calibration.touches import Shown, Touches
+from canprobe.mechanics.touch.array_calibration.touches import Shown
 from canprobe.mechanics.touch.image.calibration import CentroidDelays, ContactNoise, Lag
 from canprobe.mechanics.types import Floats
 
@@ -40,7 +40,7 @@ def _means(t: Floats, at: Floats) -> Floats:
     return ways
 
 
-def fit_noise(touches: Touches, depths: Sequence[Floats]) -> tuple[ContactNoise, CentroidDelays, Floats]:
+def fit_noise(shown: Sequence[Shown], depths: Sequence[Floats]) -> tuple[ContactNoise, CentroidDelays, Floats]:
     """Noise of contacts, delays of the centroid, and the (n,) scatter of the centroids of each touch, m.
 
     Latency and lag are fitted to the rolls to and fro. The noise from image to image follows from second differences
@@ -48,14 +48,13 @@ def fit_noise(touches: Touches, depths: Sequence[Floats]) -> tuple[ContactNoise,
     pad; that of the height from the way of the probe into the object, less the depth.
 
     Args:
-        touches: the touches.
+        shown: the touches.
         depths: (n,) depth in each image of each touch, m.
 
     Hysteresis lags by a way and latency by a time: in the middle of a stroke the way is the same at any speed, which
     separates them. The rolls are as short as those of a scan: over longer ways the centroid lags further.
     """
-    shown = [s for _, s in touches]
-    rolls = [s for d, s in touches if d.to_and_fro]
+    rolls = [s for s in shown if s.dwell.to_and_fro]
     latency, latency_sigma = _latency(rolls)
 
     def left(z: Floats, s: Shown, way: Floats) -> Floats:

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.image.calibration import MomentErrors
 from canprobe.mechanics.touch.image.force_errors import STRAIGHT_SHARE
 from canprobe.mechanics.touch.image.moments import MomentImage, PadMemory
 from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
@@ -38,8 +37,6 @@ MIN_CURVATURE_SHARE = -0.9
 """Least curvature in a search, over that of the probe."""
 MIN_IMAGES = 10
 """Least number of images with a patch in a touch."""
-NO_ERRORS = MomentErrors(1.0, 0.0, 1.0, 0.0)
-"""Errors for a model that is only used forward."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +76,7 @@ class Shown(NamedTuple):
     """What the images of a dwell show, averaged; moments in the object's principal axes, m².
 
     Attributes:
+        dwell: the dwell.
         total: sum of pressure times area, N.
         crept: mean of that sum over the whole touch, over `total`.
         moments, remembered: (3,) xx, xy, yy of the image, and of the earlier places (`PadMemory`).
@@ -94,6 +92,7 @@ class Shown(NamedTuple):
         sums: (n,) sum of pressure times area in each image, N.
     """
 
+    dwell: Dwell
     total: float
     crept: float
     moments: Floats
@@ -108,10 +107,6 @@ class Shown(NamedTuple):
     push: float
     pushes: Floats
     sums: Floats
-
-
-Touches = Sequence[tuple[Dwell, Shown]]
-"""Touches with what their images show."""
 
 
 def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf) -> Shown:
@@ -156,6 +151,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
     V, raw, peak = np.array(moments), np.array(at), float(np.mean(peaks))
     steps = np.diff(V[:, [0, 2]], axis=0) / V[:, [0, 2]].mean(axis=0)
     return Shown(
+        dwell=dwell,
         total=float(np.mean(sums)),
         crept=float(np.mean([*sums, *late]) / np.mean(sums)),
         moments=turn @ V.mean(axis=0),

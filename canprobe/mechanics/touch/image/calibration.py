@@ -63,6 +63,10 @@ class MomentErrors:
     frame_sigma: float
 
 
+NO_ERRORS = MomentErrors(1.0, 0.0, 1.0, 0.0)
+"""Errors for a model that is only used forward."""
+
+
 @dataclass(frozen=True, slots=True)
 class Lag:
     """Lag of the centroid behind the contact, as a calibration found it; the model is that of `pad_lag`.
