@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, did_you_mean
 from canprobe.mechanics.touch.checks import whole
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
@@ -69,8 +68,7 @@ def make_estimator(
 
 def unknown_method(method: str) -> UsageError:
     """The error for an unknown method, with the nearest name."""
-    near = difflib.get_close_matches(str(method), METHODS, n=1)
-    hint = f'; did you mean "{near[0]}"?' if near else ""
+    hint = did_you_mean(str(method), METHODS)
     return UsageError(f"method: expected one of {', '.join(METHODS)}, got {method!r}{hint}")
 
 

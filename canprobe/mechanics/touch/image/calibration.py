@@ -74,13 +74,10 @@ class Lag:
     Attributes:
         most: largest lag, m.
         reach: way at which the lag is half of that, m.
-        quick_s, slow_s: time constants of the mean places between which the way is taken, s.
     """
 
     most: float
     reach: float
-    quick_s: float = 0.02
-    slow_s: float = 0.3
 
 
 @dataclass(frozen=True, slots=True)
