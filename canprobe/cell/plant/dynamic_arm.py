@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.equations import ArmEquations, Effects
+from canprobe.cell.plant.equations import ArmEquations
 from canprobe.cell.plant.ideal_arm import NEVER, PEAK_PERMILLE, Ramp
 from canprobe.cell.plant.integrators import STEPS
 from canprobe.mechanics.robot.model import joints_to_units, units_per_motor
@@ -80,16 +80,16 @@ class DynamicArm:
     """The n motors that drive the arm's links.
 
     Args:
-        config, effects, held: as for ``ArmEquations``; the arm begins at rest.
+        config, held: as for ``ArmEquations``; the arm begins at rest.
 
     Raises:
         PlanError: see ``ArmEquations``.
     """
 
-    def __init__(self, config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> None:
+    def __init__(self, config: PlantConfig, *, held: bool = True) -> None:
         assert config.model is not None
         self.model = model = config.model
-        self.equations = ArmEquations(config, effects or Effects(), held=held)
+        self.equations = ArmEquations(config, held=held)
         self.t_ns = 0
         self._dynamics, self._step = config.dynamics, STEPS[config.dynamics.integrator]
         units = joints_to_units(model, config.q0)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.dynamic_arm import DynamicArm, Reference
 from canprobe.cell.plant.elastic_contact import depth_for_force
-from canprobe.cell.plant.equations import ArmEquations, Effects
+from canprobe.cell.plant.equations import ArmEquations
 from canprobe.cell.plant.ideal_arm import NEVER, IdealArm
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Dynamics
@@ -36,13 +36,17 @@ POSE = np.eye(4)
 POSE[:3, 3] = POINT
 CYLINDER = make_object("cylinder", T_base_object=POSE, radius=0.036)
 STRETCHED = np.radians((90.0, 10.0, -60.0, 0.0, 60.0, 0.0))
-NOTHING = Effects(gravity=False, coriolis=False, friction=False, links=False, contact=False)
 
 
 def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
     q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
     settings = Dynamics(**dynamics)
     return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=BODIES["puma260"])
+
+
+def without_friction(c):
+    joints = tuple(replace(joint, coulomb=0.0, viscous=0.0) for joint in c.model.joints)
+    return replace(c, model=replace(c.model, joints=joints))
 
 
 def state(arm):
@@ -65,11 +69,11 @@ def ramps(arm, cycles=60, counts=0.5, extra=lambda t: None):
 
 
 def test_motors_alone_are_the_ideal_arm():
-    c = config(integral_s=0.0)
+    c = replace(without_friction(config(shape=None, integral_s=0.0, payload=0.0)), bodies=(None,) * 6)
     ideal = ramps(IdealArm(UPENN, c.q0))
-    exact = ramps(DynamicArm(replace(c, dynamics=replace(c.dynamics, integrator="rk4", step_ns=25_000)), NOTHING))
+    exact = ramps(DynamicArm(replace(c, dynamics=replace(c.dynamics, integrator="rk4", step_ns=25_000))))
     assert exact == pytest.approx(ideal, abs=1e-9)
-    close = ramps(DynamicArm(c, NOTHING))
+    close = ramps(DynamicArm(c))
     assert 1e-6 < np.abs(close - ideal).max() < 0.01
 
 
@@ -118,7 +122,7 @@ def test_motors_and_gears_rub_as_published(rate):
     viscous, coulomb = (0.32, 0.52, 0.22, 0.023, 0.023, 0.012), (2.2, 1.1, 0.57, 0.10, 0.083, 0.064)
     c = config(shape=None)
     y = state(DynamicArm(c)) + np.repeat((0.0, rate, 0.0), 6)
-    rough, smooth = ArmEquations(c), ArmEquations(c, Effects(friction=False))
+    rough, smooth = ArmEquations(c), ArmEquations(without_friction(c))
     for e in (rough, smooth):
         e.hold(y)
     drag = rough.mass @ (rough.rate(0.0, y) - smooth.rate(0.0, y))[6:12]

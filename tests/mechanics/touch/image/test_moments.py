@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from canprobe.mechanics.touch import MomentImage, PatchCalibration
 from canprobe.mechanics.touch.image.calibration import Lag
 from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, TIME_CONSTANTS_S, PadMemory
-from canprobe.mechanics.touch.image.pad_lag import GAP_S, PadLag
+from canprobe.mechanics.touch.image.pad_lag import GAP_S, QUICK_S, SLOW_S, PadLag
 
 
 def remembered(t, uv):
@@ -70,7 +70,7 @@ def moved(speed, seconds, rate=200.0):
 def test_a_contact_is_ahead_of_its_centroid(speed):
     """Means of time constants T trail a steady motion by speed · T."""
     u, v = moved(speed, 3.0)
-    way = 1e-3 * (LAG.slow_s - LAG.quick_s)
+    way = 1e-3 * (SLOW_S - QUICK_S)
     assert v == 0.0
     assert u == pytest.approx(math.copysign(LAG.most * way / (way + LAG.reach), speed), rel=0.01)
 
