@@ -47,15 +47,77 @@ def transition(w: float, t: float) -> Transition:
     return decay + w * grown, grown, -w * w * grown, decay - w * grown
 
 
-class _Axis:
-    """One loop: its state at an anchor time, the ramp that acts from there, and ramps to come."""
+class Reference:
+    """Reference of one motor: straight ramps of counts, one after the other; the end of a ramp is held.
 
-    __slots__ = ("coming", "end", "end_ns", "event_ns", "lag", "q", "r", "slope", "t_ns", "v")
+    Args:
+        counts: position until the first ramp.
+    """
+
+    __slots__ = ("_ramps",)
+
+    def __init__(self, counts: float) -> None:
+        self._ramps: list[Ramp] = [(-1, -1, counts, counts)]
+
+    def add(self, ramp: Ramp, now_ns: int) -> None:
+        """Follow a ramp from its start on, or from now on where it began in the past; drops what was to come later.
+
+        Args:
+            ramp: not before the ramps that act already.
+            now_ns: the present time.
+        """
+        last = self._ramps[-1]
+        if last[0] <= now_ns and last[0] < ramp[0]:  # the usual case, in every cycle
+            self._ramps = [last, ramp]
+            return
+        start = max(ramp[0], now_ns)
+        kept = [r for r in self._ramps if r[0] < start]
+        past = [r for r in kept if r[0] <= now_ns]
+        self._ramps = [*past[-1:], *kept[len(past) :], ramp]
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        """Reference (counts) and its slope (counts/s) from t on.
+
+        Args:
+            t_ns: not before the last ramp that began.
+        """
+        t0, t1, start, end = self._ramps[-1]
+        if t0 > t_ns:
+            t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
+        if t_ns >= t1:
+            return end, 0.0
+        slope = (end - start) / (1e-9 * (t1 - t0))
+        return start + slope * 1e-9 * (t_ns - t0), slope
+
+    def next_bend(self, t_ns: int) -> int:
+        """First time after t at which the slope may change, ns.
+
+        Args:
+            t_ns: ns.
+        """
+        bend = NEVER
+        for t0, t1, _, _ in self._ramps:
+            if t_ns < t0 < bend:
+                bend = t0
+            if t_ns < t1 < bend:
+                bend = t1
+        return bend
+
+
+class _Axis:
+    """One loop: its state at an anchor time, and the reference that it follows from there."""
+
+    __slots__ = ("event_ns", "lag", "q", "r", "reference", "slope", "t_ns", "v")
 
     def __init__(self, q: float, lag: float) -> None:
-        self.t_ns, self.q, self.v, self.r, self.slope = 0, q, 0.0, q, 0.0
-        self.end, self.end_ns, self.event_ns, self.lag = q, NEVER, NEVER, lag
-        self.coming: list[Ramp] = []
+        self.lag, self.reference = lag, Reference(q)
+        self.anchor(0, (q, 0.0, q))
+
+    def anchor(self, t_ns: int, state: State) -> None:
+        """Begin anew at a time, in a state."""
+        self.t_ns, (self.q, self.v, _) = t_ns, state
+        self.r, self.slope = self.reference.at(t_ns)
+        self.event_ns = self.reference.next_bend(t_ns)
 
     def at(self, phi: Transition, tau: float) -> State:
         """Position, rate and reference at a time before the next event."""
@@ -63,27 +125,6 @@ class _Axis:
         e, de = self.q - self.r + self.lag * self.slope, self.v - self.slope
         r = self.r + self.slope * tau
         return r - self.lag * self.slope + p11 * e + p12 * de, self.slope + p21 * e + p22 * de, r
-
-    def begin(self, ramp: Ramp) -> None:
-        """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
-        t0, t1, start, end = ramp
-        if self.t_ns >= t1:
-            self.r, self.slope, self.end_ns = end, 0.0, NEVER
-        else:
-            self.slope = (end - start) / (1e-9 * (t1 - t0))
-            self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
-        self.plan_event()
-
-    def plan_event(self) -> None:
-        self.event_ns = min(self.end_ns, self.coming[0][0]) if self.coming else self.end_ns
-
-    def pass_event(self) -> None:
-        """The anchor stands at the next event: end of the ramp or start of a coming one."""
-        if self.coming and self.coming[0][0] <= self.t_ns:
-            self.begin(self.coming.pop(0))
-        else:
-            self.r, self.slope, self.end_ns = self.end, 0.0, NEVER
-            self.plan_event()
 
 
 class IdealArm:
@@ -130,16 +171,9 @@ class IdealArm:
             t0_ns: start.
             t1_ns: end; not after t0 for a step.
         """
-        a = self._axes[axis]
-        ramp = (t0_ns, t1_ns, start_counts, end_counts)
-        if t0_ns > self.t_ns:
-            a.coming = [*(r for r in a.coming if r[0] < t0_ns), ramp]
-            a.plan_event()
-            return
-        states = self._evaluated or self._states()
-        a.t_ns, (a.q, a.v, a.r) = self.t_ns, states[axis]
-        a.coming.clear()
-        a.begin(ramp)
+        a, states = self._axes[axis], self._evaluated or self._states()
+        a.reference.add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
+        a.anchor(self.t_ns, states[axis])
         states[axis] = (a.q, a.v, a.r)  # the other motors know nothing of this ramp
 
     def advance(self, t_ns: int) -> None:
@@ -202,16 +236,9 @@ class IdealArm:
         """All states at once. At the very end of a ramp its own formula still holds."""
         self._evaluated = states = []
         for a in self._axes:
-            if self.t_ns > a.event_ns or a.coming:
-                self._pass_events(a)
+            while self.t_ns > a.event_ns:
+                span_ns = a.event_ns - a.t_ns
+                a.anchor(a.event_ns, a.at(self._transition(span_ns), 1e-9 * span_ns))
             dt_ns = self.t_ns - a.t_ns
             states.append(a.at(self._transition(dt_ns), 1e-9 * dt_ns))
         return states
-
-    def _pass_events(self, a: _Axis) -> None:
-        """Anchor a loop at the last event up to now."""
-        while self.t_ns >= a.event_ns:
-            span_ns = a.event_ns - a.t_ns
-            a.q, a.v, a.r = a.at(self._transition(span_ns), 1e-9 * span_ns)
-            a.t_ns = a.event_ns
-            a.pass_event()

@@ -9,10 +9,10 @@ from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
 from scipy.integrate import solve_ivp
 
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import DynamicArm, Reference
+from canprobe.cell.plant.dynamic_arm import DynamicArm
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.equations import ArmEquations
-from canprobe.cell.plant.ideal_arm import NEVER, IdealArm
+from canprobe.cell.plant.ideal_arm import NEVER, IdealArm, Reference
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import PlanError
