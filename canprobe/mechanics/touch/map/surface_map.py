@@ -327,6 +327,5 @@ class SurfaceMap:
             above + floating,
             np.hypot(sigma, self.noise.place) + floating,
             sigma + floating,
-            np.where(reached, (weight > 0.0).sum(axis=1), 0),
         )
         return _Blend(feet, which, np.where(reached[:, None], weight, 0.0), xy, size)
