@@ -160,7 +160,6 @@ def score_holds(
     bounds = 0
     for dwell, true in holds:
         reading, rows = ForceReading(patch), []
-        assert dwell.windows is not None
         for t, image, window in zip(dwell.t_s.tolist(), dwell.images, dwell.windows, strict=True):
             shown = compute_patch(image, patch, window)
             found = reading.step(t, shown)

@@ -129,7 +129,7 @@ def calibrate_array(
     if by_force and not any(s.dwell.force is not None for s in good):
         raise UsageError(f'force reference "{reference}": expected touches with a known force, got none')
     scale_sigma = None if by_force else max(reference_sigma, 1e-4) if reference == "unit" else 1e-4
-    seen = side_seen(dwells, pad)
+    seen = side_seen(dwells)
 
     def fit(touches: Sequence[Shown], own: PatchCalibration) -> ParameterFit:
         found = fit_parameters(touches, own, scale_sigma, reference_sigma if by_force else 1.0, seen)
@@ -192,9 +192,9 @@ def _without_rods(touches: Sequence[Shown]) -> list[Shown]:
     return [s for s in touches if s.dwell.name != "rod"]
 
 
-def side_seen(dwells: Sequence[Dwell], pad: Pad) -> int:
+def side_seen(dwells: Sequence[Dwell]) -> int:
     """Taxels along the longer side of what images show."""
-    return max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
+    return max(window[2] for window in dwells[0].windows)
 
 
 def at_usual_lightness(errors: Floats, shown: Sequence[Shown]) -> Floats:

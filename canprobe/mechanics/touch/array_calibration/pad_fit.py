@@ -64,7 +64,8 @@ def fit_noise(shown: Sequence[Shown], depths: Sequence[Floats]) -> tuple[Contact
     z = least_squares(residuals, np.array([1.0, 1e4 * REACH_M])).x
     most, reach = (1e-4 * z).tolist()
     rest = [left(z, s, _ways(s)) for s in shown]
-    sigma = np.array([_from_image_to_image(r) for r in rest])
+    # from image to image: second differences of anything slower are nearly 0
+    sigma = np.sqrt([np.mean(np.diff(r, 2, axis=0) ** 2) / 6.0 for r in rest])
     power, log_scale = np.polyfit(np.log([s.lightness for s in shown]), np.log(sigma), 1)
     slow, slow_way = _slow(rest, [s.way for s in shown], sigma)
     heights = [np.var(s.pushes - depth) for s, depth in zip(shown, depths, strict=True)]
@@ -76,11 +77,6 @@ def fit_noise(shown: Sequence[Shown], depths: Sequence[Floats]) -> tuple[Contact
         height=math.sqrt(float(np.mean(heights))),
     )
     return noise, CentroidDelays(latency, latency_sigma, Lag(most=max(most, 0.0), reach=abs(reach))), sigma
-
-
-def _from_image_to_image(r: Floats) -> float:
-    """Standard deviation of independent errors (n, 2): second differences of anything slower are nearly 0."""
-    return math.sqrt(float(np.mean(np.diff(r, 2, axis=0) ** 2)) / 6.0)
 
 
 def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:

@@ -70,8 +70,7 @@ def fit_force(
 
 def _forces(dwell: Dwell, patch: PatchCalibration) -> Floats:
     """(n,) force of each image, N, with its creep."""
-    windows = [None] * len(dwell.images) if dwell.windows is None else dwell.windows
-    return np.array([compute_patch(i, patch, w).force for i, w in zip(dwell.images, windows, strict=True)])
+    return np.array([compute_patch(i, patch, w).force for i, w in zip(dwell.images, dwell.windows, strict=True)])
 
 
 def _followed(dwell: Dwell, forces: Floats, creep: float) -> tuple[Floats, Floats]:

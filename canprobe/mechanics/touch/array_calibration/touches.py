@@ -50,7 +50,7 @@ class Dwell:
         place: number of the place that is touched; touches at one place differ in force only.
         t_s: (n,) time stamps of the images, s.
         images: (n,) images, (16, 16) counts, 0 outside the window.
-        windows: (n,) first row, first column, rows, columns of each window; None for whole images.
+        windows: (n,) first row, first column, rows, columns of each window.
         expected: (n, 2) places of the contact on the pad by joints and object, m.
         push: (n,) way of the probe's centre towards the object, from any zero, m.
         turn: turn of the probe about its pole, from the first touch, rad.
@@ -64,7 +64,7 @@ class Dwell:
     place: int
     t_s: Floats
     images: Sequence[Image]
-    windows: Sequence[Sequence[int]] | None
+    windows: Sequence[Sequence[int]]
     expected: Floats
     push: Floats
     turn: float = 0.0
@@ -125,7 +125,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
     late = []
     sums, moments, ways, at, peaks, kept, bad = [], [], [], [], [], [], 0
     for i, (t, image) in enumerate(zip(dwell.t_s.tolist(), dwell.images, strict=True)):
-        patch = compute_patch(image, plain, None if dwell.windows is None else dwell.windows[i])
+        patch = compute_patch(image, plain, dwell.windows[i])
         if not patch.n_active:
             continue
         way = memory.add(t, patch.u, patch.v)

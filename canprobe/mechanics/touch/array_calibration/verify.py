@@ -67,7 +67,7 @@ def verify_calibration(calibration: ArrayCalibration, dwells: Sequence[Dwell], p
     touches = [what_is_shown(dwell, plain, LAST_IMAGE_S) for dwell in dwells]
     patch = make_patch_calibration(calibration, pad)
     forces = [force_of(patch, s) for s in touches]
-    model = make_image_model(calibration, patch, seen=side_seen(dwells, pad))
+    model = make_image_model(calibration, patch, seen=side_seen(dwells))
     errors = moment_errors(model, touches, forces)[:, :2]
     k = calibration.stiffness
     found, sigma, *_ = stiffness_by_depth(touches, forces, pad.radius_m, (k.moments, k.moments_sigma))

@@ -42,8 +42,6 @@ MIN_BLUR_PITCH = 0.6
 """Blur, in pitches, from which on an edge of up to 1.5 times the full scale shows in the taxel beside a steep one."""
 LINE_TAXELS = 2
 """Number of silent taxels of one row or column that make the rest of it suspect, as far as it is silent, too."""
-_SIDE = 2
-"""Number of taxels beside the image in which neighbours are looked for."""
 _Mask = NDArray[np.bool_]
 
 
@@ -225,23 +223,19 @@ def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
     """Where taxels above and below, and on both sides, are pressed as they cannot be beside a whole one that is not."""
     # one side alone is enough from a count of `steep` on, where the next taxel of the row or column shows the same: one
     # taxel may be the rim of a patch on an array with less blur than its calibration has
-    rows, columns = image.shape
-    stride = columns + _SIDE  # rows one after the other, apart by what keeps the end of one from the next
-    flat = np.zeros((rows + 2 * _SIDE + 1) * stride, np.uint8)
-    first, n = _SIDE * stride + _SIDE, rows * stride
-    flat[first : first + n].reshape(rows, stride)[:, :columns] = image
     gaps = []
-    for step, along in ((stride, 1), (1, stride)):
-        far_up, up, down, far_down = [flat[first + k * step :][:n] for k in (-2, -1, 1, 2)]
+    for seen in (image, image.T):
+        wide = np.pad(seen, ((2, 2), (0, 0)))
+        far_up, up, down, far_down = wide[:-4], wide[1:-3], wide[3:-1], wide[4:]
         gap, most = np.minimum(up, down) >= MIN_COUNTS, np.maximum(up, down)
         if most.max() >= WIDE_GAP_COUNTS:
             gap |= np.maximum(np.minimum(up, far_down), np.minimum(far_up, down)) >= WIDE_GAP_COUNTS
         if steep <= COUNTS_MAX:
-            alone = (most >= steep) & (flat[first : first + n] == 0)
-            gap[along:] |= alone[along:] & alone[:-along]
-            gap[:-along] |= alone[along:] & alone[:-along]
-        gaps.append(gap.reshape(rows, stride)[:, :columns])
-    return gaps[0], gaps[1]
+            alone = (most >= steep) & (seen == 0)
+            gap[:, 1:] |= alone[:, 1:] & alone[:, :-1]
+            gap[:, :-1] |= alone[:, 1:] & alone[:, :-1]
+        gaps.append(gap)
+    return gaps[0], gaps[1].T
 
 
 def _bridge(mask: _Mask) -> tuple[NDArray[np.intp], Floats]:
