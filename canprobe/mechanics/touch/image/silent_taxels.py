@@ -225,15 +225,17 @@ def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
     # taxel may be the rim of a patch on an array with less blur than its calibration has
     gaps = []
     for seen in (image, image.T):
-        wide = np.pad(seen, ((2, 2), (0, 0)))
+        wide = np.zeros((len(seen) + 4, seen.shape[1]), np.uint8)  # np.pad takes longer than all the rest
+        wide[2:-2] = seen
         far_up, up, down, far_down = wide[:-4], wide[1:-3], wide[3:-1], wide[4:]
         gap, most = np.minimum(up, down) >= MIN_COUNTS, np.maximum(up, down)
         if most.max() >= WIDE_GAP_COUNTS:
             gap |= np.maximum(np.minimum(up, far_down), np.minimum(far_up, down)) >= WIDE_GAP_COUNTS
         if steep <= COUNTS_MAX:
             alone = (most >= steep) & (seen == 0)
-            gap[:, 1:] |= alone[:, 1:] & alone[:, :-1]
-            gap[:, :-1] |= alone[:, 1:] & alone[:, :-1]
+            pairs = alone[:, 1:] & alone[:, :-1]
+            gap[:, 1:] |= pairs
+            gap[:, :-1] |= pairs
         gaps.append(gap)
     return gaps[0], gaps[1].T
 
