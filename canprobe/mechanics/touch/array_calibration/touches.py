@@ -122,8 +122,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
     """
     image_moments, memory = MomentImage(plain), PadMemory()
     start, end = dwell.t_s[0] + FIRST_IMAGE_S, dwell.t_s[0] + age_s
-    late = []
-    sums, moments, ways, at, peaks, kept, bad = [], [], [], [], [], [], 0
+    rows, late = [], []
     for i, (t, image) in enumerate(zip(dwell.t_s.tolist(), dwell.images, strict=True)):
         patch = compute_patch(image, plain, dwell.windows[i])
         if not patch.n_active:
@@ -135,20 +134,17 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         if t > end and not dwell.to_and_fro:
             late.append(patch.force)
             continue
-        bad += patch.saturated or patch.cut_by_pad
-        sums.append(patch.force)
-        moments.append(found)
-        ways.append(way)
-        at.append((patch.u, patch.v))
-        peaks.append(patch.peak_pa)
-        kept.append(i)
-    if len(kept) < MIN_IMAGES:
+        rows.append((i, patch, found, way))
+    if len(rows) < MIN_IMAGES:
         raise UsageError(
-            f"a touch of the {dwell.name}: expected a patch in its images, got {len(kept)} images with one"
+            f"a touch of the {dwell.name}: expected a patch in its images, got {len(rows)} images with one"
         )
+    kept, patches, moments, ways = (list(column) for column in zip(*rows, strict=True))
     c, s = math.cos(dwell.angle), math.sin(dwell.angle)
     turn = np.array([[c * c, 2 * c * s, s * s], [-c * s, c * c - s * s, c * s], [s * s, -2 * c * s, c * c]])
-    V, raw, peak = np.array(moments), np.array(at), float(np.mean(peaks))
+    sums, raw = np.array([p.force for p in patches]), np.array([(p.u, p.v) for p in patches])
+    V, peak = np.array(moments), float(np.mean([p.peak_pa for p in patches]))
+    bad = sum(p.saturated or p.cut_by_pad for p in patches)
     steps = np.diff(V[:, [0, 2]], axis=0) / V[:, [0, 2]].mean(axis=0)
     return Shown(
         dwell=dwell,
@@ -165,5 +161,5 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         usable=bad <= 0.2 * len(kept) and peak < STRAIGHT_SHARE * plain.pad.full_scale_pa,
         push=float(dwell.push[kept].mean()),
         pushes=dwell.push[kept],
-        sums=np.array(sums),
+        sums=sums,
     )

@@ -63,11 +63,8 @@ class Prior:
 
     def rows(self, length: float) -> tuple[Floats, Floats]:
         """Whitened rows (6, 9) and right-hand side (6,) on the parameters of `quadric`, in units of `length`."""
-        A, b = np.zeros((6, 9)), np.zeros(6)
-        for row, (column, sigma) in enumerate(((3, self.sigma_c13), (4, self.sigma_c23), (5, self.sigma_c33))):
-            A[row, column] = 1.0 / (sigma * length)
-        inverse = 1.0 / (self.sigma_curvature * length)
-        for row, factor in ((3, 2.0), (4, 2.0 * math.sqrt(2.0)), (5, 2.0)):
-            A[row, 3 + row] = factor * inverse
-        b[3] = b[5] = self.curvature * length * inverse
-        return A, b
+        A, inverse = np.zeros((6, 9)), 1.0 / (self.sigma_curvature * length)
+        nuisance = [1.0 / (sigma * length) for sigma in (self.sigma_c13, self.sigma_c23, self.sigma_c33)]
+        A[:, 3:] = np.diag([*nuisance, 2.0 * inverse, 2.0 * math.sqrt(2.0) * inverse, 2.0 * inverse])
+        mean = self.curvature * length * inverse
+        return A, np.array([0.0, 0.0, 0.0, mean, 0.0, mean])
