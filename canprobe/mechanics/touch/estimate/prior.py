@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 
 import numpy as np
@@ -51,15 +51,14 @@ class Prior:
     @classmethod
     def weak(cls, length: float) -> Prior:
         """The default: `NUISANCE_SIGMA / length` on c13, c23, c33, and nothing on curvature."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE_SIGMA)
-        return cls("weak on c13, c23, c33", s13, s23, s33)
+        return cls("weak on c13, c23, c33", *(s / positive("length", length) for s in NUISANCE_SIGMA))
 
     @classmethod
     def flat(cls, length: float, sigma_curvature: float) -> Prior:
         """Weak on c13, c23, c33, and curvature 0 ± sigma_curvature (1/m) in every direction."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE_SIGMA)
-        sigma_curvature = positive("sigma_curvature", sigma_curvature)
-        return cls(f"curvature 0 ± {sigma_curvature:.4g} per unit length", s13, s23, s33, 0.0, sigma_curvature)
+        sigma = positive("sigma_curvature", sigma_curvature)
+        name = f"curvature 0 ± {sigma:.4g} per unit length"
+        return replace(cls.weak(length), name=name, sigma_curvature=sigma)
 
     def rows(self, length: float) -> tuple[Floats, Floats]:
         """Whitened rows (6, 9) and right-hand side (6,) on the parameters of `quadric`, in units of `length`."""

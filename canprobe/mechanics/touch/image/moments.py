@@ -82,10 +82,6 @@ class PadMemory:
     """Fading traces of the places of the patch on the pad since the contact began."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all places: contact was lost."""
         self._t_s: float | None = None
         self._sums = np.zeros((len(TIME_CONSTANTS_S), 6))  # of 1, u, v, uu, uv, vv
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +89,7 @@ class SilentTaxels:
         self._any = bool(self._mask.any())
         self._blurred = blur_pitch >= MIN_BLUR_PITCH
         self._next_ns: int | None = None
-        self._weights: dict[tuple[int, ...], tuple[NDArray[np.intp], Floats]] = {}
+        self._bridge = lru_cache(partial(_bridge, self._mask))
 
     def look(self, taxels: Image, window: Sequence[int], t_ns: int) -> None:
         """Look at an image; nothing happens where the last look was less than `LOOK_PERIOD_NS` before.
@@ -150,7 +151,7 @@ class SilentTaxels:
         if not np.array_equal(mask, self._mask):
             self._mask, self._found = mask, mask & ~self._stated
             self._any = bool(mask.any())
-            self._weights.clear()
+            self._bridge = lru_cache(partial(_bridge, mask))
 
     @property
     def found(self) -> int:
@@ -209,15 +210,6 @@ class SilentTaxels:
         filled = float(values.sum())
         return whole, int(np.count_nonzero(values)), filled / max(float(inside.sum(dtype=np.int64)), 1.0)
 
-    def _bridge(self, window: tuple[int, ...]) -> tuple[NDArray[np.intp], Floats]:
-        """Places of the silent taxels in a window, and their values as sums over its other taxels."""
-        bridge = self._weights.get(window)
-        if bridge is None:
-            row, column, rows, columns = window
-            mask = self._mask[row : row + rows, column : column + columns]
-            bridge = self._weights[window] = _bridge(np.ascontiguousarray(mask))
-        return bridge
-
 
 def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
     """Where taxels above and below, and on both sides, are pressed as they cannot be beside a whole one that is not."""
@@ -240,9 +232,10 @@ def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
     return gaps[0], gaps[1].T
 
 
-def _bridge(mask: _Mask) -> tuple[NDArray[np.intp], Floats]:
-    """Places (n,) of the taxels in a mask, and (n, taxels) weights that interpolate them."""
-    rows, columns = mask.shape
+def _bridge(mask: _Mask, window: tuple[int, ...]) -> tuple[NDArray[np.intp], Floats]:
+    """Places (n,) of the taxels of a mask in a window, and (n, taxels) weights of its taxels that interpolate them."""
+    row, column, rows, columns = window
+    mask = np.ascontiguousarray(mask[row : row + rows, column : column + columns])
     places = np.flatnonzero(mask)
     index = np.arange(mask.size).reshape(rows, columns)
     triples = np.concatenate(

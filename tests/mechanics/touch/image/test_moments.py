@@ -44,14 +44,6 @@ def test_a_patch_that_rests_leaves_nothing_and_one_that_has_moved_is_forgotten()
     assert moved[-1] < 0.005 * moved[0]
 
 
-def test_a_reset_forgets():
-    memory = PadMemory()
-    memory.add(0.0, 0.0, 0.0)
-    memory.add(1.0, 0.0, 0.0)
-    memory.reset()
-    assert memory.add(1.1, 5e-3, 0.0) == (0.0, 0.0, 0.0)
-
-
 # The centroid's lag on the pad.
 
 LAG = Lag(most=120e-6, reach=200e-6)
