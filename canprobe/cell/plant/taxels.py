@@ -70,11 +70,6 @@ class TaxelConfig:
         """Reading of the ADC at full scale."""
         return (1 << self.adc_bits) - 1
 
-    @property
-    def adc_threshold(self) -> int:
-        """Least reading of the ADC above the threshold."""
-        return int(np.ceil(self.threshold * self.adc_max))
-
     def without(self, *effects: str) -> TaxelConfig:
         """The same array with some effects switched off.
 
@@ -249,7 +244,7 @@ def _relaxations(growth: float, dt_ns: int) -> Floats:
 def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
     """Reading at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
     counts = np.arange(config.adc_max + 1)
-    counts[counts < config.adc_threshold] = 0
+    counts[counts < np.ceil(config.threshold * config.adc_max)] = 0
     return counts.astype(np.uint8) if config.adc_max == COUNTS_MAX else counts * float(COUNTS_MAX) / config.adc_max
 
 
