@@ -122,14 +122,6 @@ class RigidBody:
         self._mujoco.mj_fullM(made, data, mass)
         return mass - self._armature, data.qfrc_bias.copy()
 
-    def gravity(self, q: npt.ArrayLike) -> Floats:
-        """(n,) torques that carry the arm's weight at rest, N m or N.
-
-        Args:
-            q: (n,) joint positions, rad or m.
-        """
-        return self.terms(q, np.zeros(len(self._armature)))[1]
-
 
 def _opened(mujoco: Any, T: Floats, slides: bool) -> str:
     """A joint's frame with its joint. The armature of 1 keeps MuJoCo's matrix regular where nothing has a mass."""

@@ -97,7 +97,7 @@ def test_at_rest_the_motors_carry_the_weight_and_nothing_moves(model):
     arm.advance(500_000_000)
     assert arm.motors()[0] == pytest.approx(start, abs=1e-6)
     body = arm.equations.body
-    share = joints_per_motor(UPENN).T @ body.gravity(STRETCHED)
+    share = joints_per_motor(UPENN).T @ body.terms(STRETCHED, 0.0)[1]
     assert torques == pytest.approx(1e3 * share / np.array((6.4, 6.4, 6.4, 1.4, 0.7, 0.7)), abs=0.51)
     assert abs(torques[1]) > 100
 
@@ -273,7 +273,7 @@ def test_any_arm_carries_its_weight_and_stands_off_the_object(made):
     free.advance(200_000_000)
     assert free.motors()[0] == pytest.approx(rest, abs=1e-3)
     assert units_to_joints(model, free.motors()[0]) == pytest.approx(q0, abs=1e-8)
-    weight = joints_per_motor(model).T @ free.equations.body.gravity(q0)
+    weight = joints_per_motor(model).T @ free.equations.body.terms(q0, 0.0)[1]
     rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]  # in the drive's own sense
     assert torques == pytest.approx(1e3 * weight / rated, abs=0.51)
     if made is gantry:  # masses of z and the probe
@@ -390,7 +390,7 @@ def test_both_arms_report_the_torque_against_a_push(made, force_n):
         model = dynamic.arm.model
         ratio = dynamic.truth()["force"] / ideal.truth()["force"]
         assert ratio == pytest.approx(1.0, abs=0.02)
-        weight = joints_per_motor(model).T @ dynamic.arm.equations.body.gravity(dynamic.truth()["q"])
+        weight = joints_per_motor(model).T @ dynamic.arm.equations.body.terms(dynamic.truth()["q"], 0.0)[1]
         rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]
         found = [dynamic.torque_permille(i) for i in range(model.n)] - 1e3 * weight / rated
         push = np.array([ideal.torque_permille(i) for i in range(model.n)])

@@ -92,8 +92,7 @@ class ImageModel:
         # crosstalk is linear in rows and columns as the blur is: a row spreads its sum, which the blur leaves as it is
         share = self.parameters.crosstalk / (self.side - 1)
         blur = (1.0 - self.side * share) * blur + share * 2.0 / STEPS_PER_PITCH
-        weight = np.ones((len(x), len(x)))
-        self._moments = np.stack([weight, weight * (x * x)[:, None], weight * x * x], axis=-1).reshape(-1, 3)
+        self._moments = np.stack(np.broadcast_arrays(1.0, (x * x)[:, None], x * x), axis=-1).reshape(-1, 3)
         self._squares, self._blur, self._turned_blur = source * source, blur, np.ascontiguousarray(blur.T)
 
     def with_stiffness(self, stiffness: float) -> ImageModel:

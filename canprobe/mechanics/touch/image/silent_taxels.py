@@ -125,18 +125,14 @@ class SilentTaxels:
         if not (gaps[0].any() or gaps[1].any()):
             return
         # where a silent taxel reads something, its neighbours must have changed by as much
-        stuck = low > MAX_CHANGE_COUNTS
+        rise = np.pad(now - low >= MIN_COUNTS, 1)
+        stuck = (low > MAX_CHANGE_COUNTS) & ~(rise[:-2, 1:-1] | rise[2:, 1:-1] | rise[1:-1, :-2] | rise[1:-1, 2:])
         enough = False
         for looks, gap in zip((self._down[part], self._across[part]), gaps, strict=True):
-            looks[gap & (looks < NEEDED_LOOKS) & ~(stuck & ~self._changed_beside(part, now))] += 1
+            looks[gap & (looks < NEEDED_LOOKS) & ~stuck] += 1
             enough = enough or bool((looks >= NEEDED_LOOKS).any())
         if enough:
             self._find()
-
-    def _changed_beside(self, part: tuple[slice, slice], now: Image) -> _Mask:
-        """Where a taxel beside, in any direction, is pressed by `MIN_COUNTS` more than it was once."""
-        rise: _Mask = np.pad(now - self._low[part] >= MIN_COUNTS, 1)
-        return rise[:-2, 1:-1] | rise[2:, 1:-1] | rise[1:-1, :-2] | rise[1:-1, 2:]
 
     def _find(self) -> None:
         """Put together what is bridged from now on."""
