@@ -116,7 +116,7 @@ class TruthRecorder(Participant):
         stamps, seen = self._stamps, self._seen
         self._stamps, self._seen = [], []
         model = self._plant.config.model
-        found = truth_columns(seen if self._at_once else [self._plant.truth_row(state) for state in seen])
+        found = truth_columns(seen) if self._at_once else self._plant.truths(seen)
         columns: dict[str, NDArray[Any]] = {
             "t_s": np.array([t_ns - self.origin_ns for t_ns, _ in stamps], dtype=np.float64) * 1e-9,
             "sync_count": np.arange(len(stamps), dtype=np.int64) + (0 if self.rows is None else len(self.rows)),

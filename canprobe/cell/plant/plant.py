@@ -243,6 +243,10 @@ class Plant:
         found = self.truth_row(state)
         return {name: np.array(value) if isinstance(value, tuple) else value for name, value in found.items()}
 
+    def truths(self, states: Sequence[PlantState]) -> dict[str, Floats]:
+        """`truth` of many states, a row each; empty without a state."""
+        return truth_columns([self.truth_row(state) for state in states])
+
     def truth_row(self, state: PlantState | None = None) -> TruthRow:
         """`truth` in plain numbers; that of the present state costs nothing where the array was just sampled."""
         return (self._solution() if state is None else self._solve(state)).truth

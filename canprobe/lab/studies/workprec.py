@@ -28,7 +28,7 @@ from canprobe.cell.plant.contact import PlantState
 from canprobe.cell.plant.dynamic_arm import DynamicArm
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.equations import ArmEquations
-from canprobe.cell.plant.plant import Plant, truth_columns
+from canprobe.cell.plant.plant import Plant
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, log_scale, picture
 from canprobe.cell.scene.arms import Bodies, arm_model
 from canprobe.cell.scene.load import read_cell
@@ -220,7 +220,7 @@ def observed(stiffness_n_m3: float, states: Floats) -> dict[str, Floats]:
     """Force (n,) N, probe centre (n, 3) m and taxel pressures (n, 256) Pa of states (n, 12), counts and rates."""
     plant = Plant(trial(stiffness_n_m3, len(states))[0])
     at = [PlantState(0, tuple(row[:6].tolist()), tuple(row[6:].tolist())) for row in states]
-    truths = truth_columns([plant.truth_row(state) for state in at])
+    truths = plant.truths(at)
     return {
         "force": truths["force"],
         "centre": truths["probe_centre"],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -162,9 +161,9 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
         quadric=quadric,
     )
     nowhere = np.eye(4)
-    for i, (p, n) in enumerate(zip(touches.points, touches.normals, strict=True)):
-        sample = ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i]))
-        estimator.add(replace(sample, sigma_height=float(height[i])))
+    rows = zip(touches.points, touches.normals, point.tolist(), normal.tolist(), height.tolist(), strict=True)
+    for i, (p, n, s, r, h) in enumerate(rows):
+        estimator.add(ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, s, r, sigma_height=h))
     answer = estimator.estimate()
     if answer is None:
         raise UsageError(
