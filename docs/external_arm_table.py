@@ -30,7 +30,7 @@ ARMS = tuple((rate_hz, delay_ms) for rate_hz in (125.0, 500.0) for delay_ms in (
 
 def verge_hz(rate_hz: float, delay_ms: float) -> float:
     """Bandwidth at which the sampled loop is on the verge of stability; half of the dead time each way."""
-    omega, images = natural_frequency(PlantSettings().drive_bandwidth_hz, 1.0), max(1, round(rate_hz / 250.0))
+    omega, images = natural_frequency(PlantSettings().drive_bandwidth_hz), max(1, round(rate_hz / 250.0))
     low, high = 0.5, 100.0
     for _ in range(20):
         middle = math.sqrt(low * high)

@@ -261,6 +261,8 @@ def _node(setup: Setup, planned: NodeConfiguration, node_id: int, plant: Plant, 
 
 def _plant_config(setup: Setup) -> PlantConfig:
     truth, array = setup.truth, setup.array
+    # an array that takes a tare at the beginning takes it off the object; with a reserve
+    tared_s = 0.0 if array is None or array.raw is None else 1.5 * array.raw.tare_images / array.rate_hz
     config = PlantConfig(
         model=truth.model,
         T_flange_probe_centre=truth.T_flange_probe,
@@ -275,7 +277,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         ),
         pad=array.pad if array is not None else Pad(),
         bandwidth_hz=truth.bandwidth_hz,
-        press=PressMotion(after_s=_tared_s(setup)),
+        press=PressMotion(after_s=tared_s),
         seed=setup.seed,
         carrier=setup.carrier,
     )
@@ -302,9 +304,3 @@ def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats
     probe at one place in the first posture.
     """
     return ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
-
-
-def _tared_s(setup: Setup) -> float:
-    """Time of the tare at the beginning of an array that takes one, with a reserve, s; 0 for others."""
-    array = setup.array
-    return 0.0 if array is None or array.raw is None else 1.5 * array.raw.tare_images / array.rate_hz

@@ -47,8 +47,7 @@ class PlantConfig:
         object: object that can be touched; None without one.
         taxels: the array's imperfections; None where there is no array.
         pad: the array's taxels.
-        bandwidth_hz: bandwidth of every drive, -3 dB.
-        damping_ratio: damping ratio of every drive.
+        bandwidth_hz: bandwidth of every drive, -3 dB; critically damped.
         press: motion of a probe without an arm.
         seed: seed of taxel gains and noise.
         fidelity: "ideal": each motor is a second-order system; "dynamic": rigid links, friction, drive cascade, push
@@ -71,7 +70,6 @@ class PlantConfig:
     taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
     pad: Pad = field(default_factory=Pad)
     bandwidth_hz: float = 30.0
-    damping_ratio: float = 1.0
     press: PressMotion = PressMotion()
     seed: int = 0
     fidelity: Fidelity = "ideal"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import cos, inf, pi, sin, sqrt
 from typing import NamedTuple
@@ -18,7 +17,7 @@ from canprobe.cell.plant.elastic_contact import (
     elastic_contact,
     total_force,
 )
-from canprobe.cell.plant.pressure import Directions, Vec, pad_basis, pad_coordinates
+from canprobe.cell.plant.pressure import Vec, pad_basis, pad_coordinates
 from canprobe.cell.scene.setup import Carrier
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
@@ -90,17 +89,6 @@ class PressedProbe:
         return ProbeState(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
 
 
-def _along(axes: Axes, e: Vec) -> Vec:
-    """A vector of the probe's frame in the base frame."""
-    (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = axes
-    a, b, c = e
-    return a * x0 + b * y0 + c * z0, a * x1 + b * y1 + c * z1, a * x2 + b * y2 + c * z2
-
-
-def _dot(a: Vec, b: Vec) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _seen_from(T_base_carrier: Floats, carrier: Carrier, probe: ProbeState) -> ProbeState:
     """The probe in the frame of a carrier, with its velocity over the carrier."""
     R, origin = T_base_carrier[:3, :3], T_base_carrier[:3, 3]
@@ -148,11 +136,11 @@ class SolvedContact:
     several: bool = False  # it touches in several places or all over, and these are of the deepest
 
     @property
-    def directions_pad(self) -> Directions:
-        """Principal directions in the transported pad basis at the contact direction."""
-        u, v = (_along(self.probe.axes, e) for e in pad_basis(self.direction))
-        first, second = self.foot.directions
-        return (_dot(first, u), _dot(first, v)), (_dot(second, u), _dot(second, v))
+    def directions_pad(self) -> Floats:
+        """(2, 2) rows: principal directions in the transported pad basis at the contact direction."""
+        basis = np.array(pad_basis(self.direction)) @ np.array(self.probe.axes)
+        directions: Floats = np.array(self.foot.directions) @ basis.T
+        return directions
 
     @property
     def truth(self) -> TruthRow:
@@ -189,14 +177,10 @@ class ContactSolver:
         self._tightest = -inf if config.object is None else (MIN_CURVATURE_SHARE - 1.0) / config.radius_m
         self._base: Vec = tuple(config.base_offset_m.tolist())
         self._chain: Chain | None = None
-        self._shares: list[list[tuple[int, float]]] = []
-        self._at_zero: list[float] | None = None  # joint positions where every drive counts zero, if not zero too
         self._pressed = PressedProbe(config) if model is None and config.object is not None else None
         if model is not None:
             self._chain = ending_in(model.chain, config.T_flange_probe_centre)
             self._joints_per_motor, self._unpushed = joints_per_motor(model), [0.0] * model.n
-            self._shares = [[(i, share) for i, share in enumerate(row) if share] for row in model.q_per_unit.tolist()]
-            self._at_zero = units_to_joints(model, np.zeros(model.n)).tolist() if model.zero_units.any() else None
 
     def solve(self, state: PlantState, first_image_s: float | None) -> SolvedContact:
         """The contact in a state.
@@ -205,10 +189,14 @@ class ContactSolver:
             state: state of the plant.
             first_image_s: time of the first image, s; None before it.
         """
-        config = self._config
-        q, qd = self._joints(state.counts), self._joints(state.rates)
-        if self._at_zero is not None:
-            q = tuple([a + b for a, b in zip(q, self._at_zero, strict=True)])
+        config, model = self._config, self._config.model
+        q: tuple[float, ...] = ()
+        qd: tuple[float, ...] = ()
+        if model is not None:
+            q, qd = (
+                tuple(units_to_joints(model, state.counts).tolist()),
+                tuple(model.q_per_unit.dot(state.rates).tolist()),
+            )
         probe = self._probe(q, qd) if self._pressed is None else self._pressed.at(1e-9 * state.t_ns, first_image_s)
         if config.carrier is not None:
             T = config.carrier.motion.T_base_carrier(1e-9 * state.t_ns * config.carrier.speed)
@@ -303,13 +291,3 @@ class ContactSolver:
         c = posture(self._chain, q)
         (c0, c1, c2), (b0, b1, b2) = c.flange, self._base
         return ProbeState((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
-
-    def _joints(self, motors: Sequence[float]) -> tuple[float, ...]:
-        """Joint positions, or rates, of motor positions or rates; empty without an arm."""
-        joints = []
-        for row in self._shares:
-            value = 0.0
-            for motor, share in row:
-                value += share * motors[motor]
-            joints.append(value)
-        return tuple(joints)

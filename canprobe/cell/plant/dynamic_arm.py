@@ -7,89 +7,30 @@ contact geometry are held over ``hold_ns``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.equations import ArmEquations, Effects
-from canprobe.cell.plant.ideal_arm import NEVER, PEAK_PERMILLE, Ramp
+from canprobe.cell.plant.equations import ArmEquations
+from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE, Reference
 from canprobe.cell.plant.integrators import STEPS
 from canprobe.mechanics.robot.model import joints_to_units, units_per_motor
 from canprobe.mechanics.types import Floats
-
-
-class Reference:
-    """Reference of one motor: straight ramps of counts, one after the other; the end of a ramp is held.
-
-    Args:
-        counts: position until the first ramp.
-    """
-
-    __slots__ = ("_ramps",)
-
-    def __init__(self, counts: float) -> None:
-        self._ramps: list[Ramp] = [(-1, -1, counts, counts)]
-
-    def add(self, ramp: Ramp, now_ns: int) -> None:
-        """Follow a ramp from its start on, or from now on where it began in the past; drops what was to come later.
-
-        Args:
-            ramp: not before the ramps that act already.
-            now_ns: the present time.
-        """
-        last = self._ramps[-1]
-        if last[0] <= now_ns and last[0] < ramp[0]:
-            self._ramps = [last, ramp]
-            return
-        start = max(ramp[0], now_ns)
-        kept: Sequence[Ramp] = [r for r in self._ramps if r[0] < start or r[0] < 0]
-        past = [r for r in kept if r[0] <= now_ns]
-        self._ramps = [*past[-1:], *(r for r in kept if r[0] > now_ns), ramp]
-
-    def at(self, t_ns: int) -> tuple[float, float]:
-        """Reference (counts) and its slope (counts/s) from t on.
-
-        Args:
-            t_ns: not before the last ramp that began.
-        """
-        t0, t1, start, end = self._ramps[-1]
-        if t0 > t_ns:
-            t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
-        if t_ns >= t1:
-            return end, 0.0
-        slope = (end - start) / (t1 - t0)
-        return start + slope * (t_ns - t0), 1e9 * slope
-
-    def next_bend(self, t_ns: int) -> int:
-        """First time after t at which the slope may change, ns.
-
-        Args:
-            t_ns: ns.
-        """
-        bend = NEVER
-        for t0, t1, _, _ in self._ramps:
-            if t_ns < t0 < bend:
-                bend = t0
-            if t_ns < t1 < bend:
-                bend = t1
-        return bend
 
 
 class DynamicArm:
     """The n motors that drive the arm's links.
 
     Args:
-        config, effects, held: as for ``ArmEquations``; the arm begins at rest.
+        config, held: as for ``ArmEquations``; the arm begins at rest.
 
     Raises:
         PlanError: see ``ArmEquations``.
     """
 
-    def __init__(self, config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> None:
+    def __init__(self, config: PlantConfig, *, held: bool = True) -> None:
         assert config.model is not None
         self.model = model = config.model
-        self.equations = ArmEquations(config, effects or Effects(), held=held)
+        self.equations = ArmEquations(config, held=held)
         self.t_ns = 0
         self._dynamics, self._step = config.dynamics, STEPS[config.dynamics.integrator]
         units = joints_to_units(model, config.q0)

@@ -113,16 +113,6 @@ def depth_for_force(force: float, kappa: tuple[float, float], radius: float, sti
     return sqrt(2.0 * force * sqrt(A * B) / (pi * stiffness_n_m3))
 
 
-def widened(kappa: Floats, radius: float) -> Floats:
-    """Curvatures of a surface, hollows as tight as the ball replaced by the least that the laws can take.
-
-    Args:
-        kappa: (..., 2) 1/m.
-        radius: radius of the ball, m.
-    """
-    return np.maximum(kappa, (MIN_CURVATURE_SHARE - 1.0) / radius)
-
-
 def force_laws(touches: TouchedPlaces, radius: float, stiffness_n_m3: float) -> tuple[Floats, Floats]:
     """Coefficient and exponent of ``force = coefficient depth^exponent`` of every place.
 
@@ -134,7 +124,8 @@ def force_laws(touches: TouchedPlaces, radius: float, stiffness_n_m3: float) -> 
     Returns:
         (n,) in N and m, and (n,).
     """
-    A, B = (0.5 * (1.0 / radius + widened(touches.kappa, radius))).T
+    kappa = np.maximum(touches.kappa, (MIN_CURVATURE_SHARE - 1.0) / radius)  # hollows as tight as the ball, widened
+    A, B = (0.5 * (1.0 / radius + kappa)).T
     edge = touches.edge_m > 0.0
     point = 0.5 * np.pi * stiffness_n_m3 / np.sqrt(A * B)
     line = 4.0 / 3.0 * stiffness_n_m3 * touches.edge_m / np.sqrt(A)

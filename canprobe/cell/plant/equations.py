@@ -8,13 +8,12 @@ reference.
 Drive cascade of a motor: position loop, velocity loop, torque limit, feed-forwards. Position: ``v* = kp (r - x) + share
 r'``. Velocity: ``u = Kv (v* - v) + s + tau_ff``, ``s' = Ki (v* - v)``, where s also unwinds while the torque is at its
 limit. Torque: ``min(max(u, -limit), limit)``, without a lag of its own. All in motor coordinates (``robot.model``). The
-loops are continuous; a real drive samples them at some kHz. With ``kp = w / 2z`` and ``Kv = 2 z w J`` a motor with the
+loops are continuous; a real drive samples them at some kHz. With ``kp = w / 2`` and ``Kv = 2 w J`` a motor with the
 inertia J and nothing else is the second-order system of the ideal arm: same bandwidth, same lag behind a ramp.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from canprobe.cell.plant.ideal_arm import STICTION_RATE, natural_frequency
 from canprobe.cell.plant.integrators import Linearised
 from canprobe.cell.plant.pushing import HeldContact, Neighbourhood
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
+from canprobe.mechanics.robot.dynamics import RigidBody, ball, dynamics_problem, joined
 from canprobe.mechanics.robot.model import joints_per_motor
 from canprobe.mechanics.types import Floats
 
@@ -43,7 +42,6 @@ class DriveLoops:
     Args:
         config: configuration of a plant with an arm: tuning, rated torques, friction.
         inertia: (n,) inertia of the motors as the drives are tuned for, kg m^2.
-        friction: whether motors and gears rub.
 
     Attributes:
         start, slope: (n,) reference at time 0 (rad) and its slope (rad/s).
@@ -53,18 +51,18 @@ class DriveLoops:
         viscous, coulomb: (n,) friction.
     """
 
-    def __init__(self, config: PlantConfig, inertia: Floats, *, friction: bool) -> None:
+    def __init__(self, config: PlantConfig, inertia: Floats) -> None:
         assert config.model is not None
-        model, z, dynamics = config.model, config.damping_ratio, config.dynamics
-        w, reset_s = natural_frequency(config.bandwidth_hz, z), dynamics.integral_s
-        self.position, self.unwind = w / (2.0 * z), 1.0 / reset_s if reset_s > 0.0 else 0.0
-        self.gain: Floats = 2.0 * z * w * inertia
+        model, dynamics = config.model, config.dynamics
+        w, reset_s = natural_frequency(config.bandwidth_hz), dynamics.integral_s
+        self.position, self.unwind = w / 2.0, 1.0 / reset_s if reset_s > 0.0 else 0.0
+        self.gain: Floats = 2.0 * w * inertia
         self.integral: Floats = self.gain * self.unwind
         rated = np.array([joint.rated_torque for joint in model.joints])
         self._most: Floats = rated * (1e-3 * dynamics.torque_limit_permille)
         self.limit = self._most.copy()
-        self.viscous = np.array([friction * joint.viscous for joint in model.joints])
-        self.coulomb = np.array([friction * joint.coulomb for joint in model.joints])
+        self.viscous = np.array([joint.viscous for joint in model.joints])
+        self.coulomb = np.array([joint.coulomb for joint in model.joints])
         self._share = dynamics.velocity_feed_forward
         self.fed, self._speed_fed = np.zeros(model.n), np.zeros(model.n)
         self.set_reference(0.0, np.zeros(model.n), np.zeros(model.n))
@@ -120,30 +118,11 @@ class DriveLoops:
         return free * self.gain, drag, self.integral - unwind * self.gain, -unwind
 
 
-@dataclass(frozen=True, slots=True)
-class Effects:
-    """Effects that act on the arm; each can be switched off.
-
-    Args:
-        gravity, coriolis: forces on the links.
-        friction: viscous and Coulomb friction of motors and gears.
-        links: False leaves the motors alone with the inertia at their own joint, without coupling.
-        contact: the object pushes back.
-    """
-
-    gravity: bool = True
-    coriolis: bool = True
-    friction: bool = True
-    links: bool = True
-    contact: bool = True
-
-
 class ArmEquations:
     """Equations of the driven arm.
 
     Args:
         config: configuration of a plant with an arm and the bodies of its links.
-        effects: effects that act.
         held: whether ``hold`` sets what the calls use; else each call evaluates everything.
 
     Attributes:
@@ -156,7 +135,7 @@ class ArmEquations:
         PlanError: the arm has no bodies, or the extra `dynamics` is missing.
     """
 
-    def __init__(self, config: PlantConfig, effects: Effects = Effects(), *, held: bool = True) -> None:
+    def __init__(self, config: PlantConfig, *, held: bool = True) -> None:
         assert config.model is not None
         model, back = config.model, joints_per_motor(config.model)
         if config.bodies is None:
@@ -164,16 +143,16 @@ class ArmEquations:
         centre = (model.chain.T_last_flange @ config.T_flange_probe_centre)[:3, 3]
         payload = ball(config.dynamics.payload, config.radius_m, centre)
         bodies = *config.bodies[:-1], joined(config.bodies[-1], payload)
-        self.body = RigidBody(model.chain, bodies, GRAVITY_M_S2 if effects.gravity else 0.0)
-        self.effects, self.held, self.positions = effects, held, model.n
+        self.body = RigidBody(model.chain, bodies)
+        self.held, self.positions = held, model.n
         self.contact: HeldContact | None = None
         self._touching = None if config.object is None else Neighbourhood(config)
         self._joints_per_motor = back
-        inertia = np.array([joint.rotor_inertia for joint in model.joints])
-        self._rotors = np.diag(inertia)
-        if effects.links:  # a drive is tuned to what its motor moves in the first posture
-            inertia = inertia + np.diag(back.T @ self.body.terms(config.q0, np.zeros(model.n))[0] @ back)
-        self.loops = DriveLoops(config, inertia, friction=effects.friction)
+        rotors = np.array([joint.rotor_inertia for joint in model.joints])
+        self._rotors = np.diag(rotors)
+        # a drive is tuned to what its motor moves in the first posture
+        moved = np.diag(back.T @ self.body.terms(config.q0, np.zeros(model.n))[0] @ back)
+        self.loops = DriveLoops(config, rotors + moved)
         self._take(self._rotors, np.zeros(model.n))
 
     def hold(self, y: Floats) -> None:
@@ -183,11 +162,8 @@ class ArmEquations:
             y: (3n,) state.
         """
         theta, rate, _ = y.reshape(3, -1)
-        mass, bias = self._rotors, np.zeros(self.positions)
-        if self.effects.links:
-            mass, bias = self._driven(theta, rate if self.effects.coriolis else np.zeros(self.positions))
-        self._take(mass, bias)
-        if self.effects.contact and self._touching is not None:
+        self._take(*self._driven(theta, rate))
+        if self._touching is not None:
             self.contact = self._touching(theta)
 
     def _driven(self, theta: Floats, rate: Floats) -> tuple[Floats, Floats]:
@@ -207,8 +183,7 @@ class ArmEquations:
             theta: (n,) motor positions, rad.
         """
         still = np.zeros(self.positions)
-        bias = self._driven(theta, still)[1] if self.effects.links else still
-        return np.concatenate((theta, still, bias))
+        return np.concatenate((theta, still, self._driven(theta, still)[1]))
 
     def rate(self, t: float, y: Floats) -> Floats:
         """f(t, y)."""

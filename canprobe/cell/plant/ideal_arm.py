@@ -1,7 +1,7 @@
 """Ideal arm: decoupled second-order position loops, one per motor, solved exactly.
 
-Each motor position q (counts) follows its reference r: ``q'' = w^2 (r - q) - 2 z w q'``. References are ramps, for
-which the solution is closed: behind a steady ramp by the lag 2z/w, plus a decaying transient. The state is a function
+Each motor position q (counts) follows its reference r: ``q'' = w^2 (r - q) - 2 w q'``. References are ramps, for
+which the solution is closed: behind a steady ramp by the lag 2/w, plus a decaying transient. The state is a function
 of time alone: calling ``advance`` more or less often changes nothing. The object's push moves no joint: it only shows
 in the torque that the drives report. Not modelled: gravity, coupling of the links, saturation.
 """
@@ -9,7 +9,8 @@ in the torque that the drives report. Not modelled: gravity, coupling of the lin
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import cos, exp, pi, sin, sqrt, tanh
+from functools import lru_cache
+from math import exp, pi, sqrt, tanh
 
 import numpy as np
 import numpy.typing as npt
@@ -29,76 +30,101 @@ State = tuple[float, float, float]
 """Position, rate and reference of one motor: counts, counts/s, counts."""
 
 
-def natural_frequency(bandwidth_hz: float, damping_ratio: float) -> float:
-    """Undamped frequency w in rad/s of the loop whose response falls by 3 dB at ``bandwidth_hz``.
-
-    Args:
-        bandwidth_hz: -3 dB frequency.
-        damping_ratio: z; 1 is critical.
-    """
-    c = 1.0 - 2.0 * damping_ratio**2
-    return 2 * pi * bandwidth_hz / sqrt(c + sqrt(c * c + 1.0))
+def natural_frequency(bandwidth_hz: float) -> float:
+    """Undamped frequency w in rad/s of the critically damped loop whose response falls by 3 dB at ``bandwidth_hz``."""
+    return 2 * pi * bandwidth_hz / sqrt(sqrt(2.0) - 1.0)
 
 
-def transition(w: float, z: float, t: float) -> Transition:
-    """Transition matrix (rows of position and rate) of ``e'' = -w^2 e - 2 z w e'`` over t seconds.
+def transition(w: float, t: float) -> Transition:
+    """Transition matrix (rows of position and rate) of ``e'' = -w^2 e - 2 w e'`` over t seconds.
 
     Args:
         w: undamped frequency, rad/s.
-        z: damping ratio.
         t: s.
     """
-    s = z * w
-    if abs(z - 1.0) < 1e-9:
-        decay = exp(-w * t)
-        even, odd = decay, decay * t
-    elif z < 1.0:
-        v, decay = w * sqrt(1.0 - z * z), exp(-s * t)
-        even, odd = decay * cos(v * t), decay * sin(v * t) / v
-    else:
-        v = w * sqrt(z * z - 1.0)
-        slow, fast = exp((v - s) * t), exp(-(v + s) * t)
-        even, odd = 0.5 * (slow + fast), 0.5 * (slow - fast) / v
-    return even + s * odd, odd, -w * w * odd, even - s * odd
+    decay = exp(-w * t)
+    grown = decay * t
+    return decay + w * grown, grown, -w * w * grown, decay - w * grown
+
+
+class Reference:
+    """Reference of one motor: straight ramps of counts, one after the other; the end of a ramp is held.
+
+    Args:
+        counts: position until the first ramp.
+    """
+
+    __slots__ = ("_ramps",)
+
+    def __init__(self, counts: float) -> None:
+        self._ramps: list[Ramp] = [(-1, -1, counts, counts)]
+
+    def add(self, ramp: Ramp, now_ns: int) -> None:
+        """Follow a ramp from its start on, or from now on where it began in the past; drops what was to come later.
+
+        Args:
+            ramp: not before the ramps that act already.
+            now_ns: the present time.
+        """
+        last = self._ramps[-1]
+        if last[0] <= now_ns and last[0] < ramp[0]:  # the usual case, in every cycle
+            self._ramps = [last, ramp]
+            return
+        start = max(ramp[0], now_ns)
+        kept = [r for r in self._ramps if r[0] < start]
+        past = [r for r in kept if r[0] <= now_ns]
+        self._ramps = [*past[-1:], *kept[len(past) :], ramp]
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        """Reference (counts) and its slope (counts/s) from t on.
+
+        Args:
+            t_ns: not before the last ramp that began.
+        """
+        t0, t1, start, end = self._ramps[-1]
+        if t0 > t_ns:
+            t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
+        if t_ns >= t1:
+            return end, 0.0
+        slope = (end - start) / (1e-9 * (t1 - t0))
+        return start + slope * 1e-9 * (t_ns - t0), slope
+
+    def next_bend(self, t_ns: int) -> int:
+        """First time after t at which the slope may change, ns.
+
+        Args:
+            t_ns: ns.
+        """
+        bend = NEVER
+        for t0, t1, _, _ in self._ramps:
+            if t_ns < t0 < bend:
+                bend = t0
+            if t_ns < t1 < bend:
+                bend = t1
+        return bend
 
 
 class _Axis:
-    """One loop: its state at an anchor time, the ramp that acts from there, and ramps to come."""
+    """One loop: its state at an anchor time, and the reference that it follows from there."""
 
-    __slots__ = ("coming", "end", "end_ns", "event_ns", "lag", "q", "r", "slope", "t_ns", "v")
+    __slots__ = ("event_ns", "lag", "q", "r", "reference", "slope", "t_ns", "v")
 
     def __init__(self, q: float, lag: float) -> None:
-        self.t_ns, self.q, self.v, self.r, self.slope = 0, q, 0.0, q, 0.0
-        self.end, self.end_ns, self.event_ns, self.lag = q, NEVER, NEVER, lag
-        self.coming: list[Ramp] = []
+        self.lag, self.reference = lag, Reference(q)
+        self.anchor(0, (q, 0.0, q))
 
-    def at(self, phi: Transition, tau: float) -> tuple[float, float, float]:
+    def anchor(self, t_ns: int, state: State) -> None:
+        """Begin anew at a time, in a state."""
+        self.t_ns, (self.q, self.v, _) = t_ns, state
+        self.r, self.slope = self.reference.at(t_ns)
+        self.event_ns = self.reference.next_bend(t_ns)
+
+    def at(self, phi: Transition, tau: float) -> State:
         """Position, rate and reference at a time before the next event."""
         p11, p12, p21, p22 = phi
         e, de = self.q - self.r + self.lag * self.slope, self.v - self.slope
         r = self.r + self.slope * tau
         return r - self.lag * self.slope + p11 * e + p12 * de, self.slope + p21 * e + p22 * de, r
-
-    def begin(self, ramp: Ramp) -> None:
-        """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
-        t0, t1, start, end = ramp
-        if self.t_ns >= t1:
-            self.r, self.slope, self.end_ns = end, 0.0, NEVER
-        else:
-            self.slope = (end - start) / (1e-9 * (t1 - t0))
-            self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
-        self.plan_event()
-
-    def plan_event(self) -> None:
-        self.event_ns = min(self.end_ns, self.coming[0][0]) if self.coming else self.end_ns
-
-    def pass_event(self) -> None:
-        """The anchor stands at the next event: end of the ramp or start of a coming one."""
-        if self.coming and self.coming[0][0] <= self.t_ns:
-            self.begin(self.coming.pop(0))
-        else:
-            self.r, self.slope, self.end_ns = self.end, 0.0, NEVER
-            self.plan_event()
 
 
 class IdealArm:
@@ -108,24 +134,21 @@ class IdealArm:
         model: the arm.
         q0: (n,) joint positions at time 0, at rest, rad or m.
         bandwidth_hz: -3 dB frequency of every loop.
-        damping_ratio: 1 is critical.
 
     Attributes:
         push: gives the object's push now, (n,) torques on the motors in motor coordinates, N m or N. It is asked for
             only where a torque is: an arm whose drives report none costs no contact.
     """
 
-    def __init__(
-        self, model: ArmModel, q0: npt.ArrayLike, bandwidth_hz: float = 30.0, damping_ratio: float = 1.0
-    ) -> None:
+    def __init__(self, model: ArmModel, q0: npt.ArrayLike, bandwidth_hz: float = 30.0) -> None:
         self.model = model
-        self.w, self.z = natural_frequency(bandwidth_hz, damping_ratio), damping_ratio
-        self.lag_s = 2.0 * damping_ratio / self.w
+        self.w = w = natural_frequency(bandwidth_hz)
+        self.lag_s = 2.0 / w
         """Lag of the motors behind a steady ramp, s."""
-        self._stiffness, self._damping = self.w * self.w, 2 * damping_ratio * self.w
+        self._stiffness, self._damping = w * w, 2 * w
         self.t_ns = 0
         self._axes = [_Axis(c, self.lag_s) for c in joints_to_units(model, q0).tolist()]
-        self._phi: dict[int, Transition] = {}
+        self._transition = lru_cache(maxsize=256)(lambda dt_ns: transition(w, 1e-9 * dt_ns))
         rows = [[(motor, share) for motor, share in enumerate(row) if share] for row in model.q_per_unit.tolist()]
         own = np.diag(model.units_per_q).tolist()
         self._loads = [  # a drive reports torque in its own sense
@@ -148,16 +171,9 @@ class IdealArm:
             t0_ns: start.
             t1_ns: end; not after t0 for a step.
         """
-        a = self._axes[axis]
-        ramp = (t0_ns, t1_ns, start_counts, end_counts)
-        if t0_ns > self.t_ns:
-            a.coming = [*(r for r in a.coming if r[0] < t0_ns), ramp]
-            a.plan_event()
-            return
-        states = self._evaluated or self._states()
-        a.t_ns, (a.q, a.v, a.r) = self.t_ns, states[axis]
-        a.coming.clear()
-        a.begin(ramp)
+        a, states = self._axes[axis], self._evaluated or self._states()
+        a.reference.add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
+        a.anchor(self.t_ns, states[axis])
         states[axis] = (a.q, a.v, a.r)  # the other motors know nothing of this ramp
 
     def advance(self, t_ns: int) -> None:
@@ -219,34 +235,10 @@ class IdealArm:
     def _states(self) -> list[State]:
         """All states at once. At the very end of a ramp its own formula still holds."""
         self._evaluated = states = []
-        t_ns, lag, last_ns, tau = self.t_ns, self.lag_s, -1, 0.0
-        p11 = p12 = p21 = p22 = 0.0
         for a in self._axes:
-            if t_ns > a.event_ns or a.coming:
-                states.append(self._state(a, t_ns))
-                continue
-            dt_ns = t_ns - a.t_ns
-            if dt_ns != last_ns:
-                (p11, p12, p21, p22), tau, last_ns = self._transition(dt_ns), 1e-9 * dt_ns, dt_ns
-            slope = a.slope
-            behind = lag * slope
-            e, de = a.q - a.r + behind, a.v - slope
-            r = a.r + slope * tau
-            states.append((r - behind + p11 * e + p12 * de, slope + p21 * e + p22 * de, r))
+            while self.t_ns > a.event_ns:
+                span_ns = a.event_ns - a.t_ns
+                a.anchor(a.event_ns, a.at(self._transition(span_ns), 1e-9 * span_ns))
+            dt_ns = self.t_ns - a.t_ns
+            states.append(a.at(self._transition(dt_ns), 1e-9 * dt_ns))
         return states
-
-    def _state(self, a: _Axis, t_ns: int) -> State:
-        while t_ns >= a.event_ns:
-            span_ns = a.event_ns - a.t_ns
-            a.q, a.v, a.r = a.at(self._transition(span_ns), 1e-9 * span_ns)
-            a.t_ns = a.event_ns
-            a.pass_event()
-        return a.at(self._transition(t_ns - a.t_ns), 1e-9 * (t_ns - a.t_ns))
-
-    def _transition(self, dt_ns: int) -> Transition:
-        phi = self._phi.get(dt_ns)
-        if phi is None:
-            if len(self._phi) > 256:
-                self._phi.clear()
-            phi = self._phi[dt_ns] = transition(self.w, self.z, 1e-9 * dt_ns)
-        return phi

@@ -59,7 +59,7 @@ class Plant:
         self._solver = ContactSolver(config)
         if config.model is not None:
             if config.fidelity == "ideal":
-                self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
+                self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz)
             else:
                 from canprobe.cell.plant.dynamic_arm import DynamicArm
 

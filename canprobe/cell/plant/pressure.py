@@ -72,10 +72,7 @@ def pad_basis(direction: Vec) -> tuple[Vec, Vec]:
 def _averaging_matrix(taxels: int, samples: int, blur_pitch: float) -> Floats:
     """(taxels, n) weights along one axis: mean over each taxel of the blurred samples."""
     count = (taxels + 2 * _BLUR_MARGIN) * samples
-    mean = np.zeros((taxels, count))
-    for i in range(taxels):
-        start = (i + _BLUR_MARGIN) * samples
-        mean[i, start : start + samples] = 1.0 / samples
+    mean: Floats = np.repeat(np.eye(taxels, taxels + 2 * _BLUR_MARGIN, _BLUR_MARGIN), samples, axis=1) / samples
     if blur_pitch <= 0.0:
         return mean
     offsets = np.subtract.outer(np.arange(count), np.arange(count)) / samples

@@ -9,6 +9,7 @@ Source: figures after FSR data sheets and Sensors 2014, 14, 12816; the forms are
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from math import ceil, exp
 from typing import Any
 
@@ -69,11 +70,6 @@ class TaxelConfig:
         """Reading of the ADC at full scale."""
         return (1 << self.adc_bits) - 1
 
-    @property
-    def adc_threshold(self) -> int:
-        """Least reading of the ADC above the threshold."""
-        return int(np.ceil(self.threshold * self.adc_max))
-
     def without(self, *effects: str) -> TaxelConfig:
         """The same array with some effects switched off.
 
@@ -128,7 +124,7 @@ class TaxelArray:
         self._loop = np.zeros(pad.shape)
         # Rows: the relaxations, and the image that drives them; and where the next ones are put.
         self._creep, self._next = np.zeros((2, len(_CREEP_TIMES_S) + 1, pad.taxels))
-        self._relaxed: dict[int, Floats] = {}
+        self._relaxed = lru_cache(maxsize=64)(partial(_relaxations, config.creep_per_decade))
         self._t_s: float | None = None
         self._columns = _leaks(pad.columns, config.crosstalk)
         self._rows = _leaks(pad.rows, config.crosstalk) * float(config.adc_max)
@@ -197,29 +193,10 @@ class TaxelArray:
         self._t_s = t_s
         if self.config.creep_per_decade > 0.0:
             self._creep[-1] = y.reshape(-1)
-            self._creep, self._next = np.dot(self._relaxed_by(dt), self._creep, out=self._next), self._creep
+            self._creep, self._next = np.dot(self._relaxed(round(1e9 * dt)), self._creep, out=self._next), self._creep
             crept: Floats = self._creep[-1].reshape(self.pad.shape)
             return crept
         return y
-
-    def _relaxed_by(self, dt: float) -> Floats:
-        """(5, 5) what becomes of relaxations and image in a time: the relaxations then, and the crept image.
-
-        Sum of relaxations a decade apart: c per decade for a step, linear, superposes under moving loads.
-        """
-        dt_ns = round(1e9 * dt)
-        matrix = self._relaxed.get(dt_ns)
-        if matrix is None:
-            if len(self._relaxed) > 64:
-                self._relaxed.clear()
-            matrix = np.zeros((len(_CREEP_TIMES_S) + 1,) * 2)
-            for i, tau in enumerate(_CREEP_TIMES_S):
-                matrix[i, i] = exp(-1e-9 * dt_ns / tau)
-                matrix[i, -1] = 1.0 - matrix[i, i]
-            matrix[-1] = self.config.creep_per_decade * matrix[:-1].sum(axis=0)
-            matrix[-1, -1] += 1.0
-            self._relaxed[dt_ns] = matrix
-        return matrix
 
     def _convert(self, counts: Floats) -> Image:
         """Apply noise, ADC, threshold and dead taxels."""
@@ -250,10 +227,24 @@ def _leaks(taxels: int, crosstalk: float) -> Floats:
     return (1.0 - crosstalk) * np.eye(taxels) + crosstalk * others
 
 
+def _relaxations(growth: float, dt_ns: int) -> Floats:
+    """(5, 5) what becomes of relaxations and image in a time: the relaxations then, and the crept image.
+
+    Sum of relaxations a decade apart: a growth per decade for a step, linear, superposes under moving loads.
+    """
+    matrix = np.zeros((len(_CREEP_TIMES_S) + 1,) * 2)
+    for i, tau in enumerate(_CREEP_TIMES_S):
+        matrix[i, i] = exp(-1e-9 * dt_ns / tau)
+        matrix[i, -1] = 1.0 - matrix[i, i]
+    matrix[-1] = growth * matrix[:-1].sum(axis=0)
+    matrix[-1, -1] += 1.0
+    return matrix
+
+
 def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
     """Reading at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
     counts = np.arange(config.adc_max + 1)
-    counts[counts < config.adc_threshold] = 0
+    counts[counts < np.ceil(config.threshold * config.adc_max)] = 0
     return counts.astype(np.uint8) if config.adc_max == COUNTS_MAX else counts * float(COUNTS_MAX) / config.adc_max
 
 

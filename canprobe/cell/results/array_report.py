@@ -112,7 +112,7 @@ def draw_calibration(fit: ArrayFit, path: Path) -> None:
         f"{c.array}: errors of touches that the fit has not seen, scatter of centroids, gains of taxels\n{c.newtons}"
     )
     colours = {"plane": BLUE, "ball": ORANGE, "rod": GREY}
-    names = np.array([d.name for d in fit.dwells])
+    names = np.array([s.dwell.name for s in fit.touches])
     with picture(path, title, 3.6) as figure:
         moments, curvatures, scatter, gains = figure.subplots(1, 4)
         for name in dict.fromkeys(names.tolist()):
@@ -123,7 +123,7 @@ def draw_calibration(fit: ArrayFit, path: Path) -> None:
         for axes, what in ((moments, "moments, %"), (curvatures, "curvature, % of K + 1/R")):
             axes.axhline(0.0, color=INK, linewidth=0.8)
             axes.set(title=what, xlabel="force, nominal N" if c.nominal else "force, N")
-        t = np.array([s.lightness for s in fit.shown])
+        t = np.array([s.lightness for s in fit.touches])
         scatter.scatter(t, 1e6 * fit.scatter, s=8, color=GREY, label="centroids of a touch")
         fine = np.geomspace(t.min(), t.max(), 50)
         scatter.plot(fine, [1e6 * c.noise.image(x) for x in fine], color=INK, label="fitted law")

@@ -111,8 +111,8 @@ def measure(seed: int) -> Row:
         if not shown.usable or model.trust((dwell.kappa[0], 0.0, dwell.kappa[1]), force) < 1.0:
             continue
         forces.append(force / dwell.force - 1.0)
-        curvatures.append(curvature_errors(model, [(dwell, shown)], [force])[0])
-        moments.append(moment_errors(model, [(dwell, shown)], [force])[0, :2])
+        curvatures.append(curvature_errors(model, [shown], [force])[0])
+        moments.append(moment_errors(model, [shown], [force])[0, :2])
     return {
         "array": seed,
         "full_scale_kpa": 1e-3 * config.full_scale_pa,
@@ -160,7 +160,6 @@ def score_holds(
     bounds = 0
     for dwell, true in holds:
         reading, rows = ForceReading(patch), []
-        assert dwell.windows is not None
         for t, image, window in zip(dwell.t_s.tolist(), dwell.images, dwell.windows, strict=True):
             shown = compute_patch(image, patch, window)
             found = reading.step(t, shown)

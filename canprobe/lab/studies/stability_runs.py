@@ -108,7 +108,7 @@ def loop_of(case: LoopCase) -> ForceLoop:
         sample_cycles=max(1, round(case.rate_hz / SENSOR_HZ)),
         height_hz=case.height_hz,
         late_s=case.late_ms * 1e-3,
-        omega=natural_frequency(PlantSettings().drive_bandwidth_hz, 1.0),
+        omega=natural_frequency(PlantSettings().drive_bandwidth_hz),
     )
 
 

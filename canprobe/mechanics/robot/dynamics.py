@@ -19,6 +19,7 @@ from canprobe.mechanics.robot.model import Body, lopsided_inertia
 from canprobe.mechanics.types import Floats
 
 GRAVITY_M_S2 = 9.81
+"""Acceleration of free fall along base -z, m/s²."""
 _PLACEHOLDER_INERTIAL = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
 """A body that MuJoCo's compiler neither refuses nor simplifies; it is replaced by the real one, which it may refuse."""
 
@@ -78,13 +79,12 @@ class RigidBody:
         chain: geometry of the arm.
         bodies: (n,) bodies of its joints; None for a joint without one. Values that no solid could have are used as
             they are, as published tables leave out what does not matter.
-        gravity: acceleration of free fall along base -z, m/s^2.
 
     Raises:
         PlanError: the extra `dynamics` is not installed.
     """
 
-    def __init__(self, chain: Chain, bodies: Sequence[Body | None], gravity: float = GRAVITY_M_S2) -> None:
+    def __init__(self, chain: Chain, bodies: Sequence[Body | None]) -> None:
         problem = dynamics_problem(chain.name, bodies)
         if problem is not None:
             raise PlanError([problem])
@@ -93,7 +93,7 @@ class RigidBody:
         self._mujoco: Any = mujoco
         text = "".join(_opened(mujoco, T, slides) for T, slides in zip(chain.fixed, chain.prismatic, strict=True))
         text = f"<worldbody>{text}{'</body>' * chain.n}</worldbody>"
-        made = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 {-gravity!r}"/>{text}</mujoco>')
+        made = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 {-GRAVITY_M_S2!r}"/>{text}</mujoco>')
         for i, body in enumerate(bodies, start=1):  # 0 is the world
             moments, axes = np.linalg.eigh(np.zeros((3, 3)) if body is None else body.tensor)
             made.body_mass[i] = 0.0 if body is None else body.mass
@@ -121,14 +121,6 @@ class RigidBody:
         self._mujoco.mj_fwdVelocity(made, data)
         self._mujoco.mj_fullM(made, data, mass)
         return mass - self._armature, data.qfrc_bias.copy()
-
-    def gravity(self, q: npt.ArrayLike) -> Floats:
-        """(n,) torques that carry the arm's weight at rest, N m or N.
-
-        Args:
-            q: (n,) joint positions, rad or m.
-        """
-        return self.terms(q, np.zeros(len(self._armature)))[1]
 
 
 def _opened(mujoco: Any, T: Floats, slides: bool) -> str:

@@ -32,7 +32,7 @@ class MotionProfile:
         ramp_s, held_s = self._ramp(peak)
         cruise_s = max(0.0, length / peak - (2.0 * ramp_s + held_s)) if peak > 0.0 else 0.0
         stretches = [(ramp_s, jerk), (held_s, 0.0), (ramp_s, -jerk), (cruise_s, 0.0)]
-        self._stretches = self._joined((0.0, 0.0, 0.0), [*stretches, (ramp_s, -jerk), (held_s, 0.0), (ramp_s, jerk)])
+        self._stretches = self._joined([*stretches, (ramp_s, -jerk), (held_s, 0.0), (ramp_s, jerk)])
 
     @property
     def duration_s(self) -> float:
@@ -60,7 +60,7 @@ class MotionProfile:
             before.append((min(seconds, left), jerk))
             left -= before[-1][0]
         rest = [(max(0.0, a + lowest) / self.jerk, -self.jerk), (held_s, 0.0), (lowest / self.jerk, self.jerk)]
-        self._stretches = self._joined((0.0, 0.0, 0.0), [*before, *rest])
+        self._stretches = self._joined([*before, *rest])
 
     def _ramp(self, peak: float) -> tuple[float, float]:
         """Seconds of growing and of constant acceleration up to a speed."""
@@ -76,11 +76,9 @@ class MotionProfile:
         return _after(state, seconds, jerk)
 
     @staticmethod
-    def _joined(
-        state: tuple[float, float, float], stretches: Iterable[tuple[float, float]]
-    ) -> list[tuple[float, float, tuple[float, float, float]]]:
-        """Duration, jerk and first state (place, speed, acceleration) of each stretch."""
-        joined = []
+    def _joined(stretches: Iterable[tuple[float, float]]) -> list[tuple[float, float, tuple[float, float, float]]]:
+        """Duration, jerk and first state (place, speed, acceleration) of each stretch, from rest."""
+        joined, state = [], (0.0, 0.0, 0.0)
         for seconds, jerk in stretches:
             joined.append((seconds, jerk, state))
             state = _after(state, seconds, jerk)

@@ -34,10 +34,7 @@ def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: flo
     if size < 1e-9 * float(np.linalg.norm(hint)) or size == 0.0:
         raise ValueError(f"x_hint {hint.tolist()} is parallel to the normal {n.tolist()}")
     T_base_probe = np.eye(4)
-    T_base_probe[:3, 0] = x / size
-    T_base_probe[:3, 1] = np.cross(-n, x / size)
-    T_base_probe[:3, 2] = -n
-    T_base_probe[:3, 3] = np.asarray(point, dtype=float) + centre_height_m * n
+    T_base_probe[:3] = np.column_stack((x / size, np.cross(-n, x / size), -n, np.asarray(point) + centre_height_m * n))
     return T_base_probe
 
 

@@ -180,9 +180,8 @@ def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Floats, r: Floa
     _, s, Vt = np.linalg.svd(J * _UNKNOWN_UNITS, full_matrices=False)
     known = s > s[0] * 1e-12
     condition = float(s[0] / s[-1]) if known.all() else float("inf")
-    weights = np.where(known, 1.0 / np.where(known, s, 1.0), np.inf)
     V = Vt.T[:3] * LENGTH_UNIT_M
-    covariance = np.where(np.abs(V) > 0, V, 0.0) * np.where(known, weights, 0.0) ** 2 @ V.T
+    covariance = V[:, known] / s[known] ** 2 @ V[:, known].T
     blind = (np.abs(V[:, ~known]) > 1e-9 * LENGTH_UNIT_M).any(axis=1)
     covariance[blind, blind] = np.inf
     observed = np.sqrt(np.diag(covariance)) < model.observed_below

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
 STEP = 0.4e-3
@@ -210,13 +211,10 @@ class DepthWitness:
         order, normals = order[facing], normals[facing]
         roots, upright = np.array([self._believed[k].root for k in order]), normals @ up
         points = centres[order] - normals * (self._radius - d1 * roots)[:, None]
-        across = np.eye(3)[int(np.argmin(np.abs(up)))]
-        across = across - up * float(across @ up)
-        across /= np.linalg.norm(across)
-        frame = np.array([across, np.cross(up, across), up])
-        local = (points - points[0]) @ frame.T
-        slopes = -(normals @ frame[:2].T) / upright[:, None]
-        x, y, z = (contact.centre - points[0]) @ frame.T
+        R = tangent_rotation(up)
+        local = (points - points[0]) @ R
+        slopes = -(normals @ R[:, :2]) / upright[:, None]
+        x, y, z = (contact.centre - points[0]) @ R
         self._fit_and_measure(local, slopes, np.abs(roots - contact.root) * d1, (float(x), float(y), float(z)))
         if math.isfinite(self.sigma):
             self.force = (max(self.depth, 0.0) / d1) ** 2

@@ -138,18 +138,15 @@ def fit_mesh(
     first = surfaces.fit(USUAL_SPACING_M if spacing is None else spacing)
     if first.curvature is None or first.curvature.is_small:
         return first
-    others = [first, *surfaces.fits(SPACINGS_BY_EDGE * _usual_edge(points[corners[up]]))]
+    triangles = points[corners[up]]
+    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
+    others = [first, *surfaces.fits(SPACINGS_BY_EDGE * np.median(edges))]
     best, error = min(
         ((one, one.curvature) for one in others if one.curvature is not None), key=lambda pair: pair[1].error
     )
     if spacing is None:
         return best
     return replace(first, better=(best.spacing, error)) if error.error < WORTH_SHARE * first.curvature.error else first
-
-
-def _usual_edge(triangles: Floats) -> float:
-    """Median length of the sides of triangles (f, 3, 3), m."""
-    return float(np.median(np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)))
 
 
 class _Surfaces:

@@ -32,7 +32,6 @@ class Feet(NamedTuple):
         height: (n,) signed distances of the query points from the surface, m, positive outside.
         sigma: (n,) standard deviations of the surface's height, m; NaN where they are not known.
         sigma_relative: (n,) the same of its height against the rest of the surface: without what displaces all of it.
-        pieces: (n,) numbers of local fits that were blended.
     """
 
     point: Floats
@@ -40,7 +39,6 @@ class Feet(NamedTuple):
     height: Floats
     sigma: Floats
     sigma_relative: Floats
-    pieces: NDArray[np.intp]
 
 
 Field = Callable[[Floats], Feet]

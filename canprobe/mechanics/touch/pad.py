@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.checks import read_only
 from canprobe.mechanics.types import Floats
 
 COUNTS_MAX = 255
@@ -135,9 +136,9 @@ class Pad:
     def uv(self) -> Floats:
         """(rows · columns, 2) pad coordinates of the taxels, m."""
         if self.positions is not None:
-            return _read_only(np.array(self.positions, dtype=np.float64)[:, :2])
+            return read_only(np.asarray(self.positions)[:, :2])
         v, u = np.meshgrid(_centred(self.rows), _centred(self.columns), indexing="ij")
-        return _read_only(self.pitch_m * np.stack((u.reshape(-1), v.reshape(-1)), axis=1))
+        return read_only(self.pitch_m * np.stack((u.reshape(-1), v.reshape(-1)), axis=1))
 
     @cached_property
     def areas(self) -> Floats:
@@ -151,14 +152,9 @@ class Pad:
             tilt = np.asarray(self.normals, dtype=np.float64)[:, 2]
         elif self.positions is not None and self.is_flat:
             tilt = np.ones(self.taxels)
-        return _read_only(self.pitch_m**2 * tilt)
+        return read_only(self.pitch_m**2 * tilt)
 
 
 def _centred(count: int) -> Floats:
     """−(count − 1)/2 … (count − 1)/2."""
     return np.arange(count, dtype=np.float64) - (count - 1) / 2
-
-
-def _read_only(values: Floats) -> Floats:
-    values.flags.writeable = False
-    return values

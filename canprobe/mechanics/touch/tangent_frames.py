@@ -1,4 +1,4 @@
-"""Frames on a tangent plane, and small rotations."""
+"""Frames on a tangent plane."""
 
 from __future__ import annotations
 
@@ -50,12 +50,3 @@ def homogeneous(R: Floats, origin: Sequence[float] | Floats) -> Floats:
     T[:3, 3] = origin
     T[3, 3] = 1.0
     return T
-
-
-def rotation_vectors(R: Floats) -> Floats:
-    """The rotation vectors (n, 3) (angle times axis, rad) of rotations (n, 3, 3) below a half turn."""
-    w = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
-    sine = 0.5 * np.linalg.norm(w, axis=1)
-    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0))
-    small = sine < 1e-12
-    return np.asarray(w * np.where(small, 0.5, 0.5 * angle / np.where(small, 1.0, sine))[:, None])

@@ -14,12 +14,21 @@ ROOMS = (
 )
 TASKS = {f"canprobe.cell.tasks.{name}" for name in ("free_and_listen", "from_plan", "paused", "shape", "task")}
 ARM = {"chain", "denavit_hartenberg", "model", "motion_profile", "tool_calibration"}
-LIMITS = {"depth_witness", "image.force_creep", "image.force_errors", "pad", "shapes", "stops"}
+LIMITS = {
+    "checks",
+    "depth_witness",
+    "image.force_creep",
+    "image.force_errors",
+    "pad",
+    "shapes",
+    "stops",
+    "tangent_frames",
+}
 """Limits and geometry that the supervision and the emulated contact have in every cell: no image, no estimator."""
 IMAGES = {f"image.{name}" for name in ("calibration", "force_reading", "image_model", "moments", "patch")}
 DRIVE = {"cyclic_modes", "drive", "homing", "mode", "parameters", "parts", "profile", "profile_position"}
 DRIVE |= {"reference", "units"}
-OBJECTS = {"checks", "contact", "heights", "mesh_curvature", "mesh_fit", "mesh_repair", "objects"}
+OBJECTS = {"contact", "heights", "mesh_curvature", "mesh_fit", "mesh_repair", "objects"}
 NEEDED = {
     "listen": {
         *(f"canprobe.mechanics.robot.{name}" for name in ARM),

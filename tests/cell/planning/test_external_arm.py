@@ -6,7 +6,7 @@ from canprobe.cell.planning.external_arm import HIGHEST, STIFFER
 from canprobe.cell.plant.ideal_arm import natural_frequency
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 
-OMEGA, LAG_S = natural_frequency(30.0, 1.0), 6.8e-3
+OMEGA, LAG_S = natural_frequency(30.0), 6.8e-3
 
 
 @pytest.mark.parametrize("rate_hz", [125.0, 500.0])

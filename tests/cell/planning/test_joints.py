@@ -126,7 +126,7 @@ def with_following_window(tmp_path, window, access):
 
 
 def test_joints_keep_within_the_speed_at_which_their_drives_lag_by_a_fixed_window(tmp_path):
-    lag_s = 2.0 / natural_frequency(30.0, 1.0)
+    lag_s = 2.0 / natural_frequency(30.0)
     plan = canprobe.plan(with_following_window(tmp_path, 200, "ro"))
     model = plan.setup.arm.model
     fastest = np.abs(model.units_per_q) @ model.qd_max
@@ -140,7 +140,7 @@ def test_joints_keep_within_the_speed_at_which_their_drives_lag_by_a_fixed_windo
 def test_a_swing_that_a_following_window_allows_is_done_and_a_faster_one_refused(tmp_path):
     free = canprobe.plan(with_following_window(tmp_path, 0xFFFFFFFF, "ro"))
     speeds = np.abs(free.setup.arm.model.units_per_q) @ np.radians(free.joint_speeds.needed)
-    lag = max(speeds) * 2.0 / natural_frequency(30.0, 1.0)
+    lag = max(speeds) * 2.0 / natural_frequency(30.0)
     narrow = with_following_window(tmp_path, math.ceil(1.5 * lag) + 2, "ro")
     assert "6065h" in canprobe.plan(narrow).warnings[0]
     assert canprobe.run(narrow, bus="direct", files=False).summary["completed"]

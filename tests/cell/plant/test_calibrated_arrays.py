@@ -165,7 +165,7 @@ def test_a_file_of_an_earlier_form_is_read_with_one_warning(fit, tmp_path):
 def test_the_noise_of_a_scan_is_found_by_the_touches(fit, touched):
     """Errors from image to image, the slow one that grows with the way over the pad, and that of the height."""
     noise = fit.calibration.noise
-    held = {d.place: s for d, s in zip(fit.dwells, fit.shown, strict=True) if d.name == "ball" and s.lightness < 0.1}
+    held = {s.dwell.place: s for s in fit.touches if s.dwell.name == "ball" and s.lightness < 0.1}
     for s in held.values():
         jumps = np.diff(s.off, axis=0)[1:] - np.diff(s.off, axis=0)[:-1]
         assert noise.image(s.lightness) == pytest.approx(np.sqrt(np.mean(jumps**2) / 6.0), rel=0.3)

@@ -9,10 +9,10 @@ from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
 from scipy.integrate import solve_ivp
 
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import DynamicArm, Reference
+from canprobe.cell.plant.dynamic_arm import DynamicArm
 from canprobe.cell.plant.elastic_contact import depth_for_force
-from canprobe.cell.plant.equations import ArmEquations, Effects
-from canprobe.cell.plant.ideal_arm import NEVER, IdealArm
+from canprobe.cell.plant.equations import ArmEquations
+from canprobe.cell.plant.ideal_arm import NEVER, IdealArm, Reference
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import PlanError
@@ -36,13 +36,17 @@ POSE = np.eye(4)
 POSE[:3, 3] = POINT
 CYLINDER = make_object("cylinder", T_base_object=POSE, radius=0.036)
 STRETCHED = np.radians((90.0, 10.0, -60.0, 0.0, 60.0, 0.0))
-NOTHING = Effects(gravity=False, coriolis=False, friction=False, links=False, contact=False)
 
 
 def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
     q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
     settings = Dynamics(**dynamics)
     return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=BODIES["puma260"])
+
+
+def without_friction(c):
+    joints = tuple(replace(joint, coulomb=0.0, viscous=0.0) for joint in c.model.joints)
+    return replace(c, model=replace(c.model, joints=joints))
 
 
 def state(arm):
@@ -65,11 +69,11 @@ def ramps(arm, cycles=60, counts=0.5, extra=lambda t: None):
 
 
 def test_motors_alone_are_the_ideal_arm():
-    c = config(integral_s=0.0)
+    c = replace(without_friction(config(shape=None, integral_s=0.0, payload=0.0)), bodies=(None,) * 6)
     ideal = ramps(IdealArm(UPENN, c.q0))
-    exact = ramps(DynamicArm(replace(c, dynamics=replace(c.dynamics, integrator="rk4", step_ns=25_000)), NOTHING))
+    exact = ramps(DynamicArm(replace(c, dynamics=replace(c.dynamics, integrator="rk4", step_ns=25_000))))
     assert exact == pytest.approx(ideal, abs=1e-9)
-    close = ramps(DynamicArm(c, NOTHING))
+    close = ramps(DynamicArm(c))
     assert 1e-6 < np.abs(close - ideal).max() < 0.01
 
 
@@ -93,7 +97,7 @@ def test_at_rest_the_motors_carry_the_weight_and_nothing_moves(model):
     arm.advance(500_000_000)
     assert arm.motors()[0] == pytest.approx(start, abs=1e-6)
     body = arm.equations.body
-    share = joints_per_motor(UPENN).T @ body.gravity(STRETCHED)
+    share = joints_per_motor(UPENN).T @ body.terms(STRETCHED, 0.0)[1]
     assert torques == pytest.approx(1e3 * share / np.array((6.4, 6.4, 6.4, 1.4, 0.7, 0.7)), abs=0.51)
     assert abs(torques[1]) > 100
 
@@ -118,7 +122,7 @@ def test_motors_and_gears_rub_as_published(rate):
     viscous, coulomb = (0.32, 0.52, 0.22, 0.023, 0.023, 0.012), (2.2, 1.1, 0.57, 0.10, 0.083, 0.064)
     c = config(shape=None)
     y = state(DynamicArm(c)) + np.repeat((0.0, rate, 0.0), 6)
-    rough, smooth = ArmEquations(c), ArmEquations(c, Effects(friction=False))
+    rough, smooth = ArmEquations(c), ArmEquations(without_friction(c))
     for e in (rough, smooth):
         e.hold(y)
     drag = rough.mass @ (rough.rate(0.0, y) - smooth.rate(0.0, y))[6:12]
@@ -269,7 +273,7 @@ def test_any_arm_carries_its_weight_and_stands_off_the_object(made):
     free.advance(200_000_000)
     assert free.motors()[0] == pytest.approx(rest, abs=1e-3)
     assert units_to_joints(model, free.motors()[0]) == pytest.approx(q0, abs=1e-8)
-    weight = joints_per_motor(model).T @ free.equations.body.gravity(q0)
+    weight = joints_per_motor(model).T @ free.equations.body.terms(q0, 0.0)[1]
     rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]  # in the drive's own sense
     assert torques == pytest.approx(1e3 * weight / rated, abs=0.51)
     if made is gantry:  # masses of z and the probe
@@ -386,7 +390,7 @@ def test_both_arms_report_the_torque_against_a_push(made, force_n):
         model = dynamic.arm.model
         ratio = dynamic.truth()["force"] / ideal.truth()["force"]
         assert ratio == pytest.approx(1.0, abs=0.02)
-        weight = joints_per_motor(model).T @ dynamic.arm.equations.body.gravity(dynamic.truth()["q"])
+        weight = joints_per_motor(model).T @ dynamic.arm.equations.body.terms(dynamic.truth()["q"], 0.0)[1]
         rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]
         found = [dynamic.torque_permille(i) for i in range(model.n)] - 1e3 * weight / rated
         push = np.array([ideal.torque_permille(i) for i in range(model.n)])

@@ -15,11 +15,10 @@ from canprobe.cell.plant.plant import Plant
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 
 MS = 1_000_000
-DAMPING = pytest.mark.parametrize("z", [0.4, 0.7, 1.0, 1.0000001, 1.8])
 
 
-def arm(z=1.0, bandwidth_hz=30.0):
-    return IdealArm(UPENN, ELBOW_FORM, bandwidth_hz, z)
+def arm():
+    return IdealArm(UPENN, ELBOW_FORM)
 
 
 def counts(a):
@@ -38,7 +37,7 @@ def reference_run(a, start, ramps, t_ns):
     """Position and rate of one motor by the matrix exponential of (q, v, r, slope)."""
     A = np.zeros((4, 4))
     A[0, 1] = A[2, 3] = 1.0
-    A[1] = (-(a.w**2), -2 * a.z * a.w, a.w**2, 0.0)
+    A[1] = (-(a.w**2), -2 * a.w, a.w**2, 0.0)
     x, now = np.array((start, 0.0, start, 0.0)), 0
     for t0, t1, r0, r1 in ramps:
         x, now = expm(A * 1e-9 * (t0 - now)) @ x, t0
@@ -48,24 +47,21 @@ def reference_run(a, start, ramps, t_ns):
     return expm(A * 1e-9 * (t_ns - now)) @ x
 
 
-@DAMPING
 @settings(max_examples=25)
 @given(t=st.floats(0.0, 0.2))
-def test_transition_is_the_matrix_exponential(z, t):
+def test_transition_is_the_matrix_exponential(t):
     w = 120.0
-    expected = expm(np.array([[0.0, 1.0], [-w * w, -2 * z * w]]) * t)
-    assert np.array(transition(w, z, t)).reshape(2, 2) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    expected = expm(np.array([[0.0, 1.0], [-w * w, -2 * w]]) * t)
+    assert np.array(transition(w, t)).reshape(2, 2) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
-@pytest.mark.parametrize("z", [0.5, 1.0, 2.0])
-def test_bandwidth_is_the_minus_3_db_frequency(z):
-    w, s = natural_frequency(30.0, z), 2j * math.pi * 30.0
-    assert abs(w * w / (s * s + 2 * z * w * s + w * w)) == pytest.approx(1 / math.sqrt(2))
+def test_bandwidth_is_the_minus_3_db_frequency():
+    w, s = natural_frequency(30.0), 2j * math.pi * 30.0
+    assert abs(w * w / (s * s + 2 * w * s + w * w)) == pytest.approx(1 / math.sqrt(2))
 
 
-@DAMPING
-def test_ramps_and_holds_are_solved_exactly(z):
-    a = arm(z)
+def test_ramps_and_holds_are_solved_exactly():
+    a = arm()
     start = float(counts(a)[2])
     ramps = [
         (0, 5 * MS, start, start + 40.0),
@@ -101,7 +97,7 @@ def test_a_ramp_in_progress_is_solved_exactly():
     targets=st.lists(st.floats(-300, 300), min_size=4, max_size=4),
 )
 def test_any_cutting_of_time_gives_the_same_state(cuts, targets):
-    once, often = arm(0.8), arm(0.8)
+    once, often = arm(), arm()
     start = float(counts(once)[1])
     for a, stops in ((once, []), (often, sorted(cuts))):
         value = start
@@ -122,14 +118,14 @@ def test_any_cutting_of_time_gives_the_same_state(cuts, targets):
     assert np.array_equal(rates(once), rates(often))
 
 
-def test_steady_ramp_lags_by_twice_damping_over_frequency():
-    a = arm(0.7)
+def test_steady_ramp_lags_by_two_over_the_frequency():
+    a = arm()
     start = float(counts(a)[0])
     a.set_ramp(0, start, start + 10_000.0, 0, 1000 * MS)
     a.advance(500 * MS)
     assert start + 5000.0 - counts(a)[0] == pytest.approx(10_000.0 * a.lag_s)
     assert rates(a)[0] == pytest.approx(10_000.0)
-    assert a.lag_s == pytest.approx(2 * 0.7 / a.w)
+    assert a.lag_s == pytest.approx(2.0 / a.w)
 
 
 def test_axes_are_independent_and_hold_without_a_ramp():

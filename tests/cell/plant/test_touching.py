@@ -1,6 +1,7 @@
 """Forces of every object as the slope of one energy; several touches; energy in closed cycles."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,7 +10,7 @@ from puma_arm import BODIES, ELBOW_FORM, UPENN
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.elastic_contact import elastic_contact, force_laws, total_force
-from canprobe.cell.plant.equations import ArmEquations, Effects
+from canprobe.cell.plant.equations import ArmEquations
 from canprobe.cell.plant.integrators import rosenbrock2
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
@@ -118,7 +119,10 @@ def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
 
 
 def equations_of(config, held=False):
-    found = ArmEquations(config, Effects(gravity=False, coriolis=True, friction=False), held=held)
+    """Equations of an arm without weight, friction of its own and drives."""
+    joints = tuple(replace(joint, coulomb=0.0, viscous=0.0) for joint in config.model.joints)
+    found = ArmEquations(replace(config, model=replace(config.model, joints=joints)), held=held)
+    found.body._model.opt.gravity[:] = 0.0
     found.loops.gain, found.loops.integral, found.loops.unwind = np.zeros(6), np.zeros(6), 0.0
     return found
 

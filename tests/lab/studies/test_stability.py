@@ -30,7 +30,7 @@ from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
 from canprobe.mechanics.touch.contact import indentation_from_force
 
-LOOP = ForceLoop(1.0, 0.0025, 2, 8.0, 0.0, natural_frequency(30.0, 1.0))
+LOOP = ForceLoop(1.0, 0.0025, 2, 8.0, 0.0, natural_frequency(30.0))
 LOOPS = [
     replace(LOOP, depth_ratio=0.3),
     replace(LOOP, depth_ratio=2.0),

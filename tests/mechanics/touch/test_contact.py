@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch import contact as c
-from canprobe.mechanics.touch.tangent_frames import homogeneous, rotation_vectors
+from canprobe.mechanics.touch.tangent_frames import homogeneous
 
 
 def turn(axis, angle):
@@ -41,12 +41,6 @@ def test_sample_goes_through_the_squeezed_layer():
     assert np.allclose((s.p_base - centre) / 0.0397, -s.n_base)  # the object's outward normal faces the centre
     assert np.allclose(T[:3, :3] @ s.r_probe + centre, s.p_base)
     assert np.allclose(T[:3, :3] @ (-s.r_probe / 0.0397), s.n_base)  # inward normal of the probe
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-10, 0.3, 2.5, 3.1])
-def test_rotation_vectors(angle):
-    axis = np.array([0.36, 0.48, 0.8])
-    assert np.allclose(rotation_vectors(turn(axis, angle)[None])[0], angle * axis, atol=1e-12)
 
 
 class TestIndentation:

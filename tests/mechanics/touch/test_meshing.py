@@ -76,7 +76,7 @@ def plane(points, half=0.0105):
     inside = (np.abs(points[:, :2]) < half).all(axis=1)
     height = np.where(inside, points[:, 2], math.nan)
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    return Feet(points * [1.0, 1.0, 0.0], up, height, 0 * height, 0 * height, inside.astype(int))
+    return Feet(points * [1.0, 1.0, 0.0], up, height, 0 * height, 0 * height)
 
 
 def test_any_closest_point_can_be_meshed():

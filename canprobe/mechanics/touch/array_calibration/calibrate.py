@@ -25,26 +25,22 @@ from canprobe.mechanics.touch.array_calibration.parameter_fit import (
 from canprobe.mechanics.touch.array_calibration.push_fit import fit_force, stiffness_by_depth
 from canprobe.mechanics.touch.array_calibration.touches import (
     LAST_IMAGE_S,
-    NO_ERRORS,
     Dwell,
     Shown,
-    Touches,
     what_is_shown,
 )
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.image.calibration import (
+    NO_ERRORS,
     ArrayCalibration,
-    CentroidDelays,
-    ContactNoise,
     ForceReference,
     ImageParameters,
-    Lag,
     MomentErrors,
     Residuals,
     StiffnessSources,
 )
 from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, USUAL_LIGHTNESS
-from canprobe.mechanics.touch.image.image_model import MOMENT_ERROR_POWER, make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.image.image_model import MOMENT_ERROR_POWER, ImageModel, with_force_gains
 from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.pad import Pad
@@ -66,7 +62,7 @@ class ArrayFit:
 
     Attributes:
         calibration: the result.
-        dwells, shown: the touches that were used.
+        touches: the touches that were used.
         forces: (n,) their forces by the calibration, N.
         errors: (n, 3) relative errors of moments of each touch by a fit that has not seen it.
         curvature_errors: (n, 2) errors of curvatures by that fit, relative to (κ + 1/R_p).
@@ -79,8 +75,7 @@ class ArrayFit:
     """
 
     calibration: ArrayCalibration
-    dwells: Sequence[Dwell]
-    shown: Sequence[Shown]
+    touches: Sequence[Shown]
     forces: Floats
     errors: Floats
     curvature_errors: Floats
@@ -123,65 +118,63 @@ def calibrate_array(
     by_force = reference in ("scale", "weights")
     dwells = dwells if by_force else [replace(d, force=None) for d in dwells]
     plain = PatchCalibration(pad)
-    every = [(d, what_is_shown(d, plain, LAST_IMAGE_S)) for d in dwells]
-    used = {id(d) for d, s in every if s.usable}
-    count = sum(s.usable and d.name != "rod" for d, s in every)
-    if count < MIN_TOUCHES or len({d.name for d, s in every if s.usable and d.name != "rod"}) < 2:
+    every = [what_is_shown(d, plain, LAST_IMAGE_S) for d in dwells]
+    good = [s for s in every if s.usable]
+    fitted = _without_rods(good)
+    if len(fitted) < MIN_TOUCHES or len({s.dwell.name for s in fitted}) < 2:
         raise UsageError(
             f"expected at least {MIN_TOUCHES} touches of a plane and a ball that neither saturate nor leave the pad,"
-            f" got {count}"
+            f" got {len(fitted)}"
         )
-    if by_force and not any(d.force is not None and id(d) in used for d in dwells):
+    if by_force and not any(s.dwell.force is not None for s in good):
         raise UsageError(f'force reference "{reference}": expected touches with a known force, got none')
     scale_sigma = None if by_force else max(reference_sigma, 1e-4) if reference == "unit" else 1e-4
-    seen = side_seen(dwells, pad)
-    blank = _blank(array, date, made_on, reference, reference_sigma, pad.full_scale_pa)
+    seen = side_seen(dwells)
 
-    def fit(touches: Touches, own: PatchCalibration) -> tuple[ArrayCalibration, ParameterFit]:
-        sigma = reference_sigma if by_force else 1.0
-        found = fit_parameters(touches, own, scale_sigma, sigma, seen)
-        crept = [s.crept for d, s in touches if d.force is not None]
+    def fit(touches: Sequence[Shown], own: PatchCalibration) -> ParameterFit:
+        found = fit_parameters(touches, own, scale_sigma, reference_sigma if by_force else 1.0, seen)
+        crept = [s.crept for s in touches if s.dwell.force is not None]
         scale = found.parameters.scale * (float(np.mean(crept)) if crept else 1.0)
-        return replace(blank, image=replace(found.parameters, scale=scale), gains=own.gains), found
+        return found._replace(parameters=replace(found.parameters, scale=scale))
 
-    good = [(d, s) for d, s in every if s.usable]
-    fitted = [(d, s) for d, s in good if d.name != "rod"]
-    first, found = fit(fitted, plain)
-    gained, alike = _by_gains(fitted, first, plain, seen)
-    gains, dead = _gains(fitted, first, plain)
-    own = plain
+    found, own = fit(fitted, plain), plain
+    gained, alike = _by_gains(fitted, found.parameters, plain, seen)
+    gains, dead = _gains(fitted, found.parameters, plain)
     if own_gains and gained < MAX_ERROR_LEFT_SHARE * alike:
         own = replace(plain, gains=tuple(tuple(row) for row in np.round(gains, 4).tolist()))
-        good = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in good]
-        fitted = [(d, s) for d, s in good if d.name != "rod"]
-        first, found = fit(fitted, own)
-    errors, curvatures, force_errors = _held_out(fitted, lambda touches: fit(touches, own)[0], own, seen)
+        good = [what_is_shown(s.dwell, own, LAST_IMAGE_S) for s in good]
+        fitted = _without_rods(good)
+        found = fit(fitted, own)
+    errors, curvatures, force_errors = _held_out(fitted, lambda touches: fit(touches, own).parameters, own, seen)
     stiffness = found.parameters.stiffness
     by_images = stiffness, stiffness * math.sqrt(float(found.covariance[0, 0]))
     by_depth = stiffness_by_depth(fitted, found.forces.tolist(), pad.radius_m, by_images)
-    rods = [(d, s) for d, s in good if d.name == "rod"]
-    across = rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
-    patch = make_patch_calibration(first, pad)
-    depths = [_depths(d, s, patch, stiffness) for d, s in fitted]
-    noise, centroid, scatter = fit_noise(fitted, depths)
-    spread = 0.0 if own_gains else spread
-    calibration = replace(
-        first,
-        force=fit_force(fitted, patch, stiffness, force_errors, spread),
-        moments=_moment_errors(errors, [s for _, s in fitted]),
+    rods = [s for s in good if s.dwell.name == "rod"]
+    across = rms(_checked(found.parameters, rods, own, seen)[1][:, 0]) if rods else math.nan
+    patch = with_force_gains(own, found.parameters)
+    noise, centroid, scatter = fit_noise(fitted, [_depths(s, patch, stiffness) for s in fitted])
+    calibration = ArrayCalibration(
+        array=array,
+        date=date,
+        made_on=made_on,
+        force_reference=reference,
+        force_sigma=math.nan if reference == "none" else reference_sigma,
+        full_scale=pad.full_scale_pa,
+        image=found.parameters,
+        moments=_moment_errors(errors, fitted),
         noise=noise,
         centroid=centroid,
         stiffness=StiffnessSources(*by_images, *by_depth),
         residuals=Residuals(len(fitted), rms(force_errors), rms(errors[:, :2]), rms(curvatures), across),
+        force=fit_force(fitted, patch, stiffness, force_errors, 0.0 if own_gains else spread),
+        gains=own.gains,
         dead=dead if own_gains else (),
     )
     offset, of_object = _offsets(good)
-    forces = np.array([force_of(patch, s) for _, s in fitted])
     return ArrayFit(
         calibration=calibration,
-        dwells=[d for d, _ in fitted],
-        shown=[s for _, s in fitted],
-        forces=forces,
+        touches=fitted,
+        forces=np.array([force_of(patch, s) for s in fitted]),
         errors=errors,
         curvature_errors=curvatures,
         scatter=scatter,
@@ -194,29 +187,14 @@ def calibrate_array(
     )
 
 
-def _blank(  # noqa: PLR0917
-    array: str, date: str, made_on: str, reference: ForceReference, sigma: float, full_scale: float
-) -> ArrayCalibration:
-    nan = math.nan
-    return ArrayCalibration(
-        array,
-        date,
-        made_on,
-        reference,
-        nan if reference == "none" else sigma,
-        full_scale,
-        ImageParameters(1.0, 1.0, 1.0, 0.0, 0.0),
-        NO_ERRORS,
-        ContactNoise(nan, nan, nan, nan, nan),
-        CentroidDelays(nan, nan, Lag(0.0, 1.0)),
-        StiffnessSources(nan, nan, nan, nan, nan, nan),
-        Residuals(0, nan, nan, nan, nan),
-    )
+def _without_rods(touches: Sequence[Shown]) -> list[Shown]:
+    """The touches that are fitted; those of a rod verify."""
+    return [s for s in touches if s.dwell.name != "rod"]
 
 
-def side_seen(dwells: Sequence[Dwell], pad: Pad) -> int:
+def side_seen(dwells: Sequence[Dwell]) -> int:
     """Taxels along the longer side of what images show."""
-    return max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
+    return max(window[2] for window in dwells[0].windows)
 
 
 def at_usual_lightness(errors: Floats, shown: Sequence[Shown]) -> Floats:
@@ -230,36 +208,34 @@ def force_of(patch: PatchCalibration, s: Shown) -> float:
     return patch.force_gain * s.total + patch.edge_gain * math.sqrt(s.total)
 
 
-def _depths(dwell: Dwell, s: Shown, patch: PatchCalibration, stiffness: float) -> Floats:
+def _depths(s: Shown, patch: PatchCalibration, stiffness: float) -> Floats:
     """(n,) depth of the layer in each image of a touch, m."""
-    at_1_n = indentation_from_force(1.0, stiffness, patch.pad.radius_m, dwell.kappa)
+    at_1_n = indentation_from_force(1.0, stiffness, patch.pad.radius_m, s.dwell.kappa)
     return at_1_n * np.sqrt(patch.force_gain * s.sums + patch.edge_gain * np.sqrt(s.sums))
 
 
 def _checked(
-    calibration: ArrayCalibration, touches: Touches, plain: PatchCalibration, seen: int
+    parameters: ImageParameters, touches: Sequence[Shown], plain: PatchCalibration, seen: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Errors (n, 3) of moments, (n, 2) of curvatures and (m,) of reference forces of touches by a calibration."""
-    patch = make_patch_calibration(calibration, plain.pad)
-    model = make_image_model(calibration, patch, seen=seen)
-    measured = [force_of(patch, s) for _, s in touches]
+    """Errors (n, 3) of moments, (n, 2) of curvatures and (m,) of reference forces of touches by a model."""
+    patch, model = with_force_gains(plain, parameters), ImageModel(parameters, NO_ERRORS, plain.pad, seen)
+    measured = [force_of(patch, s) for s in touches]
     # a reference load is read over the whole touch, and creep is part of it
-    forces = [f * s.crept / d.force - 1.0 for f, (d, s) in zip(measured, touches, strict=True) if d.force is not None]
-    return moment_errors(model, touches, measured), curvature_errors(model, touches, measured), np.array(forces)
+    known = [(f, s.crept, s.dwell.force) for f, s in zip(measured, touches, strict=True) if s.dwell.force is not None]
+    forces = np.array([f * crept / force - 1.0 for f, crept, force in known])
+    return moment_errors(model, touches, measured), curvature_errors(model, touches, measured), forces
 
 
 def _held_out(
-    touches: Touches, fit: Callable[[Touches], ArrayCalibration], plain: PatchCalibration, seen: int
+    touches: Sequence[Shown], fit: Callable[[Sequence[Shown]], ImageParameters], plain: PatchCalibration, seen: int
 ) -> tuple[Floats, Floats, Floats]:
-    """As `_checked`, each fifth of the touches by a calibration that was fitted to the others."""
+    """As `_checked`, each fifth of the touches by parameters that were fitted to the others."""
     errors, curvatures, forces = np.zeros((len(touches), 3)), np.zeros((len(touches), 2)), []
     for fold in range(FOLDS):
         out = list(range(fold, len(touches), FOLDS))
-        found = _checked(
-            fit([p for i, p in enumerate(touches) if i not in out]), [touches[i] for i in out], plain, seen
-        )
-        errors[out], curvatures[out] = found[:2]
-        forces.append(found[2])
+        found = fit([s for i, s in enumerate(touches) if i not in out])
+        errors[out], curvatures[out], of_forces = _checked(found, [touches[i] for i in out], plain, seen)
+        forces.append(of_forces)
     return errors, curvatures, np.concatenate(forces)
 
 
@@ -276,37 +252,36 @@ def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
 
 
 def _gains(
-    touches: Touches, calibration: ArrayCalibration, plain: PatchCalibration
+    touches: Sequence[Shown], parameters: ImageParameters, plain: PatchCalibration
 ) -> tuple[Floats, tuple[tuple[int, int], ...]]:
     """(16, 16) gains of the taxels by these touches, and dead ones."""
-    patch = make_patch_calibration(calibration, plain.pad)
-    model = make_image_model(calibration, patch, seen=None)
-    forces = [force_of(patch, s) for _, s in touches]
-    return taxel_gains(plain.pad, model, touches, forces)
+    patch, model = with_force_gains(plain, parameters), ImageModel(parameters, NO_ERRORS, plain.pad)
+    return taxel_gains(plain.pad, model, touches, [force_of(patch, s) for s in touches])
 
 
 def _by_gains(
-    touches: Touches, calibration: ArrayCalibration, plain: PatchCalibration, seen: int
+    touches: Sequence[Shown], parameters: ImageParameters, plain: PatchCalibration, seen: int
 ) -> tuple[float, float]:
     """RMS error of the moments of each half of the touches, with gains of the taxels from the other, and without."""
     gained, alike = [], []
     for half in (0, 1):
-        gains = _gains(touches[half::2], calibration, plain)[0]
+        gains, other = _gains(touches[half::2], parameters, plain)[0], touches[1 - half :: 2]
         own = replace(plain, gains=tuple(tuple(row) for row in gains.tolist()))
-        check = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in touches[1 - half :: 2]]
-        gained.append(_checked(calibration, check, plain, seen)[0][:, :2])
-        alike.append(_checked(calibration, touches[1 - half :: 2], plain, seen)[0][:, :2])
+        check = [what_is_shown(s.dwell, own, LAST_IMAGE_S) for s in other]
+        gained.append(_checked(parameters, check, plain, seen)[0][:, :2])
+        alike.append(_checked(parameters, other, plain, seen)[0][:, :2])
     return rms(np.concatenate(gained)), rms(np.concatenate(alike))
 
 
-def _offsets(touches: Touches) -> tuple[Floats, Floats]:
+def _offsets(touches: Sequence[Shown]) -> tuple[Floats, Floats]:
     """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m."""
     # a gradient of the taxels' gains and an error of the tool turn with the probe; a wrong place of the object does not
     unknown = np.full(2, math.nan)
     mine, its = [], []
-    for name in sorted({d.name for d, _ in touches if abs(d.turn) > 0.5 and d.name != "rod"}):
-        straight = [s.off.mean(axis=0) for d, s in touches if d.name == name and d.turn == 0.0]
-        turned = [s.off.mean(axis=0) for d, s in touches if d.name == name and abs(d.turn) > 0.5]
+    for name in sorted({s.dwell.name for s in _without_rods(touches) if abs(s.dwell.turn) > 0.5}):
+        same = [s for s in touches if s.dwell.name == name]
+        straight = [s.off.mean(axis=0) for s in same if s.dwell.turn == 0.0]
+        turned = [s.off.mean(axis=0) for s in same if abs(s.dwell.turn) > 0.5]
         if straight:
             mine.append(0.5 * (np.mean(straight, axis=0) + np.mean(turned, axis=0)))
             its.append(0.5 * (np.mean(straight, axis=0) - np.mean(turned, axis=0)))

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from canprobe.mechanics.touch.array_calibration.touches import Shown, Touches
+from canprobe.mechanics.touch.array_calibration.touches import Shown
 from canprobe.mechanics.touch.image.calibration import CentroidDelays, ContactNoise, Lag
+from canprobe.mechanics.touch.image.pad_lag import PadWay
 from canprobe.mechanics.types import Floats
 
 REACH_M, REACH_LOG_SIGMA = 200e-6, 0.2
@@ -24,23 +25,15 @@ SLOW_LAGS = (4, 8, 16, 32, 64, 128)
 """Numbers of images between two centroids that are compared."""
 CORRELATED_FRAMES = 20
 """Number of successive images whose centroids have about the same error."""
-TIME_CONSTANTS_S = 0.02, 0.3
-"""Time constants `Lag.quick_s` and `Lag.slow_s`, s."""
 
 
-def _means(t: Floats, at: Floats) -> Floats:
-    """(n, 2) ways from the slow to the quick exponential mean of places (n, 2), as `PadLag` computes them."""
-    quick = slow = at[0]
-    ways = np.zeros_like(at)
-    for i in range(1, len(t)):
-        dt = t[i] - t[i - 1]
-        quick = quick + (1.0 - math.exp(-dt / TIME_CONSTANTS_S[0])) * (at[i] - quick)
-        slow = slow + (1.0 - math.exp(-dt / TIME_CONSTANTS_S[1])) * (at[i] - slow)
-        ways[i] = quick - slow
-    return ways
+def _ways(s: Shown) -> Floats:
+    """(n, 2) ways of the contact over the pad, m."""
+    way = PadWay()
+    return np.array([way.step(t, u, v) for t, (u, v) in zip(s.t_s.tolist(), s.raw.tolist(), strict=True)])
 
 
-def fit_noise(touches: Touches, depths: Sequence[Floats]) -> tuple[ContactNoise, CentroidDelays, Floats]:
+def fit_noise(shown: Sequence[Shown], depths: Sequence[Floats]) -> tuple[ContactNoise, CentroidDelays, Floats]:
     """Noise of contacts, delays of the centroid, and the (n,) scatter of the centroids of each touch, m.
 
     Latency and lag are fitted to the rolls to and fro. The noise from image to image follows from second differences
@@ -48,21 +41,20 @@ def fit_noise(touches: Touches, depths: Sequence[Floats]) -> tuple[ContactNoise,
     pad; that of the height from the way of the probe into the object, less the depth.
 
     Args:
-        touches: the touches.
+        shown: the touches.
         depths: (n,) depth in each image of each touch, m.
 
     Hysteresis lags by a way and latency by a time: in the middle of a stroke the way is the same at any speed, which
     separates them. The rolls are as short as those of a scan: over longer ways the centroid lags further.
     """
-    shown = [s for _, s in touches]
-    rolls = [s for d, s in touches if d.to_and_fro]
+    rolls = [s for s in shown if s.dwell.to_and_fro]
     latency, latency_sigma = _latency(rolls)
 
     def left(z: Floats, s: Shown, way: Floats) -> Floats:
         rest: Floats = s.off + 1e-4 * z[0] * way / (np.hypot(*way.T)[:, None] + 1e-4 * abs(z[1]))
         return rest
 
-    taught = [(s, _means(s.t_s, s.raw)) for s in rolls or shown]
+    taught = [(s, _ways(s)) for s in rolls or shown]
 
     def residuals(z: Floats) -> Floats:
         each = [left(z, *pair) for pair in taught]
@@ -71,8 +63,9 @@ def fit_noise(touches: Touches, depths: Sequence[Floats]) -> tuple[ContactNoise,
 
     z = least_squares(residuals, np.array([1.0, 1e4 * REACH_M])).x
     most, reach = (1e-4 * z).tolist()
-    rest = [left(z, s, _means(s.t_s, s.raw)) for s in shown]
-    sigma = np.array([_from_image_to_image(r) for r in rest])
+    rest = [left(z, s, _ways(s)) for s in shown]
+    # from image to image: second differences of anything slower are nearly 0
+    sigma = np.sqrt([np.mean(np.diff(r, 2, axis=0) ** 2) / 6.0 for r in rest])
     power, log_scale = np.polyfit(np.log([s.lightness for s in shown]), np.log(sigma), 1)
     slow, slow_way = _slow(rest, [s.way for s in shown], sigma)
     heights = [np.var(s.pushes - depth) for s, depth in zip(shown, depths, strict=True)]
@@ -86,18 +79,13 @@ def fit_noise(touches: Touches, depths: Sequence[Floats]) -> tuple[ContactNoise,
     return noise, CentroidDelays(latency, latency_sigma, Lag(most=max(most, 0.0), reach=abs(reach))), sigma
 
 
-def _from_image_to_image(r: Floats) -> float:
-    """Standard deviation of independent errors (n, 2): second differences of anything slower are nearly 0."""
-    return math.sqrt(float(np.mean(np.diff(r, 2, axis=0) ** 2)) / 6.0)
-
-
 def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
     """Age of images at their time stamps, s, and its σ, from the middle of strokes at several speeds."""
     rows = []
     for s in rolls:
         along = s.way - s.way.mean(axis=0)
-        way = along[:, int(np.ptp(along[:, 1]) > np.ptp(along[:, 0]))]
         axis = int(np.ptp(along[:, 1]) > np.ptp(along[:, 0]))
+        way = along[:, axis]
         speed, off = np.gradient(way, s.t_s), s.off[:, axis] - s.off[:, axis].mean()
         middle = np.abs(way) < 0.5 * np.abs(way).max()
         rows += list(zip(np.sign(speed[middle]), speed[middle], off[middle], strict=True))

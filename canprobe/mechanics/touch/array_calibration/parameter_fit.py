@@ -14,11 +14,10 @@ from canprobe.mechanics.touch.array_calibration.touches import (
     CROSSTALK_PRIOR,
     MEMORY_PRIOR,
     MIN_CURVATURE_SHARE,
-    NO_ERRORS,
     TOUCH_SIGMA,
-    Touches,
+    Shown,
 )
-from canprobe.mechanics.touch.image.calibration import ImageParameters
+from canprobe.mechanics.touch.image.calibration import NO_ERRORS, ImageParameters
 from canprobe.mechanics.touch.image.image_model import STEPS_PER_PITCH, ImageModel
 from canprobe.mechanics.touch.image.patch import PatchCalibration
 from canprobe.mechanics.touch.pad import Pad
@@ -39,7 +38,7 @@ def _as_parameters(z: Floats, pitch: float) -> ImageParameters:
 
 
 def fit_parameters(
-    touches: Touches, plain: PatchCalibration, scale_sigma: float | None, reference_sigma: float, seen: int
+    touches: Sequence[Shown], plain: PatchCalibration, scale_sigma: float | None, reference_sigma: float, seen: int
 ) -> ParameterFit:
     """Least squares over sums and moments of touches, reference forces and priors.
 
@@ -51,10 +50,10 @@ def fit_parameters(
         reference_sigma: relative standard deviation of reference forces.
         seen: number of taxels along the side of the window.
     """
-    kappa = np.array([d.kappa for d, _ in touches])
-    S, V, D = (np.array([getattr(s, name) for _, s in touches]) for name in ("total", "moments", "remembered"))
-    known = np.array([i for i, (d, _) in enumerate(touches) if d.force is not None], dtype=int)
-    reference = np.array([touches[i][0].force for i in known], dtype=float)
+    kappa = np.array([s.dwell.kappa for s in touches])
+    S, V, D = (np.array([getattr(s, name) for s in touches]) for name in ("total", "moments", "remembered"))
+    known = np.array([i for i, s in enumerate(touches) if s.dwell.force is not None], dtype=int)
+    reference = np.array([touches[i].dwell.force for i in known], dtype=float)
     a, b = (0.5 * (1.0 / plain.pad.radius_m + kappa)).T
     side = max(plain.pad.shape)
     prior = np.array([math.log(1e8), 0.0, BLUR_PRIOR_PITCH[0], CROSSTALK_PRIOR[0], MEMORY_PRIOR[0]])
@@ -86,24 +85,25 @@ def fit_parameters(
     return ParameterFit(_as_parameters(found.x[:5], plain.pad.pitch_m), covariance, np.exp(found.x[5:]))
 
 
-def moment_errors(model: ImageModel, touches: Touches, forces: Sequence[float]) -> Floats:
+def moment_errors(model: ImageModel, touches: Sequence[Shown], forces: Sequence[float]) -> Floats:
     """(n, 3) relative errors of V_1, V_2 and of V_12 over their root, at measured forces, N."""
     errors = []
-    for (dwell, s), force in zip(touches, forces, strict=True):
-        k = (dwell.kappa[0], 0.0, dwell.kappa[1])
+    for s, force in zip(touches, forces, strict=True):
+        k = (s.dwell.kappa[0], 0.0, s.dwell.kappa[1])
         xx, _, yy = model.moments(k, force)
         v = s.moments - model.parameters.memory * s.remembered
         errors.append((v[0] / xx - 1.0, v[2] / yy - 1.0, v[1] / math.sqrt(v[0] * v[2])))
     return np.array(errors)
 
 
-def curvature_errors(model: ImageModel, touches: Touches, forces: Sequence[float]) -> Floats:
+def curvature_errors(model: ImageModel, touches: Sequence[Shown], forces: Sequence[float]) -> Floats:
     """(n, 2) errors of the principal curvatures from each touch's moments alone, relative to (κ + 1/R_p)."""
     result = []
-    for (dwell, s), force in zip(touches, forces, strict=True):
+    for s, force in zip(touches, forces, strict=True):
         v = tuple((s.moments - model.parameters.memory * s.remembered).tolist())
         v = (v[0], 0.0, v[2])
-        shows = (dwell.kappa[0], 0.0, dwell.kappa[1])
+        kappa = s.dwell.kappa
+        shows = (kappa[0], 0.0, kappa[1])
         k = model.start(v, force) or shows
         for _ in range(20):
             try:
@@ -115,13 +115,13 @@ def curvature_errors(model: ImageModel, touches: Touches, forces: Sequence[float
             step = np.clip(np.linalg.solve(J[[0, 2]][:, [0, 2]], r[[0, 2]]), -20.0, 20.0)
             least = MIN_CURVATURE_SHARE / model.radius
             k = (max(k[0] + float(step[0]), least), 0.0, max(k[2] + float(step[1]), least))
-        relative = np.array([1.0 / model.radius + x for x in dwell.kappa])
-        result.append((np.array([k[0], k[2]]) - dwell.kappa) / relative)
+        relative = np.array([1.0 / model.radius + x for x in kappa])
+        result.append((np.array([k[0], k[2]]) - kappa) / relative)
     return np.array(result)
 
 
 def taxel_gains(
-    pad: Pad, model: ImageModel, touches: Touches, forces: Sequence[float]
+    pad: Pad, model: ImageModel, touches: Sequence[Shown], forces: Sequence[float]
 ) -> tuple[Floats, tuple[tuple[int, int], ...]]:
     """Gain of each taxel over the mean, and dead taxels.
 
@@ -140,7 +140,8 @@ def taxel_gains(
 
     seen, wanted, dead = np.zeros((3, *pad.shape))
     u, v = (pad.uv.T / pad.pitch_m).reshape(2, *pad.shape)
-    for (dwell, s), force in zip(touches, forces, strict=True):
+    for s, force in zip(touches, forces, strict=True):
+        dwell = s.dwell
         a, b = (0.5 * (1.0 / model.radius + x) for x in dwell.kappa)
         quadrant = model.shown(np.array([model.depth(force, a * b)]), np.array([a]), np.array([b]))[0]
         c, si = math.cos(dwell.angle), math.sin(dwell.angle)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from canprobe.mechanics.touch.array_calibration.touches import FIRST_IMAGE_S, LAST_IMAGE_S, Dwell, Touches
+from canprobe.mechanics.touch.array_calibration.touches import FIRST_IMAGE_S, LAST_IMAGE_S, Dwell, Shown
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.image.force_creep import ForceCreep
 from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS, ForceErrors
@@ -34,7 +34,7 @@ CREEP_ROUNDS = 3
 
 
 def fit_force(
-    touches: Touches, patch: PatchCalibration, stiffness: float, held_out: Floats, spread: float
+    touches: Sequence[Shown], patch: PatchCalibration, stiffness: float, held_out: Floats, spread: float
 ) -> ForceErrors:
     """Errors of the force of an array.
 
@@ -45,14 +45,14 @@ def fit_force(
         held_out: (m,) relative errors of the reference loads by fits that have not seen them; empty without any.
         spread: standard deviation from array to array, relative.
     """
-    dwells = [d for d, _ in touches]
+    dwells = [s.dwell for s in touches]
     forces = [_forces(d, patch) for d in dwells]
     units = [indentation_from_force(1.0, stiffness, patch.pad.radius_m, d.kappa) for d in dwells]
     creep, sigma = _creep(dwells, forces, units)
     loads = [i for i, d in enumerate(dwells) if d.force is not None]
     pairs = zip(dwells, forces, strict=True)
     corrected, decades = np.array([_corrected(d, f, creep, full=d.force is not None) for d, f in pairs]).T
-    more = np.sqrt(np.maximum(np.array([s.lightness for _, s in touches]) / USUAL_LIGHTNESS, 1.0))
+    more = np.sqrt(np.maximum(np.array([s.lightness for s in touches]) / USUAL_LIGHTNESS, 1.0))
     scatter = _scatter(touches, corrected, np.array(units)) / more
     array = rms(scatter)
     if len(held_out):
@@ -70,8 +70,7 @@ def fit_force(
 
 def _forces(dwell: Dwell, patch: PatchCalibration) -> Floats:
     """(n,) force of each image, N, with its creep."""
-    windows = [None] * len(dwell.images) if dwell.windows is None else dwell.windows
-    return np.array([compute_patch(i, patch, w).force for i, w in zip(dwell.images, windows, strict=True)])
+    return np.array([compute_patch(i, patch, w).force for i, w in zip(dwell.images, dwell.windows, strict=True)])
 
 
 def _followed(dwell: Dwell, forces: Floats, creep: float) -> tuple[Floats, Floats]:
@@ -119,10 +118,10 @@ def _corrected(dwell: Dwell, forces: Floats, creep: float, *, full: bool) -> tup
     return float(force[part].mean()), float(decades[part].mean())
 
 
-def _scatter(touches: Touches, forces: Floats, units: Floats) -> Floats:
+def _scatter(touches: Sequence[Shown], forces: Floats, units: Floats) -> Floats:
     """(n,) relative errors of the force against the arm's way, held out, with one height and slope for each object."""
-    depths, names = units * np.sqrt(forces), np.array([d.name for d, _ in touches])
-    push = np.array([s.push for _, s in touches])
+    depths, names = units * np.sqrt(forces), np.array([s.dwell.name for s in touches])
+    push = np.array([s.push for s in touches])
     of_name = np.stack([names == name for name in dict.fromkeys(names.tolist())], axis=1).astype(float)
     columns = np.column_stack([depths, of_name])
     found, *_ = np.linalg.lstsq(columns, push, rcond=None)
@@ -133,7 +132,7 @@ def _scatter(touches: Touches, forces: Floats, units: Floats) -> Floats:
 
 
 def stiffness_by_depth(
-    touches: Touches, forces: Sequence[float], radius: float, by_images: tuple[float, float]
+    touches: Sequence[Shown], forces: Sequence[float], radius: float, by_images: tuple[float, float]
 ) -> tuple[float, float, float, float]:
     """Stiffness by the arm's way between touches of one place with different forces, and the arm's compliance.
 
@@ -152,12 +151,13 @@ def stiffness_by_depth(
     """
     stiffness, stiffness_sigma = by_images
     rows = []
-    for name, place, turn in sorted({(d.name, d.place, d.turn) for d, _ in touches}):
-        group = [i for i, (d, _) in enumerate(touches) if (d.name, d.place, d.turn) == (name, place, turn)]
+    places = [(s.dwell.name, s.dwell.place, s.dwell.turn) for s in touches]
+    for there in sorted(set(places)):
+        group = [i for i, place in enumerate(places) if place == there]
         if len(group) < 2:
             continue
-        unit = np.array([indentation_from_force(forces[i], 1.0, radius, touches[i][0].kappa) for i in group])
-        push, force = np.array([touches[i][1].push for i in group]), np.array([forces[i] for i in group])
+        unit = np.array([indentation_from_force(forces[i], 1.0, radius, touches[i].dwell.kappa) for i in group])
+        push, force = np.array([touches[i].push for i in group]), np.array([forces[i] for i in group])
         rows += list(zip(unit - unit.mean(), force - force.mean(), push - push.mean(), strict=True))
     if not rows:
         return (math.nan,) * 4

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.image.calibration import MomentErrors
 from canprobe.mechanics.touch.image.force_errors import STRAIGHT_SHARE
 from canprobe.mechanics.touch.image.moments import MomentImage, PadMemory
 from canprobe.mechanics.touch.image.patch import PatchCalibration, compute_patch
@@ -38,8 +37,6 @@ MIN_CURVATURE_SHARE = -0.9
 """Least curvature in a search, over that of the probe."""
 MIN_IMAGES = 10
 """Least number of images with a patch in a touch."""
-NO_ERRORS = MomentErrors(1.0, 0.0, 1.0, 0.0)
-"""Errors for a model that is only used forward."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +50,7 @@ class Dwell:
         place: number of the place that is touched; touches at one place differ in force only.
         t_s: (n,) time stamps of the images, s.
         images: (n,) images, (16, 16) counts, 0 outside the window.
-        windows: (n,) first row, first column, rows, columns of each window; None for whole images.
+        windows: (n,) first row, first column, rows, columns of each window.
         expected: (n, 2) places of the contact on the pad by joints and object, m.
         push: (n,) way of the probe's centre towards the object, from any zero, m.
         turn: turn of the probe about its pole, from the first touch, rad.
@@ -67,7 +64,7 @@ class Dwell:
     place: int
     t_s: Floats
     images: Sequence[Image]
-    windows: Sequence[Sequence[int]] | None
+    windows: Sequence[Sequence[int]]
     expected: Floats
     push: Floats
     turn: float = 0.0
@@ -79,6 +76,7 @@ class Shown(NamedTuple):
     """What the images of a dwell show, averaged; moments in the object's principal axes, m².
 
     Attributes:
+        dwell: the dwell.
         total: sum of pressure times area, N.
         crept: mean of that sum over the whole touch, over `total`.
         moments, remembered: (3,) xx, xy, yy of the image, and of the earlier places (`PadMemory`).
@@ -94,6 +92,7 @@ class Shown(NamedTuple):
         sums: (n,) sum of pressure times area in each image, N.
     """
 
+    dwell: Dwell
     total: float
     crept: float
     moments: Floats
@@ -110,10 +109,6 @@ class Shown(NamedTuple):
     sums: Floats
 
 
-Touches = Sequence[tuple[Dwell, Shown]]
-"""Touches with what their images show."""
-
-
 def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf) -> Shown:
     """Mean sum and moments of a dwell's images.
 
@@ -127,10 +122,9 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
     """
     image_moments, memory = MomentImage(plain), PadMemory()
     start, end = dwell.t_s[0] + FIRST_IMAGE_S, dwell.t_s[0] + age_s
-    late = []
-    sums, moments, ways, at, peaks, kept, bad = [], [], [], [], [], [], 0
+    rows, late = [], []
     for i, (t, image) in enumerate(zip(dwell.t_s.tolist(), dwell.images, strict=True)):
-        patch = compute_patch(image, plain, None if dwell.windows is None else dwell.windows[i])
+        patch = compute_patch(image, plain, dwell.windows[i])
         if not patch.n_active:
             continue
         way = memory.add(t, patch.u, patch.v)
@@ -140,22 +134,20 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         if t > end and not dwell.to_and_fro:
             late.append(patch.force)
             continue
-        bad += patch.saturated or patch.cut_by_pad
-        sums.append(patch.force)
-        moments.append(found)
-        ways.append(way)
-        at.append((patch.u, patch.v))
-        peaks.append(patch.peak_pa)
-        kept.append(i)
-    if len(kept) < MIN_IMAGES:
+        rows.append((i, patch, found, way))
+    if len(rows) < MIN_IMAGES:
         raise UsageError(
-            f"a touch of the {dwell.name}: expected a patch in its images, got {len(kept)} images with one"
+            f"a touch of the {dwell.name}: expected a patch in its images, got {len(rows)} images with one"
         )
+    kept, patches, moments, ways = (list(column) for column in zip(*rows, strict=True))
     c, s = math.cos(dwell.angle), math.sin(dwell.angle)
     turn = np.array([[c * c, 2 * c * s, s * s], [-c * s, c * c - s * s, c * s], [s * s, -2 * c * s, c * c]])
-    V, raw, peak = np.array(moments), np.array(at), float(np.mean(peaks))
+    sums, raw = np.array([p.force for p in patches]), np.array([(p.u, p.v) for p in patches])
+    V, peak = np.array(moments), float(np.mean([p.peak_pa for p in patches]))
+    bad = sum(p.saturated or p.cut_by_pad for p in patches)
     steps = np.diff(V[:, [0, 2]], axis=0) / V[:, [0, 2]].mean(axis=0)
     return Shown(
+        dwell=dwell,
         total=float(np.mean(sums)),
         crept=float(np.mean([*sums, *late]) / np.mean(sums)),
         moments=turn @ V.mean(axis=0),
@@ -169,5 +161,5 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         usable=bad <= 0.2 * len(kept) and peak < STRAIGHT_SHARE * plain.pad.full_scale_pa,
         push=float(dwell.push[kept].mean()),
         pushes=dwell.push[kept],
-        sums=np.array(sums),
+        sums=sums,
     )

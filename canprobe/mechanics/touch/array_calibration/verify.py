@@ -64,15 +64,15 @@ def verify_calibration(calibration: ArrayCalibration, dwells: Sequence[Dwell], p
         UsageError: a touch shows no patch.
     """
     plain = replace(PatchCalibration(pad), gains=calibration.gains)
-    touches = [(d, what_is_shown(d, plain, LAST_IMAGE_S)) for d in dwells]
+    touches = [what_is_shown(dwell, plain, LAST_IMAGE_S) for dwell in dwells]
     patch = make_patch_calibration(calibration, pad)
-    forces = [force_of(patch, s) for _, s in touches]
-    model = make_image_model(calibration, patch, seen=side_seen(dwells, pad))
+    forces = [force_of(patch, s) for s in touches]
+    model = make_image_model(calibration, patch, seen=side_seen(dwells))
     errors = moment_errors(model, touches, forces)[:, :2]
     k = calibration.stiffness
     found, sigma, *_ = stiffness_by_depth(touches, forces, pad.radius_m, (k.moments, k.moments_sigma))
     return Verification(
-        moments=rms(at_usual_lightness(errors, [s for _, s in touches])),
+        moments=rms(at_usual_lightness(errors, touches)),
         moments_sigma=math.sqrt(calibration.moments.moment),
         stiffness=found,
         stiffness_sigma=math.hypot(sigma, MIN_STIFFNESS_SIGMA * found),

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, did_you_mean
 from canprobe.mechanics.touch.checks import whole
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
@@ -69,8 +67,7 @@ def make_estimator(
 
 def unknown_method(method: str) -> UsageError:
     """The error for an unknown method, with the nearest name."""
-    near = difflib.get_close_matches(str(method), METHODS, n=1)
-    hint = f'; did you mean "{near[0]}"?' if near else ""
+    hint = did_you_mean(str(method), METHODS)
     return UsageError(f"method: expected one of {', '.join(METHODS)}, got {method!r}{hint}")
 
 
@@ -164,9 +161,9 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
         quadric=quadric,
     )
     nowhere = np.eye(4)
-    for i, (p, n) in enumerate(zip(touches.points, touches.normals, strict=True)):
-        sample = ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i]))
-        estimator.add(replace(sample, sigma_height=float(height[i])))
+    rows = zip(touches.points, touches.normals, point.tolist(), normal.tolist(), height.tolist(), strict=True)
+    for i, (p, n, s, r, h) in enumerate(rows):
+        estimator.add(ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, s, r, sigma_height=h))
     answer = estimator.estimate()
     if answer is None:
         raise UsageError(

@@ -86,7 +86,9 @@ class Gate:
             dropped.not_finite += 1
         elif abs(square - 1.0) > 1e-6:
             dropped.not_unit += 1
-        elif not all(_usable(s) for s in (sample.sigma_point, sample.sigma_height, sample.sigma_normal)):
+        elif not all(
+            s is None or 0.0 < s < math.inf for s in (sample.sigma_point, sample.sigma_height, sample.sigma_normal)
+        ):
             dropped.zero_sigma += 1
         elif t <= self._last_t:
             if t == self._last_t:
@@ -164,7 +166,3 @@ def slow_errors(touches: Sequence[MeasuredContact]) -> SlowErrors:
 def _widening(sample: ContactSample) -> float:
     """Factor on the standard deviations of a contact by the doubts about its image."""
     return max([DOUBT_SIGMA_SCALE[doubt] for doubt in sample.doubts], default=1.0)
-
-
-def _usable(sigma: float | None) -> bool:
-    return sigma is None or (math.isfinite(sigma) and sigma > 0.0)

@@ -81,8 +81,6 @@ class InformationFilter:
 
     def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
         self.length = length
-        self.root: Floats
-        self.inverse: Floats
         self._prior_rows = DIFFUSE_INFORMATION * np.eye(9)  # root of the information without samples
         self._prior_rows[3:6] = prior.rows(length)[0][:3]
         self.omitted = OmittedTerms(self._prior_rows.T @ self._prior_rows, correlation)

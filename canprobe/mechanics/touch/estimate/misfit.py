@@ -65,17 +65,10 @@ _MIN_SCALED_CURVATURE = 0.1
 _USUAL_VARIANCES = np.concatenate([[0.0], np.square(USUAL_CURVATURE_CHANGES) / 36.0])
 _VARIANCES = np.concatenate([_USUAL_VARIANCES, TAIL_VARIANCES])
 """Variances of the terms: without a misfit, usual ones over ‖K‖⁴ (in units of the length), and the tail's."""
-_PRIOR_WEIGHTS = np.repeat(
-    [NO_MISFIT_WEIGHT, USUAL_MISFIT_WEIGHT / len(USUAL_CURVATURE_CHANGES), TAIL_MISFIT_WEIGHT / len(TAIL_VARIANCES)],
-    [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
-)
-_CAUTIOUS_WEIGHTS = np.repeat(
-    [
-        0.0,
-        (NO_MISFIT_WEIGHT + USUAL_MISFIT_WEIGHT) / len(USUAL_CURVATURE_CHANGES),
-        TAIL_MISFIT_WEIGHT / len(TAIL_VARIANCES),
-    ],
-    [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
+_COUNTS = np.array([1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)])
+_PRIOR_WEIGHTS, _CAUTIOUS_WEIGHTS = (
+    np.repeat(np.array([none, usual, TAIL_MISFIT_WEIGHT]) / _COUNTS, _COUNTS)
+    for none, usual in ((NO_MISFIT_WEIGHT, USUAL_MISFIT_WEIGHT), (0.0, NO_MISFIT_WEIGHT + USUAL_MISFIT_WEIGHT))
 )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 
 import numpy as np
@@ -51,23 +51,19 @@ class Prior:
     @classmethod
     def weak(cls, length: float) -> Prior:
         """The default: `NUISANCE_SIGMA / length` on c13, c23, c33, and nothing on curvature."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE_SIGMA)
-        return cls("weak on c13, c23, c33", s13, s23, s33)
+        return cls("weak on c13, c23, c33", *(s / positive("length", length) for s in NUISANCE_SIGMA))
 
     @classmethod
     def flat(cls, length: float, sigma_curvature: float) -> Prior:
         """Weak on c13, c23, c33, and curvature 0 ± sigma_curvature (1/m) in every direction."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE_SIGMA)
-        sigma_curvature = positive("sigma_curvature", sigma_curvature)
-        return cls(f"curvature 0 ± {sigma_curvature:.4g} per unit length", s13, s23, s33, 0.0, sigma_curvature)
+        sigma = positive("sigma_curvature", sigma_curvature)
+        name = f"curvature 0 ± {sigma:.4g} per unit length"
+        return replace(cls.weak(length), name=name, sigma_curvature=sigma)
 
     def rows(self, length: float) -> tuple[Floats, Floats]:
         """Whitened rows (6, 9) and right-hand side (6,) on the parameters of `quadric`, in units of `length`."""
-        A, b = np.zeros((6, 9)), np.zeros(6)
-        for row, (column, sigma) in enumerate(((3, self.sigma_c13), (4, self.sigma_c23), (5, self.sigma_c33))):
-            A[row, column] = 1.0 / (sigma * length)
-        inverse = 1.0 / (self.sigma_curvature * length)
-        for row, factor in ((3, 2.0), (4, 2.0 * math.sqrt(2.0)), (5, 2.0)):
-            A[row, 3 + row] = factor * inverse
-        b[3] = b[5] = self.curvature * length * inverse
-        return A, b
+        A, inverse = np.zeros((6, 9)), 1.0 / (self.sigma_curvature * length)
+        nuisance = [1.0 / (sigma * length) for sigma in (self.sigma_c13, self.sigma_c23, self.sigma_c33)]
+        A[:, 3:] = np.diag([*nuisance, 2.0 * inverse, 2.0 * math.sqrt(2.0) * inverse, 2.0 * inverse])
+        mean = self.curvature * length * inverse
+        return A, np.array([0.0, 0.0, 0.0, mean, 0.0, mean])

@@ -22,7 +22,6 @@ from canprobe.mechanics.touch.estimate.gate import Dropped, Gate, MeasuredContac
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, batch_of, fit_ml, working_frame
 from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.tangent_frames import rotation_vectors
 from canprobe.mechanics.types import Floats
 
 
@@ -179,10 +178,12 @@ def paper_rates(
         object_twist: (6,) rotation, rad, and displacement of the object's point at the base's origin, m, in the time
             between those two; None: it stands still.
     """
+    from scipy.spatial.transform import Rotation  # late: this estimator alone needs it
+
     R, r = T_base_probe[:, :3, :3], r_probe[:, :, None]
     Ra, Rb, ra, rb = R[:-lag], R[lag:], r[:-lag], r[lag:]
     n = 0.5 * (n_base[:-lag] + n_base[lag:])
-    turn = rotation_vectors(Rb @ Ra.transpose(0, 2, 1))
+    turn = Rotation.from_matrix(Rb @ Ra.transpose(0, 2, 1)).as_rotvec()
     arm = (0.5 * (Ra @ ra + Rb @ rb))[:, :, 0]
     slide = (0.5 * (Ra + Rb) @ (rb - ra))[:, :, 0]
     V = T_base_probe[lag:, :3, 3] - T_base_probe[:-lag, :3, 3] + np.cross(turn, arm)

@@ -35,8 +35,8 @@ FIRST_M = 5e-3
 """Path towards the first lane, m, on which the contact gathers speed before that lane is laid."""
 BACK_M = 5e-3
 """Path that is walked back from an edge, m."""
-CLOSED_M, CLEARANCE_M = 4e-3, 2e-3
-"""Radius of the ground that an edge closes, and the distance that paths keep from the middle of a closed cell, m."""
+CLOSED_M = 4e-3
+"""Radius of the ground that an edge closes, m."""
 EDGE_M, EDGE_RAD, EDGE_SHARE = 4e-3, 0.1, 0.57
 """An edge, round which the probe turns: within this path, m, the normal turns by more than this angle, and the share of
 the path that the contact has moved, times that of the wanted force that is left, is below this. Over a fillet of 22 mm
@@ -224,7 +224,7 @@ class Explorer(PathFollower):
 
     def _close(self, x: float, y: float, radius: float) -> None:
         self.ground.close(x, y, radius)
-        self._room.close(self.ground.places[self.ground.closed], CLEARANCE_M)
+        self._room.closed = self.ground.places[self.ground.closed]
 
     def _spacing(self) -> Spacing:
         """The spacing of lanes for the change of curvature that the map has seen so far."""

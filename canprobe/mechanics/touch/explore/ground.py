@@ -97,13 +97,11 @@ class GroundCells:
         self._stale[near] += distance
         self._height[near & np.isnan(self._height)] = height
 
-    def fit_one(self) -> bool:
-        """Fit the cell whose fit is most out of date; whether there was one."""
+    def fit_one(self) -> None:
+        """Fit the cell whose fit is most out of date, if one is."""
         i = int(self._stale.argmax())
-        if self._stale[i] == 0.0:
-            return False
-        self.fit(i)
-        return True
+        if self._stale[i] > 0.0:
+            self.fit(i)
 
     def fit(self, i: int) -> None:
         """Fit a cell by its index; nothing changes where no contact is near it."""

@@ -14,6 +14,8 @@ from canprobe.mechanics.types import Floats
 
 STEP_M = 1e-3
 """Distance between the points at which a stretch is looked at, m."""
+CLEARANCE_M = 2e-3
+"""Distance that paths keep from the middle of a closed cell, m."""
 
 
 class Heading(NamedTuple):
@@ -170,24 +172,22 @@ class Room:
     Args:
         size: length and width of the rectangle, m.
         radius: smallest radius of a turn, m.
+
+    Attributes:
+        closed: (k, 2) middles of the closed cells, m.
     """
 
     def __init__(self, size: tuple[float, float], radius: float) -> None:
         self._half = 0.5 * np.array(size)
         self._radius = radius
-        self._closed: Floats = np.zeros((0, 2))
-        self._clearance = 0.0
-
-    def close(self, places: Floats, clearance: float) -> None:
-        """Set the closed places (k, 2), m, and the distance, m, that is kept from each."""
-        self._closed, self._clearance = places, clearance
+        self.closed: Floats = np.zeros((0, 2))
 
     def inside(self, points: Floats, margin: float = 0.0) -> NDArray[np.bool_]:
         """(n,) whether points (n, 2), m, are in the rectangle less a margin, m, and as far from closed places."""
         within: NDArray[np.bool_] = np.asarray((np.abs(points) <= self._half - margin + 1e-9).all(axis=1))
-        if len(self._closed):
-            apart = np.linalg.norm(points[:, None] - self._closed, axis=2).min(axis=1)
-            within = within & (apart >= self._clearance + margin)
+        if len(self.closed):
+            apart = np.linalg.norm(points[:, None] - self.closed, axis=2).min(axis=1)
+            within = within & (apart >= CLEARANCE_M + margin)
         return within
 
     def holds(self, stretch: Stretch) -> bool:

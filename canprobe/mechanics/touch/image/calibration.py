@@ -63,6 +63,10 @@ class MomentErrors:
     frame_sigma: float
 
 
+NO_ERRORS = MomentErrors(1.0, 0.0, 1.0, 0.0)
+"""Errors for a model that is only used forward."""
+
+
 @dataclass(frozen=True, slots=True)
 class Lag:
     """Lag of the centroid behind the contact, as a calibration found it; the model is that of `pad_lag`.
@@ -70,13 +74,10 @@ class Lag:
     Attributes:
         most: largest lag, m.
         reach: way at which the lag is half of that, m.
-        quick_s, slow_s: time constants of the mean places between which the way is taken, s.
     """
 
     most: float
     reach: float
-    quick_s: float = 0.02
-    slow_s: float = 0.3
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.mechanics.touch.image.calibration import ArrayCalibration, ImageParameters, MomentErrors
+from canprobe.mechanics.touch.image.calibration import NO_ERRORS, ArrayCalibration, ImageParameters, MomentErrors
 from canprobe.mechanics.touch.image.force_errors import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, Moments
 from canprobe.mechanics.touch.image.patch import PatchCalibration
@@ -92,8 +92,7 @@ class ImageModel:
         # crosstalk is linear in rows and columns as the blur is: a row spreads its sum, which the blur leaves as it is
         share = self.parameters.crosstalk / (self.side - 1)
         blur = (1.0 - self.side * share) * blur + share * 2.0 / STEPS_PER_PITCH
-        weight = np.ones((len(x), len(x)))
-        self._moments = np.stack([weight, weight * (x * x)[:, None], weight * x * x], axis=-1).reshape(-1, 3)
+        self._moments = np.stack(np.broadcast_arrays(1.0, (x * x)[:, None], x * x), axis=-1).reshape(-1, 3)
         self._squares, self._blur, self._turned_blur = source * source, blur, np.ascontiguousarray(blur.T)
 
     def with_stiffness(self, stiffness: float) -> ImageModel:
@@ -282,20 +281,32 @@ def _in_axes(v1: float, v2: float, axes: tuple[float, float]) -> Moments:
 def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCalibration:
     """From counts to force, for an array of these taxels.
 
-    On a flat array, which has no image model, the force is the plain sum of pressure times area over the scale. The
-    taxels of a list are separate: their model has the least blur. At another full scale than that of the calibration,
-    level, threshold and noise are the same counts of another pressure; layer, blur, crosstalk and scale stay.
+    At another full scale than that of the calibration, level, threshold and noise are the same counts of another
+    pressure; layer, blur, crosstalk and scale stay.
     """
-    reference = 0.0 if calibration.nominal else calibration.force_sigma
-    plain = PatchCalibration(pad, force_errors=calibration.force, reference_sigma=reference)
+    plain = PatchCalibration(
+        pad,
+        gains=() if pad.is_flat else calibration.gains,
+        dead=calibration.dead,
+        force_errors=calibration.force,
+        reference_sigma=0.0 if calibration.nominal else calibration.force_sigma,
+    )
+    return with_force_gains(plain, calibration.image)
+
+
+def with_force_gains(plain: PatchCalibration, image: ImageParameters) -> PatchCalibration:
+    """The same array with the gains of the force that these parameters give it.
+
+    On a flat array, which has no image model, the force is the plain sum of pressure times area over the scale. The
+    taxels of a list are separate: their model has the least blur.
+    """
+    pad = plain.pad
     if pad.is_flat:
-        return replace(plain, force_gain=1.0 / calibration.image.scale, dead=calibration.dead)
+        return replace(plain, force_gain=1.0 / image.scale)
     if not pad.is_grid:
-        image = calibration.image
-        calibration = replace(calibration, image=replace(image, blur=min(image.blur, LIST_BLUR_TAXELS * pad.pitch_m)))
-    plain = replace(plain, gains=calibration.gains)
-    gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
-    return replace(plain, force_gain=gain, edge_gain=edge, dead=calibration.dead, blur_m=calibration.image.blur)
+        image = replace(image, blur=min(image.blur, LIST_BLUR_TAXELS * pad.pitch_m))
+    gain, edge = ImageModel(image, NO_ERRORS, pad).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
+    return replace(plain, force_gain=gain, edge_gain=edge, blur_m=image.blur)
 
 
 def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:

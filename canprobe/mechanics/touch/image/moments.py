@@ -64,7 +64,7 @@ class MomentImage:
         return (uu, uv, vv) if uu > 0.0 and uu * vv > uv * uv else None
 
 
-TIME_CONSTANTS_S = (0.3, 3.0, 30.0)
+TIME_CONSTANTS_S = np.array([[0.3], [3.0], [30.0]])
 """Time constants of the traces, s."""
 OVERLAP_RATIO = 1.0
 """Moments of the traces, over those of the patch, up to which they overlap it. On random scenes in which the contact
@@ -82,12 +82,8 @@ class PadMemory:
     """Fading traces of the places of the patch on the pad since the contact began."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all places: contact was lost."""
         self._t_s: float | None = None
-        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for _ in TIME_CONSTANTS_S]  # of 1, u, v, uu, uv, vv
+        self._sums = np.zeros((len(TIME_CONSTANTS_S), 6))  # of 1, u, v, uu, uv, vv
 
     def add(self, t_s: float, u: float, v: float) -> Moments:
         """Take the centroid (m) of an image at a time (s).
@@ -97,15 +93,9 @@ class PadMemory:
         """
         dt = 0.0 if self._t_s is None else max(t_s - self._t_s, 0.0)
         self._t_s = t_s
-        mass = su = sv = uu = uv = vv = 0.0
-        for k, tau in enumerate(TIME_CONSTANTS_S):
-            kept = math.exp(-dt / tau)
-            new = 1.0 - kept
-            m, a, b, aa, ab, bb = self._sums[k]
-            m, a, b = kept * m + new, kept * a + new * u, kept * b + new * v
-            aa, ab, bb = kept * aa + new * u * u, kept * ab + new * u * v, kept * bb + new * v * v
-            self._sums[k] = m, a, b, aa, ab, bb
-            mass, su, sv, uu, uv, vv = mass + m, su + a, sv + b, uu + aa, uv + ab, vv + bb
+        kept = np.exp(-dt / TIME_CONSTANTS_S)
+        self._sums = kept * self._sums + (1.0 - kept) * [1.0, u, v, u * u, u * v, v * v]
+        mass, su, sv, uu, uv, vv = self._sums.sum(axis=0).tolist()
         return (
             uu - 2.0 * u * su + u * u * mass,
             uv - u * sv - v * su + u * v * mass,

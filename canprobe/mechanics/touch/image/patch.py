@@ -210,17 +210,13 @@ class PatchCalibration:
         pascals = self.pad.full_scale_pa * (counts / COUNTS_MAX)
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
-        weights = _moment_weights(self.pad)
+        u, v = self.pad.uv.T / self.pad.pitch_m
+        moments = np.ones_like(u), u, v, u * u, u * v, v * v
+        weights = np.stack([self.pad.areas * moment for moment in moments], axis=-1)
         object.__setattr__(self, "continuation", Continuation(weights, float(pascals[COUNTS_MAX])))
         if self.gains:
             weights = weights / checked("gains", self.gains, self.pad.shape).reshape(-1, 1)
         object.__setattr__(self, "weights", read_only(weights))
-
-
-def _moment_weights(pad: Pad) -> Floats:
-    """(n, 6): columns area × (1, u, v, uu, uv, vv), lengths in pitches but the area in m²."""
-    u, v = pad.uv.T / pad.pitch_m
-    return np.stack([pad.areas * moment for moment in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1)
 
 
 def compute_patch(

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,6 @@ MIN_BLUR_PITCH = 0.6
 """Blur, in pitches, from which on an edge of up to 1.5 times the full scale shows in the taxel beside a steep one."""
 LINE_TAXELS = 2
 """Number of silent taxels of one row or column that make the rest of it suspect, as far as it is silent, too."""
-_SIDE = 2
-"""Number of taxels beside the image in which neighbours are looked for."""
 _Mask = NDArray[np.bool_]
 
 
@@ -90,7 +89,7 @@ class SilentTaxels:
         self._any = bool(self._mask.any())
         self._blurred = blur_pitch >= MIN_BLUR_PITCH
         self._next_ns: int | None = None
-        self._weights: dict[tuple[int, ...], tuple[NDArray[np.intp], Floats]] = {}
+        self._bridge = lru_cache(partial(_bridge, self._mask))
 
     def look(self, taxels: Image, window: Sequence[int], t_ns: int) -> None:
         """Look at an image; nothing happens where the last look was less than `LOOK_PERIOD_NS` before.
@@ -126,18 +125,14 @@ class SilentTaxels:
         if not (gaps[0].any() or gaps[1].any()):
             return
         # where a silent taxel reads something, its neighbours must have changed by as much
-        stuck = low > MAX_CHANGE_COUNTS
+        rise = np.pad(now - low >= MIN_COUNTS, 1)
+        stuck = (low > MAX_CHANGE_COUNTS) & ~(rise[:-2, 1:-1] | rise[2:, 1:-1] | rise[1:-1, :-2] | rise[1:-1, 2:])
         enough = False
         for looks, gap in zip((self._down[part], self._across[part]), gaps, strict=True):
-            looks[gap & (looks < NEEDED_LOOKS) & ~(stuck & ~self._changed_beside(part, now))] += 1
+            looks[gap & (looks < NEEDED_LOOKS) & ~stuck] += 1
             enough = enough or bool((looks >= NEEDED_LOOKS).any())
         if enough:
             self._find()
-
-    def _changed_beside(self, part: tuple[slice, slice], now: Image) -> _Mask:
-        """Where a taxel beside, in any direction, is pressed by `MIN_COUNTS` more than it was once."""
-        rise: _Mask = np.pad(now - self._low[part] >= MIN_COUNTS, 1)
-        return rise[:-2, 1:-1] | rise[2:, 1:-1] | rise[1:-1, :-2] | rise[1:-1, 2:]
 
     def _find(self) -> None:
         """Put together what is bridged from now on."""
@@ -152,7 +147,7 @@ class SilentTaxels:
         if not np.array_equal(mask, self._mask):
             self._mask, self._found = mask, mask & ~self._stated
             self._any = bool(mask.any())
-            self._weights.clear()
+            self._bridge = lru_cache(partial(_bridge, mask))
 
     @property
     def found(self) -> int:
@@ -211,42 +206,32 @@ class SilentTaxels:
         filled = float(values.sum())
         return whole, int(np.count_nonzero(values)), filled / max(float(inside.sum(dtype=np.int64)), 1.0)
 
-    def _bridge(self, window: tuple[int, ...]) -> tuple[NDArray[np.intp], Floats]:
-        """Places of the silent taxels in a window, and their values as sums over its other taxels."""
-        bridge = self._weights.get(window)
-        if bridge is None:
-            row, column, rows, columns = window
-            mask = self._mask[row : row + rows, column : column + columns]
-            bridge = self._weights[window] = _bridge(np.ascontiguousarray(mask))
-        return bridge
-
 
 def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
     """Where taxels above and below, and on both sides, are pressed as they cannot be beside a whole one that is not."""
     # one side alone is enough from a count of `steep` on, where the next taxel of the row or column shows the same: one
     # taxel may be the rim of a patch on an array with less blur than its calibration has
-    rows, columns = image.shape
-    stride = columns + _SIDE  # rows one after the other, apart by what keeps the end of one from the next
-    flat = np.zeros((rows + 2 * _SIDE + 1) * stride, np.uint8)
-    first, n = _SIDE * stride + _SIDE, rows * stride
-    flat[first : first + n].reshape(rows, stride)[:, :columns] = image
     gaps = []
-    for step, along in ((stride, 1), (1, stride)):
-        far_up, up, down, far_down = [flat[first + k * step :][:n] for k in (-2, -1, 1, 2)]
+    for seen in (image, image.T):
+        wide = np.zeros((len(seen) + 4, seen.shape[1]), np.uint8)  # np.pad takes longer than all the rest
+        wide[2:-2] = seen
+        far_up, up, down, far_down = wide[:-4], wide[1:-3], wide[3:-1], wide[4:]
         gap, most = np.minimum(up, down) >= MIN_COUNTS, np.maximum(up, down)
         if most.max() >= WIDE_GAP_COUNTS:
             gap |= np.maximum(np.minimum(up, far_down), np.minimum(far_up, down)) >= WIDE_GAP_COUNTS
         if steep <= COUNTS_MAX:
-            alone = (most >= steep) & (flat[first : first + n] == 0)
-            gap[along:] |= alone[along:] & alone[:-along]
-            gap[:-along] |= alone[along:] & alone[:-along]
-        gaps.append(gap.reshape(rows, stride)[:, :columns])
-    return gaps[0], gaps[1]
+            alone = (most >= steep) & (seen == 0)
+            pairs = alone[:, 1:] & alone[:, :-1]
+            gap[:, 1:] |= pairs
+            gap[:, :-1] |= pairs
+        gaps.append(gap)
+    return gaps[0], gaps[1].T
 
 
-def _bridge(mask: _Mask) -> tuple[NDArray[np.intp], Floats]:
-    """Places (n,) of the taxels in a mask, and (n, taxels) weights that interpolate them."""
-    rows, columns = mask.shape
+def _bridge(mask: _Mask, window: tuple[int, ...]) -> tuple[NDArray[np.intp], Floats]:
+    """Places (n,) of the taxels of a mask in a window, and (n, taxels) weights of its taxels that interpolate them."""
+    row, column, rows, columns = window
+    mask = np.ascontiguousarray(mask[row : row + rows, column : column + columns])
     places = np.flatnonzero(mask)
     index = np.arange(mask.size).reshape(rows, columns)
     triples = np.concatenate(

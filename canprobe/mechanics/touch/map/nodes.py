@@ -60,35 +60,29 @@ class NodeGrid:
         self._size = 0
         self._numbers: dict[tuple[int, ...], int] = {}
         self._blocks: dict[tuple[int, ...], list[int]] = {}
-        self._path_length = PathLength(self._step)
+        self._path_length, self._begun_at = PathLength(self._step), 0.0
         self._open = np.zeros(COLUMNS)
         self._along_normals = 0.0  # sum of p·n of the open node, m
-        self._begun = self._first = self._last = np.zeros(3)
-        self._begun_at = 0.0
+        self._first = self._last = np.zeros(3)
 
     def __len__(self) -> int:
         return self._size + int(self._open[COUNT] > 0.0)
 
     def add(self, rows: Floats) -> None:
         """Take contacts (n, COLUMNS), in the order of time; their number and path are set here."""
-        points = self.points_of(rows)
-        begin = 0
-        for i, (point, place) in enumerate(zip(points, points.tolist(), strict=True)):
-            fresh = self._open[COUNT] == 0.0 and begin == i
-            if not fresh and math.dist(place, self._last.tolist()) > JUMP_M:
-                self._take(rows[begin:i])
-                self._close()
-                self._path_length, self._begun_at = PathLength(self._step), 0.0
-                begin, fresh = i, True
-            if fresh:
+        for row, point in zip(rows, self.points_of(rows), strict=True):
+            if not self._open[COUNT]:
                 self._first = point
+            elif math.dist(point.tolist(), self._last.tolist()) > JUMP_M:
+                self._close()
+                self._path_length, self._begun_at, self._first = PathLength(self._step), 0.0, point
             self._last = point
+            self._open[_MEANS] += row[_MEANS]
+            self._open[COUNT] += 1.0
+            self._along_normals += float(point @ row[NORMAL])
             self._path_length.add(point)
             if self._path_length.total - self._begun_at >= NODE_M:
-                self._take(rows[begin : i + 1])
                 self._close()
-                begin = i + 1
-        self._take(rows[begin:])
 
     def put(self, rows: Floats) -> None:
         """Take nodes (n, COLUMNS) as they are."""
@@ -103,15 +97,8 @@ class NodeGrid:
         self._blocks.setdefault(_block(self.points_of(row)), []).append(self._size)
         self._size += 1
 
-    def _take(self, rows: Floats) -> None:
-        self._open[_MEANS] += rows[:, _MEANS].sum(axis=0)
-        self._along_normals += float((self.points_of(rows) * rows[:, NORMAL]).sum())
-        self._open[COUNT] += len(rows)
-
     def _close(self) -> None:
         """Put the open node into its voxel."""
-        if self._open[COUNT] == 0.0:
-            return
         row = self._finished()
         number = self._numbers.setdefault(self._voxel(row), self._size)
         if number < self._size:

@@ -147,9 +147,8 @@ class SurfaceMap:
         """
         if self.pad is None:
             raise UsageError("samples: expected a map of a pad, got one of points; use add(points, normals)")
-        for sample in samples[: 1 if self._evidence.touch is None else 0]:
-            if sample.slope is not None:
-                self._evidence.touch = sample.slope, sample.p_base
+        if samples and self._evidence.touch is None and samples[0].slope is not None:
+            self._evidence.touch = samples[0].slope, samples[0].p_base
         self._add(rows_of(samples, self.pad.radius, self.noise, self._traces))
 
     def settled(self, samples: Sequence[ContactSample]) -> list[ContactSample]:
@@ -327,6 +326,5 @@ class SurfaceMap:
             above + floating,
             np.hypot(sigma, self.noise.place) + floating,
             sigma + floating,
-            np.where(reached, (weight > 0.0).sum(axis=1), 0),
         )
         return _Blend(feet, which, np.where(reached[:, None], weight, 0.0), xy, size)

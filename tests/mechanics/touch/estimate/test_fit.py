@@ -348,7 +348,7 @@ def test_errors_name_the_field(call, field):
 
 
 def test_a_wrong_method_gets_a_suggestion():
-    with pytest.raises(UsageError, match='did you mean "chen1996"'):
+    with pytest.raises(UsageError, match="did you mean chen1996"):
         bad(method="chen96")()
 
 

@@ -61,7 +61,7 @@ def test_a_turn_and_a_line_lead_to_a_place_outside_the_circle(start, side, x, y)
 
 def test_what_is_left_of_a_stretch_is_inside_and_can_turn():
     room = Room((0.03, 0.02), RADIUS)
-    room.close(np.array([[0.01, 0.0]]), 2e-3)
+    room.closed = np.array([[0.01, 0.0]])
     rng = np.random.default_rng(1)
     went = 0
     for _ in range(25):

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from canprobe.mechanics.touch import MomentImage, PatchCalibration
 from canprobe.mechanics.touch.image.calibration import Lag
 from canprobe.mechanics.touch.image.moments import LEVEL_COUNTS, TIME_CONSTANTS_S, PadMemory
-from canprobe.mechanics.touch.image.pad_lag import GAP_S, PadLag
+from canprobe.mechanics.touch.image.pad_lag import GAP_S, QUICK_S, SLOW_S, PadLag
 
 
 def remembered(t, uv):
@@ -44,14 +44,6 @@ def test_a_patch_that_rests_leaves_nothing_and_one_that_has_moved_is_forgotten()
     assert moved[-1] < 0.005 * moved[0]
 
 
-def test_a_reset_forgets():
-    memory = PadMemory()
-    memory.add(0.0, 0.0, 0.0)
-    memory.add(1.0, 0.0, 0.0)
-    memory.reset()
-    assert memory.add(1.1, 5e-3, 0.0) == (0.0, 0.0, 0.0)
-
-
 # The centroid's lag on the pad.
 
 LAG = Lag(most=120e-6, reach=200e-6)
@@ -70,7 +62,7 @@ def moved(speed, seconds, rate=200.0):
 def test_a_contact_is_ahead_of_its_centroid(speed):
     """Means of time constants T trail a steady motion by speed · T."""
     u, v = moved(speed, 3.0)
-    way = 1e-3 * (LAG.slow_s - LAG.quick_s)
+    way = 1e-3 * (SLOW_S - QUICK_S)
     assert v == 0.0
     assert u == pytest.approx(math.copysign(LAG.most * way / (way + LAG.reach), speed), rel=0.01)
 
