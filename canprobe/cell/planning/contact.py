@@ -388,6 +388,8 @@ def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[
     )
 
 
+MAX_BLIND_SHARE = 1.2
+"""Largest push that the torques show for certain, over the limit of the force, with which they bound a search."""
 STEADY_S = 0.25
 """Time of an approach after which the torques without a contact are known, s."""
 
@@ -443,8 +445,18 @@ def _torques(plan: Plan, touch: Touch | Calibrate) -> str:
             f"silent at the first contact, as {steady_s:.2f} s of approach are too short to know the torques without"
             f" it: raise task.clearance_mm to {math.ceil(STEADY_S * approach.speed * 1e4) / 10:g}"
         )
-    slow = f" at task.approach_mm_s = {1e3 * approach.speed:g}" if push > plan.setup.limits.force_max else ""
-    return f"a push of {push:.1f} N that the array does not measure: beyond 4σ of what friction may hide{slow}"
+    words = f"a push of {push:.1f} N that the array does not measure: beyond 4σ of what friction may hide"
+    if bounds_search(plan):
+        return words
+    return (
+        f"{words} at task.approach_mm_s = {1e3 * approach.speed:g}; until an image has changed the search ends after"
+        f" {1e3 * approach.blind_search:.2g} mm"
+    )
+
+
+def bounds_search(plan: Plan) -> bool:
+    """Whether the torques of the drives bound the force of a search, whatever the array measures."""
+    return certain_push(plan) < MAX_BLIND_SHARE * plan.setup.limits.force_max
 
 
 def certain_push(plan: Plan) -> float:

@@ -17,7 +17,7 @@ from canprobe.cell.master.supervision import Finding, TouchState, limits_of
 from canprobe.cell.master.supervisor import outside_workspace
 from canprobe.cell.master.tactile_frame import TactileSample
 from canprobe.cell.master.trail import GrowingForce, Retrace, TakenWay
-from canprobe.cell.planning.contact import certain_push
+from canprobe.cell.planning.contact import bounds_search
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.scene.setup import Approach, Arm, Probe, SafetyLimits
@@ -123,8 +123,6 @@ COMING = (Phase.MOVE, Phase.APPROACH, Phase.SETTLE)
 """Phases in which the probe comes from free space: the way that it has taken leads off what it touches."""
 
 
-MAX_BLIND_SHARE = 1.2
-"""Largest push that the torques show for certain, over the limit of the force, with which they bound a search."""
 LEAVING = (Phase.RETREAT, Phase.DONE)
 _IN_CONTACT = (Phase.SETTLE, Phase.SCAN, Phase.REGAIN)
 
@@ -156,7 +154,7 @@ class ProbingTask(Task):
         self._setup = plan.setup
         self._touch = TouchState(limits_of(plan))
         self.depth = self._touch.depth = DepthWitness(sensing.radius, holds=holds)
-        self._drives_witness = certain_push(plan) < MAX_BLIND_SHARE * plan.setup.limits.force_max
+        self._drives_witness = bounds_search(plan)
         probe = plan.setup.probe
         self._follows_depth = not probe.is_flat  # a flat pad has no foot on the object
         self._reach = probe.radius if probe.is_flat else 0.0  # from its centre to the point whose ways count
@@ -322,7 +320,7 @@ class ProbingTask(Task):
 
     def _found_nothing(self, what: str, way: float) -> str:
         """Words for an approach that went a way beyond the expected place, m, without a contact."""
-        words = f"{what} up to {way * 1e3:.{1 if way < 1e-3 else 0}f} mm beyond the expected place"
+        words = f"{what} up to {way * 1e3:.2g} mm beyond the expected place"
         if self.array_alive:
             return words
         return (

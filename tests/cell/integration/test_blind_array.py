@@ -80,12 +80,14 @@ def test_what_it_is_left_with_is_said_to_be_unknown():
 def test_an_approach_without_torques_goes_as_far_as_the_limit_presses_until_the_array_was_seen_alive():
     """The array is blind from the beginning, and the drives report no torque: the object is where it was expected."""
     highest, stop, _ = run("press", "node 16: dead-rows first=0 rows=16", Phase.MOVE, 0.0, arm__torque=False)
-    assert "no object found up to 0.6 mm beyond the expected place" in stop.reason
+    assert "no object found up to 0.57 mm beyond the expected place" in stop.reason
     assert "the array may be blind" in stop.reason
     assert highest < 1.5 * LIMIT_N
 
 
-@pytest.mark.parametrize(("search_mm", "words", "most_n"), [(None, "up to 0.6 mm", 6.0), (8.0, "the torques of", 20.0)])
+@pytest.mark.parametrize(
+    ("search_mm", "words", "most_n"), [(None, "up to 0.57 mm", 6.0), (8.0, "the torques of", 20.0)]
+)
 def test_a_slow_approach_presses_no_harder_though_it_adds_little_force_at_a_time(search_mm, words, most_n):
     """Turning slowly, the motors' friction may hide 13 N, so that the default search is as if no torque was reported.
 

@@ -46,13 +46,14 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
     assert truth["force_n"][-1] == 0.0
 
 
-@pytest.mark.parametrize("array", ["icub-triangles", "poweron6x6"])
-def test_a_cylinder_across_a_flat_array_is_let_go(array):
+@pytest.mark.parametrize(("array", "approach_mm_s"), [("icub-triangles", 2.1), ("poweron6x6", 3.2)])
+def test_a_cylinder_across_a_flat_array_is_let_go(array, approach_mm_s):
     """It goes on beyond the array, listed or a grid: triangles of ten taxels read 2 N where 8 N pressed.
 
     The way back is measured at the tip: about a centre 10 m away counts of the encoders alone made the 6 mm of it.
     """
-    scene = canprobe.load_scene("press", {"sensor.array": array, "sensor.channel": "can1", "task.approach_mm_s": 2})
+    sensor = {"sensor.array": array, "sensor.channel": "can1"}
+    scene = canprobe.load_scene("press", sensor | {"task.approach_mm_s": approach_mm_s})
     assert scene.object.kind == "cylinder"
     with Session(scene) as session, pytest.raises(SafetyStop, match="the contact runs off the edge of the array"):
         session.run(make_task(session.plan))
