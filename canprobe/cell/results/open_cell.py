@@ -20,7 +20,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE
-from canprobe.cell.results.scores import score_shape, summarise_map
+from canprobe.cell.results.scores import score_shape
 from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_files, write_summary
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
@@ -370,17 +370,12 @@ class OpenCell:
         estimates: dict[str, list[ShapeRecord]] = {}
         if record.shape is not None and setup.shape is not None:
             estimates[setup.shape.method] = record.shape.records
-        surface_map = None if record.shape is None else record.shape.surface_map
-        map_summary = None
-        if surface_map is not None:
-            map_summary = summarise_map(surface_map, setup.truth.object if truth_of(self.session) else None)
         summary = summarise(
             self.session,
             record,
             estimates,
             None if failure is None else _reason(failure),
             log=log,
-            map_summary=map_summary,
             bridges=self._bridges.status(),
         )
         return RunData(
@@ -391,7 +386,6 @@ class OpenCell:
             estimates={name: on_run_clock(records, start_s) for name, records in estimates.items()},
             taxels=record.taxels,
             tactile=tactile,
-            surface_map=surface_map,
             out=self._out,
             tracker=record.shape,
             start_s=start_s,

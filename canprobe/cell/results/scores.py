@@ -6,7 +6,6 @@ The contacts of a scan are arrays, on which any estimators are scored.
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -239,7 +238,7 @@ _TO_UNIT = np.array([1e6, 1e2, 1e6, 1e6])
 
 
 def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[str, Any]:
-    """The section ``shape.map`` of ``summary.json``: None for what does not apply.
+    """The section ``shape.map`` of ``summary.json``: None, or NaN, for what does not apply.
 
     Args:
         surface_map: map of the scan.
@@ -276,7 +275,7 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
         bent = off - displaced @ np.linalg.lstsq(displaced, off, rcond=1e-6)[0]
         held = np.abs(bent) < TWO_SIGMA * feet.sigma_relative[known]
         found["within_2_sigma_relative_fraction"] = float(np.mean(held))
-    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in found.items()}
+    return found
 
 
 def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Floats]:

@@ -25,6 +25,7 @@ from canprobe.cell.results.scores import (
     score_measured_force,
     score_shape,
     state_force_sigma,
+    summarise_map,
 )
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
@@ -51,7 +52,6 @@ def summarise(
     stop_reason: str | None,
     *,
     log: Mapping[str, Floats] | None = None,
-    map_summary: dict[str, Any] | None = None,
     bridges: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """The content of ``summary.json``; a value that does not apply is None.
@@ -62,7 +62,6 @@ def summarise(
         estimates: answers of its estimator, by name.
         stop_reason: why the run ended before its end; None where it did not.
         log: columns of ``log.npz``; None takes them from the session.
-        map_summary: section of the surface map.
         bridges: status of each bridge.
     """
     scene, cell, observers = session.scene, session.cell, session.observers
@@ -93,7 +92,6 @@ def summarise(
             estimates,
             truth_of(session),
             since_first_sync(log["t_s"], cell.log.start_s),
-            map_summary=map_summary,
         ),
         "calibration": summarise_calibration(scene, record.tool),
         "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
@@ -115,7 +113,8 @@ def summarise(
         summary["external_arm"] = cell.drives.figures()
     if scene.task.kind == "listen":
         summary["listen"] = _listened(log)
-    return {name: without_nan(value) for name, value in summary.items()}
+    found: dict[str, Any] = without_nan(summary)
+    return found
 
 
 def without_nan(value: Any) -> Any:
@@ -221,8 +220,6 @@ def summarise_shape(
     estimates: dict[str, list[ShapeRecord]],
     truth: Mapping[str, Floats],
     sync_times: Floats,
-    *,
-    map_summary: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The section ``shape`` of ``summary.json``: figures of the first estimator, and a table of all.
 
@@ -232,7 +229,6 @@ def summarise_shape(
         estimates: the answers of each estimator, by name.
         truth: columns of the plant's truth, one row per SYNC; empty without a truth.
         sync_times: time of each SYNC (n,), s, on the clock of the estimates.
-        map_summary: section of the scan's surface map.
     """
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
@@ -244,11 +240,11 @@ def summarise_shape(
     method = next(iter(estimates))
     records = estimates[method]
     shape["method"] = method
-    if map_summary is not None:
-        shape["map"] = map_summary
+    if tracker is not None and (surface_map := tracker.surface_map) is not None:
+        shape["map"] = summarise_map(surface_map, setup.truth.object if truth else None)
     if records:
         shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
-        shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
+        shape["kappa_est_per_m"] = without_nan(np.asarray(records[-1].estimate.kappa).tolist())
     if not truth:
         return shape
     scores = {name: score_shape(answers, truth, sync_times) for name, answers in estimates.items()}
@@ -290,11 +286,6 @@ def _bound_ratio(
         coupling=centroid_coupling(setup.probe),
     )
     return None if bound is None else score.kappa_rms_error_per_m / bound
-
-
-def finite_or_none(values: Sequence[float] | Floats) -> list[float | None]:
-    """Floats for JSON; None for a value that was not observed, which is not finite."""
-    return [float(v) if np.isfinite(v) else None for v in values]
 
 
 def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
