@@ -21,7 +21,7 @@ from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE
 from canprobe.cell.results.scores import score_shape
-from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_files, write_summary
+from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_summary, writers_of
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.joint_record import warned
@@ -342,7 +342,8 @@ class OpenCell:
             summary, lines = data.summary, files.unwritten
             if isinstance(failure, CanprobeError):
                 failure.summary = summary
-            self._write(lambda out: write_files(data, out))
+            for write in writers_of(data):
+                self._write(write)
         if failure is None:
             self._early_summary(summary)
         _estimate_again(self.session, data, self._say)
@@ -351,8 +352,7 @@ class OpenCell:
         for name in PICTURES if len(data.log["t_s"]) else ():
             if self._out is not None and name in data.plan.outputs:
                 self._say(f"draw {name}")
-                if (why := _draw(data, self._out / name)) is not None:
-                    files.note_unwritten(why)
+                files.note_unwritten(_draw(data, self._out / name))
         summary["faults"] += [line for line in lines if line not in summary["faults"]]
         if lines and failure is None:
             unwritten = ResultsError("\n".join(lines))
@@ -399,9 +399,8 @@ class OpenCell:
             with interrupts_held():
                 write(self._out)
         except ResultsError as error:
-            for line in str(error).splitlines():
-                if line not in self.session.files.unwritten:  # the summary is written twice
-                    self.session.files.note_unwritten(line)
+            if str(error) not in self.session.files.unwritten:  # the summary is written twice
+                self.session.files.note_unwritten(str(error))
 
 
 def _estimate_again(session: Session, data: RunData, say: Say) -> None:

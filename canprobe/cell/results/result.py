@@ -23,7 +23,7 @@ from canprobe.cell.planning.bridges import check_view
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE, to_frame, write_parquet
-from canprobe.cell.results.summary import write_files
+from canprobe.cell.results.summary import writers_of
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.folder import write_scene
@@ -268,7 +268,8 @@ class RunResult:
         write_scene(self.plan, folder)
         write_npz(folder / LOG, self.log)
         write_npz(folder / TACTILE, self.tactile)
-        write_files(self.data, folder)
+        for write in writers_of(self.data):
+            write(folder)
 
     @property
     def _attrs(self) -> dict[str, Any]:

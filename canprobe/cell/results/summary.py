@@ -34,7 +34,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
-from canprobe.errors import ResultsError, UsageError
+from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.mechanics.types import Floats
 
@@ -318,29 +318,22 @@ def percentiles(values_ns: Sequence[int] | NDArray[np.int64]) -> dict[str, float
     return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
 
 
-def write_files(result: RunData, out: Path) -> None:
-    """Write the files of a run into ``out`` that the session has not written, without the figures.
+def writers_of(result: RunData) -> list[Callable[[Path], None]]:
+    """The functions that write the files of a run into a folder, but those of the session and the figures.
 
-    Raises:
-        ResultsError: when a file cannot be written; no part of it is left, and the others are written.
+    Each raises `ResultsError` where its file cannot be written; no part of it is left then.
     """
     found = result.summary["calibration"]
     tool = None if found is None else tool_text(found, result.plan.scene.name)
-    writers: list[Callable[[], None]] = [lambda: write_summary(result.summary, out)]
+    writers: list[Callable[[Path], None]] = [lambda out: write_summary(result.summary, out)]
     if tool is not None:
-        writers.append(lambda: write_text(out / FILE, tool))
+        writers.append(lambda out: write_text(out / FILE, tool))
     if (surface_map := result.surface_map) is not None:
         from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
 
-        writers.append(lambda: save_surface_map(surface_map, out / SURFACE, next(iter(result.estimates.values()), [])))
-    failed = []
-    for write in writers:
-        try:
-            write()
-        except ResultsError as error:
-            failed.append(str(error))
-    if failed:
-        raise ResultsError("\n".join(failed))
+        answers = next(iter(result.estimates.values()), [])
+        writers.append(lambda out: save_surface_map(surface_map, out / SURFACE, answers))
+    return writers
 
 
 def write_summary(summary: Mapping[str, Any], out: Path) -> None:
