@@ -17,14 +17,7 @@ from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.bridges import BRIDGES, check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.recorded.recording import (
-    LogCycles,
-    RunFolder,
-    read_recording,
-    read_run,
-    replay_contacts,
-    replay_task,
-)
+from canprobe.cell.recorded.recording import LogCycles, RunFolder, read_run, replay_contacts, replay_task
 from canprobe.cell.results.run_files import TACTILE, TRUTH, is_recorded, needed, read_scene, read_truth
 from canprobe.cell.results.scores import estimate_columns
 from canprobe.cell.results.summary import summarise_shape, without_nan
@@ -88,8 +81,8 @@ def _from_run(plan: Plan, run: RunFolder) -> RecordedContacts:
 
 def _from_log(plan: Plan, path: Path) -> RecordedContacts:
     """The contacts in a recorded bus."""
-    recording = read_recording(path, plan)
-    cycles = LogCycles(plan, recording)
+    cycles = LogCycles(plan, path)
+    recording = cycles.recording
     try:
         tracker, unplaced = replay_contacts(plan, cycles)
     except ProtocolError as error:
@@ -375,9 +368,8 @@ def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayRes
     run = read_run(folder, plan.setup) if folder is not None else None
     columns: dict[str, Floats] = {}
     if run is None:
-        recording = read_recording(path, plan)
-        cycles = LogCycles(plan, recording)
-        start_ns, measurements, channel = cycles.start_ns, iter(cycles), recording.channel
+        cycles = LogCycles(plan, path)
+        start_ns, measurements, channel = cycles.start_ns, iter(cycles), cycles.recording.channel
     else:
         start_ns, measurements, channel = round(run.start_s * 1e9), run.measurements(), plan.buses[0].channel
         columns = {name: run.log[name] for name in TASK_COLUMNS if name in run.log}

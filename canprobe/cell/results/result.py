@@ -213,11 +213,8 @@ class RunResult:
             raise UsageError("score: expected a scan that touched its object, got no contacts")
         if "kappa_per_m" not in self.truth:
             raise UsageError("score: expected an emulated object and outputs.truth = true, got a run without truth")
-        start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
         ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
-        return score_estimators(
-            self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
-        )
+        return score_estimators(self.contacts, task, {**ours, **own}, self.truth, self.log["t_s"])
 
     def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
         """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.

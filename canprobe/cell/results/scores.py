@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from canprobe.cell.scene.setup import Touch
-from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, make_shape_estimator
-from canprobe.cell.tasks.shape import OwnEstimator, RenewedEstimator, ShapeRecord, replay_samples
+from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation, make_shape_estimator
+from canprobe.cell.tasks.shape import OwnEstimator, RenewedEstimator, ShapeRecord, ShapeTracker, replay_samples
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import ContactSample, Correlation, Estimator, SurfaceMap
+    from canprobe.mechanics.touch import ContactSample, Estimator, SurfaceMap
     from canprobe.mechanics.touch.shapes import PlacedShape
 
 RUN_IN_M = 0.020
@@ -175,37 +175,36 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Floats], syn
     )
 
 
-def bound_of_scan(
-    samples: Sequence[ContactSample],
-    truth: Mapping[str, Floats],
-    sync_times: Floats,
-    *,
-    memory_m: float,
-    sigma_normal: float,
-    correlation: Correlation,
-    coupling: float = 0.0,
+def bound_ratio(
+    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Floats], sync_times: Floats
 ) -> float | None:
-    """Cramér–Rao bound on the RMS Frobenius error of K (1/m), over the run; None where a window leaves K open.
+    """Error of the online estimator over the Cramér–Rao bound on the RMS Frobenius error of K, over the run.
 
-    The limit of unbiased estimates from the last ``memory_m`` of path with noise of the stated size, the
-    mean over ``CHECKPOINTS`` places after the run-in. An estimator with a longer memory may be better.
+    The bound is the limit of unbiased estimates from the last memory of path with noise of the stated size, the mean
+    over ``CHECKPOINTS`` places after the run-in. An estimator with a longer memory may be better. The ratio is None
+    where the contact patch contributed to most answers, as the bound is that of points and normals, and where a window
+    leaves K open.
 
     Args:
-        samples: the contacts of the scan.
+        setup: setup of the run.
+        tracker: tracker of the contacts of the scan; None without a shape.
+        score: score of the estimator.
         truth: columns of the plant's truth, one row for each SYNC.
         sync_times: time of each SYNC on the master's clock (n,), s.
-        memory_m: path that counts, m.
-        sigma_normal: standard deviation of the normals, rad; that of the points is in the samples.
-        correlation: correlation of the noise along the path.
-        coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
+    shape = setup.shape
+    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
+        return None
+    assert setup.array is not None
+    samples, memory_m = tracker.samples, shape.memory
+    correlation, coupling = contact_correlation(setup.array), centroid_coupling(setup.probe)
     from canprobe.mechanics.touch import SurfaceMatrix
     from canprobe.mechanics.touch.estimate.gate import Gate
     from canprobe.mechanics.touch.estimate.likelihood import batch_of, osculating_bound
 
     points = np.array([s.p_base for s in samples])
-    gate = Gate(1.0, sigma_normal)
-    gate = Gate(float(np.median([gate.sigmas(s)[0] for s in samples])), sigma_normal)
+    gate = Gate(1.0, SIGMA_NORMAL_RAD)
+    gate = Gate(float(np.median([gate.sigmas(s)[0] for s in samples])), SIGMA_NORMAL_RAD)
     touches = [gate.measured(s, coupling) for s in samples]
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
@@ -223,7 +222,7 @@ def bound_of_scan(
         C = osculating_bound(batch_of(touches[first : last + 1], correlation), surface)
         squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
     mean = float(np.mean(squares))
-    return float(np.sqrt(mean)) if np.isfinite(mean) else None
+    return score.kappa_rms_error_per_m / float(np.sqrt(mean)) if np.isfinite(mean) else None
 
 
 def _pair(values: Floats) -> tuple[float, float]:
@@ -386,28 +385,28 @@ class Scores(dict[str, dict[str, Any]]):
 
 
 def score_estimators(
-    samples: Sequence[ContactSample],
+    contacts: Contacts,
     task: Touch,
     estimators: Mapping[str, str | Callable[[], OwnEstimator]],
-    *,
     truth: Mapping[str, Floats],
-    sync_times: Floats,
+    times: Floats,
 ) -> Scores:
     """Feed the contacts of a scan to each estimator, as the loop would have, and score its answers.
 
     Args:
-        samples: contacts of the scan.
+        contacts: contacts of the scan, at least one.
         task: the planned task.
         estimators: estimators by their name in the table: the name of a method, or a function that makes one.
         truth: columns of the plant's truth, one row for each SYNC.
-        sync_times: time of each SYNC on the clock of the samples (n,), s.
+        times: time of each SYNC on the run's clock (n,), s.
     """
+    samples, sync_times = contacts.samples, times - float(contacts.t_s[0] - contacts.samples[0].t_s)
     every, clock, scores = max(1, round(ESTIMATE_PERIOD_S * task.array.rate_hz)), MonotonicClock(), Scores()
     for name, what in estimators.items():
         estimator: Estimator = make_shape_estimator(task, what) if isinstance(what, str) else RenewedEstimator(what)
         before_ns = clock.now_ns()
         records = replay_samples(estimator, samples, every)
-        cost_us = 1e-3 * (clock.now_ns() - before_ns) / max(len(samples), 1)
+        cost_us = 1e-3 * (clock.now_ns() - before_ns) / len(samples)
         score: ShapeScore = score_shape(records, truth, sync_times)
         scores[name] = {**asdict(score), "us_per_contact": cost_us}
     return scores

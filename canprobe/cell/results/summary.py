@@ -20,7 +20,7 @@ from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import (
     ShapeScore,
-    bound_of_scan,
+    bound_ratio,
     score_contact,
     score_measured_force,
     score_shape,
@@ -31,7 +31,6 @@ from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_te
 from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.errors import UsageError
@@ -251,7 +250,7 @@ def summarise_shape(
     score = asdict(scores[method])
     score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
     shape |= {name: value for name, value in score.items() if name in names}
-    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, scores[method], truth, sync_times)
+    shape["cramer_rao_ratio"] = bound_ratio(setup, tracker, scores[method], truth, sync_times)
     shape["methods"] = methods_table(scores)
     return shape
 
@@ -263,29 +262,6 @@ def methods_table(scores: Mapping[str, ShapeScore]) -> dict[str, dict[str, Any]]
         method: {name: value for name, value in asdict(score).items() if name not in of_run}
         for method, score in scores.items()
     }
-
-
-def _bound_ratio(
-    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Floats], sync_times: Floats
-) -> float | None:
-    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
-
-    None where the contact patch contributed to most answers: the bound is that of points and normals.
-    """
-    shape = setup.shape
-    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
-        return None
-    assert setup.array is not None
-    bound = bound_of_scan(
-        tracker.samples,
-        truth,
-        sync_times,
-        memory_m=shape.memory,
-        correlation=contact_correlation(setup.array),
-        sigma_normal=SIGMA_NORMAL_RAD,
-        coupling=centroid_coupling(setup.probe),
-    )
-    return None if bound is None else score.kappa_rms_error_per_m / bound
 
 
 def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
