@@ -257,25 +257,16 @@ class OpenCell:
             UsageError: not one of joint, along and about, or as `way_to`.
             SafetyStop, BusError: as `move`.
         """
-        from canprobe.cell.tasks.hand_way import jog_speed, jog_way
+        from canprobe.cell.tasks.hand_way import Jog, jog_speed, jog_way
         from canprobe.mechanics.touch.checks import checked
 
         length = float(checked("jog: velocity", velocity, ())) * float(checked("jog: for_s", for_s, ()))
         if velocity == 0.0 or for_s <= 0.0:
             raise UsageError(f"jog: expected a velocity and a time above 0, got {velocity:g} for {for_s:g} s")
         start = self._stands()  # refuses a cell without an arm
-        speed = min(1.0, abs(velocity) / jog_speed(self.plan, joint, about=about is not None))
-        way = jog_way(
-            self.plan,
-            start,
-            joint,
-            along=along,
-            about=about,
-            length=length,
-            speed=speed,
-            in_probe_frame=in_probe_frame,
-        )
-        return self.move(way.whole(), wanted=wanted)
+        jog = Jog(joint, along, about, in_probe_frame)
+        speed = min(1.0, abs(velocity) / jog_speed(self.plan, jog))
+        return self.move(jog_way(self.plan, start, jog, length, speed).whole(), wanted=wanted)
 
     def tare(self) -> None:
         """Take what the array shows for zero: nothing may touch it.
