@@ -232,8 +232,7 @@ def _pair(values: Floats) -> tuple[float, float]:
 MAX_PLACES = 500
 """Most places at which a map is scored, evenly over its nodes."""
 TWO_SIGMA = 1.96
-_COMMON = ("lag_um", "pad_scale_percent", "pad_x_um", "pad_y_um")
-_TO_UNIT = np.array([1e6, 1e2, 1e6, 1e6])
+_COMMON = {"lag_um": 1e6, "pad_scale_percent": 1e2, "pad_x_um": 1e6, "pad_y_um": 1e6}
 
 
 def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[str, Any]:
@@ -263,8 +262,8 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
         found["stiffness_n_m3"], found["stiffness_sigma_percent"] = stiffness.value, 1e2 * stiffness.sigma
     if any(surface_map.noise.common):
         mean, sigma = surface_map.common.mean, np.sqrt(np.diag(surface_map.common.covariance))
-        pairs = zip(_COMMON, (mean * _TO_UNIT).tolist(), (sigma * _TO_UNIT).tolist(), strict=True)
-        found["common"] = {name: [value, spread] for name, value, spread in pairs}
+        each = zip(_COMMON.items(), mean.tolist(), sigma.tolist(), strict=True)
+        found["common"] = {name: [unit * value, unit * spread] for (name, unit), value, spread in each}
     if shape is not None and known.any():
         off = np.array([shape.nearest((x, y, z)).distance for x, y, z in feet.point[known].tolist()])
         found["rms_error_um"] = 1e6 * rms(off)
