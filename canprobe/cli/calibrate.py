@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from dataclasses import asdict
 from datetime import date
+from functools import partial
 
 from canprobe.cell.session.terminal import StepReport
 from canprobe.cli.argument_types import folder_path, positive, seed, word
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         spread=1e-2 * args.spread,
         seed=args.seed,
     )
-    ask, say = None if args.yes else _ask, _steps(args.report)
+    ask, say = None if args.yes else _ask, partial(_say_step, args.report)
     if args.verify:
         calibration, verification = verify(request, date=today, ask=ask, say=say, out=out)
         if args.json:
@@ -118,19 +118,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _steps(report: StepReport) -> Callable[[str], None]:
-    """A function that reports the next step; the steps of each bring-up only with -v."""
-
-    def say(line: str) -> None:
-        if report.verbosity > 0 or line.startswith(("visit", "warning")):
-            report.say(line)
-
-    return say
+def _say_step(report: StepReport, line: str) -> None:
+    """Report the next step; the steps of each bring-up only with -v."""
+    if report.verbosity > 0 or line.startswith(("visit", "warning")):
+        report.say(line)
 
 
 def _ask(text: str) -> str:
-    sys.stderr.write(text)
-    sys.stderr.flush()
+    print(text, end="", file=sys.stderr, flush=True)
     answer = sys.stdin.readline()
     if not answer:
         raise EOFError("no answer: standard input is closed")

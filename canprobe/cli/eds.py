@@ -35,43 +35,35 @@ examples:
 
 def add_arguments(parser: Parser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
-    listing = actions.add_parser(
-        "list",
-        help="list the packaged files",
-        description="List the packaged EDS files.",
-        epilog="examples:\n  canprobe eds list\n  canprobe eds list --json\n",
-    )
-    listing.add_shared("--json")
-    listing.set_defaults(run=run, action="list")
-    path = actions.add_parser(
-        "path",
-        help="print the path of a packaged file",
-        description="Print the path of a packaged EDS file.",
-        epilog="example:\n  canprobe eds path puma260_joint\n",
-    )
-    path.add_argument("eds", metavar="NAME", help="name of a packaged file, with or without .eds")
-    path.set_defaults(run=run, action="path")
-    check = actions.add_parser(
-        "check",
-        help="list the faults of a file, with section and line",
-        description="List the faults and warnings of an EDS, DCF, XDD or XDC file, with section and line.",
-        epilog=_CHECK,
-    )
-    check.add_argument("file", metavar="FILE", help="path of an EDS, DCF, XDD or XDC file, or name of a packaged file")
-    check.add_option("--node-id N", "node id that replaces $NODEID [that of the DCF, or 1]", whole(1, 127))
-    check.add_shared("--json")
-    check.set_defaults(run=run_check)
+    for action, text, examples in (
+        ("list", "list the packaged EDS files", "examples:\n  canprobe eds list\n  canprobe eds list --json\n"),
+        ("path", "print the path of a packaged EDS file", "example:\n  canprobe eds path puma260_joint\n"),
+        ("check", "list the faults and warnings of an EDS, DCF, XDD or XDC file, with section and line", _CHECK),
+    ):
+        one = actions.add_parser(action, help=text, description=f"{text[0].upper()}{text[1:]}.", epilog=examples)
+        one.set_defaults(run=run, action=action)
+        if action == "path":
+            one.add_argument("eds", metavar="NAME", help="name of a packaged file, with or without .eds")
+            continue
+        if action == "check":
+            file = "path of an EDS, DCF, XDD or XDC file, or name of a packaged file"
+            one.add_argument("file", metavar="FILE", help=file)
+            one.add_option("--node-id N", "node id that replaces $NODEID [that of the DCF, or 1]", whole(1, 127))
+        one.add_shared("--json")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Print the names of the files, or the path of one."""
+def run(args: argparse.Namespace) -> int:
+    """Print the names of the files, the path of one, or what is wrong with one."""
+    if args.action == "check":
+        return _check(args)
     if args.action == "path":
         print(eds_path(args.eds))
     else:
         print_answer(args, list(eds_names()), "\n".join(eds_names()))
+    return 0
 
 
-def run_check(args: argparse.Namespace) -> int:
+def _check(args: argparse.Namespace) -> int:
     """Print the faults and warnings of a file; status 2 when it cannot be served."""
     reading = check_eds(args.file, args.node_id)
     found = [f"{'fault' if fault.prevents else 'warning'}: {fault}" for fault in reading.found]

@@ -13,7 +13,7 @@ from canprobe.cell.master.controller import Measurement
 from canprobe.cell.results.open_cell import OpenCell
 from canprobe.cell.tasks.guided_arm import LIFETIME_S, GuidedArm
 from canprobe.cell.tasks.hand_motion import UNWANTED
-from canprobe.cell.tasks.hand_way import HandWay, goal_of, jog_way, joint_way
+from canprobe.cell.tasks.hand_way import HandWay, Jog, goal_of, jog_way, joint_way
 from canprobe.cell.tasks.task import USUAL_SPEED
 from canprobe.cli.console_view import ConsoleView
 from canprobe.cli.hand_questions import Questions
@@ -135,18 +135,11 @@ class GuidedMotions:
         direction = [float(i == axis) for i in range(3)]
         joint = None if which in AXES else int(which)
         slides = not turns if joint is None else joint <= len(self._joints) and self._joints[joint - 1].prismatic
+        along, about = (None, direction) if turns else (direction if joint is None else None, None)
+        length = sign * step * (1e-3 if slides else math.radians(1.0))
         assert self.arm.target is not None
-        return jog_way(
-            self._plan,
-            self.arm.target,
-            joint,
-            length=sign * step * (1e-3 if slides else math.radians(1.0)),
-            speed=self.speed,
-            along=direction if joint is None and not turns else None,
-            about=direction if turns else None,
-            in_probe_frame=self.in_probe_frame,
-            guided=True,
-        )
+        jog = Jog(joint, along, about, self.in_probe_frame)
+        return jog_way(self._plan, self.arm.target, jog, length, self.speed, guided=True)
 
     def move(self, to: str) -> None:
         """Begin to look at the way to a posture."""

@@ -188,22 +188,27 @@ MAX_LOST_SYNCS = 5
 
 
 class LogCycles:
-    """Iterates over the cycles of a recording. One object, one pass; its counts are complete afterwards.
+    """Iterates over the cycles of a recorded bus. One object, one pass; its counts are complete afterwards.
 
     The deadlines and looks of the master that sent the SYNCs are unknown: the time of a measurement is the stamp of its
     SYNC, and all frames before the next SYNC belong to its cycle.
 
     Args:
         plan: plan of the cell.
-        recording: frames of the log.
+        path: the log.
 
     Attributes:
+        recording: frames of the log.
         start_ns: stamp of the first SYNC; a measurement's time counts from there.
         sync_times_s: time of each SYNC, from there.
         lost_syncs: SYNCs that are missing in the log.
+
+    Raises:
+        UsageError: as `read_recording`, and for an external arm, whose poses are not in a log.
     """
 
-    def __init__(self, plan: Plan, recording: Recording) -> None:
+    def __init__(self, plan: Plan, path: Path) -> None:
+        self.recording = recording = read_recording(path, plan)
         if plan.setup.arm is not None and plan.setup.arm.external is not None:
             raise UsageError(f"{plan.setup.name}: the poses of an external arm are not in a log of the bus")
         overflow = recording.sync_overflow or plan.sync.overflow or SYNCS_REMEMBERED
@@ -214,13 +219,11 @@ class LogCycles:
         self.lost_syncs = 0
         self.start_ns = int(recording.sync_stamps[0])
         self._intake = Intake(self.drives, self.tactile, overflow, carrier)
-        self._recording = recording
         self._overflow = overflow
         self._period_ns = plan.sync.period_ns
 
     def __iter__(self) -> Iterator[Measurement]:
-        recording, intake = self._recording, self._intake
-        frames, syncs = recording.frames, recording.syncs
+        intake, frames, syncs = self._intake, self.recording.frames, self.recording.syncs
         intake.route(frames[: syncs[0]])
         counter_before = 0
         for first, end in zip(syncs, [*syncs[1:], len(frames)], strict=True):

@@ -17,17 +17,10 @@ from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.bridges import BRIDGES, check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.recorded.recording import (
-    LogCycles,
-    RunFolder,
-    read_recording,
-    read_run,
-    replay_contacts,
-    replay_task,
-)
-from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, is_recorded, needed, read_log, read_scene, read_truth
-from canprobe.cell.results.scores import estimate_columns, summarise_map
-from canprobe.cell.results.summary import finite_or_none, summarise_shape
+from canprobe.cell.recorded.recording import LogCycles, RunFolder, read_run, replay_contacts, replay_task
+from canprobe.cell.results.run_files import TACTILE, TRUTH, is_recorded, needed, read_scene, read_truth
+from canprobe.cell.results.scores import estimate_columns
+from canprobe.cell.results.summary import summarise_shape, without_nan
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import SAVED_AS, load_scene
 from canprobe.cell.scene.model import BridgeSettings, OutputSettings, Scene
@@ -88,8 +81,8 @@ def _from_run(plan: Plan, run: RunFolder) -> RecordedContacts:
 
 def _from_log(plan: Plan, path: Path) -> RecordedContacts:
     """The contacts in a recorded bus."""
-    recording = read_recording(path, plan)
-    cycles = LogCycles(plan, recording)
+    cycles = LogCycles(plan, path)
+    recording = cycles.recording
     try:
         tracker, unplaced = replay_contacts(plan, cycles)
     except ProtocolError as error:
@@ -129,16 +122,14 @@ def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
     return {
         "count": len(records),
         "t_s": start_s + record.t_s,
-        "kappa_per_m": finite_or_none(record.estimate.kappa),
+        "kappa_per_m": np.asarray(record.estimate.kappa).tolist(),
         "observed": [bool(o) for o in record.estimate.observed],
     }
 
 
-def _online(folder: Path, setup: Setup, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
+def _online(log: Mapping[str, Floats], records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
     """Difference of the replayed curvature of the estimator in the loop and the logged one, number by number."""
-    path = folder / LOG
-    logged = read_log(path, setup).get("K_per_m") if is_recorded(path) else None
-    if logged is None:
+    if (logged := log.get("K_per_m")) is None:
         return None
     online = _changes(logged[np.isfinite(logged).all(axis=(1, 2))])
     replayed = _changes(np.array([r.estimate.K for r in records if np.isfinite(r.estimate.K).all()]).reshape(-1, 2, 2))
@@ -255,9 +246,6 @@ def replay(
     tracker, setup = contacts.tracker, plan.setup
     estimates = estimates_of(setup, tracker.records, tracker.settled(setup.probe.radius), methods)
     truth = _truth(folder / TRUTH, setup) if folder is not None else {}
-    map_summary = None
-    if tracker.surface_map is not None:
-        map_summary = summarise_map(tracker.surface_map, setup.truth.object if truth else None)
     summary = {
         "schema": SCHEMA,
         "scene": plan.scene.name,
@@ -268,13 +256,11 @@ def replay(
         "cycle": contacts.counts,
         "contacts": len(tracker.samples),
         "estimates": {name: _last(records, contacts.start_s) for name, records in estimates.items()},
-        "shape": summarise_shape(setup, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
-        "online": None,
+        "shape": summarise_shape(setup, tracker, estimates, truth, contacts.times_s),
+        "online": _online(run.log, tracker.records) if run is not None and contacts.driven_by == "task" else None,
     }
-    if folder is not None and contacts.driven_by == "task":
-        summary["online"] = _online(folder, setup, tracker.records)
     on_clock = {name: on_run_clock(records, contacts.start_s) for name, records in estimates.items()}
-    return ReplayResult(plan, summary, on_clock, tracker)
+    return ReplayResult(plan, without_nan(summary), on_clock, tracker)
 
 
 def find_log(log: Path) -> tuple[Path, Path | None]:
@@ -382,9 +368,8 @@ def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayRes
     run = read_run(folder, plan.setup) if folder is not None else None
     columns: dict[str, Floats] = {}
     if run is None:
-        recording = read_recording(path, plan)
-        cycles = LogCycles(plan, recording)
-        start_ns, measurements, channel = cycles.start_ns, iter(cycles), recording.channel
+        cycles = LogCycles(plan, path)
+        start_ns, measurements, channel = cycles.start_ns, iter(cycles), cycles.recording.channel
     else:
         start_ns, measurements, channel = round(run.start_s * 1e9), run.measurements(), plan.buses[0].channel
         columns = {name: run.log[name] for name in TASK_COLUMNS if name in run.log}

@@ -20,8 +20,8 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE
-from canprobe.cell.results.scores import score_shape, summarise_map
-from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_files, write_summary
+from canprobe.cell.results.scores import score_shape
+from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_summary, writers_of
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.joint_record import warned
@@ -257,25 +257,16 @@ class OpenCell:
             UsageError: not one of joint, along and about, or as `way_to`.
             SafetyStop, BusError: as `move`.
         """
-        from canprobe.cell.tasks.hand_way import jog_speed, jog_way
+        from canprobe.cell.tasks.hand_way import Jog, jog_speed, jog_way
         from canprobe.mechanics.touch.checks import checked
 
         length = float(checked("jog: velocity", velocity, ())) * float(checked("jog: for_s", for_s, ()))
         if velocity == 0.0 or for_s <= 0.0:
             raise UsageError(f"jog: expected a velocity and a time above 0, got {velocity:g} for {for_s:g} s")
         start = self._stands()  # refuses a cell without an arm
-        speed = min(1.0, abs(velocity) / jog_speed(self.plan, joint, about=about is not None))
-        way = jog_way(
-            self.plan,
-            start,
-            joint,
-            along=along,
-            about=about,
-            length=length,
-            speed=speed,
-            in_probe_frame=in_probe_frame,
-        )
-        return self.move(way.whole(), wanted=wanted)
+        jog = Jog(joint, along, about, in_probe_frame)
+        speed = min(1.0, abs(velocity) / jog_speed(self.plan, jog))
+        return self.move(jog_way(self.plan, start, jog, length, speed).whole(), wanted=wanted)
 
     def tare(self) -> None:
         """Take what the array shows for zero: nothing may touch it.
@@ -342,7 +333,8 @@ class OpenCell:
             summary, lines = data.summary, files.unwritten
             if isinstance(failure, CanprobeError):
                 failure.summary = summary
-            self._write(lambda out: write_files(data, out))
+            for write in writers_of(data):
+                self._write(write)
         if failure is None:
             self._early_summary(summary)
         _estimate_again(self.session, data, self._say)
@@ -351,8 +343,7 @@ class OpenCell:
         for name in PICTURES if len(data.log["t_s"]) else ():
             if self._out is not None and name in data.plan.outputs:
                 self._say(f"draw {name}")
-                if (why := _draw(data, self._out / name)) is not None:
-                    files.note_unwritten(why)
+                files.note_unwritten(_draw(data, self._out / name))
         summary["faults"] += [line for line in lines if line not in summary["faults"]]
         if lines and failure is None:
             unwritten = ResultsError("\n".join(lines))
@@ -370,17 +361,12 @@ class OpenCell:
         estimates: dict[str, list[ShapeRecord]] = {}
         if record.shape is not None and setup.shape is not None:
             estimates[setup.shape.method] = record.shape.records
-        surface_map = None if record.shape is None else record.shape.surface_map
-        map_summary = None
-        if surface_map is not None:
-            map_summary = summarise_map(surface_map, setup.truth.object if truth_of(self.session) else None)
         summary = summarise(
             self.session,
             record,
             estimates,
             None if failure is None else _reason(failure),
             log=log,
-            map_summary=map_summary,
             bridges=self._bridges.status(),
         )
         return RunData(
@@ -391,7 +377,6 @@ class OpenCell:
             estimates={name: on_run_clock(records, start_s) for name, records in estimates.items()},
             taxels=record.taxels,
             tactile=tactile,
-            surface_map=surface_map,
             out=self._out,
             tracker=record.shape,
             start_s=start_s,
@@ -405,9 +390,8 @@ class OpenCell:
             with interrupts_held():
                 write(self._out)
         except ResultsError as error:
-            for line in str(error).splitlines():
-                if line not in self.session.files.unwritten:  # the summary is written twice
-                    self.session.files.note_unwritten(line)
+            if str(error) not in self.session.files.unwritten:  # the summary is written twice
+                self.session.files.note_unwritten(str(error))
 
 
 def _estimate_again(session: Session, data: RunData, say: Say) -> None:

@@ -23,7 +23,7 @@ from canprobe.cell.planning.bridges import check_view
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE, to_frame, write_parquet
-from canprobe.cell.results.summary import write_files
+from canprobe.cell.results.summary import writers_of
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.folder import write_scene
@@ -213,11 +213,8 @@ class RunResult:
             raise UsageError("score: expected a scan that touched its object, got no contacts")
         if "kappa_per_m" not in self.truth:
             raise UsageError("score: expected an emulated object and outputs.truth = true, got a run without truth")
-        start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
         ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
-        return score_estimators(
-            self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
-        )
+        return score_estimators(self.contacts, task, {**ours, **own}, self.truth, self.log["t_s"])
 
     def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
         """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
@@ -268,7 +265,8 @@ class RunResult:
         write_scene(self.plan, folder)
         write_npz(folder / LOG, self.log)
         write_npz(folder / TACTILE, self.tactile)
-        write_files(self.data, folder)
+        for write in writers_of(self.data):
+            write(folder)
 
     @property
     def _attrs(self) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,13 +35,16 @@ class RunData:
     summary: dict[str, Any]
     log: Mapping[str, Floats]
     truth: Mapping[str, Floats]
-    estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
-    taxels: NDArray[np.uint8] | None = None
-    tactile: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    surface_map: SurfaceMap | None = None
-    out: Path | None = None
-    tracker: ShapeTracker | None = None
-    start_s: float = 0.0
+    estimates: dict[str, list[ShapeRecord]]
+    taxels: NDArray[np.uint8] | None
+    tactile: Mapping[str, NDArray[Any]]
+    out: Path | None
+    tracker: ShapeTracker | None
+    start_s: float
+
+    @property
+    def surface_map(self) -> SurfaceMap | None:
+        return None if self.tracker is None else self.tracker.surface_map
 
     @cached_property
     def settled(self) -> list[ContactSample]:

@@ -6,23 +6,22 @@ The contacts of a scan are arrays, on which any estimators are scored.
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from canprobe.cell.scene.setup import Touch
-from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, make_shape_estimator
-from canprobe.cell.tasks.shape import OwnEstimator, RenewedEstimator, ShapeRecord, replay_samples
+from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation, make_shape_estimator
+from canprobe.cell.tasks.shape import OwnEstimator, RenewedEstimator, ShapeRecord, ShapeTracker, replay_samples
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.touch import ContactSample, Correlation, Estimator, SurfaceMap
+    from canprobe.mechanics.touch import ContactSample, Estimator, SurfaceMap
     from canprobe.mechanics.touch.shapes import PlacedShape
 
 RUN_IN_M = 0.020
@@ -176,37 +175,36 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Floats], syn
     )
 
 
-def bound_of_scan(
-    samples: Sequence[ContactSample],
-    truth: Mapping[str, Floats],
-    sync_times: Floats,
-    *,
-    memory_m: float,
-    sigma_normal: float,
-    correlation: Correlation,
-    coupling: float = 0.0,
+def bound_ratio(
+    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Floats], sync_times: Floats
 ) -> float | None:
-    """Cramér–Rao bound on the RMS Frobenius error of K (1/m), over the run; None where a window leaves K open.
+    """Error of the online estimator over the Cramér–Rao bound on the RMS Frobenius error of K, over the run.
 
-    The limit of unbiased estimates from the last ``memory_m`` of path with noise of the stated size, the
-    mean over ``CHECKPOINTS`` places after the run-in. An estimator with a longer memory may be better.
+    The bound is the limit of unbiased estimates from the last memory of path with noise of the stated size, the mean
+    over ``CHECKPOINTS`` places after the run-in. An estimator with a longer memory may be better. The ratio is None
+    where the contact patch contributed to most answers, as the bound is that of points and normals, and where a window
+    leaves K open.
 
     Args:
-        samples: the contacts of the scan.
+        setup: setup of the run.
+        tracker: tracker of the contacts of the scan; None without a shape.
+        score: score of the estimator.
         truth: columns of the plant's truth, one row for each SYNC.
         sync_times: time of each SYNC on the master's clock (n,), s.
-        memory_m: path that counts, m.
-        sigma_normal: standard deviation of the normals, rad; that of the points is in the samples.
-        correlation: correlation of the noise along the path.
-        coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
+    shape = setup.shape
+    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
+        return None
+    assert setup.array is not None
+    samples, memory_m = tracker.samples, shape.memory
+    correlation, coupling = contact_correlation(setup.array), centroid_coupling(setup.probe)
     from canprobe.mechanics.touch import SurfaceMatrix
     from canprobe.mechanics.touch.estimate.gate import Gate
     from canprobe.mechanics.touch.estimate.likelihood import batch_of, osculating_bound
 
     points = np.array([s.p_base for s in samples])
-    gate = Gate(1.0, sigma_normal)
-    gate = Gate(float(np.median([gate.sigmas(s)[0] for s in samples])), sigma_normal)
+    gate = Gate(1.0, SIGMA_NORMAL_RAD)
+    gate = Gate(float(np.median([gate.sigmas(s)[0] for s in samples])), SIGMA_NORMAL_RAD)
     touches = [gate.measured(s, coupling) for s in samples]
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
@@ -224,7 +222,7 @@ def bound_of_scan(
         C = osculating_bound(batch_of(touches[first : last + 1], correlation), surface)
         squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
     mean = float(np.mean(squares))
-    return float(np.sqrt(mean)) if np.isfinite(mean) else None
+    return score.kappa_rms_error_per_m / float(np.sqrt(mean)) if np.isfinite(mean) else None
 
 
 def _pair(values: Floats) -> tuple[float, float]:
@@ -234,12 +232,11 @@ def _pair(values: Floats) -> tuple[float, float]:
 MAX_PLACES = 500
 """Most places at which a map is scored, evenly over its nodes."""
 TWO_SIGMA = 1.96
-_COMMON = ("lag_um", "pad_scale_percent", "pad_x_um", "pad_y_um")
-_TO_UNIT = np.array([1e6, 1e2, 1e6, 1e6])
+_COMMON = {"lag_um": 1e6, "pad_scale_percent": 1e2, "pad_x_um": 1e6, "pad_y_um": 1e6}
 
 
 def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[str, Any]:
-    """The section ``shape.map`` of ``summary.json``: None for what does not apply.
+    """The section ``shape.map`` of ``summary.json``: None, or NaN, for what does not apply.
 
     Args:
         surface_map: map of the scan.
@@ -265,8 +262,8 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
         found["stiffness_n_m3"], found["stiffness_sigma_percent"] = stiffness.value, 1e2 * stiffness.sigma
     if any(surface_map.noise.common):
         mean, sigma = surface_map.common.mean, np.sqrt(np.diag(surface_map.common.covariance))
-        pairs = zip(_COMMON, (mean * _TO_UNIT).tolist(), (sigma * _TO_UNIT).tolist(), strict=True)
-        found["common"] = {name: [value, spread] for name, value, spread in pairs}
+        each = zip(_COMMON.items(), mean.tolist(), sigma.tolist(), strict=True)
+        found["common"] = {name: [unit * value, unit * spread] for (name, unit), value, spread in each}
     if shape is not None and known.any():
         off = np.array([shape.nearest((x, y, z)).distance for x, y, z in feet.point[known].tolist()])
         found["rms_error_um"] = 1e6 * rms(off)
@@ -276,7 +273,7 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
         bent = off - displaced @ np.linalg.lstsq(displaced, off, rcond=1e-6)[0]
         held = np.abs(bent) < TWO_SIGMA * feet.sigma_relative[known]
         found["within_2_sigma_relative_fraction"] = float(np.mean(held))
-    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in found.items()}
+    return found
 
 
 def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Floats]:
@@ -387,28 +384,28 @@ class Scores(dict[str, dict[str, Any]]):
 
 
 def score_estimators(
-    samples: Sequence[ContactSample],
+    contacts: Contacts,
     task: Touch,
     estimators: Mapping[str, str | Callable[[], OwnEstimator]],
-    *,
     truth: Mapping[str, Floats],
-    sync_times: Floats,
+    times: Floats,
 ) -> Scores:
     """Feed the contacts of a scan to each estimator, as the loop would have, and score its answers.
 
     Args:
-        samples: contacts of the scan.
+        contacts: contacts of the scan, at least one.
         task: the planned task.
         estimators: estimators by their name in the table: the name of a method, or a function that makes one.
         truth: columns of the plant's truth, one row for each SYNC.
-        sync_times: time of each SYNC on the clock of the samples (n,), s.
+        times: time of each SYNC on the run's clock (n,), s.
     """
+    samples, sync_times = contacts.samples, times - float(contacts.t_s[0] - contacts.samples[0].t_s)
     every, clock, scores = max(1, round(ESTIMATE_PERIOD_S * task.array.rate_hz)), MonotonicClock(), Scores()
     for name, what in estimators.items():
         estimator: Estimator = make_shape_estimator(task, what) if isinstance(what, str) else RenewedEstimator(what)
         before_ns = clock.now_ns()
         records = replay_samples(estimator, samples, every)
-        cost_us = 1e-3 * (clock.now_ns() - before_ns) / max(len(samples), 1)
+        cost_us = 1e-3 * (clock.now_ns() - before_ns) / len(samples)
         score: ShapeScore = score_shape(records, truth, sync_times)
         scores[name] = {**asdict(score), "us_per_contact": cost_us}
     return scores

@@ -20,20 +20,20 @@ from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import (
     ShapeScore,
-    bound_of_scan,
+    bound_ratio,
     score_contact,
     score_measured_force,
     score_shape,
     state_force_sigma,
+    summarise_map,
 )
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
-from canprobe.errors import ResultsError, UsageError
+from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.mechanics.types import Floats
 
@@ -51,7 +51,6 @@ def summarise(
     stop_reason: str | None,
     *,
     log: Mapping[str, Floats] | None = None,
-    map_summary: dict[str, Any] | None = None,
     bridges: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """The content of ``summary.json``; a value that does not apply is None.
@@ -62,7 +61,6 @@ def summarise(
         estimates: answers of its estimator, by name.
         stop_reason: why the run ended before its end; None where it did not.
         log: columns of ``log.npz``; None takes them from the session.
-        map_summary: section of the surface map.
         bridges: status of each bridge.
     """
     scene, cell, observers = session.scene, session.cell, session.observers
@@ -93,7 +91,6 @@ def summarise(
             estimates,
             truth_of(session),
             since_first_sync(log["t_s"], cell.log.start_s),
-            map_summary=map_summary,
         ),
         "calibration": summarise_calibration(scene, record.tool),
         "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
@@ -115,7 +112,8 @@ def summarise(
         summary["external_arm"] = cell.drives.figures()
     if scene.task.kind == "listen":
         summary["listen"] = _listened(log)
-    return {name: without_nan(value) for name, value in summary.items()}
+    found: dict[str, Any] = without_nan(summary)
+    return found
 
 
 def without_nan(value: Any) -> Any:
@@ -221,8 +219,6 @@ def summarise_shape(
     estimates: dict[str, list[ShapeRecord]],
     truth: Mapping[str, Floats],
     sync_times: Floats,
-    *,
-    map_summary: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The section ``shape`` of ``summary.json``: figures of the first estimator, and a table of all.
 
@@ -232,7 +228,6 @@ def summarise_shape(
         estimates: the answers of each estimator, by name.
         truth: columns of the plant's truth, one row per SYNC; empty without a truth.
         sync_times: time of each SYNC (n,), s, on the clock of the estimates.
-        map_summary: section of the scan's surface map.
     """
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
@@ -244,18 +239,18 @@ def summarise_shape(
     method = next(iter(estimates))
     records = estimates[method]
     shape["method"] = method
-    if map_summary is not None:
-        shape["map"] = map_summary
+    if tracker is not None and (surface_map := tracker.surface_map) is not None:
+        shape["map"] = summarise_map(surface_map, setup.truth.object if truth else None)
     if records:
         shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
-        shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
+        shape["kappa_est_per_m"] = without_nan(np.asarray(records[-1].estimate.kappa).tolist())
     if not truth:
         return shape
     scores = {name: score_shape(answers, truth, sync_times) for name, answers in estimates.items()}
     score = asdict(scores[method])
     score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
     shape |= {name: value for name, value in score.items() if name in names}
-    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, scores[method], truth, sync_times)
+    shape["cramer_rao_ratio"] = bound_ratio(setup, tracker, scores[method], truth, sync_times)
     shape["methods"] = methods_table(scores)
     return shape
 
@@ -267,34 +262,6 @@ def methods_table(scores: Mapping[str, ShapeScore]) -> dict[str, dict[str, Any]]
         method: {name: value for name, value in asdict(score).items() if name not in of_run}
         for method, score in scores.items()
     }
-
-
-def _bound_ratio(
-    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Floats], sync_times: Floats
-) -> float | None:
-    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
-
-    None where the contact patch contributed to most answers: the bound is that of points and normals.
-    """
-    shape = setup.shape
-    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
-        return None
-    assert setup.array is not None
-    bound = bound_of_scan(
-        tracker.samples,
-        truth,
-        sync_times,
-        memory_m=shape.memory,
-        correlation=contact_correlation(setup.array),
-        sigma_normal=SIGMA_NORMAL_RAD,
-        coupling=centroid_coupling(setup.probe),
-    )
-    return None if bound is None else score.kappa_rms_error_per_m / bound
-
-
-def finite_or_none(values: Sequence[float] | Floats) -> list[float | None]:
-    """Floats for JSON; None for a value that was not observed, which is not finite."""
-    return [float(v) if np.isfinite(v) else None for v in values]
 
 
 def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
@@ -327,29 +294,22 @@ def percentiles(values_ns: Sequence[int] | NDArray[np.int64]) -> dict[str, float
     return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
 
 
-def write_files(result: RunData, out: Path) -> None:
-    """Write the files of a run into ``out`` that the session has not written, without the figures.
+def writers_of(result: RunData) -> list[Callable[[Path], None]]:
+    """The functions that write the files of a run into a folder, but those of the session and the figures.
 
-    Raises:
-        ResultsError: when a file cannot be written; no part of it is left, and the others are written.
+    Each raises `ResultsError` where its file cannot be written; no part of it is left then.
     """
     found = result.summary["calibration"]
     tool = None if found is None else tool_text(found, result.plan.scene.name)
-    writers: list[Callable[[], None]] = [lambda: write_summary(result.summary, out)]
+    writers: list[Callable[[Path], None]] = [lambda out: write_summary(result.summary, out)]
     if tool is not None:
-        writers.append(lambda: write_text(out / FILE, tool))
+        writers.append(lambda out: write_text(out / FILE, tool))
     if (surface_map := result.surface_map) is not None:
         from canprobe.cell.results.surface_file import SURFACE, save_surface_map  # late: it loads scipy.spatial
 
-        writers.append(lambda: save_surface_map(surface_map, out / SURFACE, next(iter(result.estimates.values()), [])))
-    failed = []
-    for write in writers:
-        try:
-            write()
-        except ResultsError as error:
-            failed.append(str(error))
-    if failed:
-        raise ResultsError("\n".join(failed))
+        answers = next(iter(result.estimates.values()), [])
+        writers.append(lambda out: save_surface_map(surface_map, out / SURFACE, answers))
+    return writers
 
 
 def write_summary(summary: Mapping[str, Any], out: Path) -> None:

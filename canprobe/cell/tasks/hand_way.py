@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
@@ -238,47 +239,52 @@ def joint_way(
     return HandWay(plan, start, places, number, speed, bounded=bounded, guided=guided)
 
 
-def jog_way(
-    plan: Plan,
-    start: Floats,
-    joint: int | None = None,
-    *,
-    length: float,
-    speed: float,
-    along: npt.ArrayLike | None = None,
-    about: npt.ArrayLike | None = None,
-    in_probe_frame: bool = False,
-    guided: bool = False,
-) -> HandWay:
-    """The way of a jog: one joint as far as its range goes, or the probe in a direction; see `OpenCell.jog`.
+@dataclass(frozen=True, slots=True)
+class Jog:
+    """What a jog moves: one joint, or the probe in a direction; for its attributes see `OpenCell.jog`.
+
+    Raises:
+        UsageError: not one of joint, along and about.
+    """
+
+    joint: int | None = None
+    along: npt.ArrayLike | None = None
+    about: npt.ArrayLike | None = None
+    in_probe_frame: bool = False
+
+    def __post_init__(self) -> None:
+        if sum(one is not None for one in (self.joint, self.along, self.about)) != 1:
+            raise UsageError("jog: expected one of joint, along and about")
+
+
+def jog_way(plan: Plan, start: Floats, jog: Jog, length: float, speed: float, *, guided: bool = False) -> HandWay:
+    """The way of a jog: one joint as far as its range goes, or the probe in a direction.
 
     Args:
         plan: plan of a cell with an arm.
         start: joint positions (n,), rad or m.
-        joint, along, about, in_probe_frame: as for `OpenCell.jog`.
+        jog: what moves.
         length: signed, rad or m; infinite: as far as it may go.
         speed: share of the speed limits of the joints, of `LINE_SPEED_M_S` and of `TURN_SPEED_RAD_S`.
         guided: as for `HandWay`.
 
     Raises:
-        UsageError: not one of joint, along and about, no such joint, or no direction.
+        UsageError: no such joint, or no direction.
     """
-    if [joint, along, about].count(None) != 2:
-        raise UsageError("jog: expected one of joint, along and about")
-    most, guard = jog_speed(plan, joint, about=about is not None), JointGuard(plan)
-    if joint is not None:
-        goal, i = start.copy(), joint - 1
+    most, guard, about = jog_speed(plan, jog), JointGuard(plan), jog.about
+    if jog.joint is not None:
+        goal, i = start.copy(), jog.joint - 1
         low, high = min(guard.low[i], start[i]), max(guard.high[i], start[i])
         goal[i] = min(max(start[i] + length, low), high)
         return joint_way(plan, start, goal, speed, bounded=True, guided=guided)
-    direction = checked("jog: direction", along if about is None else about, (3,))
+    direction = checked("jog: direction", jog.along if about is None else about, (3,))
     if (size := float(np.linalg.norm(direction))) == 0.0:
         raise UsageError("jog: expected a direction that is not 0")
     longest = STEP_M if about is None else STEP_RAD
     number = math.ceil(abs(length) / longest) if math.isfinite(length) else math.inf
     step = abs(length) / number if math.isfinite(length) else longest
     direction = direction * (math.copysign(step, length) / size)
-    if in_probe_frame:
+    if jog.in_probe_frame:
         direction = guard.T_base_tip(start)[:3, :3] @ direction
     still = np.zeros(3)
     places = _probe_places(plan, start, *((direction, still) if about is None else (still, direction)))
@@ -312,18 +318,18 @@ def _probe_places(plan: Plan, start: Floats, way: Floats, turn: Floats) -> Itera
         yield q
 
 
-def jog_speed(plan: Plan, joint: int | None, *, about: bool) -> float:
+def jog_speed(plan: Plan, jog: Jog) -> float:
     """Highest speed of a jog: of a joint, rad/s or m/s, or of the probe, m/s along or rad/s about a direction.
 
     Raises:
         UsageError: there is no such joint.
     """
     arm = plan.setup.needed_arm()
-    if joint is None:
-        return TURN_SPEED_RAD_S if about else LINE_SPEED_M_S
-    if not 1 <= joint <= arm.model.n:
-        raise UsageError(f"jog: expected a joint from 1 to {arm.model.n}, got {joint}")
-    return float(arm.model.qd_max[joint - 1]) * plan.setup.limits.speed_share
+    if jog.joint is None:
+        return LINE_SPEED_M_S if jog.about is None else TURN_SPEED_RAD_S
+    if not 1 <= jog.joint <= arm.model.n:
+        raise UsageError(f"jog: expected a joint from 1 to {arm.model.n}, got {jog.joint}")
+    return float(arm.model.qd_max[jog.joint - 1]) * plan.setup.limits.speed_share
 
 
 def share_of_speed(speed: float) -> float:

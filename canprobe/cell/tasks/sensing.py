@@ -65,14 +65,18 @@ class JointHistory:
         return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
 
 
+def curvature_sigma(estimate: SurfaceEstimate, i: int) -> float:
+    """Standard deviation of principal curvature `i`, 1/m: that of K along its direction."""
+    x, y = (estimate.T_frame_contact[:3, :2].T @ estimate.directions[i]).tolist()
+    weight = np.array([x * x, 2.0 * x * y, y * y])
+    return math.sqrt(max(float(weight @ estimate.covariance @ weight), 0.0))
+
+
 def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
     """Whether the object is, beyond doubt (3σ), as hollow as a probe of ``radius`` (m): no contact of one patch."""
     if not estimate.observed.all():
         return False
-    x, y = (estimate.T_frame_contact[:3, :2].T @ estimate.directions[1]).tolist()
-    weight = np.array([x * x, 2.0 * x * y, y * y])
-    sigma = math.sqrt(max(float(weight @ estimate.covariance @ weight), 0.0))
-    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOW_LIMIT_SHARE / radius
+    return float(estimate.kappa[1]) + 3.0 * curvature_sigma(estimate, 1) < -HOLLOW_LIMIT_SHARE / radius
 
 
 class ContactSensing:

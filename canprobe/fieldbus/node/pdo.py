@@ -54,8 +54,7 @@ class PdoEngine(Service):
         self._groups: list[_Group] = []
         self._on_event: list[Tpdo] = []
         self._buffered: list[Tpdo] = []
-        self._delay_ns = core.quirks.tpdo_delay_ns
-        self._late = DelayedFrames(core, self._delay_ns)
+        self._late = DelayedFrames(core, core.quirks.tpdo_delay_ns)
         self._count = self._sync_ns = self._window_ns = 0
         dictionary = core.dictionary
         self._rpdos = [Rpdo(core, emcy, PdoRules(dictionary, i, transmits=False)) for i in dictionary.indices_in(RPDOS)]
@@ -162,13 +161,8 @@ class PdoEngine(Service):
             counter: counter of the SYNC, 0 without one.
             elapsed: number of SYNCs since the last one that was heard, with the lost ones that the counter shows.
         """
-        core = self._core
         for group in self._triggered(t_ns, counter, elapsed):
-            frames = self._packed(group, t_ns)
-            if self._delay_ns:  # what the frames carry is as old as the SYNC
-                self._late.send(frames, t_ns)
-            else:
-                core.out += frames
+            self._late.send(self._packed(group, t_ns), t_ns)  # what the frames carry is as old as the SYNC
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:

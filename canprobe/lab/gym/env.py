@@ -140,7 +140,7 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
             self._recorded += 1
             folder = self._record / f"episode-{self._recorded:04d}"
         self.episode = Episode(self._plan(overrides), self._cycles, folder)
-        return self._observe(self.episode), self.episode.info() | {"overrides": overrides}
+        return self._observations.observe(self.episode), self.episode.info() | {"overrides": overrides}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Lead the probe for one step.
@@ -159,16 +159,14 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
             raise UsageError("no episode is under way: call reset()")
         reward = episode.step(np.clip(checked("action", action, (3,)), -1.0, 1.0))
         terminated = episode.reason is not None
-        return self._observe(episode), reward, terminated, episode.over and not terminated, episode.info()
+        over = episode.over and not terminated
+        return self._observations.observe(episode), reward, terminated, over, episode.info()
 
     def close(self) -> None:
         """Disable the drives and end the cell; `reset` brings another one up."""
         episode, self.episode = self.episode, None
         if episode is not None:
             episode.close()
-
-    def _observe(self, episode: Episode) -> Any:
-        return self._observations.observe(episode.task, episode.origin, episode.coverage, episode.forces, episode.truth)
 
     def _plan(self, overrides: Mapping[str, Any]) -> Plan:
         scene = load_scene(self._base, overrides)

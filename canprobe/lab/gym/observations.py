@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -10,8 +10,7 @@ from gymnasium import spaces
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
-from canprobe.lab.gym.episode import SECTORS, Coverage
-from canprobe.lab.gym.led import LedTask
+from canprobe.lab.gym.episode import SECTORS, Episode
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.types import Floats
 
@@ -70,36 +69,23 @@ class Observations:
             spaces.Dict({"features": vector, "taxels": taxels}) if kind == "tactile" else vector
         )
 
-    def observe(
-        self,
-        task: LedTask,
-        origin: Floats,
-        coverage: Coverage,
-        forces: Sequence[float],
-        truth: Mapping[str, Any],
-    ) -> Any:
-        """An element of the space.
-
-        Args:
-            task: the led task, in contact or as it was last.
-            origin: first contact (3,), base frame, m.
-            coverage: touched part of the region so far.
-            forces: forces measured since the last observation, N.
-            truth: true state of the plant.
-        """
+    def observe(self, episode: Episode) -> Any:
+        """An element of the space: the task in contact, or as it was last, and the true state of the plant."""
+        task = episode.task
+        truth: Mapping[str, Any] = episode.truth
         contact = task.last_contact
-        along, across, up = (task.axes @ (contact.p_base - origin)).tolist()
+        along, across, up = (task.axes @ (contact.p_base - episode.origin)).tolist()
         values: list[float] = [
             task.wanted_force,
             task.targets["target_force_n"],
-            float(np.mean(forces)),
-            float(np.std(forces)),
+            float(np.mean(episode.forces)),
+            float(np.std(episode.forces)),
             *(1e3 * uv for uv in task.pad_uv),
             *(1e3 * v for v in task.velocity),
             *(1e3 * along, 1e3 * across, 1e3 * up),
             *(task.axes[:2] @ contact.n_base).tolist(),
-            coverage.share,
-            *coverage.left(np.array((along, across))).tolist(),
+            episode.coverage.share,
+            *episode.coverage.left(np.array((along, across))).tolist(),
         ]
         if self._shape:  # estimated curvature, and the share of it that was observed
             estimate, found = task.estimate, [0.0] * 4
@@ -112,7 +98,7 @@ class Observations:
             tensor += truth["kappa"][1] * np.outer(truth["direction2"], truth["direction2"])
             values += [
                 truth["force"],
-                *(1e3 * task.axes @ (truth["contact_point"] - origin)).tolist(),
+                *(1e3 * task.axes @ (truth["contact_point"] - episode.origin)).tolist(),
                 *(task.axes[:2] @ truth["contact_normal"]).tolist(),
                 *_in_frame(tensor, task.frame(truth["contact_normal"])),
             ]

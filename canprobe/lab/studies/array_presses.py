@@ -115,20 +115,17 @@ class Presses:
             measured: whether the true force is given, with the error of a scale.
         """
         array, began = self._array, self._t
-        rng, force, hz = self._rng, press.force, press.hz
+        rng, force = self._rng, press.force
         depth = depth_for_force(force, kappa, RADIUS_M, self.stiffness)
         c, s = math.cos(angle), math.sin(angle)
         axes, origin = np.array([[c, s], [-s, c]]), (4, 4)
-        c, s = math.cos(press.heading), math.sin(press.heading)
-        unrest = phase = 0.0
+        unrest = 0.0
         kept = math.exp(-FRAME_S / FORCE_CORRELATION_S)
         rows = []
         for t in np.arange(0.0, LOADING_S + press.seconds, FRAME_S).tolist():
             unrest = kept * unrest + FORCE_RELATIVE_SIGMA * math.sqrt(1.0 - kept**2) * float(rng.standard_normal())
-            share = max(0.0, t - LOADING_S) / press.seconds
-            phase += 2.0 * math.pi * FRAME_S * hz[min(int(share * len(hz)), len(hz) - 1)] * (share > 0.0)
-            x, y = press.roll[0] * math.sin(phase), press.roll[1] * math.sin(2.0 * phase)
-            uv = (press.at[0] + c * x - s * y, press.at[1] + s * x + c * y)
+            u, v = press.way(max(0.0, t - LOADING_S))
+            uv = (press.at[0] + u, press.at[1] + v)
             now = force * min(1.0, t / LOADING_S) * max(1.0 + unrest, 0.0)
             sunk = depth * math.sqrt(now / force)
             image = array.image(uv, sunk, kappa, axes, began + t)
@@ -154,7 +151,7 @@ class Presses:
             expected=np.array(places),
             push=np.array(push),
             force=mean * (1.0 + float(rng.normal(0.0, REFERENCE_SIGMA))) if measured else None,
-            to_and_fro=len(hz) > 1,
+            to_and_fro=len(press.hz) > 1,
         )
 
     def rest(self) -> None:

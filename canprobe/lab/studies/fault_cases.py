@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from random import Random
 from typing import Any
-
-import numpy as np
 
 from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.motion import parked_posture
+from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
@@ -139,36 +138,30 @@ def task_plan(task: str, plant: str) -> Plan:
 
 DEEP_MM = 25.0
 """Clearance where the tool is not as long as its file says."""
-ZERO_OFF_RAD = float(np.radians(5.0))
+ZERO_OFF_DEG = 5.0
 TrueArm = Callable[[Setup, Arm, int], ArmModel]
 """Setup, arm as its file has it, axis -> the arm that is there."""
 
 
-def _geared(factor: float) -> TrueArm:
+def _geared(factor: float, setup: Setup, arm: Arm, axis: int) -> ArmModel:
     """An arm whose drive counts so many times more than its file says, right in its first posture."""
-
-    def model_of(setup: Setup, arm: Arm, axis: int) -> ArmModel:
-        model, q0 = arm.model, parked_posture(setup, arm)
-        units = model.units_per_q.copy()
-        units[axis] *= factor
-        return replace(model, units_per_q=units, zero_units=joints_to_units(model, q0) - units @ q0)
-
-    return model_of
+    model, q0 = arm.model, parked_posture(setup, arm)
+    units = model.units_per_q.copy()
+    units[axis] *= factor
+    return replace(model, units_per_q=units, zero_units=joints_to_units(model, q0) - units @ q0)
 
 
 def _zero_off(setup: Setup, arm: Arm, axis: int) -> ArmModel:
     """An arm whose joint stands elsewhere than its drive says; its base is where the start point needs it."""
-    c, s = np.cos(ZERO_OFF_RAD), np.sin(ZERO_OFF_RAD)
-    turn = np.array([[c, -s, 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     fixed: Floats = arm.model.chain.fixed.copy()
-    fixed[axis] = fixed[axis] @ turn
+    fixed[axis] = fixed[axis] @ transform((0.0, 0.0, 0.0), (0.0, 0.0, ZERO_OFF_DEG))
     return replace(arm.model, chain=replace(arm.model.chain, fixed=fixed))
 
 
 ARM_FILES: Mapping[str, TrueArm] = {
-    "true gear × ½": _geared(0.5),
-    "true gear × 2": _geared(2.0),
-    "other sign": _geared(-1.0),
+    "true gear × ½": partial(_geared, 0.5),
+    "true gear × 2": partial(_geared, 2.0),
+    "other sign": partial(_geared, -1.0),
     "zero off by 5°": _zero_off,
 }
 """Wrong numbers of one joint."""

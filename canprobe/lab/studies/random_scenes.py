@@ -211,16 +211,12 @@ def _fillet(rng: np.random.Generator) -> dict[str, Any]:
     return {"kind": "fillet", "radius_mm": _spread(rng, 12, 40), "angle_deg": _within(rng, 15, 45), "sharpest_mm": 60.0}
 
 
-def _heights(shortest_mm: float, longest_mm: float) -> Callable[[np.random.Generator], dict[str, Any]]:
+def _heights(rng: np.random.Generator, shortest_mm: float, longest_mm: float) -> dict[str, Any]:
     """A dome of radius 90 mm with six waves of any direction, whose lengths have bounds."""
-
-    def keys(rng: np.random.Generator) -> dict[str, Any]:
-        x, y, waves = waves_mm(rng, shortest_mm, longest_mm)
-        # the six curvatures add up to their largest value nearly nowhere
-        heights = 1e-3 * MOST_CURVED_PER_M / 3.0 * waves - (x**2 + y**2) / (2.0 * 90.0)
-        return {"heights": centred(heights), "sharpest_mm": 60.0}
-
-    return keys
+    x, y, waves = waves_mm(rng, shortest_mm, longest_mm)
+    # the six curvatures add up to their largest value nearly nowhere
+    heights = 1e-3 * MOST_CURVED_PER_M / 3.0 * waves - (x**2 + y**2) / (2.0 * 90.0)
+    return {"heights": centred(heights), "sharpest_mm": 60.0}
 
 
 _OBJECTS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
@@ -233,8 +229,8 @@ _OBJECTS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
     "torus": _torus,
     "wave": _wave,
     "fillet": _fillet,
-    "heights": _heights(36.0, 80.0),
-    "rough": _heights(12.0, 36.0),
+    "heights": lambda rng: _heights(rng, 36.0, 80.0),
+    "rough": lambda rng: _heights(rng, 12.0, 36.0),
 }
 """Kind → function that draws its keys of `[object]`, and the smallest radius of curvature, which bounds its path."""
 KINDS = (*_OBJECTS, FOREIGN)

@@ -22,13 +22,12 @@ from canprobe.cell.master.options import RunOptions
 from canprobe.cell.results.picture import BLUE, GREEN, ORANGE, legend, parts, picture
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.session.session import Session
-from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.lab.studies.result import Row, StudyResult
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.vcan_cells import CHANNEL, patient, served, vcan_facts, with_real_nodes
+from canprobe.lab.studies.vcan_cells import CHANNEL, ON_VCAN, patient, served, vcan_facts, with_real_nodes
 
 SOAK_S = 1800.0
 SAMPLES = 60
@@ -52,8 +51,7 @@ def soak(seconds: float) -> tuple[list[Row], str]:
     Returns:
         The samples, and why the cell stopped before the time; empty where it did not.
     """
-    scene = load_scene("cylinder", {"cycle.realtime": True})
-    scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
+    scene = load_scene("cylinder", {**ON_VCAN, "cycle.realtime": True})
     samples: list[Row] = []
     with watched() as monitor_pid, served(scene, truth=False) as nodes:
         session = Session(with_real_nodes(patient(scene)), RunOptions(rows_kept=ROWS_OF_UP))

@@ -22,16 +22,7 @@ from canprobe.cell.master.options import quiet
 from canprobe.cell.results.picture import BLUE, picture
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.lab.studies.recover_runs import (
-    REPLUG,
-    SCENES,
-    STALL,
-    RecoverCase,
-    RecoverRun,
-    draw_case,
-    shrink,
-    work_scene,
-)
+from canprobe.lab.studies.recover_runs import REPLUG, SCENES, STALL, RecoverCase, RecoverRun, draw_case, shrink
 from canprobe.lab.studies.result import Row, Say, StudyResult, measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
@@ -116,7 +107,7 @@ class LockstepRun(RecoverRun):
     """One run in lockstep; for its arguments see `RecoverRun`."""
 
     def __init__(self, case: RecoverCase, out: Path, say: Say) -> None:
-        super().__init__(case, work_scene(case.work, {"bus.timed": False}), out, say)
+        super().__init__(case, {"bus.timed": False}, out, say)
         self._faulty = self.session.buses.world.make_faulty()
         self.session.around = self._disturbed
         self._away: list[tuple[int, int, bool]] = []

@@ -21,7 +21,6 @@ from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.free_and_listen import HoldTask
 from canprobe.cell.tasks.from_plan import make_task
@@ -116,11 +115,6 @@ class RecoverCase:
         return f"{self.work}: " + "; ".join(map(str, self.outages))
 
 
-def work_scene(work: str, changes: Mapping[str, Any]) -> Scene:
-    """The scene of a kind of work, which goes on for longer than anything is lost."""
-    return load_scene(SCENES[work], {"outputs.figures": False, "task.duration_s": END_S + 2.0, **changes})
-
-
 def draw_case(seed: int) -> RecoverCase:
     """The run of a seed: every other one has a pair, whose second outage begins 1 ms to 3 s after the first."""
     rng = Random(seed)
@@ -167,7 +161,7 @@ class RecoverRun(ABC):
 
     Args:
         case: what happens.
-        scene: scene of its work.
+        changes: changes of the scene of its work.
         out: folder of the run's files.
         say: called with each step.
 
@@ -178,8 +172,10 @@ class RecoverRun(ABC):
         first_s: time of the first cycle of the work, from which the outages count, s; 0 before.
     """
 
-    def __init__(self, case: RecoverCase, scene: Scene, out: Path, say: Say) -> None:
+    def __init__(self, case: RecoverCase, changes: Mapping[str, Any], out: Path, say: Say) -> None:
         self.case, self._out, self._say = case, out, say
+        lasting = {"outputs.figures": False, "task.duration_s": END_S + 2.0}  # longer than anything is lost
+        scene = load_scene(SCENES[case.work], {**lasting, **changes})
         self.session = Session(scene, RunOptions(out, self._note, recover=True))
         self.plan = self.session.plan
         self.errors: list[CanprobeError] = []

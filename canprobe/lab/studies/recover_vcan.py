@@ -17,10 +17,10 @@ from canprobe.cell.master.controller import Measurement
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.tools.faults.control import request_faults
 from canprobe.lab.studies.recover import COLUMNS, draw_runs, findings, table_rows
-from canprobe.lab.studies.recover_runs import REPLUG, STALL, RecoverCase, RecoverRun, draw_case, work_scene
+from canprobe.lab.studies.recover_runs import REPLUG, STALL, RecoverCase, RecoverRun, draw_case
 from canprobe.lab.studies.result import Say, StudyResult
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.lab.studies.vcan_cells import CHANNEL, ON_VCAN, link, patient, replug, sleep, vcan_facts
+from canprobe.lab.studies.vcan_cells import CHANNEL, ON_VCAN, link, patience, replug, sleep, vcan_facts
 
 RUNS, QUICK_RUNS = 50, 2
 MISSED_SYNCS = 40
@@ -47,7 +47,7 @@ class ServedRun(RecoverRun):
     """One run on vcan0; for its arguments see `RecoverRun`."""
 
     def __init__(self, case: RecoverCase, out: Path, say: Say) -> None:
-        super().__init__(case, patient(work_scene(case.work, ON_VCAN), MISSED_SYNCS), out, say)
+        super().__init__(case, {**ON_VCAN, **patience(MISSED_SYNCS)}, out, say)
         self._stalls: list[tuple[float, float]] = []
 
     def carry_out(self) -> None:

@@ -40,9 +40,14 @@ WIRE_BITRATE = 50_000_000
 """Bit rate of the plans at any rate: a virtual bus has none."""
 
 
+def patience(missed_syncs: int) -> dict[str, Any]:
+    """Changes to drives that tolerate missed SYNCs, and to a master that no late cycles stop."""
+    return {"arm.missed_syncs": missed_syncs, "limits.late_cycles_max_percent": float(LATE_PERCENT)}
+
+
 def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:
-    """The scene with drives that tolerate missed SYNCs, and a master that no late cycles stop."""
-    return load_scene(scene, {"arm.missed_syncs": missed_syncs, "limits.late_cycles_max_percent": float(LATE_PERCENT)})
+    """The scene with `patience`."""
+    return load_scene(scene, patience(missed_syncs))
 
 
 def with_real_nodes(scene: Scene) -> Scene:

@@ -7,7 +7,7 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.results.summary import write_files
+from canprobe.cell.results.summary import writers_of
 from canprobe.cell.scene.geometry import true_object
 from canprobe.mechanics.touch.map import nodes
 
@@ -19,7 +19,8 @@ def scan(tmp_path_factory):
     scene = replace(scene, shape=replace(scene.shape, also=()))
     result = canprobe.run(scene, bus="direct", duration_s=4.0, files=False)
     out = tmp_path_factory.mktemp("scan")
-    write_files(result, out)
+    for write in writers_of(result):
+        write(out)
     return result, out
 
 

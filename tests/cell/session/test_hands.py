@@ -128,7 +128,7 @@ def test_a_jog_of_a_joint_and_of_the_probe_goes_its_way():
         q1 = opened.read().q
         np.testing.assert_allclose(np.degrees(q1 - q0), [0, 0, -5, 0, 0, 0], atol=0.02)
         T0 = opened.probe(q1)[0]
-        opened.jog(along=(0, 0, 1), velocity=0.04, for_s=0.25)
+        opened.jog(along=np.array([0, 0, 1]), velocity=0.04, for_s=0.25)
         T1 = opened.probe(opened.read().q)[0]
         np.testing.assert_allclose(T1[:3, 3] - T0[:3, 3], [0, 0, 0.01], atol=5e-5)
         opened.jog(about=(0, 0, 1), velocity=0.4, for_s=0.25, in_probe_frame=True)

@@ -173,7 +173,7 @@ def test_the_line_of_a_seed_repeats_its_scene(capsys):
 @pytest.mark.parametrize(
     "words, expected",
     [
-        (["estimators", "--draw", "2"], "only calibration, realtime --link, regions, surfaces has it"),
+        (["estimators", "--draw", "2"], "only calibration, faults, realtime --link, regions, surfaces has it"),
         (["regions", "--draw", "2", "--seed", "200000"], "--draw: study regions: a seed names its draw"),
         (["regions", "--against", str(Path("no") / "where.json")], "expected the regions.json of an earlier run"),
     ],
