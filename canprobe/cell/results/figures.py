@@ -29,11 +29,10 @@ from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.scores import TWO_SIGMA
 from canprobe.cell.results.surface_figure import MapPlane, add_sheet, map_surface, true_surface
 from canprobe.cell.rows import joint_positions
-from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.tasks.sensing import curvature_sigma
 from canprobe.cell.tasks.task import Phase
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
-from canprobe.mechanics.types import Floats
 
 Panel = Callable[[SubFigure, RunData], None]
 MIN_SPAN_PER_M = 1.0
@@ -189,7 +188,8 @@ def _draw_curvature(part: SubFigure, result: RunData) -> None:
     method, records = next((name, found) for name, found in result.estimates.items() if found)
     travelled = np.array([r.travelled_m for r in records]) * 1e3
     kappa = np.array([np.where(r.estimate.observed, r.estimate.kappa, np.nan) for r in records])
-    half = TWO_SIGMA * np.array([_kappa_sigma(r) for r in records])
+    with np.errstate(invalid="ignore"):  # infinite where nothing was observed
+        half = TWO_SIGMA * np.array([[curvature_sigma(r.estimate, i) for i in (0, 1)] for r in records])
     lower, upper = kappa - half, kappa + half
     for i, (colour, name) in enumerate(((ORANGE, "κ₁"), (BLUE, "κ₂"))):
         axes.fill_between(travelled, lower[:, i], upper[:, i], color=colour, alpha=0.22, linewidth=0)
@@ -225,20 +225,6 @@ def _draw_exploration(part: SubFigure, result: RunData) -> None:
         title="rectangle within the target", xlabel="path of the contact (mm)", ylabel="share (%)", ylim=(0, 102)
     )
     legend(part)
-
-
-def _kappa_sigma(record: ShapeRecord) -> Floats:
-    """Standard deviations (2,) of the principal curvatures, from the covariance of K along its directions."""
-    estimate = record.estimate
-    axes = estimate.T_frame_contact[:3, :2]
-    sigmas = []
-    for direction in estimate.directions:
-        d = np.asarray(direction, dtype=float)
-        u, v = (axes.T @ d) if d.size == 3 else d
-        gradient = np.array((u * u, 2 * u * v, v * v))
-        with np.errstate(invalid="ignore"):  # infinite where nothing was observed
-            sigmas.append(float(np.sqrt(max(gradient @ estimate.covariance @ gradient, 0.0))))
-    return np.array(sigmas)
 
 
 def _draw_taxels(part: SubFigure, result: RunData) -> None:
