@@ -351,7 +351,10 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
 
     assert arm is not None
     servo = scene.servo or ServoSettings()
-    pressed = depth_on_plane(scene.limits.force_max_n, probe.stiffness, probe.radius)  # a blind search goes no deeper
+    most = scene.limits.force_max_n  # presses as deep as a blind search goes
+    pressed = depth_on_plane(most, probe.stiffness, probe.radius)
+    if probe.is_flat:  # on the bluntest round object whose patch, of half width a = √(2Rδ), fits on the array
+        pressed = 2.0 * most / (math.pi * probe.stiffness * array.pad.reach_m**2)
     touching: dict[str, Any] = {
         "arm": arm,
         "array": array,
