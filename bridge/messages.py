@@ -21,7 +21,7 @@ from canprobe.cell.session.target import VIRTUAL
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG
 from canprobe.lab.bridge import description
-from canprobe.lab.bridge.sample import BASE, CONTACT, FLANGE, PROBE, Sample, SurfacePatch, TouchFrame
+from canprobe.lab.bridge.sample import BASE, CARRIER, CONTACT, FLANGE, PROBE, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.types import Floats
 
@@ -159,6 +159,7 @@ class Messages:
         self._types: Any = encoder.store.types
         arm, probe = plan.setup.arm, plan.scene.probe
         self._chain = arm.model.chain if arm is not None else None
+        self._object_frame = BASE if plan.setup.carrier is None else CARRIER
         self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
         self._description = description.robot_description(plan)
         self._is_virtual = plan.scene.bus.interface in VIRTUAL
@@ -212,12 +213,15 @@ class Messages:
         if q is not None and (chain := self._chain) is not None:
             yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, chain, q)
             yield TF, t_ns, lambda: self._tf(t_ns, description.link_transforms(chain, q))
+        if (carrier := sample.T_base_carrier) is not None:
+            yield TF, t_ns, lambda: self._tf(t_ns, [(BASE, CARRIER, carrier)])
         if touch is not None:
             if (counts := touch.counts) is not None:
                 yield TAXELS, touch.t_ns, lambda: self._image(touch.t_ns, counts)
             yield WRENCH, touch.t_ns, lambda: self._wrench(touch)
             if (contact := touch.contact) is not None:
-                yield TF, touch.t_ns, lambda: self._tf(touch.t_ns, [(BASE, CONTACT, contact.T_base_contact)])
+                placed = [(self._object_frame, CONTACT, contact.T_base_contact)]
+                yield TF, touch.t_ns, lambda: self._tf(touch.t_ns, placed)
         if patch is not None:
             yield PATCH, patch.t_ns, lambda: self._cloud(patch)
             yield CURVATURE, patch.t_ns, lambda: self._curvature(patch)
@@ -256,7 +260,7 @@ class Messages:
         return self._stamped(
             PATCH,
             patch.t_ns,
-            BASE,
+            self._object_frame,
             height=1,
             width=len(rows),
             fields=self._fields,

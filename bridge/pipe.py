@@ -106,14 +106,15 @@ def unpack_observation(data: bytes) -> Received:
 def _pack_measurement(m: Measurement) -> Any:
     q = m.q.tobytes() if m.q is not None else None
     tactile = _pack_tactile(m.tactile) if m.tactile is not None else None
-    return m.cycle, m.t_ns, q, m.q_age, m.torque_permille, m.statuswords, bool(m.enabled), tactile, m.tactile_age
+    parts = m.cycle, m.t_ns, q, m.q_age, m.torque_permille, m.statuswords, bool(m.enabled), tactile, m.tactile_age
+    return *parts, m.carrier
 
 
 def _unpack_measurement(parts: Any) -> Measurement:
-    cycle, t_ns, q, age, torque, words, enabled, tactile, tactile_age = parts
+    cycle, t_ns, q, age, torque, words, enabled, tactile, tactile_age, carrier = parts
     q = np.frombuffer(q) if q is not None else None
     tactile = _unpack_tactile(tactile) if tactile is not None else None
-    return Measurement(cycle, t_ns, q, age, torque, words, enabled, tactile, tactile_age)
+    return Measurement(cycle, t_ns, q, age, torque, words, enabled, tactile, tactile_age, carrier)
 
 
 def _pack_tactile(sample: TactileSample) -> Any:

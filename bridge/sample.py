@@ -19,8 +19,9 @@ from canprobe.cell.scene.model import BridgeSettings
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.mechanics.types import Floats
 
-BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
-"""Names of frames; between base and flange stand link_1, link_2, …, the frame that each joint moves."""
+BASE, FLANGE, PROBE, CONTACT, CARRIER = "base_link", "flange", "probe", "contact", "carrier"
+"""Names of frames. An object on a carrier has its contacts, answers and surface in the frame of the carrier, and "base"
+means that of them then. Between base and flange stand link_1, link_2, …, the frame that each joint moves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +158,7 @@ class Sample:
         frames: frames on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
         diagnostics: states of all nodes and of the bridge, about once a second.
         dropped: number of samples that this bridge has lost so far.
+        T_base_carrier: frame (4, 4) of the object's carrier in base, m; None without one or its report.
     """
 
     t_ns: int
@@ -169,6 +171,7 @@ class Sample:
     frames: Sequence[TimedFrame] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     dropped: int = 0
+    T_base_carrier: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,7 @@ class SampleSource:
         if isinstance(touch, Touch):
             touch = replace(touch, shape=None)  # contacts need no second moments
         self._sensing = None if touch is None else make_sensing(touch)
-        self._has_arm = arm is not None
+        self._has_arm, self._carrier = arm is not None, plan.setup.carrier
         self._radius = probe.radius
         # one reader: that of the contacts, or that of an array without them
         self._reader = self._sensing.reader if self._sensing is not None else make_patch_reader(plan.setup)
@@ -68,6 +68,7 @@ class SampleSource:
             touch=self._touch(measurement, t_ns - measurement.t_ns),
             patch=patch,
             ahead=None if received.ahead is None else 1e-3 * received.ahead,
+            T_base_carrier=None if self._carrier is None else self._carrier.frame(measurement.carrier),
         )
 
     def _touch(self, m: Measurement, shift_ns: int) -> TouchFrame | None:

@@ -49,6 +49,7 @@ class Moment:
         taxels: counts (rows, columns) of the newest frame; None before the first.
         force: contact force of the newest frame, N; NaN before the first.
         dropped: number of samples lost so far.
+        T_base_carrier: frame (4, 4) of the object's carrier in base, m; None without one.
     """
 
     t_s: float = 0.0
@@ -59,6 +60,7 @@ class Moment:
     taxels: NDArray[np.uint8] | None = None
     force: float = math.nan
     dropped: int = 0
+    T_base_carrier: Floats | None = None
 
 
 def judge(patch: SurfacePatch, shape: PlacedShape | None) -> JudgedAnswer:
@@ -95,6 +97,8 @@ class Follower:
         now = replace(self.moment, t_s=sample.t_ns * 1e-9, phase=sample.phase, dropped=sample.dropped)
         if sample.q is not None:
             now = replace(now, q=sample.q)
+        if sample.T_base_carrier is not None:
+            now = replace(now, T_base_carrier=sample.T_base_carrier)
         if (touch := sample.touch) is not None:
             self._felt_ns = sample.t_ns
             taxels = now.taxels if touch.counts is None else touch.counts

@@ -88,6 +88,7 @@ class RecordedRun:
             answer=self.answers[answer] if answer >= 0 else None,
             taxels=self.taxels[frame][1] if frame >= 0 else None,
             force=float(log["force_n"][row]) if "force_n" in log else math.nan,
+            T_base_carrier=None if (carrier := self.setup.carrier) is None else carrier.frame(log[carrier.column][row]),
         )
 
     def _phase(self, row: int) -> str | None:

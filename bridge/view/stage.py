@@ -192,7 +192,7 @@ class Stage:
     def show(self, moment: Moment) -> None:
         """Show a moment."""
         if moment.q is not None and self._model is not None:
-            self._move_arm(self._model, moment.q)
+            self._move_arm(self._model, moment.q, moment.T_base_carrier)
         if moment.taxels is not None and self._taxels is not None:
             counts = moment.taxels.reshape(-1)
             self._taxels.batched_colors = linear_light(taxel_colours(counts))
@@ -214,9 +214,11 @@ class Stage:
                 self._moved[number] = away
                 camera.position, camera.look_at = position + step, look_at + step
 
-    def _move_arm(self, model: ArmModel, q: Floats) -> None:
-        frames = link_frames(model.chain, q)
-        for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
+    def _move_arm(self, model: ArmModel, q: Floats, T_base_carrier: Floats | None) -> None:
+        frames, moved = link_frames(model.chain, q), 1  # the base stands still
+        if T_base_carrier is not None:  # the object does, and what is drawn on it: the arm goes round it
+            frames, moved = np.linalg.inv(T_base_carrier) @ frames, 0
+        for handle, T in zip(self._links[moved:], frames[moved:], strict=True):
             _place(handle, T)
         if self._probe is not None:
             _place(self._probe, frames[-1] @ self._tool)

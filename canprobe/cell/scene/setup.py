@@ -257,6 +257,10 @@ class Carrier(Node):
         """Column of its position in the log."""
         return "carrier_m" if self.motion.point is None else "carrier_rad"
 
+    def frame(self, position: float | None) -> Floats | None:
+        """Its frame (4, 4) in base at a position, rad or m; None where that is not known."""
+        return None if position is None or math.isnan(position) else self.motion.T_base_carrier(position)
+
     def text(self, way: float) -> str:
         """A way of it, rad or m, for people."""
         return f"{1e3 * way:.3g} mm" if self.motion.point is None else f"{math.degrees(way):.3g} deg"

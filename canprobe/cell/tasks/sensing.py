@@ -168,8 +168,8 @@ class ContactSensing:
         return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
 
     def probe_at(self, t_ns: int) -> Floats | None:
-        """The probe (4, 4) at a time of the last cycles; None where the joints of that time are unknown."""
-        if (q := self._history.at(t_ns)) is None:
+        """The probe (4, 4) at a time of the last cycles; None where joints or carrier of that time are unknown."""
+        if (q := self._history.at(t_ns)) is None or (self.track is not None and not self.track.is_known):
             return None
         T_base_probe = forward(self._chain, q)
         if self.track is None:

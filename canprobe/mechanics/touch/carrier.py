@@ -59,6 +59,11 @@ class CarrierTrack:
         self._motion = motion
         self._seen: deque[tuple[int, float]] = deque(maxlen=TIMES_KEPT)
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it has a position yet."""
+        return bool(self._seen)
+
     def add(self, t_ns: int, position: float) -> None:
         """Take a position, rad or m, at ``t_ns``; times must increase."""
         self._seen.append((t_ns, position))

@@ -22,6 +22,8 @@ from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.lab.bridge.messages import Encoder, Messages
 from canprobe.lab.bridge.sample import Sample
+from canprobe.lab.bridge.view.recorded import read_run
+from canprobe.mechanics.robot.chain import forward
 
 RADIUS = 0.036
 
@@ -122,6 +124,33 @@ def test_force_and_contact_are_those_the_task_logged(recorded, decoded):
 
 def vector(v):
     return (v.x, v.y, v.z)
+
+
+def test_contacts_on_a_carrier_are_in_its_frame_which_moves_in_base(tmp_path):
+    """Contact and probe come together by the frame that is sent beside them, and by the moments that the view shows."""
+    changes = {"task.duration_s": 1.0, "outputs.figures": False, "shape.also": ()}
+    result = canprobe.run("turntable", changes, bridge=["mcap"], out=tmp_path / "run")
+    assert result.summary["bridges"]["mcap"]["error"] is None
+    carriers, contacts = {}, {}
+    with (tmp_path / "run" / "run.mcap").open("rb") as file:
+        for _, channel, message, ros in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            if channel.topic == "/tf":
+                (first, *_), t_s = ros.transforms, message.log_time * 1e-9
+                if first.child_frame_id == "carrier":
+                    carriers[t_s] = first
+                elif first.child_frame_id == "contact":
+                    contacts[t_s] = first
+    assert {c.header.frame_id for c in carriers.values()} == {"base_link"}
+    assert {c.header.frame_id for c in contacts.values()} == {"carrier"} and len(contacts) > 50
+    turned = [2.0 * np.arctan2(c.transform.rotation.z, c.transform.rotation.w) for c in carriers.values()]
+    assert np.polyfit([*carriers], turned, 1)[0] == pytest.approx(np.radians(5.0), rel=0.02)
+    run, chain = read_run(tmp_path / "run"), result.plan.setup.arm.model.chain
+    moments = [moment for moment in map(run.at, run.times(0.1)) if moment.contact is not None]
+    assert len(moments) > 5
+    for moment in moments:
+        centre = forward(chain, moment.q) @ result.plan.setup.probe.T_flange_probe[:, 3]
+        seen = np.linalg.inv(moment.T_base_carrier) @ centre
+        assert np.linalg.norm(seen[:3] - moment.contact.point) == pytest.approx(0.04, abs=2e-3)
 
 
 def test_the_force_pushes_the_probe_back(decoded):
