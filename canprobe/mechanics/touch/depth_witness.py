@@ -201,7 +201,7 @@ class DepthWitness:
             return
         centres = np.array([one.centre for one in self._believed])
         apart = np.linalg.norm(centres - contact.centre, axis=1)
-        order = np.argsort(apart, kind="stable")[:NEAR_CONTACTS]
+        order = np.argsort(apart, kind="stable")[:NEAR_CONTACTS]  # equal distances: the older one, everywhere
         order = order[apart[order] < REACH]
         if not order.size:
             return

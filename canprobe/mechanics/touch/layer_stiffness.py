@@ -143,5 +143,7 @@ class ScanStiffness:
             share: share of the answer's contacts that no earlier answer had.
         """
         kept = self.information + share * max(information - self.information, 0.0)
+        # the answer had this state as its prior, whose own pull here is 0: nothing is counted twice
         self.log += share * information / kept * (log - self.log)
+        # the cap does not widen a state that was stated with more certainty
         self.information = max(min(kept, COMMON_SIGMA**-2), self.information)

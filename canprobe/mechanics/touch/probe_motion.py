@@ -69,6 +69,7 @@ class PoseSteps:
         self._chain = ending_in(model.chain, T_flange_probe)
         self._rest = np.array(q, dtype=float)
         self.at = posture(self._chain, self._rest)
+        # why not x of the last step: carried round a cone of 20° the probe would come back turned by 22°
         self._x_reference = self.at.x
 
     def step(self, q: list[float], pose: ProbePose, dt: float) -> list[float]:
@@ -109,6 +110,7 @@ def _pose_error(at: Posture, centre: list[float], pole: list[float], x_reference
         centre[0] - t0,
         centre[1] - t1,
         centre[2] - t2,
+        # half the sum of the cross products of axes: the rotation of a small error, without an arc cosine
         0.5 * (r10 * x2 - r20 * x1 + r11 * y2 - r21 * y1 + r12 * p2 - r22 * p1),
         0.5 * (r20 * x0 - r00 * x2 + r21 * y0 - r01 * y2 + r22 * p0 - r02 * p2),
         0.5 * (r00 * x1 - r10 * x0 + r01 * y1 - r11 * y0 + r02 * p1 - r12 * p0),

@@ -330,12 +330,14 @@ class TactileServo:
         steep = max(n0 * u0 + n1 * u1 + n2 * u2, MIN_SLOPE_COSINE)
         slope_along = (n0 * h0 + n1 * h1 + n2 * h2) / steep
         slope_across = (n0 * c0 + n1 * c1 + n2 * c2) / steep
+        # the slope is that along the last heading: for the next one the follower must know the distance first
         along, across = follower.heading
         in_plane = distance / math.hypot(1.0, slope_along * along + slope_across * across)
         along, across = follower.step(h0 * d0 + h1 * d1 + h2 * d2, c0 * d0 + c1 * d1 + c2 * d2, in_plane)
         x, y, z = along * h0 + across * c0, along * h1 + across * c1, along * h2 + across * c2
         fall = slope_along * along + slope_across * across
         x, y, z = x - fall * u0, y - fall * u1, z - fall * u2
+        # 0 but where `MIN_SLOPE_COSINE` has limited the slope: there the lifted step is not in the tangent plane
         out = n0 * x + n1 * y + n2 * z
         x, y, z = _unit((x - out * n0, y - out * n1, z - out * n2))
         return self.surface.foot((f0 + distance * x, f1 + distance * y, f2 + distance * z))

@@ -44,6 +44,7 @@ class Weave:
     """
 
     def __init__(self, length_m: float, width_m: float, wavelength_m: float) -> None:
+        # over the value of the series at its tip, so that the size is the full one
         self._a, self._b = length_m / 2 / (1 + 1 / 9 + 1 / 25), width_m / 2
         self._m = max(2, 2 * round(length_m / wavelength_m))
 
@@ -177,6 +178,7 @@ class PathFollower:
         self._phase += distance_m / max(norm, 1e-4)
         self._tangent = self._strategy.tangent(self._phase)
         if self._turning is not None and self._brake > 0.0:
+            # a constant deceleration: v² = 2 a s
             self.pace = min(1.0, max(MIN_PACE, math.sqrt(self._turning.way_to_turn(self._phase) / self._brake)))
         px, py = self._strategy.point(self._phase)
         hx = tx / max(norm, 1e-9) + CROSS_TRACK_PER_M * (px - x)

@@ -124,6 +124,7 @@ def _start(counts: Floats, blur: float) -> Floats | None:
     if not (V[0, 0] > 0.0 and V[0, 0] * V[1, 1] > V[0, 1] ** 2):
         return None
     peak = 1.1 * counts.max()
+    # the moments of a paraboloid are (P/6) A⁻¹; of the blur a half is off, as in `ImageModel.start`
     A = np.linalg.inv(V) * peak / 6.0
     return np.array([peak, cx, cy, A[0, 0], A[0, 1], A[1, 1], blur])
 

@@ -128,6 +128,7 @@ def calibrate_array(
         )
     if by_force and not any(s.dwell.force is not None for s in good):
         raise UsageError(f'force reference "{reference}": expected touches with a known force, got none')
+    # without a reference newtons are nominal, and the scale is 1 by definition; 1e-4 and not 0: residuals are over it
     scale_sigma = None if by_force else max(reference_sigma, 1e-4) if reference == "unit" else 1e-4
     seen = side_seen(dwells)
 
@@ -141,6 +142,7 @@ def calibrate_array(
     gained, alike = _by_gains(fitted, found.parameters, plain, seen)
     gains, dead = _gains(fitted, found.parameters, plain)
     if own_gains and gained < MAX_ERROR_LEFT_SHARE * alike:
+        # rounded before the fit: the file has these gains, and the parameters are those for them
         own = replace(plain, gains=tuple(tuple(row) for row in np.round(gains, 4).tolist()))
         good = [what_is_shown(s.dwell, own, LAST_IMAGE_S) for s in good]
         fitted = _without_rods(good)

@@ -77,6 +77,7 @@ class CalibrationCheck:
         self._pad, self._stiffness, self._crosstalk = pad, image.stiffness, image.crosstalk
         self._blur = image.blur / pad.pitch_m
         self._gains = np.array(calibration.gains) if calibration.gains else np.ones(pad.shape)
+        # the shown pressure falls by scale · k · A: from a bend in counts over pitch² and the mean of A to k
         self._stiffness_of_bend = pad.full_scale_pa / COUNTS_MAX / (pad.pitch_m**2 * image.scale)
         self._blurs: list[float] = []  # all logarithms over the calibration's
         self._by_answers: list[float] = []
@@ -148,9 +149,10 @@ class CalibrationCheck:
         self._curvature = curvature
         if answer.stiffness is not None:
             self._by_answers.append(math.log(answer.stiffness / self._stiffness))
+        # the slope is of the place of the touch: answers further on know another curvature
         if slope is None or len(self._by_touch) >= MIN_ANSWERS:
             return
-        if 2.0 * slope.sigma < MAX_TOUCH_SIGMA * slope.value:
+        if 2.0 * slope.sigma < MAX_TOUCH_SIGMA * slope.value:  # k goes with b²
             by_touch = stiffness_from_slope(slope.value, radius, kappa)
             self._by_touch.append(math.log(by_touch / self._stiffness))
 

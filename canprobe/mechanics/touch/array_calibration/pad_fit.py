@@ -50,6 +50,7 @@ def fit_noise(shown: Sequence[Shown], depths: Sequence[Floats]) -> tuple[Contact
     rolls = [s for s in shown if s.dwell.to_and_fro]
     latency, latency_sigma = _latency(rolls)
 
+    # unknowns in 0.1 mm, of about 1: the solver takes its difference step for an unknown of 1 at least
     def left(z: Floats, s: Shown, way: Floats) -> Floats:
         rest: Floats = s.off + 1e-4 * z[0] * way / (np.hypot(*way.T)[:, None] + 1e-4 * abs(z[1]))
         return rest
@@ -65,7 +66,7 @@ def fit_noise(shown: Sequence[Shown], depths: Sequence[Floats]) -> tuple[Contact
     most, reach = (1e-4 * z).tolist()
     rest = [left(z, s, _ways(s)) for s in shown]
     # from image to image: second differences of anything slower are nearly 0
-    sigma = np.sqrt([np.mean(np.diff(r, 2, axis=0) ** 2) / 6.0 for r in rest])
+    sigma = np.sqrt([np.mean(np.diff(r, 2, axis=0) ** 2) / 6.0 for r in rest])  # 1 + 4 + 1
     power, log_scale = np.polyfit(np.log([s.lightness for s in shown]), np.log(sigma), 1)
     slow, slow_way = _slow(rest, [s.way for s in shown], sigma)
     heights = [np.var(s.pushes - depth) for s, depth in zip(shown, depths, strict=True)]

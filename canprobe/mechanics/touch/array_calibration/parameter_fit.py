@@ -107,7 +107,7 @@ def curvature_errors(model: ImageModel, touches: Sequence[Shown], forces: Sequen
         k = model.start(v, force) or shows
         for _ in range(20):
             try:
-                J, r, _ = model.linearised(v, force, 100.0, k)
+                J, r, _ = model.linearised(v, force, 100.0, k)  # frames weigh only
             except ValueError:  # nothing would be above the level: half the way back to where something is
                 k = (0.5 * (k[0] + shows[0]), 0.0, 0.5 * (k[2] + shows[2]))
                 continue

@@ -126,6 +126,7 @@ def _scatter(touches: Sequence[Shown], forces: Floats, units: Floats) -> Floats:
     columns = np.column_stack([depths, of_name])
     found, *_ = np.linalg.lstsq(columns, push, rcond=None)
     leverage = np.einsum("ij,ji->i", columns, np.linalg.pinv(columns))
+    # over 1 − leverage: the residual of a fit without this touch; the force goes with δ², and errs by twice as much
     left: Floats = (push - columns @ found) / np.maximum(1.0 - leverage, 0.1)
     errors: Floats = 2.0 * left / (found[0] * depths)
     return errors

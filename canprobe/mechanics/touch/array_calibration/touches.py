@@ -152,7 +152,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         crept=float(np.mean([*sums, *late]) / np.mean(sums)),
         moments=turn @ V.mean(axis=0),
         remembered=turn @ np.mean(ways, axis=0),
-        frame_sigma=float(steps.std() / math.sqrt(2.0)),
+        frame_sigma=float(steps.std() / math.sqrt(2.0)),  # a step has the noise of two frames
         lightness=plain.pad.lightness(peak),
         off=raw - dwell.expected[kept],
         way=dwell.expected[kept],

@@ -262,6 +262,7 @@ def is_umbilic(K: Floats, covariance: Floats) -> bool:
     x, y = k11 - k22, 2.0 * k12
     a, b, d = c11 - 2.0 * c13 + c33, 2.0 * (c12 - c23), 4.0 * c22
     determinant = a * d - b * b
+    # times the determinant instead of divided by it: an infinite covariance answers False, and nothing raises
     return bool(determinant > 0.0 and (d * x * x - 2.0 * b * x * y + a * y * y) < _UMBILIC_CHI2 * determinant)
 
 
@@ -364,8 +365,9 @@ def anchor(c: Floats, T_frame_work: Floats, point: Vec, length: float) -> Anchor
     R = tangent_rotation(R_work.dot(z).tolist())
     R_work_contact = R_work.T.dot(R)
     c_new, M = transport(c, homogeneous(R_work_contact, x))
-    c_new[:3] = 0.0
+    c_new[:3] = 0.0  # what is left is rounding; `curvature_jacobian` takes them for 0
     origin = T_frame_work[:3, 3] + length * R_work.dot(x)
     (xx, xy, _), (yx, yy, _), _ = R_work_contact.tolist()
+    # the two planes are tilted: this is the turn of the plane's rotation that is nearest (polar decomposition)
     turn = math.atan2(yx - xy, xx + yy)
     return Anchor(c_new, M, homogeneous(R, origin), turn)

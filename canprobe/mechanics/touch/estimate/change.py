@@ -73,6 +73,7 @@ class ChangeTest:
         usual_best = BEST_INNOVATION_SHARE * _bounded(self._of_best / BEST_INNOVATION_SHARE)
         if self.innovation >= caution * ALARM_RATIO * self.usual and best >= caution * BEST_ALARM_RATIO * usual_best:
             return True
+        # behind the alarm: the usual innovation must not learn from a change
         self._all += LONG_TERM_WEIGHT * (now - self._all)
         if len(self._last) == LAST_SAMPLES:
             self._of_best += LONG_TERM_WEIGHT * (best - self._of_best)

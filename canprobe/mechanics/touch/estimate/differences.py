@@ -86,6 +86,7 @@ def solve_pairs(touches: ContactBatch, data: Pairs, method: str) -> SurfaceEstim
     k = variance * _propagated(data, inverse)[np.ix_(_K_OF_SIX, _K_OF_SIX)]
     flat = data.points[:, :2]
     root_q = _root_of(k * TO_Q_SQUARED, TO_Q[:, None] * Vt[rank:, _K_OF_SIX].T)
+    # a difference has the noise of two samples
     decision = decide(root_q, flat.T @ flat / (len(flat) * 2.0 * vp), size)
     return build_estimate(
         Solution(c, k, decision, has_prior=False),

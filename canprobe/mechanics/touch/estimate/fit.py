@@ -147,6 +147,7 @@ def fit_surface(
 
 def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
     """The answer of `recursive` after samples of which only place and normal are known."""
+    # why the larger of both below: at rest the distance is next to 0, while the extent has a floor (`make_touches`)
     memory = _memory_of(touches)
     point, height = (np.sqrt(variance) for variance in touches.noise.tangential_and_height(touches.normals))
     normal = np.sqrt(touches.noise.normal_variance)
@@ -162,6 +163,7 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
     )
     nowhere = np.eye(4)
     rows = zip(touches.points, touches.normals, point.tolist(), normal.tolist(), height.tolist(), strict=True)
+    # no probe is known: every contact is at one place of a pad that never turns; any time that grows will do
     for i, (p, n, s, r, h) in enumerate(rows):
         estimator.add(ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, s, r, sigma_height=h))
     answer = estimator.estimate()

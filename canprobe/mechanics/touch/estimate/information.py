@@ -119,6 +119,7 @@ class InformationFilter:
         self.T, self.c = T, c.copy()
         self._inflation = 1.0
         self._path = _Path(travelled, travelled)
+        # after a straight start `root` is singular
         self.root = upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)]))
         self.inverse = inverted_upper(self.root)
         self.omitted.start(rows, residuals, travelled, slow)
@@ -134,10 +135,11 @@ class InformationFilter:
         left = kept * self._path.share
         self._path = self._path.on(moved, kept)
         share = self._path.share
+        # share ≥ left: no weight is above 1, so that the sum of squares is at most the sum
         lost = math.sqrt(share - left) * self._prior_rows
         stacked = np.empty((18 + len(rows), 10))
         stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self.root, 0.0
-        stacked[9:18, :9], stacked[9:18, 9] = lost, -lost.dot(self.c)
+        stacked[9:18, :9], stacked[9:18, 9] = lost, -lost.dot(self.c)  # the prior is about c = 0, the unknown is a step
         stacked[18:, :9], stacked[18:, 9] = rows[:, :9], residuals
         full = upper_root(stacked)
         self.root = full[:9, :9]

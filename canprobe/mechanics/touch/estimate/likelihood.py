@@ -160,6 +160,7 @@ def fit_ml(touches: ContactBatch, prior: Prior | None, quadric: bool = False) ->
     has_prior = math.isfinite(stated.sigma_curvature)
     a = anchor(result.c, T, (0.0, 0.0, 0.0), length)
     decision = result.decision.turned(a.turn)
+    # evidence is that of the fit with nothing held, in the frame of that fit: a patch may know what is held here
     freed = anchor(result.free, T, (0.0, 0.0, 0.0), length)
     spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), freed.turn)
     covariance = curvature_covariance(freed.c, solved(result.free_root.T, freed.M.T).T)
@@ -261,6 +262,7 @@ def osculating_bound(touches: ContactBatch, surface: SurfaceMatrix, prior: Prior
     J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
     stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
     root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
+    # a bound has no thresholds: spread for everything, and any σ passes; only what is rounding is left out (rule 3)
     wide = 1e30 * np.eye(2)
     decision = decide(root[6:, 6:] * C_PER_Q, wide, math.inf)
     known = decision.passed & (decision.information > 0.0)  # points in one place know nothing

@@ -89,15 +89,17 @@ def matrix_behind(L: Floats, S: Floats, K: tuple[Floats, Floats, Floats], model_
 def linear_map(T: Floats) -> Floats:
     """(10, 10) map of the ten unknowns to those of Tᵀ S T."""
     L: Floats = (T.T @ _UNIT @ T)[:, UPPER[0], UPPER[1]].T
+    # rounding would carry NaN to entries that are not touched: of a quarter turn 20 instead of 10 entries are not 0
     return np.where(np.abs(L) > 1e-12 * np.abs(L).max(axis=1, keepdims=True), L, 0.0)
 
 
 def _mapped(L: Floats, s: Floats, covariance: Floats, hidden: Any = False) -> UncertainMatrix:
     """Unknowns (10,) and their covariance behind L; NaN where `hidden` there, and where L takes NaN."""
     S = np.empty((4, 4))
+    # 0 · NaN is NaN
     S[UPPER] = S.T[UPPER] = np.where(hidden, np.nan, np.where(L == 0.0, 0.0, L * s).sum(axis=1))
     lost = hidden | ((L != 0.0) & ~np.isfinite(covariance.diagonal())).any(axis=1)
     C = L.dot(np.where(np.isfinite(covariance), covariance, 0.0)).dot(L.T)
     C[lost] = C[:, lost] = np.nan
     C[lost, lost] = np.inf
-    return UncertainMatrix(S, 0.5 * (C + C.T))
+    return UncertainMatrix(S, 0.5 * (C + C.T))  # L C Lᵀ is symmetric up to rounding only

@@ -62,6 +62,7 @@ _ALL = np.eye(3)
 _IS_CUBIC = DEGREE == 3
 _MIN_SCALED_CURVATURE = 0.1
 """Least ‖K‖ · length by which the usual size of quartic terms over cubic ones falls."""
+# a term a x³ of the height changes the curvature by 6 a
 _USUAL_VARIANCES = np.concatenate([[0.0], np.square(USUAL_CURVATURE_CHANGES) / 36.0])
 _VARIANCES = np.concatenate([_USUAL_VARIANCES, TAIL_VARIANCES])
 """Variances of the terms: without a misfit, usual ones over ‖K‖⁴ (in units of the length), and the tail's."""

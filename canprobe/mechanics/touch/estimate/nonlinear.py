@@ -95,6 +95,7 @@ def fit(d: Design, prior: tuple[Floats, Floats], independent: Floats | None = No
         step = target - best
         c = target
         if np.abs(step).max() < _STEP_TOLERANCE:
+            # steps keep a rank of 3 (`known`); whether the data bear it out is asked here, at the end
             final = solve_rows(A, b, prior, spread, size_of(c))
             if final[2].rank == decision.rank:
                 c, root, decision = final
@@ -139,6 +140,7 @@ def linear_start(
 
 
 def _median(values: Floats) -> float:
+    # np.median takes 15 µs for 160 values, this takes 3; of an even number it gives the upper one of the two
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
 

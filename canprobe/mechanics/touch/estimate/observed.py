@@ -115,6 +115,7 @@ def excited(spread: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         Columns (3, 3) in q: curvature along the main axis, twist, curvature across; and a flag (3,) for each.
     """
     mean, radius, angle = principal(spread)
+    # the twist weighs both axes alike, so that its spread is the mean of theirs
     return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= MIN_SPREAD
 
 

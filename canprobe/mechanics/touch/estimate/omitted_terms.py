@@ -115,6 +115,7 @@ class OmittedTerms:
             expected: what is assumed.
             observed: (3, k) columns: the observed combinations of q in the working frame.
         """
+        # a curvature that was not observed is noise: it must not set the usual size of the terms
         if observed.shape[1] < 3:
             c = c.copy()
             c[6:] = C_PER_Q * observed.dot(observed.T.dot(c[6:] / C_PER_Q))

@@ -45,6 +45,7 @@ class PathLength:
         px, py, pz = here = point.tolist()
         self._last.append(here)
         middle = len(self._last) // 2
+        # np.median of five points takes 18 µs, this takes 2; it runs for every sample, twice
         a, b, c = [sorted(axis)[middle] for axis in zip(*self._last, strict=True)]
         self._weigh((px - a) ** 2 + (py - b) ** 2 + (pz - c) ** 2)
         self._count = min(self._count + 1, _MEAN_POINTS)
@@ -69,6 +70,7 @@ class PathLength:
         limit = max(_MAX_SQUARE_RATIO * self._usual2, self._step2)
         ratio = limit / max(square, limit)
         self.weight = ratio * ratio
+        # capped at the limit: one wrong point must not open the way for the next
         self._usual2 += _USUAL_UPDATE_SHARE * (min(square, limit) - self._usual2)
 
 
@@ -100,5 +102,6 @@ class Spread:
         if self._origin is None:
             self._origin = points[0].copy()
         X = np.ones((len(points), 4))
+        # about the origin of the base, half a metre away, the covariance of a path of millimetres loses six digits
         X[:, :3] = points - self._origin
         self._moments += (X.T * weights).dot(X)

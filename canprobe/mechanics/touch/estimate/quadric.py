@@ -87,7 +87,7 @@ def _monomials(x: Any, y: Any, z: Any) -> Floats:
     """The 19 monomials of `_POWERS` at a place, (19,), or at places given as arrays, (19, n)."""
     xx, xy, yy = x * x, x * y, y * y
     rest = [xx * x, xx * y, x * yy, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy]
-    return np.array((1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest))
+    return np.array((1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest))  # 1 in the shape of x
 
 
 def _derivatives() -> Floats:

@@ -170,6 +170,7 @@ class RecursiveEstimator(Estimator):
         evidence = evidence_of(a.c, covariance, flat, state.length)
         if decision.rank < 3:
             decision = decision.with_covariance(TO_Q_SQUARED * covariance)
+            # the filter itself holds nothing; its answer is held at the value nearest to flat, as by `solve_rows`
             known = decision.vectors[:, decision.passed]
             a.c[6:] = C_PER_Q * (known @ (known.T @ (a.c[6:] / C_PER_Q)))
             covariance = np.full((3, 3), math.nan)
@@ -184,7 +185,7 @@ class RecursiveEstimator(Estimator):
             method="recursive",
             prior=self._prior.name,
             notes=notes,
-            evidence=None if changing else evidence,
+            evidence=None if changing else evidence,  # else a patch would complete it
         )
 
     def _flat(self, a: Anchor) -> Floats:
@@ -211,6 +212,7 @@ class RecursiveEstimator(Estimator):
         """Add the pending samples to the filter or its start; after a change of the surface, to a new start."""
         compared = self._compared() if self._steady else None
         caution = self._caution if self._start is None else START_ALARM_SCALE * self._caution
+        # a list and no generator: the test must take the contacts behind the one that raises the alarm, too
         if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
             explained = self._explained(compared)
             if explained is None:
@@ -273,6 +275,7 @@ class RecursiveEstimator(Estimator):
             last = self._pending[-1]
             self._filter.begin(homogeneous(tangent_rotation(-last.normal), last.point))
             return
+        # the target of a step that is not small is a place where nobody has looked yet (`gauss_newton`)
         c = found.target if start.steady else found.c
         self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled, start.slow)
         self._doubtful = float(np.count_nonzero(found.weight < 1.0))
@@ -281,6 +284,7 @@ class RecursiveEstimator(Estimator):
 
     def _weigh(self, moved: float, weight: Floats) -> float:
         """Count a step (m) with the samples' weights (n,); returns the weight of each for their density, at most 1."""
+        # contacts before the first mean have no measured path: at pace the first step would look crowded by them
         thinned = min(1.0, self._full_density * moved / min(len(weight), self._path_length.measured))
         kept = math.exp(-moved / self._memory)
         self._doubtful = kept * self._doubtful + np.count_nonzero(weight < 1.0)

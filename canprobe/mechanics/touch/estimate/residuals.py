@@ -112,6 +112,7 @@ def linearise(c: Floats, d: Design) -> LinearisedResiduals:
     g = d.X.dot(B) + h
     square = np.einsum("ij,ij->i", g, g)
     f = 0.5 * np.einsum("ij,ij->i", d.X, g + h) + S[3, 3]
+    # why not more steps to the foot: 0.1 mm off a ball of 20 mm this one is 0.25 µm short
     X = d.X - g * (f / square)[:, None]
     r = np.empty((len(X), 3))
     r[:, 0] = f / np.sqrt(square)
@@ -140,6 +141,7 @@ def _whitener(K: Floats, ghat: Floats, d: Design) -> Floats:
         C = A @ point @ A.mT
         C[:, 1:, 1:] += d.T @ normal @ d.T.mT
         return np.linalg.solve(np.linalg.cholesky(C), np.broadcast_to(np.eye(3), C.shape))
+    # the same by its Cholesky factor in closed form: 17 instead of 210 µs for 160 samples, in every iteration
     vp, vn = d.point_variance, d.normal_variance
     k11, k12, k22 = K[:, 0, 0], K[:, 0, 1], K[:, 1, 1]
     l11 = np.sqrt(vn + vp * (k11 * k11 + k12 * k12))

@@ -80,6 +80,7 @@ class Score:
         n, k = len(J) // 3, J.shape[1]
         fade = math.exp(-moved / (n * self._correlation.length))
         each = J.reshape(n, 3, k)
+        # exp(−s / length) makes the sum over all earlier rows a recursion with one row: no path has to be kept
         recent, past = kept * self._recent, np.empty((n, 3, k))
         for i in range(n):
             recent *= fade

@@ -77,6 +77,7 @@ class Start:
         """Take in the contacts of a step of the path (m), and improve the solution by a Gauss–Newton step."""
         self._touches += touches
         if len(self._touches) > MAX_CONTACTS:
+            # why not the oldest: the stretch is solved as a whole, and contacts at its begin have the longest lever
             self._touches = self._touches[::2]
         self.travelled += moved
         share = self.travelled / self._length
@@ -103,6 +104,7 @@ class Start:
         yield
         better = gauss_newton(now, d, self._prior)
         self.solution, self.slow = better, slow_errors(self._touches)
+        # while a combination is held at flat steps are small, too: only the end of the stretch makes that steady
         known = self.steady or better.decision.rank == 3 or stretch_over
         self.steady = known and better.step < STEADY_STEP
 
@@ -115,6 +117,8 @@ def isolation(points: Floats, variance: Floats) -> Floats:
     """
     if len(points) < 5:
         return np.ones(len(points))
+    # mirrored without the end itself: with the end repeated it would be the median of its own window, and a last point
+    # that is 5 mm wrong would keep its full weight instead of 3e-4
     padded = np.concatenate([points[1:3][::-1], points, points[-3:-1][::-1]])
     windows = np.stack([padded[k : k + len(points)] for k in range(5)])
     off = points - np.median(windows, axis=0)

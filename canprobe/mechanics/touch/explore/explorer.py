@@ -81,6 +81,7 @@ class Explorer(PathFollower):
         self.upcoming: list[Stretch] = []
         self._search: Iterator[None] | None = None
         self._inner = 0.5 * np.array(size) - radius
+        # more than is walked back at once: of its end a part may have been gone back already (`turn_back`)
         self._walked: deque[tuple[float, float]] = deque(maxlen=round(3.0 * BACK_M / STEP_M))
         self._lately: deque[tuple[float, tuple[float, float], tuple[float, float], Floats]] = deque()
         self._force_share = 1.0
@@ -231,6 +232,7 @@ class Explorer(PathFollower):
         ground = self.ground
         seen = ground.change[np.isfinite(ground.change)]
         change = math.sqrt(float(np.mean(seen**2))) if len(seen) else 0.0
+        # no lane shrinks what all heights of the scan have in common: lanes have the rest of the variance
         wanted2 = max(ground.target, NEAR_FLOOR * ground.common) ** 2 - ground.common**2
         return self._forecast.spacing(math.sqrt(wanted2), change)
 
@@ -239,6 +241,7 @@ class Explorer(PathFollower):
         ground, end = self.ground, self._end
         left = np.arange(0.0, max(self._left, 0.0) + STEP_M, STEP_M)
         ahead = np.array([self.stretch.point(self.stretch.length - way) for way in left.tolist()])
+        # what the rest of the stretch will show needs no way to it
         shown = np.linalg.norm(ground.places[:, None] - ahead, axis=2).min(axis=1) < SHOWN_M
         which = np.flatnonzero(ground.wanting & ~shown)
         apart = np.hypot(ground.places[which, 0] - end.x, ground.places[which, 1] - end.y)

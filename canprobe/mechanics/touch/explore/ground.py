@@ -67,6 +67,7 @@ class GroundCells:
         stiffness_sigma: float,
     ) -> None:
         size = rectangle.length, rectangle.width
+        # rounding: 9 * 1e-3 over 3e-3 is just above 3, and would make four cells
         self.counts = tuple(math.ceil(side / CELL_M - 1e-9) for side in size)
         along, across = (side * ((np.arange(n) + 0.5) / n - 0.5) for side, n in zip(size, self.counts, strict=True))
         self.places: Floats = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -105,7 +106,7 @@ class GroundCells:
 
     def fit(self, i: int) -> None:
         """Fit a cell by its index; nothing changes where no contact is near it."""
-        self._stale[i] = 0.0
+        self._stale[i] = 0.0  # also where nothing is near, else it would stay the first that is due
         pad = self._map.pad
         assert pad is not None
         up = self._axes[2]

@@ -158,7 +158,7 @@ class InwardLanes:
         if (width := self._outermost[side] + self._outermost[opposite]) <= 0.0:
             return 0
         shown = self._distance(side, spacing) + self._distance(opposite, spacing) - spacing.gap
-        return max(math.ceil((width - shown) / spacing.gap - 1e-9), 0)
+        return max(math.ceil((width - shown) / spacing.gap - 1e-9), 0)  # rounding must not add a lane
 
     def _place(self, side: int, spacing: Spacing) -> float:
         """Distance of the next lane of a side from the middle, m: all distances shrink alike, so that lanes fit in."""

@@ -153,7 +153,7 @@ def stretches_to(start: Heading, end: Heading, radius: float, onward: float) -> 
 def _turned(angle: float, side: float) -> float:
     """The angle, rad, as a turn to a side, +1: left, −1: right; less than a full one."""
     turn = (side * angle) % (2.0 * math.pi)
-    return side * (turn if turn < 2.0 * math.pi - 1e-7 else 0.0)
+    return side * (turn if turn < 2.0 * math.pi - 1e-7 else 0.0)  # −1e-17 is no full turn
 
 
 def leading_to(start: Heading, side: float, radius: float, target: tuple[float, float]) -> Stretch | None:

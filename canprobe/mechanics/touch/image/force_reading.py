@@ -36,6 +36,7 @@ class ForceReading:
         """
         errors, creep = self._errors, self._creep
         shown = creep.step(t_s, patch.force, touching=patch.force >= TOUCH_FORCE / 2)
+        # newtons rest on touches that had crept by so many decades: their creep is in the gains
         force = shown * (1.0 + errors.creep * errors.creep_decades)
         sigma = errors.sigma(
             force,

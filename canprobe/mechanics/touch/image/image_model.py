@@ -81,6 +81,7 @@ class ImageModel:
         self.count, self.side = pad.full_scale_pa / COUNTS_MAX, max(pad.shape)
         self.level, self.seen = LEVEL_COUNTS * self.count, self.side if seen is None else seen
         half = 0.5 * self.seen
+        # as far as the largest patch reaches: its moment is a sixth of the square of its half-axis
         source: Floats = (
             np.arange(math.ceil(math.sqrt(6.0 * MAX_MOMENT_SHARE) * half * STEPS_PER_PITCH) + 1) + 0.5
         ) / STEPS_PER_PITCH
@@ -88,6 +89,7 @@ class ImageModel:
         width = self.parameters.blur / self.pitch
         far = np.arange(-20 * STEPS_PER_PITCH, 20 * STEPS_PER_PITCH + 1) / STEPS_PER_PITCH
         folded = [np.exp(-0.5 * ((x[:, None] - sign * source) / width) ** 2) for sign in (1.0, -1.0)]
+        # why not √(2π) width: on thirds of a pitch the least blur, 0.1 pitches, would make pressures a third too high
         blur: Floats = (folded[0] + folded[1]) / np.exp(-0.5 * (far / width) ** 2).sum()
         # crosstalk is linear in rows and columns as the blur is: a row spreads its sum, which the blur leaves as it is
         share = self.parameters.crosstalk / (self.side - 1)
@@ -244,7 +246,7 @@ class ImageModel:
         (a, b), (c, s), det = self._principal(k)
         h = _DIFFERENCE_STEP * a
         depth = self.depth(force, det)
-        bent = depth * (1.0 + h / a) ** 0.25, depth * (1.0 + h / b) ** 0.25
+        bent = depth * (1.0 + h / a) ** 0.25, depth * (1.0 + h / b) ** 0.25  # at the same force
         shown = self.shown(np.array((depth, *bent)), np.array((a, a + h, a)), np.array((b, b, b + h)))
         (v1, v2), (a1, a2), (b1, b2) = self.moments_of(shown)
         # derivatives by K in its principal axes, K = 2 A − I/R_p; moments turn with K, which gives that by K12 (shear)

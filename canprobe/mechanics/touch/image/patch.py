@@ -155,6 +155,7 @@ class Continuation:
         weights = self._weights[strip]
         used_weights = (weights * used[:, None]).T
         try:
+            # why not lstsq: it takes twice as long, for digits that counts do not have
             quadratic = np.linalg.solve(used_weights.dot(weights), used_weights.dot(self._area[strip] * seen))
         except np.linalg.LinAlgError:
             return pressure
@@ -239,6 +240,7 @@ def compute_patch(
     if pad.is_grid:  # the taxels of a list have no neighbours
         taxels, dead = mended(taxels)
     counts = taxels.tobytes()
+    # bytes and no arrays: number and peak of the active taxels take 3 instead of 8 µs
     active = counts.translate(None, _ALL_COUNTS[: max(calibration.threshold_counts, 1)])
     if not active:
         return _nothing(0.0)._replace(dead=dead)
@@ -318,6 +320,7 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
     total = max(features.force_n, 0.0)
     axes = ((abs(row) - 0.5 * rows, features.var_rr), (abs(col) - 0.5 * columns, features.var_cc))  # from the edge
     cut_by_pad = any(c + 2.0 * math.sqrt(max(var, 0.0)) > 0.0 for c, var in axes)
+    # 1/12: variance of the pressure within a taxel
     reached = max(c + OFF_PAD_SIGMAS * math.sqrt(max(var, 0.0) + 1.0 / 12.0) for c, var in axes)
     at_edge = max(c for c, _ in axes) > -OFF_PAD_TAXELS
     peak = min(max(int(features.peak), 0), COUNTS_MAX)

@@ -57,6 +57,7 @@ def mended(taxels: Image) -> tuple[Image, int]:
     inner = taxels[1:-1, 1:-1]
     sides = (taxels[:-2, 1:-1], taxels[2:, 1:-1], taxels[1:-1, :-2], taxels[1:-1, 2:])
     least = np.minimum(np.minimum(sides[0], sides[1]), np.minimum(sides[2], sides[3]))
+    # 255 makes the limit too high for any count where the taxel itself reads something; uint8 would wrap
     dead = least > (MIN_COUNTS - 1) + 255 * (inner > 0).astype(np.int16)
     n = int(np.count_nonzero(dead))
     if n == 0:
@@ -245,5 +246,6 @@ def _bridge(mask: _Mask, window: tuple[int, ...]) -> tuple[NDArray[np.intp], Flo
     second[np.arange(len(triples))[:, None], triples] = 1.0, -2.0, 1.0
     unknown = second[:, places]
     second[:, places] = 0.0
+    # why not solve: in a window without a whole taxel the equations are singular
     weights: Floats = np.asarray(np.linalg.lstsq(unknown, -second, rcond=None)[0], np.float64)
     return places, weights

@@ -120,6 +120,7 @@ class NodeGrid:
         row[COUNT], row[PATH] = count, max(self._path_length.total - self._begun_at, NODE_M)
         self._lift(row, self._along_normals / count - float(self.points_of(row) @ row[NORMAL]))
         way = self._last - self._first
+        # less than a unit vector at rest, where the direction of the way is noise
         row[HEADING] = way / max(float(np.linalg.norm(way)), 0.5 * NODE_M)
         return row
 

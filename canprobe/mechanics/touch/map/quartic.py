@@ -80,7 +80,7 @@ def _prior_information(change: float) -> Floats:
     sigma = np.empty(TERMS)
     sigma[0], sigma[1:3] = HEIGHT_SIGMA_M / L, SLOPE_SIGMA
     sigma[SECOND], sigma[THIRD], sigma[FOURTH] = CURVATURE_SIGMA * L, change * L**2, change / LENGTH_M * L**3
-    sigma[4] *= math.sqrt(0.5)
+    sigma[4] *= math.sqrt(0.5)  # K12: the prior on curvature is then the same in turned axes
     return sigma**-2
 
 
@@ -101,5 +101,7 @@ def fourth_of(K: Floats) -> Floats:
     for i in range(3):
         for j in range(3):
             power = i + j  # of y
+            # times i! j!, as unknowns are derivatives; 5 mm from the top of a ball of 40 mm a paraboloid is 1.2 µm off,
+            # with this 0.01 µm
             mean[:, FOURTH.start + power] -= 0.125 * a[i] * b[j] * math.factorial(4 - power) * math.factorial(power)
     return mean

@@ -39,6 +39,7 @@ def fused_stiffness(slope: float | None, images: float | None, stated: Stiffness
     if slope is None or images is None:
         return Stiffness(math.exp(images if slope is None else slope), SOURCE_SIGMA)  # type: ignore[arg-type]
     of_images = SOURCE_SIGMA**-2
+    # the difference has the variance of both sources: what is left beyond that of the images is the slope's
     of_slope = 1.0 / max(SOURCE_SIGMA**2, (slope - images) ** 2 - SOURCE_SIGMA**2)
     mean = (of_images * images + of_slope * slope) / (of_images + of_slope)
     return Stiffness(math.exp(mean), (of_images + of_slope) ** -0.5)

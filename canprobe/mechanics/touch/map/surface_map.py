@@ -188,7 +188,7 @@ class SurfaceMap:
         rows = np.stack(terms(*blend.xy, (1, 0), (0, 1)), axis=-2)
         V = rows @ cells.covariance[blend.cells] @ np.swapaxes(rows, -1, -2) / blend.slope_size[..., None, None] ** 2
         V = np.einsum("nk,nkip,nkpq,nkjq->nij", blend.weight, R[..., :2], V, R[..., :2])
-        return blend.feet.normal, V + 0.0 * blend.feet.normal[:, :1, None]
+        return blend.feet.normal, V + 0.0 * blend.feet.normal[:, :1, None]  # NaN where the normal is
 
     def curvature(self, points: ArrayLike) -> MapCurvature:
         """Curvature at the feet of points (n, 3), m."""
@@ -224,7 +224,7 @@ class SurfaceMap:
 
     def _disagreement(self, blend: _Blend) -> tuple[Floats]:
         excess: Floats = np.einsum("nk,nk->n", blend.weight, self.solved().fits.excess[blend.cells])
-        return (excess + 0.0 * blend.feet.normal[:, 0],)
+        return (excess + 0.0 * blend.feet.normal[:, 0],)  # NaN out of reach
 
     def mesh(self, *, cell: float = CELL_M) -> Mesh:
         """The surface as triangles with its σ at every vertex; cells of the lattice have a side `cell`, m.
@@ -269,6 +269,7 @@ class SurfaceMap:
     def _answers(self, answer: Callable[[_Blend], Sequence[NDArray[Any]]], points: ArrayLike) -> list[NDArray[Any]]:
         """The columns that an answer has for points (n, 3), of some places after the other: memory stays bounded."""
         q = checked("points", points, (None, 3))
+        # without a place there is one empty part, whose columns have their shapes
         starts = range(0, max(len(q), 1), PLACES_AT_ONCE)
         parts = [answer(self._blend(q[i : i + PLACES_AT_ONCE])) for i in starts]
         return [np.concatenate(column) for column in zip(*parts, strict=True)]

@@ -45,6 +45,7 @@ MAX_EXCESS = 1.0
 JOINED_NOTE = "of the curvature from ground that was touched before"
 MIN_NODES = 4
 """Least number of nodes of a quartic."""
+# z of the map points outward, that of a contact inward: with the same x, y turns round and K12 changes its sign
 _OUTWARD, _MIRRORED = np.array([1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0])
 
 
@@ -73,12 +74,13 @@ class MapFusion(AnswerStage):
 
     def take(self, sample: ContactSample) -> None:
         self._path_length.add(sample.p_base)
+        # why no deque with a maxlen: it would drop the oldest contacts, which become ground next
         if len(self._waiting) < MAX_WAITING:
             self._waiting.append((self._path_length.total, sample))
 
     def reset(self) -> None:
         """Forget everything but the settings and the ground."""
-        self._learn(math.inf)
+        self._learn(math.inf)  # the estimator has forgotten all of them, too
 
     def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
         self._learn(self._path_length.total - self._between)
@@ -116,6 +118,7 @@ def ground_at(surface_map: SurfaceMap, answer: SurfaceEstimate) -> KnownCurvatur
     change2 = xxx**2 + 3.0 * (xxy**2 + xyy**2) + yyy**2  # of the tensor along both axes
     turn = TO_Q * _MIRRORED / LENGTH_M
     V = covariance[0, SECOND, SECOND] * np.outer(turn, turn)
+    # the square of the change is shared out evenly to the three entries of q
     return KnownCurvature(-turn * fits.a[0, SECOND], V + BLUR_M**2 * change2 / 3.0 * np.eye(3))
 
 

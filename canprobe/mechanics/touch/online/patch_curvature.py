@@ -182,6 +182,7 @@ class PatchCurvature:
         x, y, z = sample.r_probe.tolist()
         k = 1.0 / math.sqrt(x * x + y * y + z * z)
         direction = k * x, k * y, k * z
+        # before the image is judged: the pad remembers this place, whether its moments are used or not
         was = self._memory.add(sample.t_s, *direction_to_pad(direction, self.model.radius))
         if sample.moments is None:
             self.refused += 1
@@ -191,6 +192,7 @@ class PatchCurvature:
         self._place = sample.p_base
         nx, ny, nz = sample.n_base.tolist()
         inward = -nx, -ny, -nz
+        # why not always `tangent_rotation`: where a normal passes 18° from x of the base, its axes jump by 90°
         x_axis = self._axes[0] if self.frames else tangent_rotation(inward)[:, 0].tolist()
         self._axes = transported(x_axis, inward)
         (uu, uv, vv), memory = sample.moments, self.model.parameters.memory
@@ -201,7 +203,7 @@ class PatchCurvature:
         share = self._mean.add(*moments)
         self._traces = _mixed(self._traces, _turned(tuu, tuv, tvv, *axis), share)
         self.frames = self._mean.frames
-        self.force += share * (sample.force_n - self.force)
+        self.force += share * (sample.force_n - self.force)  # of the same frames as the moments
 
     def _pad_axis(self, direction: Moments, T_base_probe: Floats) -> tuple[float, float]:
         """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
@@ -247,7 +249,7 @@ class PatchCurvature:
 
     def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
         """Solve from the last answer, and where that fails from that of the ideal layer."""
-        last, self._last = self._last, None
+        last, self._last = self._last, None  # a solution that fails leaves no start for the next
         found = None if last is None else self._iterated(last, seen, motion)
         for guess in self._guesses():
             start = None if found is not None else self._model(guess).start(seen[0], self.force)
@@ -298,6 +300,7 @@ class PatchCurvature:
                 cost += float(apart.dot(drawn))
                 x = x + way
                 *of_q, of_stiffness = map(abs, way.tolist())
+                # an error of ln k looks like that times 1/R_p in the curvature of a plane
                 step = max(*of_q, of_stiffness / self.model.radius)
                 if step < LAST_STEP / self.model.radius:
                     break
@@ -326,6 +329,7 @@ class PatchCurvature:
         kappa = np.linalg.eigvalsh(K)
         off = math.log(stiffness_from_slope(slope.value, self.model.radius, kappa)) - x[3]
         row = np.array([-half[0, 0], -2.0 * half[0, 1] / TO_Q[1], -half[1, 1], 1.0])
+        # 2: the stiffness goes with the square of the slope
         return row, off, 1.0 / ((2.0 * slope.sigma / slope.value) ** 2 + SLOPE_SIGMA**2)
 
 

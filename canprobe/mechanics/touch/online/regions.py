@@ -103,6 +103,7 @@ def _with_error(root: Floats, error: Floats) -> Floats:
     square = float(u.dot(u))
     if square == 0.0:
         return root
+    # (I − share u uᵀ)² = (I + u uᵀ)⁻¹: the formula of Sherman and Morrison on the root, without a decomposition
     share = (1.0 - 1.0 / math.sqrt(1.0 + square)) / square
     result: Floats = root - (share * u)[:, None] * u.dot(root)
     return result

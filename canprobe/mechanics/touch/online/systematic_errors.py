@@ -76,7 +76,7 @@ class SystematicErrors(AnswerStage):
         return cls(memory_m, scale=SCALE_ERROR, drag=drag, offset=offset)
 
     def reset(self) -> None:
-        self._past.clear()
+        self._past.clear()  # only differences of the path count, so that the path itself goes on
         self._path = AnswerPath()
 
     def refine(self, answer: SurfaceEstimate | None, sample: ContactSample) -> SurfaceEstimate | None:
