@@ -167,6 +167,7 @@ class TactileReceiver(ArrayReceiver):
             return False
         if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
             return True
+        # at -later stands the fifth SYNC behind its trigger (at -1 - cycles_ago); the header has to come before that
         later = cycles_ago - MAX_HEADER_AGE_CYCLES
         return later > 0 and sync_stamps[-later] <= frame.t_ns
 

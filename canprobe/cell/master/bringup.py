@@ -111,6 +111,7 @@ class BringUp:
         self.listen()
         self._refuse_unconfigured()
         self._start()
+        # once more: on a bus full of SDOs a boot-up (700h + id) is heard only behind them
         self._refuse_unconfigured()
 
     # 1. listen
@@ -160,6 +161,7 @@ class BringUp:
                 "; check power, node id, bit rate and termination, or mark it emulated in the scene",
                 *missing,
             )
+        # a second device of a node id has heard the same reset, and its boot-up may still be on its way
         self._network.pump_until(lambda: False, SECOND_ANSWER_S)
         self._booted = dict(boot_ups)
         for setup in self._setups:
@@ -218,6 +220,7 @@ class BringUp:
             all_of_them = len(waiting) == len(self._setups)
             which = "all nodes" if all_of_them else f"nodes {', '.join(str(s.node_id) for s in waiting)} again"
             self._say(f"start {which}")
+            # each by its id, not all by id 0: devices that are not in the scene stay as they are
             self._network.port.send_batch([pack_nmt(NmtCommand.START, s.node_id) for s in waiting])
             self._network.pump_until(lambda: not self._not_operational(), self._settings.start_s)
             if not (waiting := self._not_operational()):
@@ -295,9 +298,11 @@ class BringUp:
         if not self.took_over:
             return
         self._network.port.send_batch([pack_nmt(NmtCommand.PRE_OPERATIONAL, s.node_id) for s in self._setups])
+        # NMT went first: PDOs end at once, and SDO works in pre-operational all the same
         failures: list[NodeError] = []
 
         def consumer_off(setup: NodeConfiguration) -> Dialogue:
+            # left on, each node would report the loss of its master (8130h) 250 ms after the last heartbeat
             has_one = any(write.index == HEARTBEAT_CONSUMER for write in setup.writes)
             if setup.node_id not in self._booted or not has_one:
                 return

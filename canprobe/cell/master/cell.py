@@ -263,6 +263,7 @@ class Cell:
             command = self._held.freeze(measurement) if held else controller.step(measurement)
             check_command(command, arm=self.drives is not None)
         command, finding = self.supervisor.guard_target(command if held else self._held.thaw(command, measurement))
+        # a hold sends where the arm is: beyond a limit that is left out, and the hold does not become a stop
         if finding is not None and not held:
             self._react(finding)
         cycles.cycle.end(command)  # RPDOs
@@ -273,6 +274,7 @@ class Cell:
         progress(measurement)
         if command.stop_reason is not None:
             found = self._retreats_for
+            # the error as it was found: its type has node and exit status, and a task gives back the words alone
             raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
         return bool(command.done)
 
@@ -290,6 +292,7 @@ class Cell:
         else:
             with self.bring_up.tares(array.node_id) as writes:
                 while writes.waiting:
+                    # in the cycle, which sends the heartbeat: nodes miss their master after 250 ms without it
                     self.idle(self._plan.sync.period_ns * 1e-9)
                     writes.serve()
         self.idle(TARE_S)

@@ -255,6 +255,7 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
             if address in found:
                 raise FoundTwiceError(network.port.channel, [*(one for one in found if one != address), address])
             found.append(address)
+            # all that were found answer, each once: one answer more is of a second device, found by the same address
             if len(lss.inquire_node_ids()) > len(found):
                 raise BusError(
                     f"{network.port.channel}: more than one node without an id has the address {found[-1]}"
@@ -295,6 +296,7 @@ def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True
         lss.configure_node_id(node_id)
         kept = store and lss.store()
         lss.release()
+        # a device without an id boots by itself when it is released (CiA 305); one with an id keeps it until a reset
         if assignment.before is not None:
             network.port.send_batch([frames.pack_nmt(frames.NmtCommand.RESET_COMMUNICATION, assignment.before)])
         if not network.pump_until(lambda: bool(booted), BOOT_UP_S):

@@ -210,6 +210,7 @@ class Cycle:
         self.statistics.period_error_ns.append(late_ns)
         if late_ns > self._period_ns // 2:
             self.statistics.overruns += 1
+            # overdue SYNCs are left out: made up for in a row, they would give the targets less than a period each
             self._deadline += late_ns // self._period_ns * self._period_ns
         self.number += 1
         self.begun = True

@@ -454,6 +454,7 @@ class DriveTargets:
         if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
             goals = [self._goal_of(axis.node_id) for axis in drives.axes]
             words = list(map(_controlword, drives.states, goals, self._words, self._interpolated))
+            # not while words change: a fault reset needs an edge every second cycle, all with one statusword
             self._steady = key if words == self._words else None
             self._words = words
         values = [*self._words, *targets, *self._constants]

@@ -107,7 +107,9 @@ class FlangeGroup(DriveGroup):
         R = T[:3, :3] if T.shape == (4, 4) else np.zeros((3, 3))
         if not (np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < RIGID and np.linalg.det(R) > 0.0):
             raise ArmError(f"read: expected a pose (4, 4) with a rotation, got {T.tolist()}")
+        # an arm that is slower than the cycle gives its last pose again, which is no report
         if arm_ns > self._arm_ns or not self._all_heard:
+            # the least delay may rise by the drift: held for ever, it would make the poses of a slower clock ever older
             offset_ns = self._offset_ns + (arm_ns - self._arm_ns) // DRIFT
             self._offset_ns = min(offset_ns, t_ns - arm_ns) if self._all_heard else t_ns - arm_ns
             self._arm_ns = arm_ns
@@ -137,6 +139,7 @@ class FlangeGroup(DriveGroup):
         return (max(overdue, int(self._disbelieved)),) * len(self.tracks)
 
     def joints(self) -> Floats:
+        # + 1, as if no report had come: a pose that was read in this cycle is older than its SYNC, and is carried on
         q = units_to_joints(self.model, [track.position(self.cycle + 1, self.deadline_ns) for track in self.tracks])
         q.flags.writeable = False
         return q
@@ -166,7 +169,7 @@ class FlangeTargets(DriveTargets):
 
     def __init__(self, drives: FlangeGroup, arm: ExternalArm, lag_s: float) -> None:
         self._arm = arm
-        self._goal = DriveState.SWITCH_ON_DISABLED
+        self._goal = DriveState.SWITCH_ON_DISABLED  # before the base, which sets `goal`
         super().__init__(drives, 1, lag_s)
 
     @property

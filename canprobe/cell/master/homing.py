@@ -249,6 +249,7 @@ class Homing:
         self._record = NodeRecord(record, "home the drives again")
         guard = JointGuard(plan)
         inside = TOLERANCE_RAD * self._model.radian
+        # a joint that comes to stand a tolerance short of its place is in its range all the same
         self._low, self._high = guard.low + inside, guard.high - inside
         self._zeros = {axis: drive.zero for axis, drive in enumerate(arm.drives) if drive.zero is not None}
         self.order = tuple(sorted(self._zeros, key=lambda axis: (self._zeros[axis].order, axis)))
@@ -358,9 +359,11 @@ class Homing:
         self.link.beats = True
         units = self._positions(axis)
         home = round(drive_position_at(self._model, axis, zero.home, units))
+        # first: whatever ends a homing half-way leaves a drive that may have another zero
         self._set_known(axis, False)
         with drive.left_disabled():
             for write in setup.homing:
+                # zero is the home position plus 607Ch (CiA 402-2), so that at home 6064h is -607Ch
                 drive.write(replace(write, value=-home) if write.index == HOME_OFFSET else write)
             drive.enable(OperationMode.HOMING)
             drive.command(cia402.ENABLE_WORD | 1 << cia402.HOMING_START_BIT)
@@ -368,6 +371,7 @@ class Homing:
             late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
             found_bits = cia402.HOMING_ATTAINED_BIT, cia402.TARGET_REACHED_BIT
             drive.wait_for_bits(found_bits, zero.timeout_s, what, late, error=cia402.HOMING_ERROR_BIT)
+        # not every drive goes back to the pulse or edge: it may stand behind it by the way on which it has braked
         found, braking = drive.read(cia402.POSITION), zero.zero_speed**2 / (2.0 * zero.acceleration)
         per_q = abs(float(self._model.units_per_q[axis, axis]))
         if abs(found - home) > self._tolerance(axis) + braking * per_q:

@@ -99,6 +99,7 @@ class ImageWitness:
         if sigma is None or sigma <= 0.0 or len(self._places) < 3:
             return False
         (u0, v0), (u1, v1), (u2, v2) = self._places
+        # a second difference has (1 + 4 + 1) σ², and there are two directions
         scatter2 = ((u2 - 2.0 * u1 + u0) ** 2 + (v2 - 2.0 * v1 + v0) ** 2) / 12.0
         share = 1.0 - math.exp(-(t_ns - self._t_ns) * 1e-9 / SCATTER_S)
         before = self._scatter2 if self._scatter2 is not None else sigma * sigma

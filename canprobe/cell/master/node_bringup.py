@@ -155,6 +155,7 @@ class NodeBringUp:
             yield from self._check_units()
             self.kept = store and (yield from self._is_kept())
             yield from self._write_all()
+            # the date comes last: a device clears 1020h with every other write (CiA 301), and stores it with the values
             if store and not self.kept:
                 for subindex, value in setup.configuration_date.items():
                     yield from write_entry(setup, Write(VERIFY_CONFIGURATION, subindex, value, "configuration date"))
@@ -230,6 +231,7 @@ class NodeBringUp:
         setup = self.setup
         times = [tuple(write for write in setup.writes if write.index == INTERPOLATION_TIME), *setup.otherwise]
         for write in setup.writes:
+            # what is not read back is a command, such as a tare: stored or not, it is given each time
             if self.kept and write.read_back:
                 continue
             if write.index != INTERPOLATION_TIME:

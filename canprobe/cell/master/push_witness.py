@@ -101,6 +101,7 @@ class PushWitness:
         like, early = self._alike(recent, now), self._alike(self._early, now)
         unfelt, self.sigma = self._unfelt(now, like[-MOST_LIKE:] if len(like) >= LEAST_LIKE else recent)
         if len(early) >= LEAST_LIKE and not unfelt > self._certain(self.sigma):
+            # the oldest of them, since which a slow push has grown most
             unfelt, self.sigma = self._unfelt(now, early[:MOST_LIKE])
         shows = unfelt > self._certain(self.sigma)
         self.unfelt = unfelt if shows and self._showed else None

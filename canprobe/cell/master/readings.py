@@ -80,4 +80,5 @@ class Readings:
                     self._waiting.append(entry)
 
             self._held = Dialogues(self._network, {setup.node_id: read()}, timeout_s=self._timeout_s)
+            # not by `with`: the dialogue goes on over several cycles, of which each only serves it
             self._held.__enter__()

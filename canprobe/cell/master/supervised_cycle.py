@@ -172,6 +172,7 @@ class SupervisedCycle:
         if words is None or str(watch.foreign) in str(error):
             return
         if isinstance(error, CanprobeError):
+            # in place: another error would lose type and attributes, by which callers know node and exit status
             error.args = (f"{error}; {words}",)
         elif words not in self.notes.lines():
             self.notes.add(words)

@@ -58,6 +58,7 @@ class JointGuard:
 
     def __init__(self, plan: Plan) -> None:
         arm, probe, safety = plan.setup.needed_arm(), plan.setup.probe, plan.setup.limits
+        # a target that a task has clipped to the margin must not be beyond it by its last bit
         model, margin = arm.model, safety.joint_margin - _ROUNDING * arm.model.radian
         self.low, self.high = model.q_min + margin, model.q_max - margin
         self.count = np.abs(model.q_per_unit).sum(axis=1)
@@ -189,6 +190,7 @@ class PressDetector:
         assert self._T_base_tip is not None
         pole = self._T_base_tip[:3, 2]
         back = -float(way @ pole)
+        # within 45° of the pole: a probe that has slid further aside than back may still press
         return back > CLEARANCE and float(np.linalg.norm(way + back * pole)) < back
 
 

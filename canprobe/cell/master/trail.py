@@ -64,6 +64,7 @@ class TakenWay:
         place = (forward(self._model.chain, measured) @ self._flange_point)[:3, 3]
         gone = knots[-1][2] + float(np.linalg.norm(place - knots[-1][1])) if knots else 0.0
         knots.append((q, place, gone))
+        # by the second: the first that stays lies beyond the end of the way back, which is between the two
         while len(knots) > 2 and gone - knots[1][2] > WAY_BACK:
             knots.popleft()
 
@@ -109,6 +110,7 @@ class Retrace:
         return wanted
 
     def _at(self, t: float) -> Floats:
+        # from rest: the time of the way gets going within START_S, evenly, and is half of that behind afterwards
         gone = way_gone(t - START_S / 2 if t > START_S else t * t / (2.0 * START_S))
         return np.array([np.interp(gone, self._ways, column) for column in self._joints.T])
 

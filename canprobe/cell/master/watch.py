@@ -71,6 +71,7 @@ class NodeWatch:
     def push(self, can_id: int, data: bytes, t_ns: int) -> bool:
         """Take a frame that is no PDO; True where it was a frame of error control, EMCY or another master."""
         node_id = can_id & 0x7F
+        # no port gives back what it has sent, so these are of somebody else
         if can_id == HEARTBEAT_BASE + MASTER_NODE_ID:
             self.foreign = self.foreign or f"a heartbeat of node {MASTER_NODE_ID}, our own id"
         elif can_id in (SYNC_ID, NMT_ID):

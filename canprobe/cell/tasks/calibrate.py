@@ -192,6 +192,7 @@ class CalibrateTask(TouchSeries):
     def _ball_touch(self, felt: Sequence[ContactSample]) -> BallTouch:
         """Mean of the samples of a touch at rest."""
         n = np.mean([contact.n_base for contact in felt], axis=0)
+        # at rest any orientation will do, and a mean of rotation matrices is none
         T_base_probe = felt[len(felt) // 2].T_base_probe.copy()
         T_base_probe[:3, 3] = np.mean([contact.T_base_probe[:3, 3] for contact in felt], axis=0)
         T_base_flange = T_base_probe @ np.linalg.inv(self.sensing.flange_probe)
@@ -244,6 +245,7 @@ class Press:
         """Way over the pad from the place where it begins, m, after so many seconds of roll."""
         part = self.seconds / len(self.hz)
         full = min(int(t / part), len(self.hz) - 1)
+        # the phase of the parts before goes on: by 2π hz t the probe would jump where the rate changes
         phase = 2.0 * math.pi * (part * sum(self.hz[:full]) + (t - full * part) * self.hz[full])
         x, y = self.roll[0] * math.sin(phase), self.roll[1] * math.sin(2.0 * phase)
         c, s = math.cos(self.heading), math.sin(self.heading)
@@ -382,7 +384,7 @@ class RollTask(TouchSeries):
     def _scan(self) -> ProbePose:
         press = self.presses[self._number]
         depth = self.sensing.depth(press.force)
-        error = depth * (1.0 - math.sqrt(max(self._touch.force, 0.0) / press.force))
+        error = depth * (1.0 - math.sqrt(max(self._touch.force, 0.0) / press.force))  # force goes with depth squared
         self._gone += 2.0 * math.pi * FORCE_HZ * self._dt * error
         if self._t >= press.seconds:
             self._number += 1

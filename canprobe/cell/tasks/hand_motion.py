@@ -92,6 +92,7 @@ class HandMotion(Controller):
             self.stop_s = stop.duration_s - self._t
             if not self._renewed():
                 self._end(UNWANTED)
+            # up to where it would stop now, and a place more: in the next cycle it would stop further on
             elif (why := self._way.look(self._begin + stop.length + 1.0)) is not None:
                 self._end(why)
         motion = self._motion if self._back is None else self._back

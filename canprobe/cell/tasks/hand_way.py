@@ -181,6 +181,7 @@ class HandWay:
         acceleration = float((model.qdd_max[moves] / rates[moves]).min()) / self._growth
         stop_s, why = math.inf, ""
         if self._guided:
+            # from a speed v it brakes in v / a and the time of one jerk
             stop_s, why = GUIDED_STOP_S - GUIDED_JERK_S, "it has to stop at once where nobody renews it"
         if self._plan.setup.needed_arm().profile_lag:
             stop_s, why = PROFILE_STOP_S, "the drives lag by their way to stop (profile position)"

@@ -369,6 +369,7 @@ class JointCheck(Controller):
             measurement = yield Command(q_target=q_from + share * way)
             if watched and self._presses(joint, measurement):
                 yield from self._hold(q_from + share * way)
+                # unwatched: at first the array still shows what pressed, which would turn it round again
                 return (yield from self._move(joint, q_from + share * way, -share * angle, speed, watched=False))
         return (yield from self._hold(q_from + way))
 

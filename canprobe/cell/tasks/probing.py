@@ -94,6 +94,7 @@ class ProbeMotion:
             self.limit = outside_workspace(np.array(at.flange) + self._radius * np.array(at.z), self._workspace)
         share = max([abs(step) / most for step, most in zip(dq, self._step_max, strict=True)])
         if share > 1.0:
+            # all joints by the slowest of them, so that the probe goes the same way
             dq = [step / share for step in dq]
             self.slowed += 1
         self._last = dq

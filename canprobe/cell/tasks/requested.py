@@ -89,8 +89,8 @@ class RequestedTask(WrappingController):
         self._plan = plan
         self._period_s = period_s
         self._time = MotionTime(round(1e9 * period_s))
-        self._step_s = period_s
-        self._targets: list[Floats] = []
+        self._step_s = period_s  # between the last two targets: a late cycle has several periods
+        self._targets: list[Floats] = []  # the last two: what takes over goes on at their speed
         self._make = make
         self._requests = requests
         self._asked: dict[str, float] = {}

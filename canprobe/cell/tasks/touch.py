@@ -278,6 +278,7 @@ class TouchTask(ProbingTask):
     def _ease(self, estimate: SurfaceEstimate) -> None:
         """Lower the targets by an answer: the speed where the curvature changes, the force where it is known well."""
         kappa, C, path = np.array(estimate.kappa), estimate.covariance, self._servo.travelled
+        # of the norm of K, as `change` is the norm of both curvatures: K12 stands in the tensor twice
         sigma = math.sqrt(max(0.0, C[0, 0] + 2.0 * C[1, 1] + C[2, 2]))
         before, till = self._answered
         mean = kappa + (before - kappa) * math.exp((till - path) / CHANGE_M)

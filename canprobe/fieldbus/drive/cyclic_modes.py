@@ -58,6 +58,7 @@ class CyclicPosition(CyclicMode):
         counts, onset = allowed * units.scale + units.origin, motion.onset(t_ns)
         reach_ns, passed_ns = parameters.interpolation_ns, t_ns - self._latched_ns
         passed_ns = passed_ns if passed_ns > reach_ns else reach_ns
+        # followed as far as it goes, the target of one corrupted RPDO threw the arm
         if abs(counts - onset) > parameters.max_speed * passed_ns * 1e-9 + MAX_ROUNDING_COUNTS:
             self.parts.fault(REFERENCE_LIMIT_CODE, t_ns)
             return
@@ -65,6 +66,7 @@ class CyclicPosition(CyclicMode):
         if self.parts.loop.changed:
             self.parts.loop.feed_forward()
         motion.reach(onset, counts, t_ns, t_ns + reach_ns)
+        # `_strains` compares the torque limit as well; here that saves a call in each cycle of most drives
         limited = allowed != target or (parameters.max_torque < PEAK_TORQUE_PERMILLE and self._strains())
         if limited is not self.limited:
             self._limit(limited)

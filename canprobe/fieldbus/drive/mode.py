@@ -169,6 +169,7 @@ class CyclicMode(DriveMode):
         supervision = self._supervision
         supervision.sync(fresh, t_ns)
         self._commanded = fresh or (self._commanded and self.repeats)
+        # `supervision.sync` may have found the master lost just now: the drive brakes, and nothing is latched
         if self._commanded and not self.halted and supervision.watching:
             self.latch(t_ns)
 

@@ -209,6 +209,7 @@ class Supervision:
         """Count a SYNC, with a target since the last one (fresh) or without."""
         if patience_ns := self._parameters.patience_ns:
             self._timer.arm(t_ns + patience_ns)
+        # targets by SDO come when they come: then only SYNC is watched
         if fresh or not self._by_rpdo:
             self._misses = 0
             return

@@ -116,6 +116,7 @@ def trapezoid(position: float, velocity: float, target: float, rates: Rates) -> 
         pieces.append(Piece(abs(velocity) / deceleration, position, velocity, sign * deceleration))
         position, velocity = stop, 0.0
     way, v0 = sign * (target - position), abs(velocity)
+    # from this speed p on braking ends at the target: (p² - v0²) / 2a + p² / 2d = way
     within = sqrt((2 * acceleration * deceleration * way + deceleration * v0**2) / (acceleration + deceleration))
     peak = min(speed, within)
     change = acceleration if peak >= v0 else -deceleration

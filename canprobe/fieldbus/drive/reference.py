@@ -175,6 +175,7 @@ class Motion:
             return
         self.plant.advance(due_ns)
         here = self.plant.motor_counts(self.axis)
+        # of the motor: its reference stands up to 30 ms before
         moved, self._was = abs(here - self._was), here
         self._patience -= 1
         if moved > STANDSTILL_COUNTS and self._patience > 0:

@@ -138,4 +138,5 @@ class Emergency(Service):
             raise SdoAbort(Abort.VALUE)
 
     def _check_cob_id(self, subindex: int, value: Value) -> None:
+        # with bit 30, which is "no RTR" in a TPDO and reserved here
         check_cob_id(value, self._core.dictionary.number(0x1014), reserved=0x7FFFF800)

@@ -174,6 +174,7 @@ class LssSearch:
         if position != self._position or (_number_in(data) ^ mine.numbers[position]) & asked:
             return False, False
         self._position = following
+        # after the serial number (3) the master goes on to the vendor id (0): the whole address is found
         return True, bit == 0 and following < position
 
     def _complete(self, data: bytes, sequence: range) -> list[int]:

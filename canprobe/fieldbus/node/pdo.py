@@ -94,7 +94,7 @@ class PdoEngine(Service):
             pdo.stop()
         self._late.clear()
         if self._core.state is NmtState.OPERATIONAL:
-            self._groups = []
+            self._groups = []  # with them goes their phase, which `_rebuild` keeps
             self._rebuild()
             for tpdo in self._on_event:
                 tpdo.started(t_ns)
@@ -186,6 +186,7 @@ class PdoEngine(Service):
         for group in self._groups:
             first = group.first
             if first is None:
+                # only the first by its counter, which begins again behind 1019h: that need be no multiple of the type
                 if counter != group.start:
                     continue
                 first = group.first = count

@@ -102,6 +102,7 @@ class Rpdo:
             if key in watched:
                 reported.append(key)
         if reported:
+            # one event for all: by one for each value a TPDO would go out with half of the new ones
             dictionary.written(reported)
 
     def _forgive(self) -> None:

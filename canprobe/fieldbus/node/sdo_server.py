@@ -88,12 +88,13 @@ class SdoServer(Service):
         if self.state is SdoState.IDLE:
             self._drop()
         else:
-            self._timer.arm(t_ns + self._slow_ns + SDO_TIMEOUT_NS)
+            self._timer.arm(t_ns + self._slow_ns + SDO_TIMEOUT_NS)  # the delay of the answer is ours
 
     def _answer(self, data: bytes) -> list[bytes]:
         """What is answered to a request. Raises SdoAbort when the client breaks the protocol."""
         request = request_of(self.state, data[0])
         initiate = self._initiate.get(request)
+        # frames amid a transfer name no object: an abort then names that of the transfer
         if initiate is not None or (self.state is SdoState.IDLE and request is not SdoRequest.ABORT):
             self._place = sdo.place_of(data)
         if (self.state, request) not in SDO_TRANSITIONS:

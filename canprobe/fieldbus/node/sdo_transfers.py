@@ -98,6 +98,7 @@ def block_download(
         follows = number == accepted + 1
         if follows:
             accepted = number
+            # only the end says how many bytes of the last segment are filling
             received.take(data[1:8], slack=_SEGMENT_BYTES - 1)
         if last or number == MAX_BLOCK_SEGMENTS:
             answers = [bytes((0xA2, accepted, MAX_BLOCK_SEGMENTS, 0, 0, 0, 0, 0))]

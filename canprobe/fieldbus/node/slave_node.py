@@ -162,6 +162,7 @@ class SlaveNode(Participant):
             return []
         core = self.core
         due = self.next_deadline_ns
+        # what is due at `t_ns` itself is left to `advance`, behind the frames that wait (see `lockstep`)
         if due is not None and due < t_ns:
             self._run(t_ns)
         core.now_ns = t_ns
@@ -229,7 +230,7 @@ class SlaveNode(Participant):
     def _boot(self, t_ns: int) -> None:
         self._heartbeat.boot_up(t_ns)
         self.core.state = NmtState.PRE_OPERATIONAL
-        for service in self._services[:-1]:
+        for service in self._services[:-1]:  # but the heartbeat: the boot-up message was its first
             service.entered(t_ns)
         self.application.entered(t_ns)
         self._reroute()

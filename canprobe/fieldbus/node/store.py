@@ -44,6 +44,7 @@ class Store:
         self.volatile: set[int] = set()
         core.dictionary.configured = self._unverify
         for index, act in ((0x1010, self._save), (0x1011, self._load)):
+            # as a check: where it cannot store, the write itself is aborted
             core.dictionary.on_check(index, act)
             core.dictionary.on_write(index, self._show)
 
@@ -95,4 +96,5 @@ class Store:
     def _show(self, subindex: int, value: Value) -> None:
         for index in (0x1010, 0x1011):
             for sub in _GROUPS:
+                # the write has left its signature there; who reads gets bit 0: stores, or restores, on command
                 self._core.dictionary.put(index, sub, 1)

@@ -24,6 +24,7 @@ class SyncConsumer(Service):
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int, int], None]) -> None:
         self._core, self._emcy, self._on_sync = core, emcy, on_sync
+        # it only reports: a drive stops by a watch of its own, as only it knows in which modes it needs SYNC
         self._timer = core.timers.new(lambda _due_ns: emcy.report(SYNC_LOST_CODE))
         self._overflow = self._timeout_ns = self._last = 0
         self._operational = False

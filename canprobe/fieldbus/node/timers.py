@@ -83,5 +83,5 @@ class Timers:
         self.now_ns = t_ns
         while (due_ns := self.next_ns) is not None and due_ns <= t_ns:
             timer = next(timer for timer, ns in self.armed.items() if ns == due_ns)
-            timer.cancel()
+            timer.cancel()  # before the call, which may arm it again
             timer.callback(due_ns)

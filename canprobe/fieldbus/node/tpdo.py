@@ -63,7 +63,7 @@ class Tpdo:
     def configure(self) -> None:
         """Read the parameters. A PDO with an impossible mapping stays silent."""
         number, index, entries = self._core.dictionary.number, self.rules.communication, self.rules.present()
-        self.stop()
+        self.stop()  # what waits was asked for by the parameters before
         cob_id = number(index, PdoSub.COB_ID)
         self._cob_id = cob_id & 0x7FF
         self.active = self.rules.valid and bool(entries)

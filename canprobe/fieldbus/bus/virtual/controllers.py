@@ -54,6 +54,7 @@ class BitErrors:
 
     def _gap(self) -> float:
         """Number of good bits before the next bad one."""
+        # geometric: a draw for each bad bit in place of one for each bit; 1 - u, as u may be 0
         return math.floor(math.log(1.0 - self._random.random()) / self._log) if self._log else math.inf
 
 
@@ -201,6 +202,7 @@ class Controllers:
         sequence = self._bits_ns(_RECOVERY_BITS)
         count = (until_ns - self._quiet_ns) // sequence
         self._quiet_ns += count * sequence
+        # a list: of a generator the first node that comes back would keep those behind it from counting
         if any([counters.heard_recessive(count) for counters in self._counters.values()]):
             self._show_states()
 

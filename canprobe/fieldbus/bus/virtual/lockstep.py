@@ -343,5 +343,6 @@ def arbitration_key(can_id: int) -> int:
     remote = 1 if can_id & RTR_FLAG else 0
     if can_id & EFF_FLAG:
         can_id &= EFF_MASK
+        # 0b11: SRR and IDE are recessive, so a base frame with the same eleven bits wins, even a remote request
         return (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1 | remote
     return (can_id & 0x7FF) << 21 | remote << 20

@@ -203,6 +203,7 @@ def start_position(description: Description) -> int:
     """Place of a served drive at first, counts: away from 0, and within its software limits (607Dh)."""
     limit = description.entry(0x607D, 2)
     high = limit.initial if limit is not None else None
+    # at 0 a jump to a target of 0 would not show
     return min(high // 10, _START) if isinstance(high, int) and high > 0 else _START
 
 

@@ -55,6 +55,7 @@ class BusState:
         if len(self.syncs_ns) < 3:
             return 0
         times = list(self.syncs_ns)
+        # not the mean, which one pause of the master shifts
         return sorted(b - a for a, b in pairwise(times))[(len(times) - 1) // 2]
 
     def take(self, frame: BusFrame) -> Iterator[BusEvent]:

@@ -132,7 +132,7 @@ def stepped_blind(case: Case, node: SeenNode) -> Watch[events.ControlSeen]:
             continue
         status, wanted = node.known(cia402.STATUSWORD), _STATES_FOR[command]
         if before is DriveCommand.SWITCH_ON:
-            wanted = wanted - {DriveState.READY_TO_SWITCH_ON}
+            wanted = wanted - {DriveState.READY_TO_SWITCH_ON}  # switch on has left that
         seen = f"6041h was {status.value:04X}h" if status is not None else "6041h was not seen"
         what = f"6040h = {event.word:04X}h after {event.before or 0:04X}h; {seen}"
         case.expect(node, node.state in wanted, what, status, event)

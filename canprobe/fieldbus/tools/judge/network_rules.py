@@ -67,6 +67,7 @@ def guards_beside_heartbeat(case: Case, node: SeenNode) -> Watch[events.RemoteSe
     unasked = False  # whether a heartbeat came that answers no request
     while event := (yield):
         if isinstance(event, events.HeartbeatSeen):
+            # the answer to a remote request looks like a heartbeat: same identifier, one byte, toggle bit aside
             answer = asked is not None and event.frame.t_ns - asked.t_ns < QUEUED_NS
             unasked = unasked or (event.state is not NmtState.INITIALISING and not answer)
         elif event.frame.can_id & 0x7FF == HEARTBEAT_BASE + node.node_id:

@@ -54,6 +54,7 @@ class SdoChannel:
             self._open, self._aborted = None, one or self._aborted
             writes, of, request = (one.writes, one.place, one.request) if one is not None else (False, None, None)
             yield AbortSeen(frame, self._node, writes, of, place, sdo.abort_code(data), True, request)
+        # its frames are segments now, whose first byte is a number and looks like any command
         elif one is not None and one.block and one.answered:
             if not one.writes and data[0] == _BLOCK_END:
                 yield from self._end(frame)

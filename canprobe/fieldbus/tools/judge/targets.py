@@ -49,6 +49,7 @@ class Onward:
             least = self._least if cyclic else 0.0
             before = self._before
             found = found or (before is not None and before > least and self._way >= 0.9 * before)
+            # 0 for good: an axis that has stood for a window was stopped, and what comes later is another motion
             self._before, self._way = (0.0 if before == 0.0 else self._way), 0.0
             self._begin_ns += self._window_ns
         if event.frame.t_ns >= self._begin_ns and event.before is not None:
