@@ -68,7 +68,7 @@ class DriveParameters:
         number = self._dictionary.number
         self.units.read()
         sync_ns, value = number(0x1006) * 1000, number(0x60C2, 1, -1)
-        period_ns = sync_ns if value < 0 else value * 10 ** max(0, 9 + number(0x60C2, 2, -4))
+        period_ns = sync_ns if value < 0 else value * 10 ** max(0, 9 + number(0x60C2, 2, -3))  # CiA 402: ms by default
         self.interpolation_ns = period_ns or CONTROL_PERIOD_NS
         self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
         self.position_window = self._window(0x6067, DEFAULT_WINDOW)

@@ -153,6 +153,14 @@ def test_60c2_as_delivered_of_0_does_not_divide_by_it(serve):
     assert served.rig.counts == 200
 
 
+def test_60c2_without_an_index_counts_milliseconds_as_the_plan_takes_it(serve):
+    objects = standard_drive()
+    del objects[0x60C2, 2]
+    served = serve(Make("without_index", 0x0203, objects=objects))
+    assert served.wish(0x60C2, 1, 10) == 0
+    assert served.bench.node.application.parts.parameters.interpolation_ns == 10_000_000
+
+
 def test_a_unit_of_the_plant_is_the_position_unit_as_delivered(serve):
     """An EDS with degrees as delivered: 4096 lines, gear 100, feed 360."""
     objects = standard_drive()
