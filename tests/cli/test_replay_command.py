@@ -16,7 +16,7 @@ SYNCS = "".join(f"({k // 400:010d}.{k % 400 * 2500:06d}) can0 080#\n" for k in r
         ({"bus.log": SYNCS, "scene.toml": "[scen]\n"}, [], "scene.toml: scen: unknown section; did you mean scene?"),
         ({"bus.log": SYNCS}, ["--scene", "cylindr"], "cylindr: no such scene, cell or file; did you mean cylinder?"),
         ({"bus.log": SYNCS}, ["--scene", "press"], "scene press: task press estimates no shape"),
-        ({"bus.log": SYNCS}, ["--scene", "cylinder", "--method", "recursiv"], 'did you mean "recursive"?'),
+        ({"bus.log": SYNCS}, ["--scene", "cylinder", "--method", "recursiv"], "did you mean recursive?"),
         ({"bus.log": SYNCS}, ["--scene", "cylinder"], "node 1 (joint 1) was never heard: no TPDO 181h"),
         ({"bus.log": SYNCS + "(00\n"}, ["--scene", "cylinder"], "bus.log:11: no candump line: '(00'"),
         ({"bus.log": SYNCS + "(00"}, ["--scene", "cylinder"], "node 1 (joint 1) was never heard: no TPDO 181h"),

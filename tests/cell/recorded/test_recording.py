@@ -182,7 +182,7 @@ def test_what_is_missing_or_wrong_in_the_request(lockstep_run, tmp_path):
         canprobe.replay(tmp_path / "bus.log")
     with pytest.raises(UsageError, match=r"none\.log: no such folder or file"):
         canprobe.replay(tmp_path / "none.log", scene="cylinder")
-    with pytest.raises(UsageError, match='did you mean "recursive"'):
+    with pytest.raises(UsageError, match=r"did you mean recursive\?"):
         canprobe.replay(lockstep_run.out, method="recursve")
     with pytest.raises(UsageError, match="task press estimates no shape"):
         canprobe.replay(lockstep_run.out, scene="press")

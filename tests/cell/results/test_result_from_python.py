@@ -94,7 +94,7 @@ def test_an_own_estimator_stands_beside_ours(result):
 
 
 def test_what_cannot_be_scored(result):
-    with pytest.raises(UsageError, match=r"expected one of chen1996, .* did you mean \"ml\""):
+    with pytest.raises(UsageError, match=r"expected one of chen1996, .* did you mean ml"):
         result.score("mll")
     press = canprobe.run("press", {"task.clearance_mm": 0.5}, bus="direct", duration_s=0.05, files=False)
     assert press.contacts is None
