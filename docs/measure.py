@@ -57,6 +57,7 @@ ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --p
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
 LONG = ("faults", "test_lines", "soak", "growth", "held", "canopen_node", "canopen_node_vcan")
 FORMS = {
+    "faults": "faults --draw=1",
     "bound": "estimators",
     "calibrations": "calibration",
     "exploration": "surfaces",
