@@ -62,6 +62,19 @@ CASES: Mapping[str, tuple[str, Callable[[], Score]]] = {
         "array reads 0.3 of the force since before its first contact: press",
         partial(press, 4.0, Phase.MOVE, "gain-lost", values={"gain": 0.3}),
     ),
+    "fading": (
+        "array reads 30 counts less each second: cylinder at 2 mm/s",
+        partial(
+            from_phase,
+            "cylinder",
+            {"task.speed_mm_s": 2.0, "task.duration_s": 6.0, "shape.also": ()},
+            Phase.SCAN,
+            0.5,
+            "drift",
+            node_id=16,
+            values={"counts_s": -30.0},
+        ),
+    ),
     "dead-rows": ("four of sixteen rows dead in the middle of the first contact: press", partial(of_study, 297)),
     "half-torque": ("drive of joint 2 loses half of its torque: explore, dynamic plant", partial(of_study, 1469)),
     "no-torque": (

@@ -123,12 +123,12 @@ class StuckRows(ImageFault):
 
 
 class Drift(ImageFault):
-    """All taxels drift upward, in whole counts where the array has such."""
+    """All taxels drift, up or down, in whole counts where the array has such."""
 
     name = "drift"
 
     def change(self, image: Raw, held_s: float) -> None:
-        image[...] = np.minimum(image + self.fault.value("counts_s") * held_s, COUNTS_MAX)
+        image[...] = np.clip(image + self.fault.value("counts_s") * held_s, 0, COUNTS_MAX)
 
 
 class Saturation(ImageFault):
