@@ -77,6 +77,11 @@ def _frame(limits: Limits) -> int:
     return (limits.tactile_cycles + 2) * limits.period_ns
 
 
+def _missed(limits: Limits) -> int:
+    """Time until a node that misses more than `missed_cycles` is noticed, ns."""
+    return (limits.missed_cycles + 2) * limits.period_ns
+
+
 def _sample(limits: Limits) -> int:
     """Time from an instant to the reaction on the tactile sample of it, which is sent a frame later."""
     return limits.cycles_to_feel * limits.period_ns
@@ -171,7 +176,7 @@ def _drive_late(seen: CycleState) -> BusError | None:
     return _not_heard(seen, HOLD_CYCLES, "")
 
 
-@_checked("drive silent", Reaction.LIFT, lambda limits: (limits.missed_cycles + 2) * limits.period_ns)
+@_checked("drive silent", Reaction.LIFT, _missed)
 def _drive_silent(seen: CycleState) -> BusError | None:
     return _not_heard(seen, seen.limits.missed_cycles + 1, "lost: ")
 
@@ -189,12 +194,7 @@ def _not_heard(seen: CycleState, cycles: int, word: str) -> BusError | None:
     return axis.error(f"{word}no usable TPDO for {ages[i]} cycles")
 
 
-@_checked(
-    "position of the carrier lost, or a jump of it",
-    Reaction.RETREAT,
-    lambda limits: (limits.missed_cycles + 2) * limits.period_ns,
-    enabling=True,
-)
+@_checked("position of the carrier lost, or a jump of it", Reaction.RETREAT, _missed, enabling=True)
 def _carrier(seen: CycleState) -> NodeError | None:
     return seen.carrier.lost if seen.carrier is not None else None
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 import numpy as np
 
@@ -99,11 +99,13 @@ class PushWitness:
         means = list(self._means)
         now, recent = means[-1], [one for one in means[:-LATEST] if math.isfinite(one.way[0])]
         like, early = self._alike(recent, now), self._alike(self._early, now)
-        unfelt, self.sigma = self._unfelt(now, like[-MOST_LIKE:] if len(like) >= LEAST_LIKE else recent)
-        if len(early) >= LEAST_LIKE and not unfelt > self._certain(self.sigma):
-            # the oldest of them, since which a slow push has grown most
-            unfelt, self.sigma = self._unfelt(now, early[:MOST_LIKE])
-        shows = unfelt > self._certain(self.sigma)
+        shows = False
+        # of the earlier ones the oldest, since which a slow push has grown most
+        for before in (like[-MOST_LIKE:] if len(like) >= LEAST_LIKE else recent, early[:MOST_LIKE]):
+            if len(before) >= LEAST_LIKE and not shows:
+                push, self.sigma = push_since(self._geometry, now, before)
+                unfelt = push - (now.force - float(np.mean([one.force for one in before])))
+                shows = unfelt > max(PUSH_SIGMAS * self.sigma, self._least)
         self.unfelt = unfelt if shows and self._showed else None
         self._showed = shows
 
@@ -114,12 +116,3 @@ class PushWitness:
         differs = np.abs(np.array([one.way for one in before]) - now.way)
         alike = np.all(differs <= LIKE_SHARE * np.abs(now.way) + self._least_way, axis=1)
         return [one for one, is_alike in zip(before, alike.tolist(), strict=True) if is_alike]
-
-    def _unfelt(self, now: TorqueMean, before: Sequence[TorqueMean]) -> tuple[float, float]:
-        """Growth of the push that the array has not measured since a moment before, and its standard deviation, N."""
-        push, sigma = push_since(self._geometry, now, before)
-        return push - (now.force - float(np.mean([one.force for one in before]))), sigma
-
-    def _certain(self, sigma: float) -> float:
-        """Least push that is none by chance, N."""
-        return max(PUSH_SIGMAS * sigma, self._least)
