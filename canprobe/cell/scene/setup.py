@@ -289,17 +289,27 @@ class Probe:
     is_flat: bool = False
 
     @property
-    def T_flange_tip(self) -> Floats:
-        """(4, 4) of the point of its pole on the flange; z is the pole."""
-        T = self.T_flange_probe.copy()
-        T[:3, 3] += self.radius * T[:3, 2]
-        return T
+    def lever(self) -> float:
+        """Distance along the pole from its centre to the point whose ways count, m: 0, the centre itself.
+
+        A flat pad has its tip: a count of an encoder moves its centre, 10 m away, by a millimetre.
+        """
+        return self.radius if self.is_flat else 0.0
 
     @property
     def T_flange_point(self) -> Floats:
-        """(4, 4) of the point whose ways count: its centre. A flat pad has its tip, as a count of an encoder moves its
-        centre, 10 m away, by a millimetre."""
-        return self.T_flange_tip if self.is_flat else self.T_flange_probe
+        """(4, 4) of the point whose ways count on the flange; z is the pole."""
+        return self._along_pole(self.lever)
+
+    @property
+    def T_flange_tip(self) -> Floats:
+        """(4, 4) of the point of its pole on the flange; z is the pole."""
+        return self._along_pole(self.radius)
+
+    def _along_pole(self, distance: float) -> Floats:
+        T = self.T_flange_probe.copy()
+        T[:3, 3] += distance * T[:3, 2]
+        return T
 
     @property
     def tip(self) -> str:

@@ -158,7 +158,7 @@ class ProbingTask(Task):
         self._drives_witness = bounds_search(plan)
         probe = plan.setup.probe
         self._follows_depth = not probe.is_flat  # a flat pad has no foot on the object
-        self._reach = probe.radius if probe.is_flat else 0.0  # from its centre to the point whose ways count
+        self._lever = probe.lever
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
         self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
@@ -256,7 +256,7 @@ class ProbingTask(Task):
         """Ask what else knows of the force: whether the images live, and how deep the probe is."""
         touch, sensing = self._touch, self.sensing
         T = contact.T_base_probe if contact is not None else sensing.probe_at(sample.t_sample_ns)
-        centre = None if T is None else T[:3, 3] + self._reach * T[:3, 2]
+        centre = None if T is None else T[:3, 3] + self._lever * T[:3, 2]
         normal = contact.n_base if contact is not None else None
         touch.images.look(sample, patch, centre, sensing.image_sigma if contact is not None else None)
         if not self._follows_depth or self.phase not in _IN_CONTACT:

@@ -374,7 +374,7 @@ class TouchTask(ProbingTask):
             rolling_share=scan.rolling_share if scan is not None else 0.0,
         )
         self.depth.restart()
-        self._sinking = Sinking(contact, pose, self.sensing.radius, self._reach)
+        self._sinking = Sinking(contact, pose, self.sensing.radius, self._lever)
         self._touched = True
         self._enter(Phase.SETTLE)
 
@@ -439,7 +439,7 @@ class TouchTask(ProbingTask):
             loss.regained_s = (self._cycle - loss.cycle) * self._period_s
             self._servo.rest_on(self._contact.p_base, self._contact.n_base)
             self.depth.restart()
-            self._sinking = Sinking(self._contact, pose, self.sensing.radius, self._reach)
+            self._sinking = Sinking(self._contact, pose, self.sensing.radius, self._lever)
             self._search = None
             self._enter(Phase.REGAIN)
         return pose
