@@ -49,6 +49,12 @@ def stuck_joint(scene: str, joint: int, after_s: float) -> Score:
     return from_phase(scene, changes, Phase.SCAN, after_s, "brake-stuck", node_id=joint, duration_ns=10**9)
 
 
+def fading(speed_mm_s: float) -> Score:
+    """A scan whose array reads ever less."""
+    changes = {"task.speed_mm_s": speed_mm_s, "task.duration_s": 8.0, "shape.also": ()}
+    return from_phase("cylinder", changes, Phase.SCAN, 0.5, "drift", node_id=16, values={"counts_s": -30.0})
+
+
 def lost_while_others_move(seed: int) -> Score:
     """A run of study `recover` in which a joint stops without a word."""
     run = recover.run_case(recover.draw_case(seed))
@@ -62,19 +68,13 @@ CASES: Mapping[str, tuple[str, Callable[[], Score]]] = {
         "array reads 0.3 of the force since before its first contact: press",
         partial(press, 4.0, Phase.MOVE, "gain-lost", values={"gain": 0.3}),
     ),
-    "fading": (
-        "array reads 30 counts less each second: cylinder at 2 mm/s",
-        partial(
-            from_phase,
-            "cylinder",
-            {"task.speed_mm_s": 2.0, "task.duration_s": 6.0, "shape.also": ()},
-            Phase.SCAN,
-            0.5,
-            "drift",
-            node_id=16,
-            values={"counts_s": -30.0},
-        ),
-    ),
+    **{
+        f"fading-{speed:g}mm_s": (
+            f"array reads 30 counts less each second: cylinder at {speed:g} mm/s",
+            partial(fading, speed),
+        )
+        for speed in (2.0, 10.0)
+    },
     "dead-rows": ("four of sixteen rows dead in the middle of the first contact: press", partial(of_study, 297)),
     "half-torque": ("drive of joint 2 loses half of its torque: explore, dynamic plant", partial(of_study, 1469)),
     "no-torque": (

@@ -124,6 +124,8 @@ COMING = (Phase.MOVE, Phase.APPROACH, Phase.SETTLE)
 """Phases in which the probe comes from free space: the way that it has taken leads off what it touches."""
 
 
+ARM_LENGTH_M = 0.4
+"""Length of a small arm, m: one whose flange is off by some share of it goes ways that are off by that share."""
 LEAVING = (Phase.RETREAT, Phase.DONE)
 _IN_CONTACT = (Phase.SETTLE, Phase.SCAN, Phase.REGAIN)
 
@@ -154,9 +156,10 @@ class ProbingTask(Task):
         self.taxels: NDArray[np.uint8] | None = None
         self._setup = plan.setup
         self._touch = TouchState(limits_of(plan))
-        self.depth = self._touch.depth = DepthWitness(sensing.radius, holds=holds)
-        self._drives_witness = bounds_search(plan)
         probe = plan.setup.probe
+        slope_sigma = probe.place_sd / ARM_LENGTH_M
+        self.depth = self._touch.depth = DepthWitness(sensing.radius, holds=holds, slope_sigma=slope_sigma)
+        self._drives_witness = bounds_search(plan)
         self._follows_depth = not probe.is_flat  # a flat pad has no foot on the object
         self._lever = probe.lever
         self._period_s = self._dt = plan.sync.period_ns * 1e-9

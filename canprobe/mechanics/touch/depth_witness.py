@@ -8,6 +8,9 @@ Contacts are kept with their force, not their depth, so that a better d₁ place
 surface contradicts begins a suspect time; what comes in it is not believed until it agrees again, or until the path is
 so long that the witness has nothing to say. A force that falls from one image to the next by more than the probe can
 have moved off begins one at once: from then on d₁ is that of before, too.
+
+A touch that goes on over new ground is followed by its `Sinking`, too, as contacts that sink with the probe show no
+surface that would contradict them.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from canprobe.mechanics.touch.sinking import Sinking
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
@@ -42,6 +46,8 @@ CURVATURE_CHANGE = 12.0
 """Standard deviation of the curvature a few millimetres further, 1/m: of a fillet it jumps by 30."""
 CERTAIN_SIGMAS = 2.5
 """Standard deviations of the depth that must lie within the margin to the limit of the force."""
+SUNK_SHARE = 0.8
+"""Share of the margin to the limit by which a probe has sunk when it counts."""
 CONTRADICTED_S = 0.05
 """Time for which a contradiction lasts before it counts."""
 FALL_SHARE = 0.6
@@ -108,11 +114,12 @@ class DepthWitness:
     Args:
         radius: radius of the probe, m.
         holds: the touch stays in one place: only its first contacts show the surface.
+        slope_sigma: standard deviation of a way of the arm against where it says that it goes, rad.
 
     Attributes:
         depth, sigma: depth of the probe in the surface that was touched before, m, and its standard deviation; NaN and
             infinite where nothing is known.
-        force: force of that depth, N.
+        force: force of that depth, or of the depth to which the probe has sunk, N.
         fall: fall of the force that no motion explains, as long as it lasts; None without one.
         contradicts: whether the depth has meant far more force than was measured for `CONTRADICTED_S`, or a touch in
             one place has wandered for as long.
@@ -120,8 +127,8 @@ class DepthWitness:
         watched, silent: number of contacts at which the witness could say something, and could not.
     """
 
-    def __init__(self, radius: float, *, holds: bool = False) -> None:
-        self._radius, self._holds = radius, holds
+    def __init__(self, radius: float, *, holds: bool = False, slope_sigma: float = 0.0) -> None:
+        self._radius, self._holds, self._slope_sigma = radius, holds, slope_sigma
         self.watched = self.silent = 0
         self.restart()
 
@@ -131,6 +138,7 @@ class DepthWitness:
         self._recent: list[_Kept] = []
         self._deep_since: float | None = None
         self._last: _Kept | None = None
+        self._sinking = Sinking(self._slope_sigma)
         self._d1: float | None = None
         self.fall: Fall | None = None
         self.depth, self.sigma, self.force = math.nan, math.inf, math.nan
@@ -167,7 +175,11 @@ class DepthWitness:
         if self.fall is not None and (not known or force >= FALL_SHARE * self.force):
             self.fall = self._d1 = None
         least = max(doubt, 0.5 * (limit - now))
-        deeper = known and self.depth - now > least
+        sunk = self._sinking.step(centre, normal, contact.root, d1) if normal is not None and not self._holds else 0.0
+        sinks = sunk > SUNK_SHARE * max(limit - now, 0.0)
+        if sinks:
+            self.force = max(((now + sunk) / d1) ** 2, 0.0 if math.isnan(self.force) else self.force)
+        deeper = sinks or (known and self.depth - now > least)
         suspect = known and self.depth - now > 0.5 * least
         aside = self._believed[0].aside(contact) if self._holds and self._believed else 0.0
         self.wandered = aside if aside > WANDER else None

@@ -21,6 +21,7 @@ LIMITS = {
     "image.force_errors",
     "pad",
     "shapes",
+    "sinking",
     "stops",
     "tangent_frames",
 }

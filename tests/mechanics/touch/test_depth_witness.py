@@ -170,3 +170,50 @@ def test_a_contact_on_a_flank_does_not_show_the_top():
             witness.step(k * STEP_S, centre, np.array([0.0, 0.0, 1.0]), 2.0, d1=D1, force_max=LIMIT)
         depths.append(witness.depth)
     assert depths[1] == pytest.approx(depths[0], abs=1e-6)
+
+
+def sinking(t, rate=0.1e-3):
+    """Depth of a probe that sinks from 0.5 s on, m."""
+    return depth(2.0) + rate * max(t - 0.5, 0.0)
+
+
+@pytest.mark.parametrize("speed", [2e-3, 5e-3])
+def test_a_probe_that_sinks_with_its_contacts_is_told_before_the_limit(speed):
+    """The array fades, the servo holds what it shows, and each contact lies a little deeper than the last one."""
+    witness = DepthWitness(R)
+    times = scan(witness, 5.0, speed, sinking, lambda t: 2.0)
+    assert times, "never noticed"
+    assert 0.8 * LIMIT < (sinking(times[0]) / D1) ** 2 < LIMIT
+    assert witness.force > 0.8 * LIMIT
+
+
+def test_a_probe_that_goes_in_as_far_as_its_force_says_does_not_sink():
+    witness = DepthWitness(R)
+    assert not scan(witness, 2.5, 5e-3, sinking, lambda t: (sinking(t, 0.07e-3) / D1) ** 2)
+
+
+def over_plane(witness, *, tilt=0.0, rate=0.0):
+    """The first time at which a scan to and fro over 20 mm of a plane, at 14 mm/s, is contradicted; None: never.
+
+    The arm's ways are off by an angle, rad; the probe sinks, m/s.
+    """
+    for k in range(1200):
+        t, x = k * STEP_S, 20e-3 * (1.0 - abs(1.0 - (k % 600) / 300))
+        centre = np.array([x, 0.0, R - depth(2.0) - tilt * x - rate * t])
+        witness.step(t, centre, np.array([0.0, 0.0, 1.0]), 2.0, d1=D1, force_max=LIMIT)
+        if witness.contradicts:
+            return t
+    return None
+
+
+def test_a_path_that_comes_back_shows_how_far_the_probe_has_sunk():
+    told = over_plane(DepthWitness(R), rate=0.06e-3)
+    assert told is not None
+    assert 3.0 < ((depth(2.0) + 0.06e-3 * told) / D1) ** 2 < LIMIT
+
+
+def test_an_arm_that_is_not_where_it_says_goes_ways_at_an_angle():
+    """Between two new places nothing else tells the sinking of a probe from ways that are off."""
+    assert over_plane(DepthWitness(R), tilt=4e-3) is None
+    assert over_plane(DepthWitness(R), tilt=30e-3) is not None
+    assert over_plane(DepthWitness(R, slope_sigma=30e-3), tilt=30e-3) is None
