@@ -29,6 +29,7 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.protocol.pdo import PdoEntry
 from canprobe.mechanics.touch.mesh_fit import MeshHeights
 from canprobe.mechanics.touch.servo import TARGET_RATES
+from canprobe.mechanics.touch.stops import depth_on_bluntest
 
 MIN_CHARACTERS = 40
 """Least length of a line: no line is broken before it."""
@@ -348,8 +349,13 @@ def _measured(setup: Setup) -> str:
     """The quantities of the task's contact that the array measures, in words."""
     support, array = support_of(setup), setup.array
     assert support is not None and array is not None
-    if setup.touch is None or array.pad.is_flat:
+    if setup.touch is None:
         return f"it measures {support}"
+    if array.pad.is_flat:
+        force, reach = setup.touch.force, array.pad.reach_m
+        bluntest = reach**2 / (2.0 * depth_on_bluntest(force, setup.probe.stiffness, reach))
+        fits = f"its patch at {force:g} N fits on what is rounder than a ball of {1e3 * bluntest:.2g} mm radius"
+        return f"it measures {support}; {fits}"
     return f"at {setup.touch.least_force:g} N on a plane about {support.taxels:.0f} taxels are pressed: {support}"
 
 

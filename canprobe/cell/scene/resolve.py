@@ -347,14 +347,14 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     if settings.kind == "listen":
         return Listen(array, probe, settings.duration_s)
     from canprobe.mechanics.touch.servo import SurfaceGains
-    from canprobe.mechanics.touch.stops import depth_on_plane
+    from canprobe.mechanics.touch.stops import depth_on_bluntest, depth_on_plane
 
     assert arm is not None
     servo = scene.servo or ServoSettings()
     most = scene.limits.force_max_n  # presses as deep as a blind search goes
     pressed = depth_on_plane(most, probe.stiffness, probe.radius)
-    if probe.is_flat:  # on the bluntest round object whose patch, of half width a = √(2Rδ), fits on the array
-        pressed = 2.0 * most / (math.pi * probe.stiffness * array.pad.reach_m**2)
+    if probe.is_flat:
+        pressed = depth_on_bluntest(most, probe.stiffness, array.pad.reach_m)
     touching: dict[str, Any] = {
         "arm": arm,
         "array": array,

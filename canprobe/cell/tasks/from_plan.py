@@ -38,7 +38,7 @@ def make_sensing(task: Touch | Calibrate) -> ContactSensing:
     from canprobe.cell.tasks.sensing import ContactSensing
 
     moments = isinstance(task, Touch) and _uses_patch(task)
-    return ContactSensing(task.arm, task.probe, task.array, moments=moments, carrier=task.carrier)
+    return ContactSensing(task.arm, task.probe, task.array, task.force, moments=moments, carrier=task.carrier)
 
 
 def centroid_coupling(probe: Probe) -> float:

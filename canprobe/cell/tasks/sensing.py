@@ -23,6 +23,7 @@ from canprobe.mechanics.touch.image.moments import Moments
 from canprobe.mechanics.touch.image.pad_lag import PadLag
 from canprobe.mechanics.touch.image.silent_taxels import mended
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
+from canprobe.mechanics.touch.stops import depth_on_bluntest
 from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 
 
 MAX_STIFFNESS_RATIO = 6.0
-"""Largest ratio of the measured slope and the slope by the stated stiffness on a plane; the slope is limited to it."""
+"""Largest ratio of the measured slope and that of before any touch; the slope is limited to it. Squared for a flat
+array, whose first slope knows neither layer nor object."""
 HISTORY_CYCLES = 64
 """Cycles whose joints are kept."""
 SPEED_OVER_NS = 10_000_000
@@ -84,6 +86,7 @@ class ContactSensing:
 
     Args:
         arm, probe, array: the arm, and what it touches with.
+        force: wanted force, N.
         moments: the contacts have the second moments of their images.
         carrier: what the object moves with; None: it stands still.
 
@@ -96,7 +99,9 @@ class ContactSensing:
         track: where the carrier is in time; None without one.
     """
 
-    def __init__(self, arm: Arm, probe: Probe, array: Array, *, moments: bool, carrier: Carrier | None = None) -> None:
+    def __init__(
+        self, arm: Arm, probe: Probe, array: Array, force: float, *, moments: bool, carrier: Carrier | None = None
+    ) -> None:
         calibration = make_patch_calibration(array.calibration, array.pad)
         self.model: ArmModel = arm.model
         self.flange_probe: Floats = probe.T_flange_probe
@@ -106,6 +111,11 @@ class ContactSensing:
         self.slope: Slope | None = None
         self._settled = True
         self.set_kappa(np.zeros(2))
+        self._most_ratio = MAX_STIFFNESS_RATIO
+        if probe.is_flat:  # how deep it goes is by the object's curvature, of which nothing is known before a touch
+            self.set_depth_at_1_n(depth_on_bluntest(force, probe.stiffness, array.pad.reach_m) / math.sqrt(force))
+            self._most_ratio **= 2
+        self._first_slope = 1.0 / self._depth_at_1_n
         self.patch: Patch | None = None
         self.dropped = 0
         self.image_sigma: float | None = None
@@ -158,8 +168,8 @@ class ContactSensing:
 
     def set_slope(self, slope: Slope) -> None:
         """Take the slope that a touch showed; depths follow from it until the object's curvature is known."""
-        flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
-        self.slope = slope._replace(value=min(max(slope.value, flat / MAX_STIFFNESS_RATIO), flat * MAX_STIFFNESS_RATIO))
+        least, most = self._first_slope / self._most_ratio, self._first_slope * self._most_ratio
+        self.slope = slope._replace(value=min(max(slope.value, least), most))
         self._settled = False
         self._depth_at_1_n = 1.0 / self.slope.value
 

@@ -115,8 +115,8 @@ def loop_of(case: LoopCase) -> ForceLoop:
 def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> ContactSensing:
     """The scene's sensing, of another kind."""
     setup = resolve(scene)
-    assert setup.arm is not None and setup.array is not None
-    return kind(setup.arm, setup.probe, setup.array, moments=False)
+    assert setup.arm is not None and setup.array is not None and setup.touch is not None
+    return kind(setup.arm, setup.probe, setup.array, setup.touch.force, moments=False)
 
 
 def delay(world: World, late_ids: Container[int], late_ns: Callable[[int], int]) -> None:

@@ -54,6 +54,17 @@ def depth_on_plane(force: float, stiffness: float, radius: float) -> float:
     return math.sqrt(force / (math.pi * stiffness * radius))
 
 
+def depth_on_bluntest(force: float, stiffness: float, reach: float) -> float:
+    """Indentation of a flat layer, m, by the bluntest ball whose patch fits on it: half width `a = √(2Rδ)`.
+
+    Args:
+        force: N.
+        stiffness: K/h of the layer, N/m³.
+        reach: distance from the middle to the nearest edge, m.
+    """
+    return 2.0 * force / (math.pi * stiffness * reach**2)
+
+
 class AtRest:
     """Spread and saturation from running means (Welford): constant time and memory."""
 
