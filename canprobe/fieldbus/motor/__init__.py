@@ -17,8 +17,8 @@ that is not asked is silent:
 
 What masters trip over: numbers are places in ranges which no frame names (registers 21 to 23 have them). A motor in a
 fault answers every command and stands still, and only the status, the high nibble of the first byte, shows it. The
-watchdog (register 9, ticks of 50 µs) is off as the factory leaves it, and any frame to the motor feeds it. The answer to
-a request has the identifier of feedback. MST_ID is 000h at the factory, which is NMT beside CANopen nodes: `on_bus`
+watchdog (register 9, ticks of 50 µs) is off as the factory leaves it, and any frame to the motor feeds it. The answer
+to a request has the identifier of feedback. MST_ID is 000h at the factory, which is NMT beside CANopen nodes: `on_bus`
 refuses that.
 
 Invariants: a decoder raises `ProtocolError` and nothing else; a motor never sleeps, opens, waits or raises, whatever is

@@ -6,6 +6,7 @@ from a binary. What that leaves open is decided here, and docs/motors.md has eac
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from struct import pack, unpack
 
@@ -18,6 +19,8 @@ from canprobe.fieldbus.protocol.frames import Frame
 
 _MAX_STEPS = 400
 """Most steps of the joint between two frames. Behind more than 20 ms they are longer, which costs accuracy alone."""
+_FAR = 1e9
+"""Where a velocity leads, rad."""
 _FLASH_NS = 30_000_000
 """Time that writing the flash takes."""
 _TRIP_TICKS = dict(zip(range(MotorStatus.OVERVOLTAGE, 13), (20_001, 5_001, 5_001, 8_001, 8_001), strict=True))
@@ -35,7 +38,7 @@ class DamiaoMotor(Participant):
 
     Attributes:
         node_id: id by which faults name it, which is its first ESC_ID.
-        torque: largest torque, N·m, whatever its registers say.
+        ranges: what it is made for, whatever its registers 21 to 23 say.
         joint: what it turns.
         registers: values by number, in RAM.
         status: its status; a fault is latched.
@@ -48,12 +51,11 @@ class DamiaoMotor(Participant):
     _tripped = frozenset[MotorStatus]()
 
     def __init__(self, type_name: str, motor_id: int, mst_id: int = 0, q: float = 0.0) -> None:
-        ranges = protocol.TYPES[type_name]
-        self.node_id, self.torque = motor_id, ranges.t
-        self.joint, self.heat = MotorJoint(ranges, q), (30, 30)
+        self.node_id, self.ranges = motor_id, protocol.TYPES[type_name]
+        self.joint, self.heat = MotorJoint(self.ranges, q), (30, 30)
         self._flash = {rid: register.value for rid, register in protocol.REGISTERS.items()}
         self._flash |= {Rid.ESC_ID: motor_id, Rid.MST_ID: mst_id}
-        self._flash |= zip((Rid.PMAX, Rid.VMAX, Rid.TMAX), ranges, strict=True)
+        self._flash |= zip((Rid.PMAX, Rid.VMAX, Rid.TMAX), self.ranges, strict=True)
         self.start(0)
 
     @property
@@ -93,7 +95,7 @@ class DamiaoMotor(Participant):
         """
         self.status = status
         self._tripped = self._tripped | {status} if status >= MotorStatus.OVERVOLTAGE else frozenset()
-        self._command, self._goal, self._speed, self._limit = MitCommand(), 0.0, 0.0, self.torque
+        self._command, self._goal, self._speed, self._limit = MitCommand(), 0.0, 0.0, self.ranges.t
 
     def _trips(self) -> list[tuple[int, MotorStatus]]:
         """What the motor will trip of, and when, unless something changes."""
@@ -131,18 +133,17 @@ class DamiaoMotor(Participant):
         return self._written(self._feedback())
 
     def _take(self, mode: Mode, data: bytes) -> None:
-        """Take a target; modes but MIT follow theirs by its law, with all of its stiffness and damping."""
+        """Take a target; modes but MIT move theirs there, and follow it by the law of MIT at its stiffest."""
         with suppress(ProtocolError):
             target = protocol.unpack_target(mode, data, self._scale)
             if mode is Mode.MIT:
                 self._command = MitCommand(*target)
-            elif mode is Mode.VEL:
-                self._command = MitCommand(v=target[0], kd=protocol.KD_MAX)
-            else:
-                start = self._command.p if self._command.kp else self.joint.q
-                self._command = MitCommand(start, kp=protocol.KP_MAX, kd=protocol.KD_MAX)
-                self._goal, self._speed = target[0], abs(target[1])
-                self._limit = self.torque * min((*target, 1.0)[2], 1.0)
+                return
+            v = target[0]
+            self._goal, speed, share = (math.copysign(_FAR, v), v, 1.0) if mode is Mode.VEL else (*target, 1.0)[:3]
+            self._speed, self._limit = min(abs(speed), self.ranges.v), self.ranges.t * min(share, 1.0)
+            start = self._command.p if self._command.kp else self.joint.q
+            self._command = MitCommand(start, kp=protocol.KP_MAX, kd=protocol.KD_MAX)
 
     @property
     def _scale(self) -> protocol.Ranges:

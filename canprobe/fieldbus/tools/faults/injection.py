@@ -13,7 +13,7 @@ from canprobe.fieldbus.drive.drive import DriveApplication
 from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Fault, FaultKind, FaultSpan
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
 from canprobe.fieldbus.tools.faults.frame_faults import HEADER_INDEX
-from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
+from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, SERVED_FAULTS, FaultyMotor
 from canprobe.fieldbus.tools.faults.text import node_of, parse_fault
 
 
@@ -25,7 +25,7 @@ class FaultyNodes:
         kinds: kinds of faults that may be thrown.
     """
 
-    def __init__(self, nodes: Iterable[FaultyNode], kinds: Mapping[str, FaultKind] = BUS_FAULTS) -> None:
+    def __init__(self, nodes: Iterable[FaultyNode], kinds: Mapping[str, FaultKind] = SERVED_FAULTS) -> None:
         self.nodes = list(nodes)
         self.kinds = kinds
 
@@ -42,7 +42,10 @@ class FaultyNodes:
         """
         fault = parse_fault(text, self.kinds)
         node = self._node(fault.node_id, text)
-        kind = fault.kind
+        kind, is_motor = fault.kind, isinstance(node, FaultyMotor)
+        if kind.name not in MOTOR_FAULTS if is_motor else kind.needs == "motor":
+            of_motors = ", ".join(MOTOR_FAULTS)
+            raise UsageError(f"fault {text!r}: {kind.name} cannot happen to {node.name}; to motors can: {of_motors}")
         if kind.needs == "drive" and not isinstance(node.node.application, DriveApplication):
             raise UsageError(f"fault {text!r}: node {fault.node_id} is no CiA 402 drive, which {kind.name} needs")
         if kind.needs == "array" and not node.node.dictionary.has_index(HEADER_INDEX):
