@@ -182,7 +182,7 @@ def test_vel_takes_four_bytes_and_eight(master):
     for behind in (b"", bytes(4)):
         master.answer(0x201, pack_target(Mode.VEL, 3.0) + behind)
         master.wait(S)
-        assert master.motor.joint.qd == pytest.approx(3.0, rel=0.1)
+        assert master.motor.joint.qd == pytest.approx(3.0, rel=1e-3)
 
 
 def test_registers_answer_with_what_is_effective(master):
@@ -264,7 +264,7 @@ def test_a_later_fault_takes_the_place_of_an_earlier_one(master):
     assert master.special(Special.DISABLE).status == MotorStatus.OVERVOLTAGE
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(6))
 def test_no_frame_makes_it_raise_and_its_state_stays_finite(seed):
     """Random frames, many of them nearly right, and the dangerous ones of 7FFh that set ids or start a bootloader."""
     rng = random.Random(seed)
@@ -272,7 +272,7 @@ def test_no_frame_makes_it_raise_and_its_state_stays_finite(seed):
     heads = [motor.node_id.to_bytes(2, "little") + bytes((op,)) for op in RegisterOp]
     legacy = [bytes.fromhex(one) for one in ("550000aa", "aa010255", "ee000011", "550102aa01")]
     t_ns = 0
-    for _ in range(1500):
+    for _ in range(1000):
         t_ns += rng.choice((0, 1, 50_000, MS, 100 * MS))
         numbers = struct.pack("<f", rng.choice((0.0, 1.0, -3e38, 1e-40, float("inf"), rng.uniform(-20, 20))))
         special = SPECIAL + bytes((rng.randrange(250, 256),))
