@@ -63,9 +63,7 @@ def add_arguments(parser: Parser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Serve until Ctrl-C, which is the normal way to leave."""
     if [args.scene is not None, bool(args.eds or args.motor), args.bus_yml is not None].count(True) != 1:
-        raise UsageError(
-            "emulate: name a SCENE, or else --eds FILE --node-id N, --bus-yml FILE, or --motor TYPE --id N"
-        )
+        raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, --bus-yml FILE or --motor TYPE --id N")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
     from canprobe.fieldbus.bus.system import system

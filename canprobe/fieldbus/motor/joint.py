@@ -31,15 +31,14 @@ class MotorJoint:
         stiffness or damping makes it diverge, or swing where the limit acts; its error is of first order.
         """
         p, v, kp, kd, t = command
-        gain = h / self.inertia
+        gain, drag = h / self.inertia, 1 + h / self.inertia * self.viscous
+        free, stiff = self.qd + gain * (kp * (p - self.q) + kd * v + t), drag + gain * (kp * h + kd)
+        low, high = self.qd - gain * limit, self.qd + gain * limit
 
         def solved(friction: float) -> float:
-            force = kp * (p - self.q) + kd * v + t
-            free = (self.qd + gain * (force - friction)) / (1 + gain * (kp * h + kd + self.viscous))
-            low, high = ((self.qd + gain * (end - friction)) / (1 + gain * self.viscous) for end in (-limit, limit))
-            return min(max(free, low), high)
+            return min(max((free - friction) / stiff, (low - friction) / drag), (high - friction) / drag)
 
         # Friction of either sign that leaves the joint moving its way is the right one; else the joint sticks.
-        self.qd = max(solved(self.coulomb), 0.0) or min(solved(-self.coulomb), 0.0)
+        self.qd = max(solved(gain * self.coulomb), 0.0) or min(solved(-gain * self.coulomb), 0.0)
         self.q += h * self.qd
         self.tau = min(max(kp * (p - self.q) + kd * (v - self.qd) + t, -limit), limit)
