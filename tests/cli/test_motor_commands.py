@@ -42,4 +42,5 @@ def test_inject_lists_the_faults_of_motors_once(capsys):
     kinds = json.loads(capsys.readouterr().out)
     names = [kind["name"] for kind in kinds]
     assert len(names) == len(set(names))
-    assert [kind["name"] for kind in kinds if kind["needs"] == "motor"] == ["brown-out", "over-temperature"]
+    of_motors = [kind["name"] for kind in kinds if kind["needs"] == "motor"]
+    assert of_motors == ["brown-out", "over-temperature", "over-voltage", "under-voltage"]

@@ -205,12 +205,13 @@ def serve_nodes(
 
 def _named(faulty: FaultyNodes) -> str:
     """Names of nodes: their ids, or their LSS addresses where they have none; and of motors."""
-    motors = [node.name for node in faulty.nodes if isinstance(node, FaultyMotor)]
+    motors = [str(node.node_id) for node in faulty.nodes if isinstance(node, FaultyMotor)]
     nodes = [node.node for node in faulty.nodes if not isinstance(node, FaultyMotor)]
     ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED_ID)
     blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
     with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []
-    return ", and ".join(with_ids + ([f"without an id {', '.join(blank)}"] if blank else []) + motors)
+    without_ids = [f"without an id {', '.join(blank)}"] if blank else []
+    return ", and ".join(with_ids + without_ids + ([f"motors {', '.join(motors)}"] if motors else []))
 
 
 def keep_in(nodes: Iterable[SlaveNode], folder: Path | None) -> None:

@@ -22,10 +22,8 @@ _STEP_NS, _MAX_STEPS = 250_000, 100
 
 The motor's own loop has 50 µs; seven motors would take more than a processor then. The joint is stable in any step.
 """
-_FAR = 1e9
-"""Where a velocity leads, rad."""
 _FLASH_NS = 30_000_000
-"""Time that writing the flash takes."""
+"""Time that writing the flash takes; the answers to all frames that come meanwhile leave when it is done."""
 _TRIP_TICKS = dict(zip(range(MotorStatus.OVERVOLTAGE, 13), (20_001, 5_001, 5_001, 8_001, 8_001), strict=True))
 """Ticks for which the limit behind a fault is exceeded before the motor trips, by status."""
 
@@ -134,8 +132,10 @@ class DamiaoMotor(Participant):
             self._take(Mode((can_id >> 8) + 1), data)
         if special is not Special.ZERO:
             return [self._feedback()]
-        self.joint.q, self._goal, self._command = 0.0, 0.0, self._command._replace(p=0.0)
-        return self._written(self._feedback())
+        self.joint.q, self._command = 0.0, self._command._replace(p=0.0)
+        self._goal = 0.0 if math.isfinite(self._goal) else self._goal  # a velocity leads to infinity
+        self._late, self.next_deadline_ns = [self._feedback()], self._now_ns + _FLASH_NS
+        return []
 
     def _take(self, mode: Mode, data: bytes) -> None:
         """Take a target; modes but MIT move theirs there, and follow it by the law of MIT at its stiffest."""
@@ -145,7 +145,7 @@ class DamiaoMotor(Participant):
                 self._command = MitCommand(*target)
                 return
             v = target[0]
-            self._goal, speed, share = (math.copysign(_FAR, v), v, 1.0) if mode is Mode.VEL else (*target, 1.0)[:3]
+            self._goal, speed, share = (math.copysign(math.inf, v), v, 1.0) if mode is Mode.VEL else (*target, 1.0)[:3]
             self._speed, self._limit = min(abs(speed), self.ranges.v), self.ranges.t * min(share, 1.0)
             start = self._command.p if self._command.kp else self.joint.q
             self._command = MitCommand(start, kp=protocol.KP_MAX, kd=protocol.KD_MAX)
@@ -159,19 +159,15 @@ class DamiaoMotor(Participant):
         feedback = protocol.Feedback(self.status, low, joint.q, joint.qd, joint.tau, *self.heat)
         return int(self.registers[Rid.MST_ID]), feedback.pack(self._scale)
 
-    def _written(self, answer: Frame) -> list[Frame]:
-        """Write the flash: this answer, and those to the frames that come meanwhile, leave when it is done."""
-        self._late, self.next_deadline_ns = [answer], self._now_ns + _FLASH_NS
-        return []
-
     def _asked(self, data: bytes) -> list[Frame]:
         """Answer a request for registers."""
         mst_id, op, rid, register = int(self.registers[Rid.MST_ID]), data[2], data[3], protocol.REGISTERS.get(data[3])
         if op == RegisterOp.STORE and self.status is MotorStatus.DISABLED:
             self._flash = dict(self.registers)
-            return self._written((mst_id, data[:3] + b"\1"))
-        if op == RegisterOp.FEEDBACK and rid == 0:
-            return [self._feedback()]
+            self._late, self.next_deadline_ns = [(mst_id, data[:3] + b"\1")], self._now_ns + _FLASH_NS
+        if op == RegisterOp.FEEDBACK and rid < 4:
+            precise = pack("<f", (0.0, self.joint.q, self.joint.qd, self.joint.tau)[rid])
+            return [(mst_id, bytes((data[0], self.status, *self.heat)) + precise) if rid else self._feedback()]
         if op not in (RegisterOp.READ, RegisterOp.WRITE) or register is None:
             return []
         self.registers[Rid.P_M] = self.registers[Rid.XOUT] = self.joint.q

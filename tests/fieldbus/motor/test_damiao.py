@@ -242,6 +242,27 @@ def test_feedback_can_be_asked_for(master):
     assert Feedback.unpack(asked, DM4310).p == pytest.approx(0.5, abs=1e-3)
 
 
+def test_feedback_without_steps_can_be_asked_for(master):
+    master.special(Special.ENABLE)
+    master.mit(t=0.5)
+    master.wait(100 * MS)
+    joint = master.motor.joint
+    for rid, value in ((1, joint.q), (2, joint.qd), (3, joint.tau)):
+        ((_, asked),) = master.register(RegisterOp.FEEDBACK, rid)
+        assert asked[:4] == bytes((1, MotorStatus.ENABLED, 30, 30))
+        assert struct.unpack("<f", asked[4:])[0] == pytest.approx(value, rel=1e-6)
+
+
+def test_zero_leaves_a_velocity_as_it_is(master):
+    master.write(Rid.CTRL_MODE, Mode.VEL)
+    master.special(Special.ENABLE)
+    master.answer(0x201, pack_target(Mode.VEL, -2.0))
+    master.wait(500 * MS)
+    master.send(1, SPECIAL + bytes((Special.ZERO,)))
+    master.wait(500 * MS)
+    assert master.motor.joint.qd == pytest.approx(-2.0, rel=1e-2)
+
+
 def test_a_limit_that_is_exceeded_trips_after_its_delay_and_again_after_fb_while_it_lasts(master):
     master.special(Special.ENABLE)
     master.motor.exceeded_ns[MotorStatus.UNDERVOLTAGE] = master.now_ns

@@ -88,6 +88,22 @@ def test_over_temperature_trips_and_comes_back_until_the_motor_is_cold(line):
     assert line.feedback(1).status == MotorStatus.ENABLED
 
 
+@pytest.mark.parametrize(
+    ("name", "delay_ms", "status"),
+    [("over-voltage", 1000, MotorStatus.OVERVOLTAGE), ("under-voltage", 250, MotorStatus.UNDERVOLTAGE)],
+)
+def test_a_supply_outside_of_its_limits_trips_after_its_delay(line, name, delay_ms, status):
+    line.feedback(1)
+    fault = line.bus.inject(f"motor 1: {name}")
+    line.pass_ms(delay_ms - 10)
+    assert line.feedback(1, bytes(8)).status == MotorStatus.ENABLED
+    line.pass_ms(20)
+    assert line.feedback(1, bytes(8)).status == status
+    line.bus.end(fault)
+    line.feedback(1, SPECIAL + bytes((Special.CLEAR,)))
+    assert line.feedback(1).status == MotorStatus.ENABLED
+
+
 def test_a_fault_waits_for_a_motor_to_be_enabled(line):
     line.bus.inject("motor 1: mute on enabled for 100 ms")
     assert line.feedback(1, bytes(8)) is not None

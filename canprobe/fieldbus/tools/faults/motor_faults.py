@@ -43,21 +43,20 @@ class BrownOut(Effect):
 
 
 class OverTemperature(Effect):
-    """The rotor is hotter than its limit (register 2): the motor trips after 0.4 s, and again after each FBh."""
+    """A limit of the motor is exceeded: it trips after the delay of that limit, and again after each FBh."""
 
     name = "over-temperature"
     needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        motor = cast(DamiaoMotor, self.node)
-        motor.heat = (30, int(self.fault.value("deg_c")))
-        motor.exceeded_ns[MotorStatus.ROTOR_OVERTEMPERATURE] = t_ns
+        self._motor = cast(DamiaoMotor, self.node)
+        self._motor.heat = (30, int(self.fault.value("deg_c")))
+        self._motor.exceeded_ns[MotorStatus(int(self.fault.value("status")))] = t_ns
         return ()
 
     def end(self, t_ns: int) -> None:
-        motor = cast(DamiaoMotor, self.node)
-        motor.heat = (30, 30)
-        motor.exceeded_ns.pop(MotorStatus.ROTOR_OVERTEMPERATURE, None)
+        self._motor.heat = (30, 30)
+        self._motor.exceeded_ns.pop(MotorStatus(int(self.fault.value("status"))), None)
 
 
 MOTOR_FAULTS: Mapping[str, FaultKind] = {name: BUS_FAULTS[name] for name in _LINK} | {**kinds_of(sys.modules[__name__])}
