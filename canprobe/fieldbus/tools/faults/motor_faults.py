@@ -39,6 +39,7 @@ class BrownOut(Effect):
     needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
+        self.node.advance(t_ns)  # up to here the last command moves it
         return self.node.start(t_ns)
 
 
