@@ -25,11 +25,9 @@ from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import check_eds
-from canprobe.fieldbus.motor.on_bus import motors_on_bus
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
-from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
 
 if TYPE_CHECKING:
     from canprobe.cell.master.options import Say
@@ -84,6 +82,8 @@ def emulate_eds(
         ResultsError: when `store_folder` cannot be written.
     """
     from canprobe.fieldbus.drive.from_eds import make_eds_node
+    from canprobe.fieldbus.motor.on_bus import motors_on_bus
+    from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
 
     node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED_ID)
     if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
@@ -205,8 +205,8 @@ def serve_nodes(
 
 def _named(faulty: FaultyNodes) -> str:
     """Names of nodes: their ids, or their LSS addresses where they have none; and of motors."""
-    motors = [str(node.node_id) for node in faulty.nodes if isinstance(node, FaultyMotor)]
-    nodes = [node.node for node in faulty.nodes if not isinstance(node, FaultyMotor)]
+    motors = [str(node.node_id) for node in faulty.nodes if not isinstance(node.node, SlaveNode)]
+    nodes = [node.node for node in faulty.nodes if isinstance(node.node, SlaveNode)]
     ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED_ID)
     blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
     with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []

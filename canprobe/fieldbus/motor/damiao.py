@@ -55,8 +55,8 @@ class DamiaoMotor(Participant):
         self.node_id, self.ranges = motor_id, protocol.TYPES[type_name]
         self.joint, self.heat = MotorJoint(self.ranges, q), (30, 30)
         self._flash = {rid: register.value for rid, register in protocol.REGISTERS.items()}
-        self._flash |= {Rid.ESC_ID: motor_id, Rid.MST_ID: mst_id}
-        self._flash |= zip((Rid.PMAX, Rid.VMAX, Rid.TMAX), self.ranges, strict=True)
+        own = (Rid.ESC_ID, Rid.MST_ID, Rid.PMAX, Rid.VMAX, Rid.TMAX)
+        self._flash |= zip(own, (motor_id, mst_id, *self.ranges), strict=True)
         self.start(0)
 
     @property
@@ -114,8 +114,8 @@ class DamiaoMotor(Participant):
         for _ in range(steps):
             h = took_ns * 1e-9 / steps
             if way := self._speed * h:
-                p = self._command.p
-                self._command = self._command._replace(p=p + min(max(self._goal - p, -way), way))
+                ahead = self._goal - self._command.p
+                self._command = self._command._replace(p=self._command.p + min(max(ahead, -way), way))
             self.joint.step(h, self._command, self._limit)
 
     def _answers(self, can_id: int, data: bytes) -> list[Frame]:

@@ -13,7 +13,7 @@ from canprobe.fieldbus.drive.drive import DriveApplication
 from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Fault, FaultKind, FaultSpan
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
 from canprobe.fieldbus.tools.faults.frame_faults import HEADER_INDEX
-from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, SERVED_FAULTS, FaultyMotor
+from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
 from canprobe.fieldbus.tools.faults.text import node_of, parse_fault
 
 
@@ -22,10 +22,10 @@ class FaultyNodes:
 
     Args:
         nodes: the nodes, attached to their buses in this form.
-        kinds: kinds of faults that may be thrown.
+        kinds: kinds of faults that may be thrown at nodes; motors have their own.
     """
 
-    def __init__(self, nodes: Iterable[FaultyNode], kinds: Mapping[str, FaultKind] = SERVED_FAULTS) -> None:
+    def __init__(self, nodes: Iterable[FaultyNode], kinds: Mapping[str, FaultKind] = BUS_FAULTS) -> None:
         self.nodes = list(nodes)
         self.kinds = kinds
 
@@ -40,7 +40,9 @@ class FaultyNodes:
         Raises:
             UsageError: the text is wrong, no node here has this id, or the kind needs another device.
         """
-        fault = parse_fault(text, self.kinds)
+        from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, FaultyMotor
+
+        fault = parse_fault(text, {**MOTOR_FAULTS, **self.kinds})
         node = self._node(fault.node_id, text)
         kind, is_motor = fault.kind, isinstance(node, FaultyMotor)
         if kind.name not in MOTOR_FAULTS if is_motor else kind.needs == "motor":

@@ -62,5 +62,3 @@ class OverTemperature(Effect):
 
 MOTOR_FAULTS: Mapping[str, FaultKind] = {name: BUS_FAULTS[name] for name in _LINK} | {**kinds_of(sys.modules[__name__])}
 """Kinds of faults of motors by name."""
-SERVED_FAULTS: Mapping[str, FaultKind] = {**BUS_FAULTS, **MOTOR_FAULTS}
-"""Kinds of faults of devices without a plant by name."""
