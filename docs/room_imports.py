@@ -9,7 +9,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent / "canprobe"
 WINGS = {
-    "fieldbus": ("protocol", "eds", "bus", "node", "drive", "vcan"),
+    "fieldbus": ("protocol", "eds", "bus", "node", "drive", "motor", "vcan"),
     "mechanics": ("robot", "touch"),
     "cell": ("scene", "planning", "master", "tasks", "plant", "emulated", "session", "results", "recorded"),
     "": ("api",),

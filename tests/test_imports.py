@@ -1,6 +1,6 @@
 """The wings and rooms of the package: who may import whom, read from the source; no circles.
 
-    fieldbus   protocol < eds < bus < node < drive < tools; vcan          neither numpy nor scipy
+    fieldbus   protocol < eds < bus < node < drive < motor < tools; vcan          neither numpy nor scipy
     mechanics  types < robot < touch
     cell       scene < planning < master < tasks | plant < emulated, then session < results < recorded
     lab        bridge, studies, gym, examples
@@ -24,7 +24,7 @@ FILES = glob.glob("**/*.py", root_dir=PACKAGE, recursive=True)  # it follows the
 MODULES = {PACKAGE / name: Path(name) for name in sorted(FILES)}
 
 WINGS = {
-    "fieldbus": ("protocol", "eds", "bus", "node", "drive", "tools", "vcan"),
+    "fieldbus": ("protocol", "eds", "bus", "node", "drive", "motor", "tools", "vcan"),
     "mechanics": ("types", "robot", "touch"),
     "cell": (
         "npz",
@@ -49,7 +49,7 @@ MECHANICS = {"types", "robot", "touch"}
 SCENE = {"protocol", "eds", "node", *MECHANICS, "npz", "scene"}
 PLANNING = SCENE | {"planning", "bus"}
 MASTER = PLANNING | {"master", "tasks", "npz", "rows"}
-BOTH = MASTER | {"drive", "tools", "plant", "emulated", "session"}
+BOTH = MASTER | {"drive", "motor", "tools", "plant", "emulated", "session"}
 ALLOWED = {
     "errors": set(),
     "protocol": set(),
@@ -57,7 +57,8 @@ ALLOWED = {
     "bus": {"protocol", "eds"},
     "node": BUS,
     "drive": BUS | {"node"},
-    "tools": BUS | {"node", "drive"},
+    "motor": {"protocol", "bus"},
+    "tools": BUS | {"node", "drive", "motor"},
     "vcan": {"bus"},
     "types": set(),
     "robot": {"types"},

@@ -63,6 +63,8 @@ seconds = number_type(float, lambda value: 0.0 < value < math.inf, "seconds abov
 """An argument type: a duration."""
 positive = number_type(float, lambda value: 0.0 < value < 1e6, "a number above 0")
 """An argument type: a number above 0, below a million."""
+can_id = number_type(lambda text: int(text, 0), lambda value: 0 <= value < 0x800, "an identifier such as 0x11")
+"""An argument type: an 11-bit identifier, decimal or hexadecimal with 0x."""
 number_of_32_bits = number_type(
     lambda text: int(text, 0), lambda value: 0 <= value < 1 << 32, "a number of 32 bits such as 4711 or 0x1267"
 )

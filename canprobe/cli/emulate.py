@@ -2,6 +2,7 @@
 
 With a SCENE the nodes are its arm and array, and a model of the arm and the contact moves them. With --eds each file is
 one node: it answers with the values of the file; where the file describes a CiA 402 drive, it moves an ideal axis.
+Each --motor is one that speaks the protocol of its maker, alone or beside such nodes.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ examples:
   canprobe emulate --eds drive.eds --node-id 255 --serial 0x4711 --channel vcan0
   canprobe emulate free --channel vcan0 --inject "node 3: heartbeat-off at 5 s"
   canprobe emulate --bus-yml config/bus.yml --channel vcan0
+  canprobe emulate --motor damiao:dm4310 --id 1 --channel vcan0
+  canprobe emulate --motor damiao:dm8009 --id 1 --mst-id 0x11 --motor damiao:dm4340 --id 3 --mst-id 0x13 --channel vcan0
 """
 
 
@@ -47,6 +50,7 @@ def add_arguments(parser: Parser) -> None:
         "--without-id IDS", "nodes that start without an id; `canprobe scan --lss` assigns it", node_ids, default=()
     )
     parser.add_option("--bus-yml FILE", "serve the slaves of a bus.yml of ros2_canopen", Path)
+    parser.add_motors()
     parser.add_option("--nodes IDS", "nodes to serve, such as 1-6,16 [those with emulated = true]", node_ids)
     parser.add_option("--truth FILE", "write the true values of the model to this npz file at the end", Path)
     parser.add_option("--store DIR", "folder that keeps what a master stores by 1010h or LSS [nothing is kept]", Path)
@@ -58,8 +62,8 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Serve until Ctrl-C, which is the normal way to leave."""
-    if [args.scene is not None, bool(args.eds), args.bus_yml is not None].count(True) != 1:
-        raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
+    if [args.scene is not None, bool(args.eds or args.motor), args.bus_yml is not None].count(True) != 1:
+        raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, --bus-yml FILE or --motor TYPE --id N")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
     from canprobe.fieldbus.bus.system import system
@@ -71,10 +75,10 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
-    for option in ("node_id", "serial"):
+    for option, owner in (("node_id", "eds"), ("serial", "eds"), ("id", "motor"), ("mst_id", "motor")):
         if getattr(args, option):
             name = option.replace("_", "-")
-            raise UsageError(f"emulate: --{name} belongs to --eds; of a scene's nodes, choose with --nodes")
+            raise UsageError(f"emulate: --{name} belongs to --{owner}; of a scene's nodes, choose with --nodes")
     scene = loaded(args)
     wanted = _nodes(args.nodes, scene)
     target = scene_target(args, scene)
@@ -100,7 +104,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
 
 
 def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
-    source = "--bus-yml" if args.bus_yml is not None else "--eds"
+    source = "--bus-yml" if args.bus_yml is not None else "--eds" if args.eds else "--motor"
     for option in ("nodes", "seed", "truth", "without_id"):
         if getattr(args, option) not in (None, ()):
             raise UsageError(f"emulate: --{option.replace('_', '-')} belongs to a scene, not to {source}")
@@ -117,6 +121,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
         target,
         store_folder=args.store,
         serial_numbers=args.serial,
+        motors=(args.motor, args.id, args.mst_id),
         in_realtime=args.realtime,
         faults=args.inject,
         say=args.report.say,

@@ -21,6 +21,7 @@ examples:
   canprobe inject --list
   canprobe inject --channel vcan0 "node 3: heartbeat-off for 2 s"
   canprobe inject --channel vcan0 "node 3: delay ms=2 share=0.5 seed=7" "node 16: torn at 1 s"
+  canprobe inject --channel vcan0 "motor 1: over-temperature for 1 s"
   canprobe inject --channel vcan0 --clear
 """
 
@@ -49,7 +50,9 @@ def run(args: argparse.Namespace) -> None:
 def _list(args: argparse.Namespace) -> None:
     from canprobe.cell.emulated.array_faults import CELL_FAULTS
     from canprobe.fieldbus.tools.faults.fault import number_text
+    from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS
 
+    kinds = {**CELL_FAULTS, **MOTOR_FAULTS}
     document = [
         {
             "name": kind.name,
@@ -59,10 +62,10 @@ def _list(args: argparse.Namespace) -> None:
             "points": sorted(kind.points),
             "needs": kind.needs,
         }
-        for kind in CELL_FAULTS.values()
+        for kind in kinds.values()
     ]
     rows = [("fault", "what happens", "clause", "expected reaction")]
-    for kind in CELL_FAULTS.values():
+    for kind in kinds.values():
         values = [number_text(name, one.default) for name, one in kind.parameters.items()]
         rows.append((" ".join([kind.name, *values]), kind.what, kind.clause, kind.reaction))
     print_answer(args, document, lambda: print_table(rows))

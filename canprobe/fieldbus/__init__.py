@@ -17,14 +17,15 @@ What comes in are bytes and times; what goes out are bytes and deadlines:
   a `Clock` and a `Port`, and the requests that wait for an answer (SDO, LSS).
 - `node` is a CiA 301 slave, `drive` a CiA 402 drive on it. Both take bytes and a time and return bytes and the next
   deadline; they never sleep and never open anything. `node.serve` puts nodes on an interface.
+- `motor` is motors that speak no CANopen, as functions of frames and time like `node`.
 - `tools` are for other people's nodes and masters: faults that happen on demand.
 - `vcan` runs a command where a real vcan0 exists.
 
 Invariants: times are integer nanoseconds; a decoder raises `ProtocolError` and nothing else; a port raises nothing for
 what a bus does; the same seed gives the same frames on a virtual bus.
 
-Imports point downward: protocol < eds < bus < node < drive < tools. Of the rest of the package only `canprobe.errors`
-is seen. Start reading at `protocol.frames`, then `bus.port`, then `node.slave_node`.
+Imports point downward: protocol < eds < bus < node < drive < motor < tools. Of the rest of the package only
+`canprobe.errors` is seen. Start reading at `protocol.frames`, then `bus.port`, then `node.slave_node`.
 """
 
 from __future__ import annotations

@@ -54,6 +54,7 @@ def emulate_eds(
     store_folder: Path | None = None,
     serial_numbers: Sequence[int | None] = (),
     positions: Sequence[int] = (),
+    motors: tuple[Sequence[str], Sequence[int], Sequence[int]] = ((), (), ()),
     in_realtime: bool = False,
     faults: Sequence[str] = (),
     observer: ServeObserver | None = None,
@@ -67,6 +68,7 @@ def emulate_eds(
         store_folder: as for :func:`canprobe.cell.session.bus_tools.emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         positions: place of the motor of each drive at first, counts; left out: 0.
+        motors: make and type, ESC_ID and MST_ID of motors beside them, as `motors_on_bus` takes them.
         in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
         faults, observer: as for :func:`canprobe.cell.session.bus_tools.emulate`.
         say: called with the number of warnings of each file, and when the nodes are served.
@@ -80,10 +82,13 @@ def emulate_eds(
         ResultsError: when `store_folder` cannot be written.
     """
     from canprobe.fieldbus.drive.from_eds import make_eds_node
+    from canprobe.fieldbus.motor.on_bus import motors_on_bus
+    from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
 
     node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED_ID)
     if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
         raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
+    beside = motors_on_bus(*motors, node_ids)
     nodes: list[SlaveNode] = []
     for (name, node_id), serial, position in zip_longest(files, serial_numbers, positions):
         reading = check_eds(name, 1 if node_id == UNCONFIGURED_ID else node_id)
@@ -103,7 +108,7 @@ def emulate_eds(
             if node.lss is not None:
                 node.lss.bitrate = target.bitrate
         keep_in(nodes, store_folder)
-        faulty = FaultyNodes(map(FaultyNode, nodes))
+        faulty = FaultyNodes([*map(FaultyNode, nodes), *map(FaultyMotor, beside)])
         serve_nodes([(faulty.nodes, port)], faulty, faults, observer, say=say, in_realtime=in_realtime)
 
 
@@ -184,7 +189,7 @@ def serve_nodes(
         start_ns = clock.now_ns()
         for text in faults:
             say(f"fault: {faulty.inject(text, start_ns).words(start_ns)}")
-        say(f"serving {_named([node.node for node in faulty.nodes]) or 'the array'} on {where}; Ctrl-C stops them")
+        say(f"serving {_named(faulty) or 'the array'} on {where}; Ctrl-C stops them")
 
         def look() -> bool:
             for server in servers:
@@ -198,12 +203,15 @@ def serve_nodes(
             serve(buses, look, outlasts=outlasts)
 
 
-def _named(nodes: Sequence[SlaveNode]) -> str:
-    """Names of nodes: their ids, or their LSS addresses where they have none."""
+def _named(faulty: FaultyNodes) -> str:
+    """Names of nodes: their ids, or their LSS addresses where they have none; and of motors."""
+    motors = [str(node.node_id) for node in faulty.nodes if not isinstance(node.node, SlaveNode)]
+    nodes = [node.node for node in faulty.nodes if isinstance(node.node, SlaveNode)]
     ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED_ID)
     blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
     with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []
-    return ", and ".join(with_ids + ([f"without an id {', '.join(blank)}"] if blank else []))
+    without_ids = [f"without an id {', '.join(blank)}"] if blank else []
+    return ", and ".join(with_ids + without_ids + ([f"motors {', '.join(motors)}"] if motors else []))
 
 
 def keep_in(nodes: Iterable[SlaveNode], folder: Path | None) -> None:

@@ -11,6 +11,7 @@ from canprobe.fieldbus import VirtualClock, load_eds, make_eds_node
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 from canprobe.fieldbus.tools import faults
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
+from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS
 
 MS = 1_000_000
 ID = 0x185
@@ -169,6 +170,6 @@ FACTS = {"does", "what", "clause", "reaction", "trips", "fails", "frames", "dire
 def test_the_table_of_kinds_has_only_words_that_are_known():
     kinds = tomllib.loads(Path(faults.__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
     for name, facts in kinds.items():
-        assert set(facts) <= FACTS and facts.get("does", "drop") in BUS_FAULTS, name
+        assert set(facts) <= FACTS and facts.get("does", "drop") in {**BUS_FAULTS, **MOTOR_FAULTS}, name
         assert facts.get("frames", "PDO") in SERVICES and facts.get("direction", "in") in ("in", "either"), name
         assert all(one["low"] <= one["default"] <= one["high"] for one in facts.get("parameters", {}).values()), name

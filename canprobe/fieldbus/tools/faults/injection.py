@@ -22,7 +22,7 @@ class FaultyNodes:
 
     Args:
         nodes: the nodes, attached to their buses in this form.
-        kinds: kinds of faults that may be thrown.
+        kinds: kinds of faults that may be thrown at nodes; motors have their own.
     """
 
     def __init__(self, nodes: Iterable[FaultyNode], kinds: Mapping[str, FaultKind] = BUS_FAULTS) -> None:
@@ -40,9 +40,14 @@ class FaultyNodes:
         Raises:
             UsageError: the text is wrong, no node here has this id, or the kind needs another device.
         """
-        fault = parse_fault(text, self.kinds)
+        from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, FaultyMotor
+
+        fault = parse_fault(text, {**MOTOR_FAULTS, **self.kinds})
         node = self._node(fault.node_id, text)
-        kind = fault.kind
+        kind, is_motor = fault.kind, isinstance(node, FaultyMotor)
+        if kind.name not in MOTOR_FAULTS if is_motor else kind.needs == "motor":
+            of_motors = ", ".join(MOTOR_FAULTS)
+            raise UsageError(f"fault {text!r}: {kind.name} cannot happen to {node.name}; to motors can: {of_motors}")
         if kind.needs == "drive" and not isinstance(node.node.application, DriveApplication):
             raise UsageError(f"fault {text!r}: node {fault.node_id} is no CiA 402 drive, which {kind.name} needs")
         if kind.needs == "array" and not node.node.dictionary.has_index(HEADER_INDEX):

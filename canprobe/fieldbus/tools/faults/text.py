@@ -2,6 +2,7 @@
 
     node N: NAME [k=v …] [at T | on EVENT] [for D]
 
+For a motor that speaks no CANopen it is `motor N`.
 T and D have a unit, s, ms or us. Besides the parameters of the kind, k is share (0…1), count (frames, then it is over),
 seed, or direction (in, out). Numbers may be hexadecimal, such as 0x1017.
 """
@@ -17,7 +18,7 @@ from canprobe.fieldbus.tools.faults.faulty_node import EVENTS
 
 FORM = "node N: NAME [k=v …] [at T | on EVENT] [for D], such as: node 3: heartbeat-off at 5 s for 200 ms"
 _FORM = re.compile(
-    r"\s*node\s+(?P<node>\d+)\s*:\s*(?P<name>[\w-]+)(?P<values>(?:\s+[\w-]+=\S+)*)"
+    r"\s*(?:node|motor)\s+(?P<node>\d+)\s*:\s*(?P<name>[\w-]+)(?P<values>(?:\s+[\w-]+=\S+)*)"
     r"(?:\s+at\s+(?P<at>[\d.eE+-]+)\s*(?P<at_unit>[a-zµ]+)|\s+on\s+(?P<event>[\w-]+))?"
     r"(?:\s+for\s+(?P<long>[\d.eE+-]+)\s*(?P<long_unit>[a-zµ]+))?\s*"
 )
@@ -31,7 +32,7 @@ _COMMON = {
 
 def node_of(text: str) -> int:
     """Node id that a fault names, before it is read; 0 where it names none."""
-    match = re.match(r"\s*node\s+(\d+)", text)
+    match = re.match(r"\s*(?:node|motor)\s+(\d+)", text)
     return int(match[1]) if match else 0
 
 

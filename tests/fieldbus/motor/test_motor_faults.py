@@ -1,0 +1,137 @@
+"""Motors on the bus of a test, beside nodes, with the faults that `canprobe inject` throws."""
+
+from __future__ import annotations
+
+import pytest
+
+from canprobe.errors import UsageError
+from canprobe.fieldbus import load_eds
+from canprobe.fieldbus.motor.damiao import DamiaoMotor
+from canprobe.fieldbus.motor.protocol import SPECIAL, TYPES, Feedback, MitCommand, MotorStatus, Special
+from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, FaultyMotor
+
+MS = 1_000_000
+DM4310 = TYPES["dm4310"]
+
+
+class Line:
+    """Motors 1 and 3 on a bus, and a port that commands them."""
+
+    def __init__(self, bus):
+        self.bus, self.port = bus, bus.port()
+        self.motors = [FaultyMotor(DamiaoMotor("dm4310", one, 0x10 + one)) for one in (1, 3)]
+        bus.power_on(self.motors)
+
+    def feedback(self, motor_id, data=SPECIAL + b"\xfc", ms=1.0):
+        """The only answer to a frame; None where there is none."""
+        self.port.drain()
+        self.port.send_batch([(motor_id, data)])
+        self.bus.clock.sleep_until_ns(self.bus.clock.now_ns() + round(ms * MS))
+        frames = self.port.drain()
+        assert {can_id for can_id, _, _ in frames} <= {0x10 + motor_id}
+        return Feedback.unpack(frames[0][1], DM4310) if frames else None
+
+    def pass_ms(self, ms):
+        self.bus.clock.sleep_until_ns(self.bus.clock.now_ns() + ms * MS)
+
+
+@pytest.fixture
+def line(emulated_bus):
+    return Line(emulated_bus)
+
+
+def test_motors_hear_their_own_commands_alone(line):
+    assert line.feedback(1).status == MotorStatus.ENABLED
+    assert line.feedback(3, bytes(8)).status == MotorStatus.DISABLED
+    assert line.feedback(1, MitCommand(p=0.2, kp=50, kd=1).pack(DM4310), ms=500).status == MotorStatus.ENABLED
+    assert line.feedback(1).p == pytest.approx(0.2, abs=2e-3)
+    assert line.feedback(3).p == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_motor_stands_beside_a_node(line, emulated_nodes, canopen_network):
+    emulated_nodes("puma260_joint", first_id=5)
+    drive = canopen_network.add_node(5, load_eds("puma260_joint", 5))
+    assert drive.sdo[0x6041].raw == 0x40 | drive.sdo[0x6041].raw
+    assert line.feedback(1).status == MotorStatus.ENABLED
+
+
+def test_a_mute_motor_hears_and_says_nothing(line):
+    line.feedback(1)
+    fault = line.bus.inject("motor 1: mute")
+    assert line.feedback(1, MitCommand(p=0.2, kp=50, kd=1).pack(DM4310), ms=500) is None
+    assert line.feedback(3).status == MotorStatus.ENABLED
+    line.bus.end(fault)
+    assert line.feedback(1).p == pytest.approx(0.2, abs=2e-3)
+
+
+def test_after_a_brown_out_the_motor_is_disabled_and_says_nothing_of_it(line):
+    line.feedback(1)
+    line.bus.inject("motor 1: brown-out at 10 ms")
+    line.pass_ms(20)
+    assert line.port.drain() == []
+    assert line.feedback(1, bytes(8)).status == MotorStatus.DISABLED
+
+
+def test_over_temperature_trips_and_comes_back_until_the_motor_is_cold(line):
+    line.feedback(1)
+    line.bus.inject("motor 1: over-temperature deg_c=130 for 1 s")
+    line.pass_ms(390)
+    assert line.feedback(1, bytes(8)).status == MotorStatus.ENABLED
+    line.pass_ms(20)
+    hot = line.feedback(1, bytes(8))
+    assert (hot.status, hot.t_rotor) == (MotorStatus.ROTOR_OVERTEMPERATURE, 130)
+    clear = SPECIAL + bytes((Special.CLEAR,))
+    line.feedback(1, clear)
+    assert line.feedback(1).status == MotorStatus.ROTOR_OVERTEMPERATURE
+    line.pass_ms(1000)
+    line.feedback(1, clear)
+    assert line.feedback(1).status == MotorStatus.ENABLED
+
+
+@pytest.mark.parametrize(
+    ("name", "delay_ms", "status"),
+    [("over-voltage", 1000, MotorStatus.OVERVOLTAGE), ("under-voltage", 250, MotorStatus.UNDERVOLTAGE)],
+)
+def test_a_supply_outside_of_its_limits_trips_after_its_delay(line, name, delay_ms, status):
+    line.feedback(1)
+    fault = line.bus.inject(f"motor 1: {name}")
+    line.pass_ms(delay_ms - 10)
+    assert line.feedback(1, bytes(8)).status == MotorStatus.ENABLED
+    line.pass_ms(20)
+    assert line.feedback(1, bytes(8)).status == status
+    line.bus.end(fault)
+    line.feedback(1, SPECIAL + bytes((Special.CLEAR,)))
+    assert line.feedback(1).status == MotorStatus.ENABLED
+
+
+def test_a_fault_waits_for_a_motor_to_be_enabled(line):
+    line.bus.inject("motor 1: mute on enabled for 100 ms")
+    assert line.feedback(1, bytes(8)) is not None
+    line.feedback(1)
+    assert line.feedback(1) is None
+    line.pass_ms(100)
+    assert line.feedback(1) is not None
+
+
+@pytest.mark.parametrize("text", ["motor 1: heartbeat-off", "motor 1: drive-fault", "motor 1: sdo-silent"])
+def test_a_fault_of_a_service_that_a_motor_does_not_have_is_refused(line, text):
+    with pytest.raises(UsageError, match=r"cannot happen to motor 1; .*brown-out"):
+        line.bus.inject(text)
+
+
+def test_a_fault_of_a_motor_cannot_happen_to_a_node(line, emulated_nodes):
+    emulated_nodes("puma260_joint", first_id=5)
+    with pytest.raises(UsageError, match="cannot happen to node 5"):
+        line.bus.inject("node 5: brown-out")
+
+
+@pytest.mark.parametrize("name", MOTOR_FAULTS)
+@pytest.mark.parametrize("bound", ["low", "high"])
+def test_every_kind_begins_and_ends_on_a_motor_at_both_ends_of_its_numbers(line, name, bound):
+    values = "".join(f" {key}={getattr(one, bound)}" for key, one in MOTOR_FAULTS[name].parameters.items())
+    line.bus.inject(f"motor 1: {name}{values} for 20 ms")
+    for _ in range(4):
+        line.port.send_batch([(1, SPECIAL + b"\xfc"), (1, bytes(8))])
+        line.pass_ms(10)
+    assert line.motors[0].spans
+    assert line.feedback(3).status == MotorStatus.ENABLED
