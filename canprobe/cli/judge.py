@@ -2,7 +2,8 @@
 
 With --eds each file is an emulated node, with a SCENE or a cell its nodes are; COMMAND is your master, which is started
 once they are served, with no input, and its output goes into a file. Without COMMAND a master that runs elsewhere is
-awaited, and Ctrl-C ends the judgement. With --record a log is judged for what can be seen in it.
+awaited, and Ctrl-C ends the judgement. With --record a log is judged for what can be seen in it,
+that of motors which speak no CANopen (--motor), too.
 
 Once a drive has been enabled for two seconds, faults are thrown at it, one after the other, and the reaction is judged:
 slow SDO answers, a lost heartbeat, a mute node, a fault of the drive, a reboot. --inject names others, and --passive
@@ -46,6 +47,7 @@ examples:
   canprobe judge puma560 --channel vcan0 --inject "node 3: mute on enabled for 2 s" -- ./bring_up
   canprobe judge --eds drive.eds --node-id 5 --record candump.log --html judge.html
   canprobe judge free --record runs/free/bus.log
+  canprobe judge --motor damiao:dm4310 --id 1 --mst-id 0x11 --record candump.log
   canprobe judge --list
 """
 _TIMED_OUT = 124
@@ -59,6 +61,7 @@ def add_arguments(parser: Parser) -> None:
     parser.usage = "canprobe judge [SCENE | --eds FILE --node-id N ...] [--record FILE] [options] [-- COMMAND...]"
     parser.add_shared("[SCENE]", "BUS")
     parser.add_eds_nodes()
+    parser.add_motors()
     parser.add_option("--record FILE", "judge a log, and serve nothing", Path)
     parser.add_option("--seconds S", "end after S seconds [at the end of COMMAND, or at Ctrl-C]", seconds)
     parser.add_inject("throw this fault in the place of the sequence")
@@ -91,13 +94,15 @@ def run(args: argparse.Namespace) -> int:
     """Judge a log, or a master on served nodes."""
     if args.list:
         return _list(args)
-    if (args.scene is None) is not bool(args.eds):
-        raise UsageError("judge: name a SCENE or a cell, or else --eds FILE --node-id N")
+    if (args.scene is None) is not bool(args.eds or args.motor):
+        raise UsageError("judge: name a SCENE or a cell, or else --eds FILE --node-id N, or --motor TYPE --id N")
     if args.inject and args.passive:
         raise UsageError("judge: --inject throws faults, and --passive throws none; choose one")
     args.older = read_baseline(args)
     if args.record is not None:
         return _judge_record(args)
+    if args.motor:
+        raise UsageError("judge: masters of motors are judged by a log: serve motors with `canprobe emulate --motor …`")
     return _judge_served(args)
 
 
@@ -106,13 +111,19 @@ def _judge_record(args: argparse.Namespace) -> int:
         if getattr(args, option):
             name = "COMMAND" if option == "command" else f"--{option}"
             raise UsageError(f"judge: {name} belongs to served nodes, not to --record")
+    from canprobe.fieldbus.motor.on_bus import motors_on_bus
+    from canprobe.fieldbus.motor.protocol import Rid
     from canprobe.fieldbus.tools.judge import Judge, nodes_of, read_record
+    from canprobe.fieldbus.tools.judge.seen_motor import SeenMotor
 
     channel = one_channel(args, "judge: a log is judged for one channel: --channel CH")
     nodes = _descriptions(args, channel)
-    judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without)
+    made = motors_on_bus(args.motor, args.id, args.mst_id, nodes)
+    motors = [SeenMotor(one.node_id, int(one.registers[Rid.MST_ID]), one.ranges) for one in made]
+    judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without, motors=motors)
     judge.hear(read_record(args.record, channel))
-    if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
+    known = any(node.seen or node.addressed for node in judge.bus.nodes.values())
+    if not known and not any(motor.shown for motor in motors):
         raise UsageError(_no_such_node(args, nodes, nodes_of(read_record(args.record, channel))))
     if not judge.bus.now_ns:
         args.report.say(f"{args.record} has no times, so no interval or time-out is judged; record with candump -ta")
@@ -124,6 +135,8 @@ def _judge_record(args: argparse.Namespace) -> int:
 
 def _no_such_node(args: argparse.Namespace, asked: Iterable[int], found: Sequence[int]) -> str:
     """The message where a log has no frame of the nodes that are judged: which it has, and what to type."""
+    if args.motor:
+        return f"judge: {args.record} has no answer of a motor with this --id and --mst-id"
     ids = ", ".join(map(str, asked))
     head = f"judge: {args.record} has no frame of node {ids} or to it"
     if not found:

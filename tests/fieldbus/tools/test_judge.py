@@ -40,7 +40,7 @@ def test_a_bad_master_raises_its_rule_alone(master):
 
 
 def test_every_rule_has_a_bad_master():
-    assert {master.number for master in BAD} == {rule.number for rule in RULES}
+    assert {master.number for master in BAD} == {rule.number for rule in RULES if rule.group != "motor"}
 
 
 @pytest.mark.parametrize(("master", "number", "judged_times"), [(DrivesMuteAxis, 46, 0), (MutePassedOver, 46, 1)])

@@ -5,6 +5,7 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
     bus_frame   a frame, with its time; those of a candump log
     events      what a frame means, such as `ControlSeen`, a controlword
     seen_node   what is known of one node, from frames and its EDS
+    seen_motor  the same of a motor that does not speak CANopen, whose rules are motor_rules
     sdo_channel which SDO transfer is open, and what it carried
     bus_state   frames → events; nothing that was not on the bus
     rule        what a rule is: its facts, which rules.toml has, and a generator that gets events; a `Case` is one at

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from canprobe.fieldbus.eds.description import Description
@@ -13,6 +13,7 @@ from canprobe.fieldbus.tools.judge import events
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.events import BusEvent
 from canprobe.fieldbus.tools.judge.sdo_channel import SdoChannel
+from canprobe.fieldbus.tools.judge.seen_motor import SeenMotor
 from canprobe.fieldbus.tools.judge.seen_node import TARGETS, PdoView, SeenNode
 
 _STORE = 0x1010
@@ -27,6 +28,7 @@ class BusState:
         nodes: description of each node by its id.
         served: whether the nodes are emulated ones that are served here.
         bitrate: bit rate, bit/s.
+        motors: motors that do not speak CANopen.
 
     Attributes:
         nodes: nodes by id.
@@ -37,7 +39,15 @@ class BusState:
         arbitration_ns: time for which a frame may have to wait for another.
     """
 
-    def __init__(self, nodes: Mapping[int, Description], *, served: bool = False, bitrate: int = 1_000_000) -> None:
+    def __init__(
+        self,
+        nodes: Mapping[int, Description],
+        *,
+        served: bool = False,
+        bitrate: int = 1_000_000,
+        motors: Sequence[SeenMotor] = (),
+    ) -> None:
+        self.motors = motors
         self.nodes = {node_id: SeenNode(node_id, what, served=served) for node_id, what in nodes.items()}
         self._channels = {node_id: SdoChannel(node) for node_id, node in self.nodes.items()}
         self.now_ns = 0
@@ -64,6 +74,8 @@ class BusState:
         The state has changed when an event comes; NMT commands and boot-ups change the nodes afterwards.
         """
         self.now_ns = frame.t_ns
+        for motor in self.motors:
+            yield from motor.take(frame)
         can_id, data = frame.can_id, frame.data
         node, base = self.nodes.get(can_id & 0x7F), can_id & ~0x7F
         if can_id > 0x7FF:

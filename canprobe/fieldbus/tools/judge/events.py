@@ -23,8 +23,8 @@ class BusEvent:
 
     frame: BusFrame
 
-    def among(self, nodes: Iterable[SeenNode]) -> Iterable[SeenNode]:
-        """Those of the nodes that it is about: all, unless it names some."""
+    def among(self, nodes: Iterable[SeenNode]) -> Iterable[object]:
+        """Those of the nodes that it is about, or a motor: all nodes, unless it names some."""
         return nodes
 
 

@@ -9,15 +9,15 @@ from operator import attrgetter
 from typing import Any
 
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.tools.judge import enable, network_rules, pdo_rules, reactions, sdo_rules, targets
+from canprobe.fieldbus.tools.judge import enable, motor_rules, network_rules, pdo_rules, reactions, sdo_rules, targets
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
 from canprobe.fieldbus.tools.judge.rule import Case, Rule, Watch
-from canprobe.fieldbus.tools.judge.seen_node import SeenNode
+from canprobe.fieldbus.tools.judge.seen_motor import SeenMotor
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
-_MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, reactions)
+_MODULES = (enable, targets, pdo_rules, network_rules, sdo_rules, reactions, motor_rules)
 _FOUND = (one for module in _MODULES for one in vars(module).values() if isinstance(one, Rule))
 RULES = tuple(sorted(_FOUND, key=attrgetter("number")))
 """All rules, in the order of their numbers."""
@@ -25,8 +25,8 @@ NO_RULES: tuple[tuple[str, str], ...] = (
     ("12 enabling as part of initialisation", "the bus does not show whether a person asked for it"),
 )
 """Known faults of masters that are not judged, and why."""
-_Key = tuple[type[BusEvent], SeenNode | None]
-"""Kind of an event, and the node that it is about; None for rules on the whole bus."""
+_Key = tuple[type[BusEvent], object]
+"""Kind of an event, and the node or motor that it is about; None for rules on the whole bus."""
 
 
 class Judge:
@@ -38,6 +38,7 @@ class Judge:
         bitrate: bit rate, bit/s.
         charges_ns: begin and end of each fault that was thrown at the nodes.
         without: numbers of rules that are left out.
+        motors: motors that do not speak CANopen; without any, no rule on them is there.
 
     Attributes:
         bus: state of the bus.
@@ -53,9 +54,12 @@ class Judge:
         bitrate: int = 1_000_000,
         charges_ns: Sequence[tuple[int, int]] = (),
         without: Collection[int] = (),
+        motors: Sequence[SeenMotor] = (),
     ) -> None:
-        self.bus = BusState(nodes, served=served, bitrate=bitrate)
-        self.cases = {rule.number: Case(rule, self.bus, charges_ns) for rule in RULES if rule.number not in without}
+        self.bus = BusState(nodes, served=served, bitrate=bitrate, motors=motors)
+        self._rules = [rule for rule in RULES if (motors if rule.group == "motor" else nodes or not motors)]
+        cases = (Case(rule, self.bus, charges_ns) for rule in self._rules if rule.number not in without)
+        self.cases = {case.rule.number: case for case in cases}
         self.frame_count = 0
         self._watches: list[Watch[Any]] = []
         self._ears: dict[_Key, list[Watch[Any]]] = {}
@@ -94,8 +98,9 @@ class Judge:
             log: path of the recorded frames; None where they were not kept.
         """
         report = Report("judge", title, dict(facts), [_row(case) for case in self.cases.values()], log=log)
-        without = [rule for rule in RULES if rule.number not in self.cases]
-        report.left_out += [*NO_RULES, *((f"{rule.number:02} {rule.name}", "left out on request") for rule in without)]
+        without = [rule for rule in self._rules if rule.number not in self.cases]
+        report.left_out += NO_RULES if self.bus.nodes else ()
+        report.left_out += [(f"{rule.number:02} {rule.name}", "left out on request") for rule in without]
         for case in self.cases.values():
             if case.intervals_ns:
                 report.distributions["SYNC interval"] = tuple(ns * 1e-6 for ns in case.intervals_ns)
@@ -111,13 +116,13 @@ def _row(case: Case) -> ReportRow:
     if not case.count:
         return row
     first = case.findings[0]
-    node = f"node {first.node_id}: " if first.node_id is not None else ""
+    device = f"{first.device}: " if first.device is not None else ""
     more = f" ({case.count} times)" if case.count > 1 else ""
     return replace(
         row,
         verdict=Verdict.FAIL,
         came=tuple(str(frame) for finding in case.findings for frame in finding.frames),
-        detail=f"{node}{first.what} at {first.t_ns * 1e-9:.6f} s{more}",
+        detail=f"{device}{first.what} at {first.t_ns * 1e-9:.6f} s{more}",
         hint=rule.hint,
         severity=rule.severity.value,
     )

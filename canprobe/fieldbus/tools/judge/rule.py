@@ -13,6 +13,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import BusEvent
+from canprobe.fieldbus.tools.judge.seen_motor import SeenMotor
 from canprobe.fieldbus.tools.judge.seen_node import Known, SeenNode
 from canprobe.fieldbus.tools.reports.report import Severity
 
@@ -24,6 +25,7 @@ CHARGED_NS = SECOND_NS
 _KEPT_FINDINGS = 5
 _FACTS = tomllib.loads(Path(__file__).with_name("rules.toml").read_text(encoding="utf-8"))
 Event = TypeVar("Event", bound=BusEvent)
+Device = SeenNode | SeenMotor
 Watch = Generator[None, Event | None, None]
 """Gets the events that its annotation names, one after the other, and None at the end of the bus."""
 
@@ -34,13 +36,13 @@ class RuleFinding:
 
     Attributes:
         t_ns: time.
-        node_id: node; None where it is none.
+        device: name of the node or motor; None where it is none.
         what: what was wrong, a sentence with its numbers.
         frames: frames that show it, in order.
     """
 
     t_ns: int
-    node_id: int | None
+    device: str | None
     what: str
     frames: tuple[BusFrame, ...]
 
@@ -108,14 +110,16 @@ class Case:
         self._charges_ns = charges_ns
         self._runs: Counter[Hashable] = Counter()
 
-    def watches(self) -> Iterable[tuple[SeenNode | None, Watch[Any]]]:
-        """Each node with the generator that follows it; None with the one that follows the bus."""
+    def watches(self) -> Iterable[tuple[Device | None, Watch[Any]]]:
+        """Each node or motor with the generator that follows it; None with the one that follows the bus."""
         watch = self.rule.watch
+        if "motor" in watch.__annotations__:
+            return [(motor, watch(self, motor)) for motor in self.bus.motors]
         if "node" not in watch.__annotations__:
             return [(None, watch(self))]
         return [(node, watch(self, node)) for node in self.bus.nodes.values()]
 
-    def blame(self, node: SeenNode | None, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
+    def blame(self, device: Device | None, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
         """Note a finding at the present time, with the frames that show it."""
         if self._is_excused():
             return
@@ -123,14 +127,14 @@ class Case:
         if len(self.findings) < _KEPT_FINDINGS:
             frames = dict.fromkeys(one if isinstance(one, BusFrame) else one.frame for one in shown if one is not None)
             ordered = tuple(sorted(frames, key=lambda frame: frame.t_ns))
-            node_id = node.node_id if node is not None else None
-            self.findings.append(RuleFinding(self.bus.now_ns, node_id, what, ordered))
+            name = device.name if device is not None else None
+            self.findings.append(RuleFinding(self.bus.now_ns, name, what, ordered))
 
-    def expect(self, node: SeenNode | None, good: bool, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
+    def expect(self, device: Device | None, good: bool, what: str, *shown: BusFrame | BusEvent | Known | None) -> None:
         """Judge once: note a finding, as `blame` does, unless all is well."""
         self.looked += 1
         if not good:
-            self.blame(node, what, *shown)
+            self.blame(device, what, *shown)
 
     def in_a_row(self, key: Hashable, bad: bool, wanted: int = 2) -> bool:
         """Count what is bad in a row; whether it has just become `wanted`. While a fault excuses it nothing counts."""

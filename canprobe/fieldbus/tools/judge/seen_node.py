@@ -102,7 +102,7 @@ class SeenNode:
     """
 
     def __init__(self, node_id: int, description: Description, *, served: bool) -> None:
-        self.node_id = node_id
+        self.node_id, self.name = node_id, f"node {node_id}"
         self._description = description
         self._served = served
         self.nmt: NmtState | None = None
