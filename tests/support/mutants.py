@@ -49,7 +49,7 @@ MODULES = {
     **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
     **{name: f"canprobe/cell/planning/{name}.py" for name in PLANNING_MODULES},
     "depth_witness": "canprobe/mechanics/touch/depth_witness.py",
-    "sinking": "canprobe/mechanics/touch/sinking.py",
+    "sinkage": "canprobe/mechanics/touch/sinkage.py",
     "recovery": "canprobe/cell/session/recovery.py",
     "held": "canprobe/cell/tasks/paused.py",
 }

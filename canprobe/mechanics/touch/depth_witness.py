@@ -9,7 +9,7 @@ surface contradicts begins a suspect time; what comes in it is not believed unti
 so long that the witness has nothing to say. A force that falls from one image to the next by more than the probe can
 have moved off begins one at once: from then on d₁ is that of before, too.
 
-A touch that goes on over new ground is followed by its `Sinking`, too, as contacts that sink with the probe show no
+A touch that goes on over new ground is followed by its `Sinkage`, too, as contacts that sink with the probe show no
 surface that would contradict them.
 """
 
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canprobe.mechanics.touch.sinking import Sinking
+from canprobe.mechanics.touch.sinkage import Sinkage
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
@@ -138,7 +138,7 @@ class DepthWitness:
         self._recent: list[_Kept] = []
         self._deep_since: float | None = None
         self._last: _Kept | None = None
-        self._sinking = Sinking(self._slope_sigma)
+        self._sinkage = Sinkage(self._slope_sigma)
         self._d1: float | None = None
         self.fall: Fall | None = None
         self.depth, self.sigma, self.force = math.nan, math.inf, math.nan
@@ -175,7 +175,7 @@ class DepthWitness:
         if self.fall is not None and (not known or force >= FALL_SHARE * self.force):
             self.fall = self._d1 = None
         least = max(doubt, 0.5 * (limit - now))
-        sunk = self._sinking.step(centre, normal, contact.root, d1) if normal is not None and not self._holds else 0.0
+        sunk = self._sinkage.step(centre, normal, contact.root, d1) if normal is not None and not self._holds else 0.0
         sinks = sunk > SUNK_SHARE * max(limit - now, 0.0)
         if sinks:
             self.force = max(((now + sunk) / d1) ** 2, 0.0 if math.isnan(self.force) else self.force)

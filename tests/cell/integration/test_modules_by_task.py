@@ -21,7 +21,7 @@ LIMITS = {
     "image.force_errors",
     "pad",
     "shapes",
-    "sinking",
+    "sinkage",
     "stops",
     "tangent_frames",
 }

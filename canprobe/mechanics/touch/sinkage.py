@@ -27,10 +27,10 @@ CERTAIN_SIGMAS = 2.5
 """Standard deviations below which the sum says nothing."""
 
 
-class Sinking:
+class Sinkage:
     """Follows one touch that goes on over a surface.
 
-    Example: `sunk = sinking.step(centre, normal, root, d1)` for each image.
+    Example: `sunk = sinkage.step(centre, normal, root, d1)` for each image.
 
     Args:
         slope_sigma: standard deviation of a way of the arm against where it says that it goes, rad.
