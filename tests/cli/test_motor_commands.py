@@ -15,6 +15,7 @@ from canprobe.cli import main
     [
         ("--motor damiao:4310 --id 1", "did you mean damiao:dm4310?"),
         ("--motor damiao:dm4310", "1 --motor, 0 --id"),
+        ("--motor damiao:dm4310 --id 1 --motor damiao:dm4310 --id 2 --mst-id 0x12", "all of them an --mst-id or none"),
         ("--motor damiao:dm4310 --id 0", "from 1 to 127"),
         ("--motor damiao:dm4310 --id 1 --mst-id 0x800", "an identifier such as 0x11, got '0x800'"),
         ("--motor damiao:dm4310 --id 1 --eds puma260_joint --node-id 5", "is NMT; give --mst-id 0x11"),

@@ -16,19 +16,20 @@ def motors_on_bus(
 
     Args:
         names: make and type of each, such as `damiao:dm4310`.
-        ids, mst_ids: ESC_ID and MST_ID of each; an MST_ID that is left out is 0.
+        ids, mst_ids: ESC_ID and MST_ID of each; where no MST_ID is given, all are 0.
         node_ids: ids of the nodes, whose identifiers are those of CANopen's predefined connection set.
 
     Raises:
         UsageError: a type is unknown, an id is missing, or two devices would share an identifier.
     """
-    if len(ids) != len(names) or len(mst_ids) > len(names):
-        raise UsageError(f"{len(names)} --motor, {len(ids)} --id, {len(mst_ids)} --mst-id: each motor needs its --id")
+    if len(ids) != len(names) or len(mst_ids) not in (0, len(names)):
+        given = f"{len(names)} --motor, {len(ids)} --id, {len(mst_ids)} --mst-id"
+        raise UsageError(f"{given}: each motor needs its --id, and all of them an --mst-id or none")
     types = {f"damiao:{name}": name for name in TYPES}
     taken = {REGISTER_ID: "requests for registers"} | ({0: "NMT", 0x80: "SYNC", 0x100: "TIME"} if node_ids else {})
     taken |= {base + one: f"a frame of node {one}" for one in node_ids for base in range(0x80, 0x780, 0x80)}
     motors = []
-    for name, motor_id, mst_id in zip(names, ids, (*mst_ids, *[0] * len(ids)), strict=False):
+    for name, motor_id, mst_id in zip(names, ids, mst_ids or [0] * len(ids), strict=True):
         if name not in types:
             raise UsageError(f"--motor {name}: expected one of {', '.join(types)}{did_you_mean(name, types)}")
         if motor_id in node_ids or ids.count(motor_id) > 1:
