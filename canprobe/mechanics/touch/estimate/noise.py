@@ -29,7 +29,7 @@ class Correlation:
     The centroids of an array err beside this by a part that changes only as the contact moves over the pad
     (`ContactSample.sigma_slow`): hysteresis, gains of taxels. It is correlated by `exp(−w / pad_length)`, w the way of
     the contact over the pad between two samples. Where the pad rests it is one error for all samples, which bends no
-    surface.
+    surface. `share` is then that of the variance which these slow errors leave.
 
     Attributes:
         length: correlation length, m (the unit of the points).
@@ -67,6 +67,7 @@ class Correlation:
         """Correlations (3, n, n) of the rows of samples at places (n,) along the path, m, with their slow errors."""
         R: Floats = self.shares[:, None, None] * np.exp(-np.abs(path[:, None] - path) / self.length)
         if slow is not None:
+            R[1:] *= np.outer(slow.rest, slow.rest)
             R[1:] += np.outer(slow.share, slow.share) * np.exp(-np.abs(slow.way[:, None] - slow.way) / self.pad_length)
         here = np.arange(len(path))
         R[:, here, here] = 1.0
@@ -91,6 +92,11 @@ class SlowErrors(NamedTuple):
 
     share: Floats
     way: Floats
+
+    @property
+    def rest(self) -> Floats:
+        """(n,) standard deviation of all other errors over that of the whole."""
+        return np.sqrt(1.0 - self.share**2)
 
 
 def mixed(matrices: Floats, rows: Floats) -> Floats:

@@ -8,7 +8,6 @@ wrong would otherwise stay in the memory.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -42,13 +41,10 @@ class ExpectedMisfit(NamedTuple):
     """What is assumed where a filter looks for a misfit.
 
     Attributes:
-        noise: variance of the residuals over the stated one. Without it a σ that is stated too large would make a
-            misfit look like noise.
         curvature: least ‖K‖ · length whose usual changes are allowed for: a flat place need not lie on a plane.
         sigma_point: stated standard deviation of a point over the length.
     """
 
-    noise: float = 1.0
     curvature: float = 0.0
     sigma_point: float = 0.0
 
@@ -130,9 +126,9 @@ class OmittedTerms:
         m = D[:, None] * self._information[9:].dot(X)
         weighted = solved(V, m)
         values, U = eigen(m.dot(weighted))  # directions in which the samples' information about the terms is diagonal
-        information = np.maximum(values, 0.0) / expected.noise
-        s = U.T.dot(weighted.T.dot(D * self._slope)) / expected.noise
-        blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
+        information = np.maximum(values, 0.0)
+        s = U.T.dot(weighted.T.dot(D * self._slope))
+        blur = sharpest(c) * expected.sigma_point
         off, terms = X[:9].dot(U), D[:, None] * U  # what a unit along each does to the parameters, and its terms
         off[6:] += shifted(place[0], place[1])[1][6:].dot(terms)
         found = averaged(information, s, -off, curvature, blur, observed)

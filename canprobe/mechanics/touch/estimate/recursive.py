@@ -48,8 +48,6 @@ CORRELATED_ALARM_SCALE = 1.75
 """Factor on the alarm's thresholds where errors of neighbours are correlated: running means vary more, and errors that
 change as the contact moves over the pad treble the innovation at a turn of a weave. A false alarm costs millimetres of
 larger errors. On 69 random scenes 1.4 gives 31 alarms and 1.75 gives 8, with errors 2 % smaller."""
-MIN_BELIEVED_INNOVATION = 0.5
-"""Usual innovation below which the stated noise is replaced by the observed one when a misfit is looked for."""
 
 CHANGING_NOTE = "the surface may be changing: nothing is observed"
 
@@ -197,10 +195,10 @@ class RecursiveEstimator(Estimator):
         return flat
 
     def _expected(self) -> ExpectedMisfit:
-        """The stated noise is used unless it is twice the usual; surfaces are taken to be as curved as the probe."""
-        usual = self._change.usual
-        noise = usual if usual < MIN_BELIEVED_INNOVATION else 1.0
-        return ExpectedMisfit(noise, self._coupling * self._memory, self._gate.sigma_point / self._memory)
+        """Surfaces are taken to be as curved as the probe."""
+        # why not less noise where innovations are small: a pad that hardly moves has small errors from contact to
+        # contact, and yet ones that last for millimetres and look like cubic terms
+        return ExpectedMisfit(self._coupling * self._memory, self._gate.sigma_point / self._memory)
 
     def _notes(self) -> tuple[str, ...]:
         changes, doubtful = self._change.alarms, round(self._doubtful)

@@ -50,7 +50,7 @@ class Score:
         places = np.linspace(0.0, travelled, len(J))
         self.matrix += rows.T @ mixed(self._correlation.matrix(places, slow), J).reshape(-1, k)
         fades = np.exp((places - travelled) / self._correlation.length)
-        self._recent = self._shares * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
+        self._recent = (fades[:, None, None] * self._correlated(len(J), slow) * J).sum(axis=0)
         if slow is not None:
             self._way = float(slow.way[-1])
             fades = slow.share * np.exp((slow.way - self._way) / self._correlation.pad_length)
@@ -73,19 +73,24 @@ class Score:
         self.matrix = back.T.dot(self.matrix).dot(back)
         self._recent, self._slow = self._recent.dot(back), self._slow.dot(back)
 
+    def _correlated(self, n: int, slow: SlowErrors | None) -> Floats:
+        """(n, 3, 1) standard deviations, over those of the rows, of what is correlated along the path."""
+        rest = np.ones(n) if slow is None else slow.rest
+        return self._shares * (1.0 - _TILTS * (1.0 - rest[:, None, None]))
+
     def _added(self, J: Floats, moved: float, kept: float, slow: SlowErrors | None) -> Floats:
         """(k, k) that new rows add: by themselves, and with earlier rows with which they are correlated."""
         if self._correlation is None:
             return np.asarray(J.T.dot(J), dtype=np.float64)
         n, k = len(J) // 3, J.shape[1]
         fade = math.exp(-moved / (n * self._correlation.length))
-        each = J.reshape(n, 3, k)
+        each, correlated = J.reshape(n, 3, k), self._correlated(n, slow)
         # exp(−s / length) makes the sum over all earlier rows a recursion with one row: no path has to be kept
         recent, past = kept * self._recent, np.empty((n, 3, k))
         for i in range(n):
             recent *= fade
-            past[i] = self._shares * recent
-            recent += self._shares * each[i]
+            past[i] = correlated[i] * recent
+            recent += correlated[i] * each[i]
         self._recent = recent
         if slow is not None:
             self._slow *= kept

@@ -4,9 +4,9 @@ Covariance, information, root and evidence of an answer say one thing; they are 
 region of curvature holds, in the order in which it comes in:
 
 1. Noise of points and normals as contacts state it, wider for images in doubt and for the time of a moving probe
-   (`estimate.gate`), correlated along the path and over the pad: `estimate.sandwich` (`recursive`),
-   `Correlation.whitener` (`ml`). Source: Huber, "The behavior of maximum likelihood estimates under nonstandard
-   conditions", 1967.
+   (`estimate.gate`), correlated along the path, heights and normals, and over the pad: `estimate.sandwich`
+   (`recursive`), `Correlation.whitener` (`ml`). Source: Huber, "The behavior of maximum likelihood estimates under
+   nonstandard conditions", 1967.
 2. The terms that a quadric leaves out: `estimate.misfit`, `estimate.omitted_terms`. Source: Hoeting, Madigan, Raftery
    and Volinsky, "Bayesian model averaging: a tutorial", 1999.
 3. Errors of c13, c23, c33, as far as a plane is refuted: `estimate.observed.curvature_covariance`. Source: Judge
@@ -15,7 +15,8 @@ region of curvature holds, in the order in which it comes in:
    earlier place, and of traces of creep (`patch_curvature`); χ² of both, where motion and patch disagree, widens it:
    `patch_fusion`.
 5. The level of the innovations, a factor: `noise_level`. Source: Birge, Phys. Rev. 40, 1932.
-6. Lag of the answer, scale, error of the tool, drag of the pad, each an error that is added: `systematic_errors`.
+6. Lag of the answer behind slow changes of curvature and quick ones, scale, error of the tool, drag of the pad, each
+   an error that is added: `systematic_errors`.
 7. Ground that was touched before narrows it, less where the curvature changes there: `map_fusion`.
 8. An array that is not as its calibration says, a factor: `FOREIGN_ARRAY_FACTOR`, once `CalibrationCheck` has found it.
 9. A force above those of the calibration, a factor: `beyond_factor`.

@@ -3,9 +3,9 @@
 **Lag.** An answer is a mean over the memory, and a patch is one over its own size. Where curvature changes along the
 path the mean belongs to an earlier place; the terms that a quadric leaves out (`misfit`) follow most of the change, not
 all of it. The error that is left points in the direction in which the answers move, and is taken to be their movement
-over a small share of the memory. So it is zero where the answers stay, however uncertain the surface was before, and
-large for a while where they change from one curvature to another. Why not move the answer on too: the movement is
-itself an estimate, and extrapolated noise would do more harm than the lag.
+over a small share of the memory (`LAGS`). So it is zero where the answers stay, however uncertain the surface was
+before, and large for a while where they change from one curvature to another. Why not move the answer on too: the
+movement is itself an estimate, and extrapolated noise would do more harm than the lag.
 
 **Scale** is a relative error that all curvatures have in common.
 
@@ -21,6 +21,7 @@ Each is added to the covariance (`with_errors`); curvature is not changed.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -30,13 +31,13 @@ from canprobe.mechanics.touch.online.estimator import AnswerPath, AnswerStage
 from canprobe.mechanics.touch.online.regions import with_errors
 from canprobe.mechanics.types import Floats
 
-SPAN_SHARE = 0.5
-"""Path, over the memory, over which a change of the answers is measured."""
+LAGS = ((0.5, 0.075), (0.1, 0.035))
+"""Path over which a change of the answers is measured, and path by which an answer lags behind such a change (one
+standard deviation), both over the memory. Slow changes lag by 1.5 mm of 20 mm, half a patch: set on scans of nine
+packaged scenes. A surface whose curvature goes up and down within some millimetres changes little over half the memory,
+so changes over 2 mm count apart, by 0.7 mm: set on 90 scenes of a development draw."""
 MIN_SPAN_SHARE = 0.05
-"""Least such path, just after a start."""
-LAG_SHARE = 0.075
-"""Path, over the memory, by which an answer lags (one standard deviation): 1.5 mm of 20 mm, half a patch. The value was
-set on scans of nine packaged scenes."""
+"""Least path of a change, just after a start."""
 SCALE_ERROR = 4e-3
 """Relative error of curvature that no path averages."""
 PAD_DRAG = 0.03
@@ -84,9 +85,8 @@ class SystematicErrors(AnswerStage):
             return answer
         self._travelled += self._path.step(answer)
         tensor = answer.curvature_tensor_base()
-        lag = self._lag_error(tensor)
+        errors = list(self._lag_errors(tensor))
         self._past.append((self._travelled, tensor))
-        errors = [] if lag is None else [lag]
         if self._scale != 0.0:
             errors.append(self._scale * tensor)
         if self._offset != 0.0:
@@ -95,16 +95,15 @@ class SystematicErrors(AnswerStage):
             errors += drag_errors(answer, self._drag)
         return with_errors(answer, *errors)
 
-    def _lag_error(self, tensor: Floats) -> Floats | None:
-        """(3, 3) change of the curvature tensor over the path by which an answer lags; None where it is not known."""
+    def _lag_errors(self, tensor: Floats) -> Iterator[Floats]:
+        """(3, 3) changes of the curvature tensor over the paths by which an answer lags, as far as they are known."""
         past = self._past
-        while len(past) > 1 and self._travelled - past[1][0] >= SPAN_SHARE * self._memory:
+        while len(past) > 1 and self._travelled - past[1][0] >= LAGS[0][0] * self._memory:
             past.popleft()
-        if not past or self._travelled - past[0][0] < MIN_SPAN_SHARE * self._memory:
-            return None
-        then, before = past[0]
-        result: Floats = (tensor - before) * (LAG_SHARE * self._memory / (self._travelled - then))
-        return result
+        for span, lag in LAGS if past else ():
+            then, before = next((p for p in reversed(past) if self._travelled - p[0] >= span * self._memory), past[0])
+            if self._travelled - then >= MIN_SPAN_SHARE * self._memory:
+                yield (tensor - before) * (lag * self._memory / (self._travelled - then))
 
 
 def drag_errors(answer: SurfaceEstimate, drag: float) -> list[Floats]:

@@ -7,7 +7,7 @@ import pytest
 
 from canprobe.mechanics.touch import Correlation, Prior
 from canprobe.mechanics.touch.estimate.information import InformationFilter
-from canprobe.mechanics.touch.estimate.noise import Noise
+from canprobe.mechanics.touch.estimate.noise import Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.observed import curvature_covariance
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, OmittedTerms
@@ -157,14 +157,14 @@ def test_sums_are_carried_along_as_if_they_were_taken_in_the_last_frame():
 QUADRIC = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
 
 
-def sums_of(seed, size, scale=1.0):
+def sums_of(seed, size):
     """Sums of 200 samples of a surface with terms that a quadric has not; rows, H of the quadric, and residuals."""
     rng = RNG(seed)
     J, E, e = rng.normal(size=(200, 3, 9)), rng.normal(size=(200, 3, 9)), rng.normal(size=600)
     rows = np.concatenate([J, E], axis=2)
     flat = rows.reshape(-1, 18)
     H = np.linalg.inv(flat[:, :9].T @ flat[:, :9])
-    residuals = scale * (flat[:, 9:] @ (size * rng.normal(size=9)) + e)
+    residuals = flat[:, 9:] @ (size * rng.normal(size=9)) + e
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))  # at the quadric that fits best
     sums = OmittedTerms(1e-9 * np.eye(9), None)
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
@@ -198,26 +198,16 @@ def test_where_k_is_its_noise_the_others_hardly_count():
         assert (np.linalg.eigvalsh(found) > 0.0).all()
 
 
-def test_generous_noise_does_not_hide_a_misfit():
-    """Deviations stated three times too large make a misfit ten times less evident; said so, it is found again."""
-    sums, _, H, _ = sums_of(11, 0.14, 1.0 / 3.0)
-    stated, known = (
-        sums.amend(QUADRIC, H, np.zeros(3), ExpectedMisfit(noise), np.eye(3)) for noise in (1.0, 1.0 / 9.0)
-    )
-    assert stated.average.misfit < 0.5
-    assert known.average.misfit > 0.99
-
-
 # The running covariance of the score is the one of all rows at once.
 
 STEPS = [(4, 0.5e-3, 0.9), (3, 0.6e-3, 0.8), (5, 0.4e-3, 0.95)]
 PRIOR = np.diag(np.arange(1.0, 10.0))
 
 
-def of_all(rows, places, weights, correlation):
+def of_all(rows, places, weights, correlation, slow=None):
     """Σ_ij w_i w_j Σ_k ρ_k(s_i − s_j) J_ikᵀ J_jk, one kind of row k after the other."""
     total = np.zeros((9, 9))
-    for kind, R in enumerate(correlation.matrix(places)):
+    for kind, R in enumerate(correlation.matrix(places, slow)):
         J = rows[:, kind] * weights[:, None]
         total += J.T @ R @ J
     return total
@@ -243,6 +233,18 @@ def test_steps_add_up_across_a_change_of_frame(correlation):
         if k == 1:
             score.carry(back)
     assert np.allclose(score.matrix, of_all(np.concatenate(rows) @ back, places, weights, correlation))
+
+
+def test_slow_errors_and_those_along_the_path_add_up():
+    correlation, rng = Correlation(1e-3, 0.6, 0.0, pad_length=0.3e-3), np.random.default_rng(3)
+    rows, places, weights = stretch(rng)
+    n = len(places)
+    slow = SlowErrors(rng.uniform(0.5, 1.0, n), np.cumsum(rng.uniform(0.0, 0.1e-3, n)))
+    score, done = Score(np.zeros((9, 9)), correlation), 0
+    for J, (k, moved, kept) in zip(rows, STEPS, strict=True):
+        here = slice(done, done := done + k)
+        score.take(J.reshape(-1, 9), moved, kept, 0.0, SlowErrors(slow.share[here], slow.way[here]))
+    assert np.allclose(score.matrix, of_all(np.concatenate(rows), places, weights, correlation, slow))
 
 
 def test_a_batch_goes_on_as_steps():

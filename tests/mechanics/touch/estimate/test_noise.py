@@ -7,6 +7,7 @@ import pytest
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch import Correlation, Prior, cramer_rao, fit_surface
+from canprobe.mechanics.touch.estimate.noise import SlowErrors
 
 SIGMA = {"sigma_point": 5e-5, "sigma_normal": 3e-3}
 LENGTH, SHARE, STEP = 1.5e-3, 0.9, 0.125e-3
@@ -76,6 +77,14 @@ def test_whitening_is_the_inverse_of_the_correlation():
     W = KNOWN.whitener(path)
     expected = SHARE * np.exp(-np.abs(np.subtract.outer(path, path)) / LENGTH) + (1.0 - SHARE) * np.eye(30)
     assert np.allclose(W.mT @ W @ expected, np.eye(30), atol=1e-6)
+
+
+def test_slow_errors_take_their_part_of_the_variance_first():
+    """Whatever is said of the rest: where slow errors are nearly all of the error, they are all that is correlated."""
+    path, slow = np.linspace(0.0, 0.01, 40), SlowErrors(np.full(40, 0.999), np.linspace(0.0, 1e-6, 40))
+    R = Correlation(2e-3, 0.8, pad_length=1.0).matrix(path, slow)
+    assert np.linalg.eigvalsh(R)[:, 0].min() > 0.0
+    assert R[1, 0, 1] == pytest.approx(0.999**2 + 0.8 * (1.0 - 0.999**2) * np.exp(-0.01 / 39 / 2e-3), abs=1e-5)
 
 
 @pytest.mark.parametrize(

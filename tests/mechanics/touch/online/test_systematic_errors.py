@@ -6,7 +6,7 @@ import pytest
 from canprobe.mechanics.touch import ContactSample, SystematicErrors, fit_surface
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.online.regions import with_errors
-from canprobe.mechanics.touch.online.systematic_errors import LAG_SHARE, SPAN_SHARE
+from canprobe.mechanics.touch.online.systematic_errors import LAGS
 
 MEMORY = 0.02
 SIGMAS = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
@@ -42,14 +42,20 @@ def test_where_answers_stay_their_regions_stay():
 
 
 def test_a_region_grows_by_the_change_over_the_lag():
-    """Curvature grows by 0.5 1/m a millimetre in both directions: the lag of 1.5 mm is 0.75 1/m of K11 and of K22."""
+    """Curvature grows by 0.5 1/m a millimetre in both directions: a lag of 1.5 mm is 0.75 1/m of K11 and of K22."""
     found, bare = followed([20.0 + 0.5 * i for i in range(15)], 1e-3)
     added = found.covariance - bare.covariance
-    expected = 0.5e3 * LAG_SHARE * MEMORY
+    expected = 0.5e3 * MEMORY * np.hypot(*(lag for _, lag in LAGS))
     assert np.sqrt(added[0, 0]) == pytest.approx(expected, rel=0.05)
     assert added[0, 2] == pytest.approx(expected**2, rel=0.1)
     assert abs(added[1, 1]) < 0.01 * expected**2
     assert np.array_equal(found.K, bare.K)
+
+
+def test_a_region_grows_where_curvature_goes_up_and_down_within_millimetres():
+    """Half a memory ago the curvature was the same; 2 mm ago it was another one."""
+    found, bare = followed([20.0 + 6.0 * np.cos(2.0 * np.pi * i / 10.0) for i in range(21)], 1e-3)
+    assert np.sqrt(found.covariance[0, 0] - bare.covariance[0, 0]) > 0.5
 
 
 def test_a_region_holds_the_curvature_of_the_surface_that_an_offset_of_the_probe_shifts():
@@ -87,7 +93,7 @@ def test_a_region_holds_the_curvature_that_a_pad_with_wrong_ways_shows(error):
 
 
 def test_a_jump_is_doubted_for_as_long_as_the_span():
-    n = round(SPAN_SHARE * MEMORY / 1e-3)
+    n = round(max(span for span, _ in LAGS) * MEMORY / 1e-3)
     soon, bare = followed([5.0] * 12 + [30.0] * 3, 1e-3)
     later, _ = followed([5.0] * 12 + [30.0] * (n + 2), 1e-3)
     assert soon.covariance[0, 0] > bare.covariance[0, 0] + 3.0**2
