@@ -23,11 +23,6 @@ class EmcyEvent:
     t_ns: int
 
     @property
-    def is_communication(self) -> bool:
-        """Whether the message is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
-        return self.emcy.code >> 8 in (0x81, 0x82)
-
-    @property
     def what(self) -> str:
         """The message in words."""
         late = " (no SYNC in time)" if self.emcy.code == SYNC_LOST_CODE else ""
@@ -105,7 +100,7 @@ class NodeWatch:
             return
         self.last_alarm[node_id] = event
         self._untold.append(event)
-        if event.is_communication:
+        if event.emcy.code >> 8 in (0x81, 0x82):  # it is about frames, by the error codes of CiA 301
             self.communication += 1
         else:
             self.device_alarm = self.device_alarm or event

@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Container, Iterator, Sequence
 
 from canprobe.cell.planning.array import cut_patch, measured_share, patch_across_taxels, support_of
-from canprobe.cell.planning.bridges import bridge_outputs
+from canprobe.cell.planning.bridges import BRIDGES
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.scene.geometry import mesh_warnings
@@ -141,8 +141,9 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
         "surface.npz": mapped,
         "report.png": FIGURE not in absent,
         "surface.png": mapped and FIGURE not in absent,
+        **{output: True for name in setup.bridge.use if (output := BRIDGES[name].output) is not None},
     }
-    return (*(file for file, is_written in written.items() if is_written), *bridge_outputs(setup))
+    return tuple(file for file, is_written in written.items() if is_written)
 
 
 MISSED_SYNCS_REAL = 10

@@ -6,7 +6,6 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from canprobe.cell.scene.setup import Setup
 from canprobe.errors import UsageError, did_you_mean, install_line
 from canprobe.fieldbus.bus.system import system
 
@@ -101,13 +100,3 @@ def check_bridges(names: Iterable[str]) -> None:
             raise UsageError(f"bridge {name!r}: there is no such bridge{hint}; there are: {known}")
         if lacks := BRIDGES[name].lacks:
             raise UsageError(f"bridge {name}: {lacks}")
-
-
-def unavailable_bridges(setup: Setup) -> tuple[tuple[str, str], ...]:
-    """Bridges that the scene asks for and cannot have here, as (what, why)."""
-    return tuple((f"bridge {name}", lacks) for name in setup.bridge.use if (lacks := BRIDGES[name].lacks))
-
-
-def bridge_outputs(setup: Setup) -> tuple[str, ...]:
-    """The files that the scene's bridges write."""
-    return tuple(output for name in setup.bridge.use if (output := BRIDGES[name].output) is not None)

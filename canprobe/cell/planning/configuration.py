@@ -31,14 +31,7 @@ from canprobe.cell.planning.node_configuration import (
     Write,
 )
 from canprobe.cell.planning.pdos import BusPlan
-from canprobe.cell.planning.sync import (
-    SYNC_PERIOD,
-    choose_mode,
-    follows_sync_period,
-    homing_problems,
-    interpolations,
-    is_profiled,
-)
+from canprobe.cell.planning.sync import SYNC_PERIOD, choose_mode, follows_sync_period, homing_problems, interpolations
 from canprobe.cell.planning.units import (
     FOLLOWING_WINDOW,
     POLARITY,
@@ -92,7 +85,7 @@ def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfig
     elif isinstance(node, Carrier):
         own, given = iter(()), _as_in_eds(device, _ENCODER_OTHERWISE)
     else:
-        own, given = _drive_writes(bus.sync, bus.axis_of(node.node_id)), _drive_given(device)
+        own, given = _drive_writes(bus.sync, bus.axis_of(node.node_id)), _as_in_eds(device, _DRIVE_OTHERWISE)
     wanted = [*_pdo_writes(device, used, switched_off), *_common_writes(bus.sync, device), *own]
     writes, left_out = _possible(bus, device, wanted)
     found = NodeConfiguration(
@@ -115,7 +108,7 @@ def configure(bus: BusPlan, kind: NodeKind, name: str, node: Node) -> NodeConfig
 
 def _with_drive(found: NodeConfiguration, bus: BusPlan, axis: PlannedAxis) -> NodeConfiguration:
     """The configuration with mode, homing and units of a drive."""
-    device, times = axis.device, _times(bus.sync, axis.device)
+    device, times = axis.device, interpolations(axis.device, bus.sync.period_us)
     others = [_interpolation_writes(device, time) for time in times[1:]]
     homing, not_homing = _possible(bus, device, _homing_writes(axis))
     if homing:
@@ -130,11 +123,6 @@ def _with_drive(found: NodeConfiguration, bus: BusPlan, axis: PlannedAxis) -> No
         turn=axis.turn,
         speed_unit=axis.unit(VELOCITY_UNIT_INDEX) or 1.0,
     )
-
-
-def _times(sync: SyncPlan, device: DeviceCapabilities) -> tuple[Interpolation, ...]:
-    """The values of 60C2h that express the period; none for profile position."""
-    return () if is_profiled(device) else interpolations(device, sync.period_us)
 
 
 Writes = tuple[Write, ...]
@@ -256,7 +244,7 @@ def _drive_writes(sync: SyncPlan, axis: PlannedAxis) -> Iterator[Write]:
     yield Write(MODE, 0, mode, "mode of operation")
     if mode is OperationMode.INTERPOLATED_POSITION:
         yield Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")
-    for time in _times(sync, device)[:1]:
+    for time in interpolations(device, sync.period_us)[:1]:
         yield from _interpolation_writes(device, time)
     if mode is OperationMode.PROFILE_POSITION:
         for (index, subindex), value in profile_values(axis).items():
@@ -337,16 +325,12 @@ def _array_writes(setup: Setup, array: Array, device: DeviceCapabilities) -> Ite
         yield Write(TARE_COMMAND, 0, TARE, "tare", read_back=False)
 
 
-def _drive_given(device: DeviceCapabilities) -> tuple[FixedEntry, ...]:
-    """The cell states in `sign` how a drive counts; 607Eh would turn that round. Speeds are written in unit 60A9h."""
-    otherwise = {
-        POLARITY: "it would count the other way round than the cell's sign says; set 607Eh back in the drive",
-        VELOCITY_UNIT_INDEX: "limits of speed would be wrong by the ratio of the units; set 60A9h back in the drive, or"
-        " take the drive's value into the EDS",
-    }
-    return _as_in_eds(device, otherwise)
-
-
+_DRIVE_OTHERWISE = {
+    POLARITY: "it would count the other way round than the cell's sign says; set 607Eh back in the drive",
+    VELOCITY_UNIT_INDEX: "limits of speed would be wrong by the ratio of the units; set 60A9h back in the drive, or"
+    " take the drive's value into the EDS",
+}
+"""The cell states in `sign` how a drive counts; 607Eh would turn that round. Speeds are written in unit 60A9h."""
 _ENCODER_OTHERWISE = {
     OPERATING_PARAMETERS: "it may count the other way round; set 6000h back in the encoder",
     TOTAL_RANGE: "its counts begin again at 0 elsewhere; set 6002h back in the encoder, or take its value into the EDS",

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from canprobe.cell.planning.advice import omitted_features, outputs, warnings
 from canprobe.cell.planning.array import array_problems, as_supported, cut_patch, speed_over_array_problems
-from canprobe.cell.planning.bridges import unavailable_bridges
+from canprobe.cell.planning.bridges import BRIDGES
 from canprobe.cell.planning.configuration import configure
 from canprobe.cell.planning.device_capabilities import SECTIONS, DeviceCapabilities, lacks
 from canprobe.cell.planning.external_arm import external_problems, servo_problems
@@ -71,7 +71,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         raise PlanError(_shared(problems), ways, "" if alone else ", beside what the other lines ask for")
     bus.setup = setup = setup.with_choices({choice.key: choice.value for choice in bus.choices})
     absent = omitted_features(setup)
-    bus.not_available += unavailable_bridges(setup)
+    bus.not_available += [(f"bridge {name}", lacks) for name in setup.bridge.use if (lacks := BRIDGES[name].lacks)]
     nodes = [configure(bus, *role) for role in _roles(setup)]
     if bus.problems:
         raise PlanError(_shared(bus.problems))

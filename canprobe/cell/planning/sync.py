@@ -221,8 +221,8 @@ def _values(entry: DescribedEntry | None, most: int) -> range:
 
 
 def interpolations(device: DeviceCapabilities, period_us: int) -> tuple[Interpolation, ...]:
-    """A period as the 60C2h of a device may express it, the first choice first; empty without 60C2h."""
-    return () if follows_sync_period(device) else _offer(device).expressions(period_us)
+    """A period as the 60C2h of a device may express it, the first choice first; empty where it needs none."""
+    return () if is_profiled(device) or follows_sync_period(device) else _offer(device).expressions(period_us)
 
 
 def period_problem(

@@ -17,7 +17,6 @@ from datetime import UTC, datetime
 from gzip import GzipFile
 from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
 from pathlib import Path
-from types import TracebackType
 
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
@@ -134,7 +133,7 @@ class CandumpWriter:
     def __enter__(self) -> CandumpWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

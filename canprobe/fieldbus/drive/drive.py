@@ -269,7 +269,7 @@ class DriveApplication(Application):
     def _show(self) -> None:
         """Compose the statusword; a change is an event for the PDOs that carry it."""
         word = (
-            cia402.statusword_of(self.state)
+            self.state.value
             | 1 << cia402.VOLTAGE_ENABLED_BIT
             | (self._core.state is NmtState.OPERATIONAL) << cia402.REMOTE_BIT
             | self._standstill << cia402.TARGET_REACHED_BIT

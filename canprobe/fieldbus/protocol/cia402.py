@@ -173,11 +173,6 @@ def describe_state(statusword: int) -> str:
     return state.name if state is not None else f"in no CiA 402 state (statusword {statusword:#06x})"
 
 
-def statusword_of(state: DriveState) -> int:
-    """The state bits of the statusword; the drive adds bits 4, 7 and 9..13."""
-    return state.value
-
-
 def command_of(controlword: int, previous: int = 0) -> DriveCommand | None:
     """The command in a controlword, given the one before it.
 

@@ -16,7 +16,6 @@ from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from types import TracebackType
 from typing import Self, TypeVar
 
 import canopen
@@ -150,7 +149,7 @@ class EmulatedBus(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._stack.close()
 
 
@@ -299,10 +298,10 @@ class ServedBus(EmulatedBus):
         port = open_port(self._interface, self.channel, self._bitrate, self.clock, waits=True)
         return self._stack.enter_context(closing(port))
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._ended.set()
         self._threads.close()
-        super().__exit__(kind, error, tb)
+        super().__exit__(kind, error, trace)
         if self._failures and error is None:
             raise self._failures[0]
 

@@ -153,8 +153,7 @@ class TimedBus(LockstepBus):
         self.settle()
 
     def _earliest(self) -> int | None:
-        dues = [node.due for node in self._nodes if node.due is not None]
-        return min(dues) if dues else None
+        return min((node.due for node in self._nodes if node.due is not None), default=None)
 
     def _bits_ns(self, bits: int) -> int:
         return -(-bits * NS_PER_S // self.bitrate)
