@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.argument_types import node_ids, number_of_32_bits, whole
+from canprobe.cli.argument_types import can_id, node_ids, number_of_32_bits, whole, word
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded, one_channel, real_target, scene_target
@@ -50,7 +50,10 @@ def add_arguments(parser: Parser) -> None:
         "--without-id IDS", "nodes that start without an id; `canprobe scan --lss` assigns it", node_ids, default=()
     )
     parser.add_option("--bus-yml FILE", "serve the slaves of a bus.yml of ros2_canopen", Path)
-    parser.add_motors()
+    motor = "motor that speaks no CANopen, such as damiao:dm4310; may be repeated, each with its --id"
+    parser.add_option("--motor MAKE:TYPE", motor, word, many=True)
+    parser.add_option("--id N", "id (ESC_ID) of the --motor at the same position", whole(1, 127), many=True)
+    parser.add_option("--mst-id N", "MST_ID of its answers [0, the factory's]", can_id, many=True)
     parser.add_option("--nodes IDS", "nodes to serve, such as 1-6,16 [those with emulated = true]", node_ids)
     parser.add_option("--truth FILE", "write the true values of the model to this npz file at the end", Path)
     parser.add_option("--store DIR", "folder that keeps what a master stores by 1010h or LSS [nothing is kept]", Path)
@@ -112,7 +115,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     if len(args.serial) > len(files):
         raise UsageError(f"emulate: {len(args.serial)} --serial, but {len(files)} --eds")
     channel = one_channel(args, f"emulate: with {source} there is one channel, without a name: --channel CH")
-    target = real_target(args.bus, channel, args.bitrate)
+    target = real_target(args, channel)
 
     from canprobe.cell.session.served import emulate_eds
 

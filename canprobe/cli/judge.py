@@ -168,7 +168,7 @@ def _server(args: argparse.Namespace, bench: MasterBench, nodes: Nodes) -> tuple
         from canprobe.cell.session.served import emulate_eds
         from canprobe.fieldbus.tools.judge.bench import start_position
 
-        target = real_target(args.bus, channel, args.bitrate)
+        target = real_target(args, channel)
         files = eds_files("judge", args)
         positions = [start_position(node) for node in nodes.values()]
         return target, lambda: emulate_eds(files, target, positions=positions, observer=bench, say=args.report.say)

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Container, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from canprobe.cli.argument_types import can_id, channel, folder_path, node_id, seconds, seed, setting, whole, word
+from canprobe.cli.argument_types import channel, folder_path, node_id, seconds, seed, setting, whole, word
 from canprobe.errors import did_you_mean
 
 PATIENT_SYNCS = 40
@@ -181,13 +181,6 @@ class Parser(argparse.ArgumentParser):
         what = "EDS, DCF, XDD or XDC file of a node; may be repeated, each with its --node-id"
         self.add_option("--eds FILE", what, many=True)
         self.add_option("--node-id N", f"node id for the --eds at the same position{more}", node_id, many=True)
-
-    def add_motors(self) -> None:
-        """Add --motor and --id, which stand in pairs, and --mst-id."""
-        what = "motor that speaks no CANopen, such as damiao:dm4310; may be repeated, each with its --id"
-        self.add_option("--motor MAKE:TYPE", what, word, many=True)
-        self.add_option("--id N", "id (ESC_ID) of the --motor at the same position", whole(1, 127), many=True)
-        self.add_option("--mst-id N", "MST_ID of its answers [0, the factory's]", can_id, many=True)
 
     def add_inject(self, what: str) -> None:
         """Add --inject; `what` begins its help."""

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
 
     from canprobe import api
 
-    target = real_target(args.bus, args.channel, args.bitrate, channel_else="can0")
+    target = real_target(args, args.channel, channel_else="can0")
     if not args.lss:
         nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
         print_answer(args, nodes, lambda: _print_nodes(nodes, target.channel))
