@@ -96,9 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if args.inject and args.passive:
         raise UsageError("judge: --inject throws faults, and --passive throws none; choose one")
     args.older = read_baseline(args)
-    if args.record is not None:
-        return _judge_record(args)
-    return _judge_served(args)
+    return _judge_served(args) if args.record is None else _judge_record(args)
 
 
 def _judge_record(args: argparse.Namespace) -> int:
