@@ -16,7 +16,7 @@ from functools import partial
 
 from canprobe.cell.session.terminal import StepReport
 from canprobe.cli.argument_types import folder_path, positive, seed, word
-from canprobe.cli.output import print_json
+from canprobe.cli.output import print_answer
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import target_of
 from canprobe.errors import install_line
@@ -94,11 +94,8 @@ def run(args: argparse.Namespace) -> int:
     ask, say = None if args.yes else _ask, partial(_say_step, args.report)
     if args.verify:
         calibration, verification = verify(request, date=today, ask=ask, say=say, out=out)
-        if args.json:
-            document = {**asdict(verification), "holds": verification.holds, "verified": calibration.verified}
-            print_json(without_nan(document))
-        else:
-            print(verification_text(calibration, verification))
+        document = {**asdict(verification), "holds": verification.holds, "verified": calibration.verified}
+        print_answer(args, without_nan(document), verification_text(calibration, verification))
         return 0 if verification.holds else 1
     found = calibrate(request, date=today, ask=ask, say=say, out=out)
     write_text(out / "calibration.toml", dump_calibration(found.fit.calibration))
@@ -106,15 +103,14 @@ def run(args: argparse.Namespace) -> int:
         draw_calibration(found.fit, out / "calibration.png")
     except ModuleNotFoundError:  # the touches are done: only their picture is missing
         args.report.say(f"calibration.png is left out: matplotlib is not installed: {install_line('study')}")
-    if args.json:
-        document = as_document(found.fit)
-        print_json({**document, "restless": [list(p) for p in found.restless], "notes": list(found.notes)})
-    else:
-        print(calibration_text(found.fit))
-        print(f"  unloaded   {len(found.restless)} taxels show counts, drift {found.drift_counts:.2f} counts")
-        for note in found.notes:
-            print(f"  note       {note}")
-        print(f'  file       {out / "calibration.toml"}; name it in the cell: [sensor] calibration = "..."')
+    document = as_document(found.fit) | {"restless": [list(p) for p in found.restless], "notes": list(found.notes)}
+    lines = [
+        calibration_text(found.fit),
+        f"  unloaded   {len(found.restless)} taxels show counts, drift {found.drift_counts:.2f} counts",
+        *(f"  note       {note}" for note in found.notes),
+        f'  file       {out / "calibration.toml"}; name it in the cell: [sensor] calibration = "..."',
+    ]
+    print_answer(args, document, "\n".join(lines))
     return 0
 
 

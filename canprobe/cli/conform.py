@@ -25,12 +25,11 @@ from canprobe.cli.reports import add_report_options, command_line, eds_and_hash,
 from canprobe.cli.stdin import yes_typed
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.eds.packaged import check_eds, load_eds
 from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
-    from canprobe.fieldbus.bus.port import Port
     from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.conform import Examination, Point
 
@@ -185,7 +184,7 @@ def _port(args: argparse.Namespace) -> Iterator[Port]:
             from canprobe.cell.session.target import open_bus, refuse_virtual
 
             refuse_virtual(args.bus, "conform")
-            target = real_target(args.bus, args.channel, args.bitrate, channel_else="can0")
+            target = real_target(args, args.channel, channel_else="can0")
             port = stack.enter_context(open_bus(target, args.report.say, args.data_bitrate))
         if args.log is not None:
             writer = stack.enter_context(CandumpWriter(args.log, port.channel, port.clock.now_ns()))

@@ -112,7 +112,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     if len(args.serial) > len(files):
         raise UsageError(f"emulate: {len(args.serial)} --serial, but {len(files)} --eds")
     channel = one_channel(args, f"emulate: with {source} there is one channel, without a name: --channel CH")
-    target = real_target(args.bus, channel, args.bitrate)
+    target = real_target(args, channel)
 
     from canprobe.cell.session.served import emulate_eds
 

@@ -99,11 +99,9 @@ def run(args: argparse.Namespace) -> int:
     if args.inject and args.passive:
         raise UsageError("judge: --inject throws faults, and --passive throws none; choose one")
     args.older = read_baseline(args)
-    if args.record is not None:
-        return _judge_record(args)
-    if args.motor:
+    if args.motor and args.record is None:
         raise UsageError("judge: masters of motors are judged by a log: serve motors with `canprobe emulate --motor …`")
-    return _judge_served(args)
+    return _judge_served(args) if args.record is None else _judge_record(args)
 
 
 def _judge_record(args: argparse.Namespace) -> int:
@@ -181,7 +179,7 @@ def _server(args: argparse.Namespace, bench: MasterBench, nodes: Nodes) -> tuple
         from canprobe.cell.session.served import emulate_eds
         from canprobe.fieldbus.tools.judge.bench import start_position
 
-        target = real_target(args.bus, channel, args.bitrate)
+        target = real_target(args, channel)
         files = eds_files("judge", args)
         positions = [start_position(node) for node in nodes.values()]
         return target, lambda: emulate_eds(files, target, positions=positions, observer=bench, say=args.report.say)

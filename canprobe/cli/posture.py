@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.hands import opened
 from canprobe.cli.move import standing
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_answer, print_table
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import loaded
 from canprobe.errors import UsageError
@@ -57,18 +57,16 @@ def run(args: argparse.Namespace) -> int:
 
     plan = make_plan(resolve(loaded(args)))
     arm = plan.setup.needed_arm("posture")
+    if args.action == "check":
+        return _check(plan)
     shown = {
         name: [round(its.shown(value), 3) for its, value in zip(arm.model.joints, q, strict=True)]
         for name, q in arm.postures.items()
     }
-    if args.action == "list":
-        if args.json:
-            print_json(shown)
-        else:
-            heads = [f"{its.name} ({its.unit})" for its in arm.model.joints]
-            print_table([["posture", *heads], *([name, *(f"{v:g}" for v in row)] for name, row in shown.items())])
-        return 0
-    return _check(plan)
+    heads = [f"{its.name} ({its.unit})" for its in arm.model.joints]
+    table = [["posture", *heads], *([name, *(f"{v:g}" for v in row)] for name, row in shown.items())]
+    print_answer(args, shown, lambda: print_table(table))
+    return 0
 
 
 def _check(plan: Plan) -> int:

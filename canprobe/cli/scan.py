@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> None:
 
     from canprobe import api
 
-    target = real_target(args.bus, args.channel, args.bitrate, channel_else="can0")
+    target = real_target(args, args.channel, channel_else="can0")
     if args.motors:
         found = api.scan(target, timeout_s=args.timeout, motors=True, say=args.report.say)
         print_answer(args, found, lambda: _print_motors(found, target.channel))

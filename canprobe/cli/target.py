@@ -122,17 +122,13 @@ def one_channel(args: argparse.Namespace, refusal: str) -> str | None:
 
 
 def real_target(
-    bus: str | None,
-    channel: str | None,
-    bitrate: int | None,
-    *,
-    channel_else: str | None = None,
-    bitrate_else: int = 1_000_000,
+    args: argparse.Namespace, channel: str | None, *, channel_else: str | None = None, bitrate_else: int = 1_000_000
 ) -> Target:
     """The bus of a command that needs a real one: from the command line, else from python-can's configuration.
 
     Args:
-        bus, channel, bitrate: options of the command line; None where not given.
+        args: the command line, with `bus` and `bitrate`.
+        channel: its channel; None where not given.
         channel_else, bitrate_else: values where neither the command line nor the configuration gives one.
 
     Raises:
@@ -141,8 +137,8 @@ def real_target(
     from canprobe.cell.session.target import Target
     from canprobe.fieldbus.bus.real.adapters import check_interface_name
 
-    interface = bus or "socketcan"
-    if bus in (None, CONFIG) and (found := _configured(bus)) is not None:
+    interface, bitrate = args.bus or "socketcan", args.bitrate
+    if args.bus in (None, CONFIG) and (found := _configured(args.bus)) is not None:
         interface, channel, bitrate = found.interface, channel or found.channel, bitrate or found.bitrate
     check_interface_name(interface)
     if (channel := channel or channel_else) is None:
@@ -155,7 +151,7 @@ def scene_target(args: argparse.Namespace, scene: Scene) -> Target:
     from canprobe.cell.session.target import Target
 
     name, channel = args.channel[0] if args.channel else ("", None)
-    real = real_target(args.bus, channel, args.bitrate, bitrate_else=scene.bus.bitrate)
+    real = real_target(args, channel, bitrate_else=scene.bus.bitrate)
     channels = _channels(args.channel, scene.channels) or {scene.bus.channel: real.channel}
     target = Target.over(scene, real.interface, channels, real.bitrate)
     one = channel if name is None else None

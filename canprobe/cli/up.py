@@ -6,6 +6,7 @@ The drives hold their positions. A SocketCAN interface is checked before anythin
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
@@ -51,16 +52,11 @@ def run(args: argparse.Namespace) -> None:
         need_terminal(args.yes, "up --check-joints asks before each motion")
 
     from canprobe import api
+    from canprobe.cli.operator import LetterKey, TerminalOperator
 
     if args.check_joints:
-        from canprobe.cli.operator import TerminalOperator
-
         api.check_joints(scene, operator=None if args.yes else TerminalOperator(), say=args.report.say)
         return
     with left_by_ctrl_c():
-        if args.recover:
-            from canprobe.cli.operator import LetterKey
-
-            api.up(scene, bridge=args.bridge, say=args.report.say, recover=True, asked=LetterKey("r").pressed)
-        else:
-            api.up(scene, bridge=args.bridge, say=args.report.say)
+        back: dict[str, Any] = {"recover": True, "asked": LetterKey("r").pressed} if args.recover else {}
+        api.up(scene, bridge=args.bridge, say=args.report.say, **back)

@@ -19,8 +19,8 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.recorded.recording import LogCycles, RunFolder, read_run, replay_contacts, replay_task
 from canprobe.cell.results.run_files import TACTILE, TRUTH, is_recorded, needed, read_scene, read_truth
-from canprobe.cell.results.scores import estimate_columns
-from canprobe.cell.results.summary import summarise_shape, without_nan
+from canprobe.cell.results.scores import estimate_columns, summarise_shape
+from canprobe.cell.results.summary import without_nan
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import SAVED_AS, load_scene
 from canprobe.cell.scene.model import BridgeSettings, OutputSettings, Scene

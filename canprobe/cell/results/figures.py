@@ -41,11 +41,9 @@ MIN_SPAN_PER_M = 1.0
 
 def draw_run(result: RunData, path: Path) -> None:
     """Draw the panels for which the run has data, and write a PNG."""
-    rows = _rows(result)
-    if not rows:
-        return
-    with picture(path, _title(result), 0.8 + 2.9 * len(rows)) as figure:
-        _fill(figure, rows, result)
+    if rows := _rows(result):
+        with picture(path, _title(result), 0.8 + 2.9 * len(rows)) as figure:
+            _fill(figure, rows, result)
 
 
 def run_figure(result: RunData) -> Figure:
@@ -54,8 +52,7 @@ def run_figure(result: RunData) -> Figure:
     Raises:
         UsageError: when the run has nothing to draw.
     """
-    rows = _rows(result)
-    if not rows:
+    if not (rows := _rows(result)):
         raise UsageError("plot: this run has no data for any panel")
     with sheet(_title(result), 0.8 + 2.9 * len(rows)) as figure:
         _fill(figure, rows, result)

@@ -20,8 +20,8 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE
-from canprobe.cell.results.scores import score_shape
-from canprobe.cell.results.summary import methods_table, summarise, truth_of, without_nan, write_summary, writers_of
+from canprobe.cell.results.scores import methods_table, score_shape
+from canprobe.cell.results.summary import summarise, truth_of, without_nan, write_summary, writers_of
 from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.joint_record import warned

@@ -23,11 +23,12 @@ from canprobe.cell.planning.bridges import check_view
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import LOG, TACTILE, to_frame, write_parquet
+from canprobe.cell.results.scores import Contacts, Scores, estimate_columns, score_estimators
 from canprobe.cell.results.summary import writers_of
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.folder import write_scene
-from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.tasks.shape import OwnEstimator, ShapeRecord
 from canprobe.errors import UsageError, needed_module
 from canprobe.mechanics.types import Floats
 
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-    from canprobe.cell.results.scores import Contacts, Scores
-    from canprobe.cell.tasks.shape import OwnEstimator
     from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 
@@ -206,8 +205,6 @@ class RunResult:
         Raises:
             UsageError: when nothing was scanned, no truth is known, or a method is unknown.
         """
-        from canprobe.cell.results.scores import score_estimators
-
         task, scene = self.plan.setup.task, self.plan.scene
         if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
             raise UsageError("score: expected a scan that touched its object, got no contacts")
@@ -274,8 +271,6 @@ class RunResult:
 
     def _columns(self, what: str) -> Mapping[str, Floats]:
         if what == "estimates":
-            from canprobe.cell.results.scores import estimate_columns
-
             return estimate_columns(next(iter(self.estimates.values()), []))
         if what not in ("log", "truth"):
             raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")

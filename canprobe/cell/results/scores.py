@@ -276,6 +276,58 @@ def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[st
     return found
 
 
+def summarise_shape(
+    setup: Setup,
+    tracker: ShapeTracker | None,
+    estimates: dict[str, list[ShapeRecord]],
+    truth: Mapping[str, Floats],
+    sync_times: Floats,
+) -> dict[str, Any]:
+    """The section ``shape`` of ``summary.json``: figures of the first estimator, and a table of all.
+
+    Args:
+        setup: setup of the run.
+        tracker: tracker of its contacts; None without a shape.
+        estimates: the answers of each estimator, by name.
+        truth: columns of the plant's truth, one row per SYNC; empty without a truth.
+        sync_times: time of each SYNC (n,), s, on the clock of the estimates.
+    """
+    names = (
+        *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
+        *("normal_rms_deg", "position_rms_mm", "observed", "patch_fraction", "cramer_rao_ratio"),
+    )
+    shape: dict[str, Any] = dict.fromkeys(names)
+    if not estimates:
+        return shape
+    method = next(iter(estimates))
+    records = estimates[method]
+    shape["method"] = method
+    if tracker is not None and (surface_map := tracker.surface_map) is not None:
+        shape["map"] = summarise_map(surface_map, setup.truth.object if truth else None)
+    if records:
+        shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
+        kappa = np.asarray(records[-1].estimate.kappa).tolist()
+        shape["kappa_est_per_m"] = [one if np.isfinite(one) else None for one in kappa]
+    if not truth:
+        return shape
+    scores = {name: score_shape(answers, truth, sync_times) for name, answers in estimates.items()}
+    score = asdict(scores[method])
+    score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
+    shape |= {name: value for name, value in score.items() if name in names}
+    shape["cramer_rao_ratio"] = bound_ratio(setup, tracker, scores[method], truth, sync_times)
+    shape["methods"] = methods_table(scores)
+    return shape
+
+
+def methods_table(scores: Mapping[str, ShapeScore]) -> dict[str, dict[str, Any]]:
+    """The table ``shape.methods`` of ``summary.json`` from the scores of methods, by name."""
+    of_run = ("kappa_true_per_m", "kappa_est_per_m")
+    return {
+        method: {name: value for name, value in asdict(score).items() if name not in of_run}
+        for method, score in scores.items()
+    }
+
+
 def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Floats]:
     """Estimates as columns, one row for each estimate; the suffix of a name is its unit."""
     answers = [r.estimate for r in records]

@@ -6,7 +6,6 @@ import contextlib
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +17,12 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
-from canprobe.cell.results.scores import (
-    ShapeScore,
-    bound_ratio,
-    score_contact,
-    score_measured_force,
-    score_shape,
-    state_force_sigma,
-    summarise_map,
-)
+from canprobe.cell.results.scores import score_contact, score_measured_force, state_force_sigma, summarise_shape
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
-from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.files import write_text
@@ -211,57 +202,6 @@ def _hidden_force(session: Session, highest: float | None, log: Mapping[str, Flo
         f"the true force rose to {highest:.2f} N, above limits.force_max_n = {limit:g}: the array measured at most"
         f" {np.nanmax(log['force_n'], initial=0.0):.2f} N"
     ]
-
-
-def summarise_shape(
-    setup: Setup,
-    tracker: ShapeTracker | None,
-    estimates: dict[str, list[ShapeRecord]],
-    truth: Mapping[str, Floats],
-    sync_times: Floats,
-) -> dict[str, Any]:
-    """The section ``shape`` of ``summary.json``: figures of the first estimator, and a table of all.
-
-    Args:
-        setup: setup of the run.
-        tracker: tracker of its contacts; None without a shape.
-        estimates: the answers of each estimator, by name.
-        truth: columns of the plant's truth, one row per SYNC; empty without a truth.
-        sync_times: time of each SYNC (n,), s, on the clock of the estimates.
-    """
-    names = (
-        *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
-        *("normal_rms_deg", "position_rms_mm", "observed", "patch_fraction", "cramer_rao_ratio"),
-    )
-    shape: dict[str, Any] = dict.fromkeys(names)
-    if not estimates:
-        return shape
-    method = next(iter(estimates))
-    records = estimates[method]
-    shape["method"] = method
-    if tracker is not None and (surface_map := tracker.surface_map) is not None:
-        shape["map"] = summarise_map(surface_map, setup.truth.object if truth else None)
-    if records:
-        shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
-        shape["kappa_est_per_m"] = without_nan(np.asarray(records[-1].estimate.kappa).tolist())
-    if not truth:
-        return shape
-    scores = {name: score_shape(answers, truth, sync_times) for name, answers in estimates.items()}
-    score = asdict(scores[method])
-    score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
-    shape |= {name: value for name, value in score.items() if name in names}
-    shape["cramer_rao_ratio"] = bound_ratio(setup, tracker, scores[method], truth, sync_times)
-    shape["methods"] = methods_table(scores)
-    return shape
-
-
-def methods_table(scores: Mapping[str, ShapeScore]) -> dict[str, dict[str, Any]]:
-    """The table ``shape.methods`` of ``summary.json`` from the scores of methods, by name."""
-    of_run = ("kappa_true_per_m", "kappa_est_per_m")
-    return {
-        method: {name: value for name, value in asdict(score).items() if name not in of_run}
-        for method, score in scores.items()
-    }
 
 
 def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:

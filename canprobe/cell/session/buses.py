@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.observers import Observers
@@ -74,12 +74,13 @@ class TrafficCounter:
 
 
 class BusRecord:
-    """Record of every bus of a run. A context manager: leaving closes ``bus.log``.
+    """Record of every bus of a run.
 
     Args:
         plan: plan of the run.
         out: folder for ``bus.log``, which the first `writer` prepares, where the scene wants it; None writes nothing.
         observers: observers that get the frames; None where there are none.
+        stack: the way out of the session, which closes ``bus.log``.
 
     Attributes:
         origin_ns: time on the clock of the buses from which the log counts.
@@ -88,7 +89,7 @@ class BusRecord:
             the log is compared afterwards.
     """
 
-    def __init__(self, plan: Plan, out: Path | None, observers: Observers | None) -> None:
+    def __init__(self, plan: Plan, out: Path | None, observers: Observers | None, stack: ExitStack) -> None:
         self.origin_ns = 0
         self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
         self.meters: dict[str, TrafficMeter] = {}
@@ -98,13 +99,7 @@ class BusRecord:
         self._candump: CandumpWriter | None = None
         self._writers: dict[str, Write] = {}
         self._time_ns = 0
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._stack = stack
 
     def writer(self, channel: str) -> Write:
         """Make the function that takes each frame of a bus; a bus that is opened again has the same one."""

@@ -22,7 +22,6 @@ from canprobe.cell.emulated.world import World
 from canprobe.cell.master.bringup import HEARTBEAT_CONSUMER
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
-from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.node_configuration import NodeConfiguration, Write
 from canprobe.fieldbus.bus.port import Port, nothing
@@ -38,8 +37,6 @@ from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 
 if TYPE_CHECKING:
     from canprobe.cell.master.array import TactileReceiver
-    from canprobe.cell.master.carrier import CarrierReceiver
-    from canprobe.cell.master.drives import DriveGroup
     from canprobe.fieldbus.drive.drive import DriveApplication
 
 
@@ -102,20 +99,10 @@ class DirectCycle(Cycle):
         NodeError: a node refuses a required write.
     """
 
-    def __init__(
-        self,
-        port: Port,
-        plan: Plan,
-        *,
-        world: World,
-        drives: DriveGroup | None,
-        tactile: TactileReceiver | None,
-        watch: NodeWatch,
-        carrier: CarrierReceiver | None = None,
-        **more: Any,
-    ) -> None:
+    def __init__(self, port: Port, plan: Plan, *, world: World, tactile: TactileReceiver | None, **more: Any) -> None:
         port.clock.sleep_until_ns(port.clock.now_ns() + round(SECOND_ANSWER_S * 1e9))  # as bring-up for second boot-ups
-        super().__init__(port, plan, drives=drives, tactile=tactile, watch=watch, carrier=carrier, **more)
+        super().__init__(port, plan, tactile=tactile, **more)
+        drives, carrier = self._drives, self._intake.carrier
         self._clock, self._first_look_ns = port.clock, plan.budget.looks_ns[0]
         self._counter = 0
         self._commands = drives.targets.commands if drives is not None else tuple

@@ -10,9 +10,6 @@ from canprobe.errors import BusError, InterfaceError
 from canprobe.fieldbus.bus.port import ControllerState, Port
 from canprobe.fieldbus.bus.real.adapters import SOCKETCAN
 from canprobe.fieldbus.bus.real.link import (
-    FAST_SAMPLE_POINTS,
-    MAX_SLOW_BITRATE,
-    SLOW_SAMPLE_POINTS,
     TX_QUEUE_FRAMES,
     VIRTUAL_KINDS,
     LinkState,
@@ -20,6 +17,7 @@ from canprobe.fieldbus.bus.real.link import (
     ip_line,
     missing_ip,
     read_link,
+    sample_points,
     setting_line,
 )
 
@@ -118,7 +116,7 @@ def check_link(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
     if "ONE-SHOT" in link.modes:
         yield Remark(False, "it is in one-shot mode: a frame that loses the arbitration is not sent again")
     yield from _state(link)
-    low, best, high = SLOW_SAMPLE_POINTS if expected.bitrate <= MAX_SLOW_BITRATE else FAST_SAMPLE_POINTS
+    low, best, high = sample_points(expected.bitrate)
     point = link.sample_point
     if point is not None and not low - 1e-3 <= point <= high + 1e-3:
         at = f"{100 * point:.1f} % of the bit, {100 * best:g} % is recommended at {expected.bitrate} bit/s"

@@ -122,7 +122,7 @@ class Session:
         self.started_ns = elapsed_ns()
         for warning in self.plan.warnings:
             self.steps(f"warning: {warning}")
-        self.record = self._stack.enter_context(BusRecord(self.plan, self.options.out, self.observers))
+        self.record = BusRecord(self.plan, self.options.out, self.observers, self._stack)
         try:
             port = self.around(self.buses.open(self.record))
             self.steps.time_s = lambda: (port.clock.now_ns() - self.record.origin_ns) * 1e-9

@@ -15,7 +15,6 @@ from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.task import Phase
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.mechanics.touch import ContactSample, Patch
-from canprobe.mechanics.touch.contact import direction_to_pad
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import PathFollower
 from canprobe.mechanics.types import Floats
@@ -87,12 +86,6 @@ class LedTask(TouchTask):
         """The newest contact; there is one from the touch-down on."""
         assert self._newest is not None
         return self._newest
-
-    @property
-    def pad_uv(self) -> tuple[float, float]:
-        """Place of the contact on the pad, m."""
-        u, v = direction_to_pad(self.last_contact.r_probe, self.sensing.radius)
-        return u, v
 
     @property
     def estimate(self) -> SurfaceEstimate | None:

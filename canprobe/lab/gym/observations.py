@@ -11,6 +11,7 @@ from gymnasium import spaces
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.lab.gym.episode import SECTORS, Episode
+from canprobe.mechanics.touch.contact import direction_to_pad
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.types import Floats
 
@@ -80,7 +81,7 @@ class Observations:
             task.targets["target_force_n"],
             float(np.mean(episode.forces)),
             float(np.std(episode.forces)),
-            *(1e3 * uv for uv in task.pad_uv),
+            *(1e3 * uv for uv in direction_to_pad(contact.r_probe, task.sensing.radius)),
             *(1e3 * v for v in task.velocity),
             *(1e3 * along, 1e3 * across, 1e3 * up),
             *(task.axes[:2] @ contact.n_base).tolist(),

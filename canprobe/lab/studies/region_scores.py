@@ -146,10 +146,8 @@ def scores_of(session: Session, records: list[ShapeRecord]) -> tuple[list[list[f
 def scored(record: ShapeRecord, truth: Mapping[str, Floats], row: int) -> list[float]:
     """One row of `ScoredScan.scores`, in the axes of the answer."""
     P = record.estimate.T_frame_contact[:3, :2]
-    D = (
-        record.estimate.K
-        - P.T @ curvature_tensor(*(truth[k][row] for k in ("kappa_per_m", "direction1", "direction2"))) @ P
-    )
+    tensor = curvature_tensor(*(truth[k][row] for k in ("kappa_per_m", "direction1", "direction2")))
+    D = record.estimate.K - P.T @ tensor @ P
     e, C = np.array([D[0, 0], D[0, 1], D[1, 1]]), record.estimate.covariance
     square = float(e @ np.linalg.solve(C, e))
     density = -0.5 * (square + float(np.linalg.slogdet(2.0 * math.pi * C)[1]))

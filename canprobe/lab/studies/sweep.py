@@ -296,7 +296,6 @@ def run_study(typed: str, *, quick: bool, sweep: Sweep, **chosen: Any) -> StudyR
         chosen: arguments of this study only.
     """
     name, _ = FORMS.get(typed, (typed, ""))
-    result: StudyResult = importlib.import_module(f"canprobe.lab.studies.{name}").run(
-        quick=quick, sweep=sweep, **chosen
-    )
+    study = importlib.import_module(f"canprobe.lab.studies.{name}")
+    result: StudyResult = study.run(quick=quick, sweep=sweep, **chosen)
     return result

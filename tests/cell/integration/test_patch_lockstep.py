@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.results.scores import score_shape
-from canprobe.cell.results.summary import summarise_shape
+from canprobe.cell.results.scores import score_shape, summarise_shape
 from canprobe.cell.results.text import shape_lines
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_shape_estimator, make_task

@@ -20,7 +20,6 @@ from canprobe.fieldbus.bus.system import system
 T = TypeVar("T", dict[str, Any], list[Any], str)
 VIRTUAL_KINDS = ("vcan", "vxcan")
 MAX_SLOW_BITRATE = 500_000
-SLOW_SAMPLE_POINTS, FAST_SAMPLE_POINTS = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
 RESTART_MS, TX_QUEUE_FRAMES = 100, 1000
 FD_MTU_BYTES = 72
 _TIMEOUT_S = 5.0
@@ -107,6 +106,11 @@ def read_link(name: str) -> LinkState | None:
         return None
 
 
+def sample_points(bitrate: int) -> tuple[float, float, float]:
+    """The lowest, the recommended and the highest sample point at a bit rate, as shares of the bit."""
+    return (0.85, 0.875, 0.90) if bitrate <= MAX_SLOW_BITRATE else (0.75, 0.80, 0.90)
+
+
 def setting_line(name: str, bitrate: int, data_bitrate: int | None = None) -> str:
     """The line to type that sets an interface as a cell needs it and brings it up.
 
@@ -118,7 +122,7 @@ def setting_line(name: str, bitrate: int, data_bitrate: int | None = None) -> st
     if name.startswith(VIRTUAL_KINDS):
         fd = (f"{name} down", f"{name} mtu {FD_MTU_BYTES} up")
         return ip_line(f"{name} up") if data_bitrate is None else ip_line(*fd)
-    sample = (SLOW_SAMPLE_POINTS if bitrate <= MAX_SLOW_BITRATE else FAST_SAMPLE_POINTS)[1]
+    _, sample, _ = sample_points(bitrate)
     fast = "" if data_bitrate is None else f" dbitrate {data_bitrate} fd on"
     return ip_line(
         f"{name} down",
