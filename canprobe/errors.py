@@ -181,7 +181,6 @@ def check_schema(file: object, found: object, newest: int, remedy: str) -> None:
 
 EXTRA_OF = {
     "matplotlib": "study",
-    "distributed": "dask",
     "cantools": "can",
     "yaml": "can",
     "msgpack": "can",

@@ -289,7 +289,7 @@ def test_only_declared_packages_are_imported():
     """Base dependencies everywhere; an extra's package only in studies, and in the one module that needs it."""
     base = {"can", "canopen", "numpy", "scipy"}
     for path, relative in MODULES.items():
-        extras = {"matplotlib", "distributed"} if layer_of(relative.with_suffix("").parts) == "studies" else set()
+        extras = {"matplotlib"} if layer_of(relative.with_suffix("").parts) == "studies" else set()
         extras |= EXTRAS.get(str(relative), set())
         for name, line, _ in imports_of(path, relative):
             top = name.split(".")[0]

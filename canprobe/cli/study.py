@@ -23,7 +23,6 @@ EXAMPLE = """\
 examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
-  canprobe study regions --dask tcp://10.0.0.1:8786
   canprobe study faults --draw 1
   canprobe study faults --seed 4711
   canprobe study faults --recover --seed 17
@@ -65,7 +64,6 @@ def add_arguments(parser: Parser) -> None:
     parser.add_option("--link", "realtime: whether a check of a link says what the next minute shows, in virtual time")
     parser.add_option("--soak", "realtime: hold the cell for half an hour, and watch memory, clocks and counters")
     parser.add_option("--workers N", "number of processes [one for each core]", whole(1, 1024))
-    parser.add_option("--dask ADDRESS", "compute on the Dask cluster with this scheduler")
     parser.add_option("--fresh", "ignore finished cells in DIR")
     parser.add_shared("--json", "-v")
     parser.set_defaults(complain=parser.error)
@@ -87,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.lab.studies.sweep import open_sweep
 
     out = args.out or Path("runs") / f"study-{typed.replace(' --', '-')}"
-    options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
+    options = {"workers": args.workers, "fresh": args.fresh}
     try:
         with open_sweep(out, say=args.report.say, progress=args.report.bar(".0f cells"), **options) as sweep:
             result = run_study(typed, quick=args.quick, sweep=sweep, **_chosen(args))

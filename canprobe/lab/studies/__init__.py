@@ -4,7 +4,7 @@
 cases; the sweep measures each case once, in any process; the study makes rows and findings from the answers, and a
 function that draws them. `--quick` takes fewer cases and repeats. No other room imports a study.
 
-    sweep       lists the studies; computes cells on processes of this machine or a Dask cluster, keeps what is finished
+    sweep       lists the studies; computes cells on processes of this machine, keeps what is finished
     cell_store  finished cells on disk, with a digest of the code behind them
     result      the result of a study: columns, rows, findings, picture; its files; facts and intervals
     figure      a figure that many studies have

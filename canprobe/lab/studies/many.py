@@ -1,4 +1,4 @@
-"""Many runs of one scene: each combination of values and seeds, on all cores or a cluster; as a table, or over time."""
+"""Many runs of one scene: each combination of values and seeds, on all cores; as a table, or over time."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def run_many(
     seeds: SupportsIndex | Iterable[SupportsIndex] | None = None,
     bus: str | None = None,
     duration_s: float | None = None,
-    workers: int | str | None = None,
+    workers: int | None = None,
     out: Path | str | None = None,
     fresh: bool = False,
     series: Sequence[str] = SERIES,
@@ -129,8 +129,7 @@ def run_many(
         bus: ``direct`` or ``lockstep``; the scene's by default. Where the wire is of no interest, ``direct`` gives the
             results of a lockstep bus without delays, several times as fast.
         duration_s: duration that replaces the scene's, s.
-        workers: number of processes, one for each core by default; or the address of a Dask scheduler, such as
-            ``tcp://10.0.0.1:8786``, whose workers have the same canprobe.
+        workers: number of processes, one for each core by default.
         out: folder of the finished runs; ``runs/many-<scene>`` by default.
         fresh: whether to forget the runs in ``out``.
         series: columns of the log to keep over time for `Runs.to_xarray`; ``truth.force_n`` is one of the truth.
@@ -144,7 +143,7 @@ def run_many(
     Raises:
         UsageError: a combination has mistakes, a list is empty, or the bus is a real one; nothing was started.
         ResultsError: ``out`` cannot be written.
-        StudyError: a worker was killed, no scheduler answers, or another process uses ``out``.
+        StudyError: a worker was killed, or another process uses ``out``.
     """
     given = {} if duration_s is None else {"task.duration_s": duration_s}
     base = load_scene(scene, given)
@@ -163,9 +162,8 @@ def run_many(
         text, digest = _with_own_files(changed, folder)
         cases += [RunCase(text, digest, seed, tuple(series), float(every_ms)) for seed in wanted]
         rows += [{**change, "seed": seed} for seed in wanted]
-    where: dict[str, Any] = {"dask": workers} if isinstance(workers, str) else {"workers": workers}
     bar = StepReport().bar(".0f runs") if progress else None
-    with open_sweep(folder, fresh=fresh, say=say, progress=bar, **where) as sweep:
+    with open_sweep(folder, fresh=fresh, say=say, progress=bar, workers=workers) as sweep:
         outcomes = sweep.map(measure, cases)
     return Runs(base, tuple(keys), tuple(rows), tuple(outcomes), tuple(series), every_ms * 1e-3)
 

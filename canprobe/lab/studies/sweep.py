@@ -1,4 +1,4 @@
-"""Sweeps: many independent cells on all cores or on a cluster; finished cells are kept, a new start computes the rest.
+"""Sweeps: many independent cells on all cores; finished cells are kept, a new start computes the rest.
 
 A study is a module with `run(*, quick, sweep) -> StudyResult`. It names a function of the module that measures one cell
 and the cells; the sweep does the rest:
@@ -32,7 +32,6 @@ import json
 import multiprocessing
 import os
 import platform
-import re
 import sys
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -47,14 +46,13 @@ from types import ModuleType
 from typing import Any
 
 from canprobe.cell.session.terminal import Progress
-from canprobe.errors import StudyError, needed_module
+from canprobe.errors import StudyError
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 from canprobe.fieldbus.bus.system import system
 from canprobe.lab.studies.cell_store import CellStore, as_json, cell_key, model_digest
 from canprobe.lab.studies.result import Say, StudyResult
 
 Opener = Callable[[], AbstractContextManager[Executor]]
-_DASK_WAIT = "10s"
 _GRACE_S = 1.0
 """Time in which workers end by themselves: a run catches SIGTERM, stops, and its worker continues."""
 
@@ -123,15 +121,12 @@ class Sweep:
 
 
 @contextmanager
-def open_sweep(
-    folder: Path, *, workers: int | None = None, dask: str | None = None, fresh: bool = False, **watched: Any
-) -> Iterator[Sweep]:
-    """A sweep over the processes of this machine, or a Dask cluster, that keeps its cells in a folder.
+def open_sweep(folder: Path, *, workers: int | None = None, fresh: bool = False, **watched: Any) -> Iterator[Sweep]:
+    """A sweep over the processes of this machine that keeps its cells in a folder.
 
     Args:
         folder: folder of `cells.jsonl`; what that holds is not computed again.
         workers: number of processes, one for each core by default.
-        dask: address of a Dask scheduler to use instead.
         fresh: whether to forget the cells in the folder.
         watched: `say` and `progress` of the sweep.
 
@@ -140,7 +135,7 @@ def open_sweep(
     """
     store = CellStore(folder, fresh=fresh)
     try:
-        yield Sweep(partial(dask_executor, dask) if dask else partial(process_pool, workers), store, **watched)
+        yield Sweep(partial(process_pool, workers), store, **watched)
     finally:
         store.close()
 
@@ -205,32 +200,6 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
         raise
     finally:
         pool.shutdown()
-
-
-@contextmanager
-def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster; they need the same canprobe.
-
-    Args:
-        address: address of the scheduler, such as "tcp://10.0.0.1:8786".
-
-    Raises:
-        UsageError: package `distributed` is missing.
-        StudyError: not an address, or no scheduler answers.
-    """
-    distributed = needed_module("distributed", "dask", "a Dask cluster needs the package distributed:")
-    if not re.search(r":[0-9]+$", address):  # a Client that fails at once takes twenty seconds to end
-        raise StudyError(f"Dask scheduler {address}: expected its address and port, as tcp://10.0.0.1:8786")
-    try:
-        client = distributed.Client(address, timeout=_DASK_WAIT, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise StudyError(f"Dask scheduler {address}: expected an answer, got: {error}") from error
-    executor = client.get_executor(pure=False)
-    try:
-        yield executor
-        executor.shutdown()
-    finally:
-        client.close()  # cancels what is under way
 
 
 class _DeafPool(ProcessPoolExecutor):

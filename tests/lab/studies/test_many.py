@@ -232,18 +232,3 @@ def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
     store = CellStore(tmp_path)
     assert len(store.answers) == 60 == kept.read_bytes().count(b"\n") - store.damaged  # no run twice
     store.close()
-
-
-@pytest.mark.slow(reason="starts a scheduler of dask with its processes")
-@pytest.mark.filterwarnings("default")
-def test_a_dask_scheduler_gives_the_same_table(runs, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=None, protocol="tcp://"
-    ) as cluster:
-        where = {"workers": cluster.scheduler_address, "out": tmp_path}
-        scene = canprobe.load_scene("press", QUICK)
-        other = run_many(scene, VARY, seeds=2, bus="direct", series=SERIES, every_ms=10, **where)
-    measured = runs.table().drop(columns="wall_time_s")
-    assert measured.equals(other.table().drop(columns="wall_time_s"))
-    assert runs.to_xarray().equals(other.to_xarray())

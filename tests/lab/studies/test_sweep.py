@@ -15,13 +15,12 @@ import pytest
 from patience import patience_s
 from waiting import wait_until
 
-from canprobe.cli import main
-from canprobe.errors import StudyError, UsageError
+from canprobe.errors import StudyError
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 from canprobe.lab.studies import cell_store as sweep_store
 from canprobe.lab.studies import sweep
 from canprobe.lab.studies.cell_store import CellStore, as_json, cell_key, model_digest
-from canprobe.lab.studies.sweep import Sweep, dask_executor, open_sweep, process_pool
+from canprobe.lab.studies.sweep import Sweep, open_sweep, process_pool
 
 DEMO = '''
 """A study of six cells; what happens in the fourth is set by the environment. Every measurement leaves a line."""
@@ -298,36 +297,3 @@ def test_a_killed_process_leaves_no_worker(tmp_path):
 def test_a_child_whose_parent_is_gone_before_it_asks_ends_at_once(number):
     command = f"from canprobe.fieldbus.bus.system import system; system.end_with_parent(1 << 22, {int(number)})"
     assert subprocess.run([sys.executable, "-c", command], check=False, timeout=patience_s(60)).returncode == -number
-
-
-@pytest.mark.slow(reason="starts a cluster of dask with its processes")
-@pytest.mark.filterwarnings("default")
-def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
-    import distributed
-
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setattr(sweep, "STUDIES", {"demo": "a demonstration"})
-    monkeypatch.setitem(sys.modules, "canprobe.lab.studies.demo", demo)
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, protocol="tcp://"
-    ) as cluster:
-        argv = ["study", "demo", "--out", str(tmp_path / "out"), "--dask", cluster.scheduler_address]
-        assert main(argv) == 0
-        assert sorted(x for x, _ in measured(tmp_path)) == list(range(6))
-        assert {pid for _, pid in measured(tmp_path)} <= {n.pid for n in cluster.workers.values()}
-        assert main([*argv, "--json"]) == 0
-        assert len(measured(tmp_path)) == 6
-
-
-def test_a_dask_address_has_a_port():
-    with (
-        pytest.raises(StudyError, match=r"Dask scheduler nonsense: expected its address and port, as tcp://"),
-        dask_executor("nonsense"),
-    ):
-        pass
-
-
-def test_dask_is_asked_for_by_name_or_address(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"pip install .*\[dask\]'"), dask_executor("tcp://127.0.0.1:1"):
-        pass

@@ -52,11 +52,8 @@ def other_ranges(case: Case, motor: SeenMotor) -> Watch[MotorSeen]:
     """The motor has said that its ranges are others than those of the type by which its master scales."""
     told = False
     while event := (yield):
-        known = [
-            (rid, motor.registers[rid], scale)
-            for rid, scale in zip((Rid.PMAX, Rid.VMAX, Rid.TMAX), motor.ranges, strict=True)
-            if rid in motor.registers
-        ]
+        scales = zip((Rid.PMAX, Rid.VMAX, Rid.TMAX), motor.ranges, strict=True)
+        known = [(rid, motor.registers[rid], scale) for rid, scale in scales if rid in motor.registers]
         if told or not event.drives or not known:
             continue
         told = True
