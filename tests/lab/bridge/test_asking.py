@@ -79,7 +79,7 @@ def test_a_wrong_name_on_the_command_line_lists_what_there_is(command, capsys, t
 
 def test_a_missing_extra_is_named_with_its_pip_line(monkeypatch):
     nowhere = BridgeInfo("nothing", "nowhere", "mcap", ("a_package_that_nobody_has",))
-    monkeypatch.setattr("canprobe.cell.planning.bridges.BRIDGES", {"mcap": nowhere})
+    monkeypatch.setitem(BRIDGES, "mcap", nowhere)
     with pytest.raises(UsageError, match=r"mcap: needs a_package_that_nobody_has; type: pip install .*\[mcap\]'"):
         check_bridges(["mcap"])
     plan = canprobe.plan(parse_scene(FREE + '[bridge]\nuse = ["mcap"]\n'))
