@@ -66,9 +66,12 @@ class Sinkage:
             self._kept.append((self._way, self._sunk, root, *centre.tolist()))
             while self._way - self._kept[0][0] > WAY:
                 self._kept.pop(0)
+        if len(self._kept) < 3:
+            return 0.0
         kept = np.array(self._kept)
-        sunk = self._sunk - kept[:, 1]
+        # why not each place by itself: a pose of the probe that is wrong once, as behind a lost PDO, would stay as one
+        before = np.maximum(np.maximum(kept[:-2, 1], kept[1:-1, 1]), kept[2:, 1])
+        sunk, kept = self._sunk - before, kept[1:-1]
         sigma = np.hypot(HEIGHT_SIGMA, self._slope_sigma * np.linalg.norm(kept[:, 3:] - centre, axis=1))
         certain = np.where(np.abs(kept[:, 2] - root) < NEAR_ROOT, sunk - CERTAIN_SIGMAS * sigma, 0.0)
-        most = int(np.argmax(certain))
-        return float(sunk[most]) if certain[most] > 0.0 else 0.0
+        return float(sunk[np.argmax(certain)]) if certain.max() > 0.0 else 0.0
