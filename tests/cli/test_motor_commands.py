@@ -8,6 +8,8 @@ import pytest
 
 from canprobe.cell.session import served
 from canprobe.cli import main
+from canprobe.fieldbus.motor.damiao import DamiaoMotor
+from canprobe.fieldbus.motor.protocol import SPECIAL, TYPES, MitCommand, RegisterOp, Rid, pack_register
 
 
 @pytest.mark.parametrize(
@@ -45,3 +47,20 @@ def test_inject_lists_the_faults_of_motors_once(capsys):
     assert len(names) == len(set(names))
     of_motors = [kind["name"] for kind in kinds if kind["needs"] == "motor"]
     assert of_motors == ["brown-out", "over-temperature", "over-voltage", "under-voltage"]
+
+
+@pytest.mark.parametrize(("first", "status"), [(0.3, 0), (0.0, 1)])
+def test_a_log_of_a_master_is_judged(first, status, tmp_path, capsys):
+    motor, log, lines = DamiaoMotor("dm4310", 1, 0x11, q=0.3), tmp_path / "candump.log", []
+    timeout = pack_register(1, RegisterOp.WRITE, Rid.TIMEOUT, (300).to_bytes(4, "little"))
+    held = MitCommand(first, kp=50.0, kd=1.0).pack(TYPES["dm4310"])
+    sent = [(0x7FF, timeout), (1, SPECIAL + b"\xfd"), (1, SPECIAL + b"\xfc"), *[(1, held)] * 5]
+    for cycle, frame in enumerate(sent, 1):
+        for can_id, data in (frame, *motor.receive(*frame, cycle * 5_000_000)):
+            lines.append(f"({cycle * 5e-3:.6f}) can0 {can_id:03X}#{data.hex().upper()}\n")
+    log.write_text("".join(lines))
+    judge = ["judge", "--motor", "damiao:dm4310", "--id", "1", "--mst-id", "0x11", "--record", str(log)]
+    assert main(judge) == status
+    assert ("with kp 50 at 0.300 rad: 15.0 N·m" in capsys.readouterr().out) == bool(status)
+    assert main([*judge[:-3], "0x12", *judge[-2:]]) == 2
+    assert "no answer of a motor with this --id and --mst-id" in capsys.readouterr().err

@@ -51,7 +51,7 @@ def test_frames_by_hand_with_python_can(motors, tmp_path):
 
 @pytest.fixture
 def driver(motors, tmp_path):
-    package = pytest.importorskip("damiao_motor", reason="pip install --no-deps damiao-motor==1.0.6")
+    package = pytest.importorskip("damiao_motor", reason="damiao-motor is not at hand, see above")
     controller = package.DaMiaoController(str(tmp_path), "virtual")
     yield controller.add_motor(1, 0x11, "4310"), controller.add_motor(3, 0x13, "4340")
     controller.shutdown()

@@ -6,7 +6,6 @@ import random
 
 import pytest
 
-from canprobe.cli import main
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
 from canprobe.fieldbus.motor.protocol import (
     REGISTER_ID,
@@ -181,17 +180,3 @@ def test_any_frames_are_judged_without_an_error(seed):
         data = rng.choice((SPECIAL + rng.randbytes(1), b"\1\0" + rng.randbytes(rng.randrange(7)), rng.randbytes(8)))
         master.send(data, can_id)
     master.found()
-
-
-@pytest.mark.parametrize(("play", "status"), [(good, 0), (kicks, 1)])
-def test_a_log_is_judged_at_the_command_line(play, status, tmp_path, capsys):
-    master, log = Master(), tmp_path / "candump.log"
-    play(master)
-    lines = (f"({f.t_ns * 1e-9:.6f}) can0 {f.can_id:03X}#{f.data.hex().upper()}" for f in master.frames)
-    log.write_text("\n".join(lines) + "\n")
-    judge = ["judge", "--motor", "damiao:dm4310", "--id", "1", "--mst-id", "0x11", "--record", str(log)]
-    assert main(judge) == status
-    out = capsys.readouterr().out
-    assert ("with kp 50 at 0.300 rad: 15.0 N·m" in out) == bool(status)
-    assert main([*judge[:-3], "0x12", *judge[-2:]]) == 2
-    assert "no answer of a motor with this --id and --mst-id" in capsys.readouterr().err
