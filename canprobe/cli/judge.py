@@ -3,7 +3,7 @@
 With --eds each file is an emulated node, with a SCENE or a cell its nodes are; COMMAND is your master, which is started
 once they are served, with no input, and its output goes into a file. Without COMMAND a master that runs elsewhere is
 awaited, and Ctrl-C ends the judgement. With --record a log is judged for what can be seen in it,
-that of motors which speak no CANopen (--motor), too.
+also one of motors that speak no CANopen (--motor).
 
 Once a drive has been enabled for two seconds, faults are thrown at it, one after the other, and the reaction is judged:
 slow SDO answers, a lost heartbeat, a mute node, a fault of the drive, a reboot. --inject names others, and --passive

@@ -38,10 +38,11 @@ from canprobe.errors import at_least, at_most
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import position_per_unit
-from canprobe.mechanics.touch.depth_witness import CERTAIN_SIGMAS, SUSPECT_S, sigma_ahead
+from canprobe.mechanics.touch.depth_witness import SUSPECT_S, sigma_ahead
 from canprobe.mechanics.touch.image.force_creep import decades_after, late_decades_after
 from canprobe.mechanics.touch.image.force_errors import UPPER_SIGMAS, ForceSigma, upper_end
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS
+from canprobe.mechanics.touch.sinkage import CERTAIN_SIGMAS
 from canprobe.mechanics.touch.stops import (
     LEAST_PUSH_SHARE,
     MAX_FORCE_SPREAD,

@@ -120,12 +120,12 @@ class ProbeMotion:
         self.q = np.clip(self.q, self._low, self._high)
 
 
+ARM_LENGTH_M = 0.4
+"""Length of a small arm, m: one whose flange is off by some share of it goes ways that are off by that share."""
 COMING = (Phase.MOVE, Phase.APPROACH, Phase.SETTLE)
 """Phases in which the probe comes from free space: the way that it has taken leads off what it touches."""
 
 
-ARM_LENGTH_M = 0.4
-"""Length of a small arm, m: one whose flange is off by some share of it goes ways that are off by that share."""
 LEAVING = (Phase.RETREAT, Phase.DONE)
 _IN_CONTACT = (Phase.SETTLE, Phase.SCAN, Phase.REGAIN)
 

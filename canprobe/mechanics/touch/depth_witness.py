@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canprobe.mechanics.touch.sinkage import Sinkage
+from canprobe.mechanics.touch.sinkage import CERTAIN_SIGMAS, Sinkage
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
@@ -44,8 +44,6 @@ CURVATURE_SIGMA = 40.0
 """Standard deviation of a curvature before any contact, 1/m."""
 CURVATURE_CHANGE = 12.0
 """Standard deviation of the curvature a few millimetres further, 1/m: of a fillet it jumps by 30."""
-CERTAIN_SIGMAS = 2.5
-"""Standard deviations of the depth that must lie within the margin to the limit of the force."""
 SUNK_SHARE = 0.8
 """Share of the margin to the limit by which a probe has sunk when it counts."""
 CONTRADICTED_S = 0.05

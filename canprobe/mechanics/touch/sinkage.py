@@ -24,7 +24,7 @@ NEAR_ROOT = 0.2
 HEIGHT_SIGMA, SLOPE_SIGMA = 25e-6, 4e-3
 """Standard deviation of the sum at rest, m, and its growth by the distance, rad."""
 CERTAIN_SIGMAS = 2.5
-"""Standard deviations below which the sum says nothing."""
+"""Standard deviations below which a depth says nothing: of the sum, and of the surface that was touched before."""
 
 
 class Sinkage:
