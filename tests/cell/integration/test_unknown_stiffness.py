@@ -11,9 +11,10 @@ import canprobe
 from canprobe.cell.scene.model import PlantSettings
 
 NOMINAL = 1.27e8  # N/m³: 9.4 kN/m at 2 N on the cylinder
-pytestmark = pytest.mark.slow(reason="four whole touches of a servo")
+pytestmark = pytest.mark.slow(reason="whole touches of a servo")
 
 
+@pytest.mark.timeout(400)
 @pytest.mark.parametrize(
     ("share", "fidelity", "seconds", "rms_percent", "most_n"),
     [
@@ -30,14 +31,14 @@ def test_force_is_kept_without_retuning(share, fidelity, seconds, rms_percent, m
     At 40 kN/m one count of an encoder is up to 1.1 N, which must not make the stiffness that is felt a doubtful one.
     There the dynamic arm errs by 20 to 21 % over the first two seconds, while the curvature is learned, by 17 to 18 %
     over six and 16 % over a whole scan. Its highest force depends on the seed, from 3.1 to 3.7 N: the limit is that of
-    the median of three.
+    the median of nine, which is 3.4 N.
     """
     scene = canprobe.load_scene("cylinder")
     plant = replace(scene.plant or PlantSettings(), stiffness_n_m3=share * NOMINAL, fidelity=fidelity)
     assert scene.shape is not None
     scene = replace(scene, plant=plant, shape=replace(scene.shape, also=()))
     highest = []
-    for seed in range(3 if fidelity == "dynamic" else 1):
+    for seed in range(9 if fidelity == "dynamic" else 1):
         result = canprobe.run(scene, bus="direct", files=False, duration_s=seconds, seed=seed)
         contact = result.summary["contact"]
         assert contact["contact_fraction"] == 1.0
