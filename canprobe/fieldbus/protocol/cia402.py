@@ -186,7 +186,7 @@ def command_of(controlword: int, previous: int = 0) -> DriveCommand | None:
 _DISABLING_WORDS = dict.fromkeys(DriveState, 0x0000)
 _WORDS_TOWARD: dict[DriveState, dict[DriveState, int]] = {
     _S.SWITCH_ON_DISABLED: _DISABLING_WORDS,
-    # whatever state is reported: below operation it disables, and a drive in operation after all brakes as the others do
+    # whatever is reported: below operation it disables, and a drive in operation after all brakes as the others do
     _S.QUICK_STOP_ACTIVE: dict.fromkeys(DriveState, 0x0002),
     _S.OPERATION_ENABLED: _DISABLING_WORDS
     | {
