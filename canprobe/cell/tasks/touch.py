@@ -225,11 +225,6 @@ class TouchTask(ProbingTask):
         self._updated = True
         self._images = [False, False]  # whether the last two cycles have read one
 
-    @property
-    def restarts(self) -> int:  # type: ignore[override]
-        """How often its estimator diverged and started afresh."""
-        return self.shape.restarts if self.shape is not None else 0
-
     def record(self) -> TaskRecord:
         scan = None
         if self._scan_start is not None:
@@ -262,9 +257,11 @@ class TouchTask(ProbingTask):
             return
         self._updated = True
         learned, contact = self.learned, self._contact
-        if self._images == [False, True] or learned.doubt():
+        if self._images == [False, True] or learned.doubt() or self.shape is None:
             return
-        if self.shape is not None and (estimate := self.shape.work()) is not None:
+        estimate = self.shape.work()
+        self.restarts = self.shape.restarts
+        if estimate is not None:
             if learned.check is not None:
                 learned.check.take(estimate, self.sensing.slope)
             if contact is not None and self._touched:
