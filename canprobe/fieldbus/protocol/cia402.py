@@ -187,7 +187,7 @@ _DISABLING_WORDS = dict.fromkeys(DriveState, 0x0000)
 _WORDS_TOWARD: dict[DriveState, dict[DriveState, int]] = {
     _S.SWITCH_ON_DISABLED: _DISABLING_WORDS,
     # whatever is reported: below operation it disables, and a drive in operation after all brakes as the others do
-    _S.QUICK_STOP_ACTIVE: dict.fromkeys(DriveState, 0x0002),
+    _S.QUICK_STOP_ACTIVE: dict.fromkeys(DriveState, 0x0002) | {_S.SWITCH_ON_DISABLED: 0x0000},
     _S.OPERATION_ENABLED: _DISABLING_WORDS
     | {
         _S.SWITCH_ON_DISABLED: 0x0006,

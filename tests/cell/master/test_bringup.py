@@ -333,7 +333,7 @@ def test_a_drive_in_another_mode_is_not_enabled(tmp_path):
     with open_session(tmp_path, change=stay, enable_s=0.3) as session, pytest.raises(NodeError, match=told):
         session.cell.run(lambda _: Command())
     words = {d[:2] for _, i, d in frames(tmp_path) if 0x201 <= i <= 0x206}
-    assert words == {b"\x00\x00", b"\x02\x00"}, "no drive was switched on: disabled or stopped"
+    assert words == {bytes(2)}, "no drive was switched on"
 
 
 def test_a_drive_that_changes_its_mode_late_is_waited_for(tmp_path):
