@@ -1,13 +1,15 @@
-"""Mutation testing of the modules that keep an arm safe: small changes, one at a time, that some test notices.
+"""Mutation testing: small changes of the package, one at a time, that some test notices. It needs pytest-cov.
 
     python tests/support/mutants.py --seed 1 --count 300 --record /tmp/reach.json
+    python tests/support/mutants.py --all --seed 1 --count 300 --record /tmp/reach.json
 
 A mutant is one changed place of one module, in a copy of the tree: a comparison, a condition, a boolean, a number, a
 sum, a returned value, a call whose result is not used. What is no behaviour is not changed: annotations, how
-dataclasses are made, texts. The nearest tests run once without a mutant, and it is recorded which of them run which
-lines, and for how long. A mutant then meets the tests that run its line, the quickest first, as many as fit into a
-time. It is killed where one fails or does not end; where no test runs its line it survives. Survivors are printed with
-their line, and the share that was killed with its interval of 95 % (Wilson). Not part of CI: it takes an hour.
+dataclasses are made, texts. The tests run once without a mutant, and it is recorded which of them run which lines, and
+for how long. A mutant then meets the tests that run its line, the quickest first, as many as fit into a time. It is
+killed where one fails or does not end; where no test runs its line it survives. Survivors are printed with their line,
+and the share that was killed with its interval of 95 % (Wilson). Without --all only modules that keep an arm safe are
+changed, and only the tests next to them are run. Not part of CI: it takes an hour.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ import canopen  # noqa: F401
 import pytest
 import scipy.optimize
 import scipy.spatial  # noqa: F401
-from reach import Reach
+from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parents[2]
 MASTER_MODULES = (
@@ -44,15 +46,13 @@ MASTER_MODULES = (
     *("watch", "cycle", "supervised_cycle", "arm_power", "cell"),
     *("following", "position_track", "trail", "image_witness", "push_witness"),
 )
-PLANNING_MODULES = ("contact",)
-MODULES = {
-    **{name: f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES},
-    **{name: f"canprobe/cell/planning/{name}.py" for name in PLANNING_MODULES},
-    "depth_witness": "canprobe/mechanics/touch/depth_witness.py",
-    "sinkage": "canprobe/mechanics/touch/sinkage.py",
-    "recovery": "canprobe/cell/session/recovery.py",
-    "held": "canprobe/cell/tasks/paused.py",
-}
+SAFETY_MODULES = (
+    *(f"canprobe/cell/master/{name}.py" for name in MASTER_MODULES),
+    *("canprobe/cell/planning/contact.py", "canprobe/cell/session/recovery.py", "canprobe/cell/tasks/paused.py"),
+    *("canprobe/mechanics/touch/depth_witness.py", "canprobe/mechanics/touch/sinkage.py"),
+)
+PACKAGE = ("canprobe", "bridge", "eds")
+COVERAGE = "[run]\nsource = .\nomit = tests/*\n"
 INTEGRATION = (
     "lift_off",
     "recovery",
@@ -65,7 +65,7 @@ INTEGRATION = (
     "blind_array",
     "way_back",
 )
-TESTS = (
+SAFETY_TESTS = (
     *("tests/cell/master", "tests/cell/planning", "tests/cell/tasks/test_paused.py"),
     "tests/mechanics/touch/test_depth_witness.py",
     *("tests/cell/session/test_up.py", "tests/cell/session/test_recovery.py"),
@@ -99,7 +99,7 @@ class Mutant:
     names: frozenset[str]
 
     def __str__(self) -> str:
-        return f"{MODULES[self.module]}:{self.line}: {self.what}"
+        return f"{self.module}:{self.line}: {self.what}"
 
     def text(self) -> str:
         """The module's text with the change."""
@@ -110,7 +110,7 @@ class Mutant:
 
 def parse(module: str) -> ast.Module:
     """The syntax tree of a module."""
-    return ast.parse((ROOT / MODULES[module]).read_text(encoding="utf-8"))
+    return ast.parse((ROOT / module).read_text(encoding="utf-8"))
 
 
 def mutants_of(module: str) -> Iterator[Mutant]:
@@ -171,6 +171,22 @@ def _changes(node: Any) -> Iterator[tuple[str, Callable[[], object]]]:
         yield f"without `{ast.unparse(node)[:60]}`", lambda: setattr(node, "value", ast.Constant(None))
 
 
+class Seconds:
+    """How long each test takes, infinite where it does not pass; a plugin of pytest that writes it down."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, float] = {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Add a part of a test."""
+        duration = report.duration if report.passed else math.inf
+        self._of[report.nodeid] = self._of.get(report.nodeid, 0.0) + duration
+
+    def pytest_sessionfinish(self) -> None:
+        """Write the times."""
+        Path("seconds.json").write_text(json.dumps(self._of), encoding="utf-8")
+
+
 class Tree:
     """A copy of the repository, in which one module is changed and tests run."""
 
@@ -179,20 +195,29 @@ class Tree:
         ignored = shutil.ignore_patterns(".git", ".venv", "runs", "site", ".*_cache")
         shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
 
-    def record(self) -> dict[str, Any]:
-        """Run all tests, and return what `Reach` writes."""
-        self.run(TESTS, 180, 3600, Reach(MODULES))
-        return json.loads((self.folder / "reach.json").read_text(encoding="utf-8"))
+    def record(self, tests: Iterable[str]) -> dict[str, Any]:
+        """Run tests; return their times, and which of them run which line."""
+        (self.folder / ".coveragerc").write_text(COVERAGE, encoding="utf-8")
+        self.run(["--cov", "--cov-context=test", "--cov-report=", *tests], 180, 7200, Seconds())
+        data = CoverageData(str(self.folder / ".coverage"))
+        data.read()
+        reached = {
+            f"{Path(path).relative_to(self.folder)}:{line}": [one.rpartition("|")[0] for one in contexts if one]
+            for path in data.measured_files()
+            for line, contexts in data.contexts_by_lineno(path).items()
+        }
+        seconds = json.loads((self.folder / "seconds.json").read_text(encoding="utf-8"))
+        return {"seconds": seconds, "tests": reached}
 
     def kills(self, number: int, mutant: Mutant, tests: dict[str, float]) -> str | None:
         """The test that notices a mutant; None where all pass. The tests come with their times."""
-        place = self.folder / MODULES[mutant.module]
+        place = self.folder / mutant.module
         place.write_text(mutant.text(), encoding="utf-8")
         os.utime(place, (number, number))  # or Python would take the compiled file of another mutant for it
         try:
             return self.run(tests, LEAST_TIMEOUT_S + 10 * max(tests.values()), 60 + 10 * sum(tests.values()))
         finally:
-            shutil.copy2(ROOT / MODULES[mutant.module], place)
+            shutil.copy2(ROOT / mutant.module, place)
 
     def run(self, tests: Iterable[str], test_s: float, all_s: float, *plugins: object) -> str | None:
         """Run tests in a fork, without a plugin until one fails; what failed or did not end, None where none did."""
@@ -215,8 +240,8 @@ class Tree:
         with open("out.txt", "w", encoding="utf-8") as out:
             os.dup2(out.fileno(), 1)
             os.dup2(out.fileno(), 2)
-        first = [] if plugins else ["-x"]
-        options = ["-n0", "-q", "--tb=no", "-m", "not vcan and not slow", "-o", f"timeout={test_s:.0f}", *first]
+        first = [] if plugins else ["-x", "-n0"]
+        options = ["-q", "--tb=no", "-m", "not vcan and not slow", "-o", f"timeout={test_s:.0f}", *first]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # plugins are loaded already
         sys.exit(pytest.main([*options, *tests], plugins=plugins))
 
@@ -225,14 +250,15 @@ class Choice:
     """Which tests a mutant meets.
 
     Args:
-        record: what `Reach` has written.
+        record: what `Tree.record` has found.
+        modules: paths of the modules.
         limit_s: longest time of the tests of one mutant.
     """
 
-    def __init__(self, record: dict[str, Any], limit_s: float) -> None:
+    def __init__(self, record: dict[str, Any], modules: Iterable[str], limit_s: float) -> None:
         self._seconds, self._tests, self._limit_s = record["seconds"], record["tests"], limit_s
         self._uses: dict[tuple[str, str], set[str]] = {}
-        for module in MODULES:
+        for module in modules:
             for node in ast.walk(parse(module)):
                 if _is_name(node, ast.Load) or isinstance(node, ast.Attribute):
                     name = node.id if isinstance(node, ast.Name) else node.attr
@@ -257,6 +283,13 @@ class Choice:
         return {test for test in self._seconds if test.partition("::")[0] in files}
 
 
+def package_modules() -> Iterator[str]:
+    """Every module of the package, without those of links."""
+    for folder in PACKAGE:
+        for place, _, names in sorted(os.walk(ROOT / folder)):
+            yield from (str(Path(place, name).relative_to(ROOT)) for name in sorted(names) if name.endswith(".py"))
+
+
 def wilson(killed: int, count: int) -> tuple[float, float]:
     """The 95 % interval of a share, after Wilson (1927)."""
     z, share = 1.96, killed / count
@@ -270,7 +303,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--modules", nargs="+", choices=MODULES, default=list(MODULES))
+    parser.add_argument("--all", action="store_true", help="change every module of the package, and run all tests")
     parser.add_argument(
         "--limit", type=float, default=15.0, help="longest processor time of the tests of one mutant, s"
     )
@@ -280,14 +313,17 @@ def main() -> None:
     for plugin in entry_points(group="pytest11"):
         if not plugin.value.startswith("canprobe"):
             plugin.load()
-    pool = [mutant for module in options.modules for mutant in mutants_of(module)]
+    modules, tests = SAFETY_MODULES, SAFETY_TESTS
+    if options.all:
+        modules, tests = tuple(package_modules()), ("tests",)
+    pool = [mutant for module in modules for mutant in mutants_of(module)]
     drawn = dict(enumerate(random.Random(options.seed).sample(pool, min(options.count, len(pool))), start=1))
-    print(f"seed {options.seed}: {len(drawn)} of {len(pool)} mutants of {', '.join(options.modules)}", flush=True)
+    print(f"seed {options.seed}: {len(drawn)} of {len(pool)} mutants of {len(modules)} modules", flush=True)
     drawn = {number: mutant for number, mutant in drawn.items() if number in (options.again or drawn)}
     with tempfile.TemporaryDirectory() as folder:
         tree = Tree(Path(folder) / "tree")
         if options.record is None or not options.record.exists():
-            record = tree.record()
+            record = tree.record(tests)
             if options.record is not None:
                 options.record.write_text(json.dumps(record), encoding="utf-8")
         else:
@@ -296,12 +332,12 @@ def main() -> None:
                 sys.exit("the record names tests that are not there: remove it")
         left_out = sum(seconds == math.inf for seconds in record["seconds"].values())
         print(f"{len(record['seconds'])} tests, and {left_out} of them left out, as they do not pass", flush=True)
-        choice, killed = Choice(record, options.limit), 0
+        choice, killed = Choice(record, modules, options.limit), 0
         for tried, (number, mutant) in enumerate(drawn.items(), start=1):
-            tests = choice.tests(mutant)
-            by = tree.kills(number, mutant, tests) if tests else None
+            near = choice.tests(mutant)
+            by = tree.kills(number, mutant, near) if near else None
             killed += by is not None
-            fate = f"killed by {by}" if by is not None else f"SURVIVED {len(tests)} tests"
+            fate = f"killed by {by}" if by is not None else f"SURVIVED {len(near)} tests"
             print(f"{number}: {mutant}: {fate} ({killed} of {tried} killed)", flush=True)
     low, high = wilson(killed, len(drawn))
     print(f"{killed} of {len(drawn)} killed: {killed / len(drawn):.1%} ({low:.1%} to {high:.1%})")
