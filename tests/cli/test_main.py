@@ -532,7 +532,7 @@ def test_the_page_on_hardware_has_the_table():
         assert (hardware, channel, example) == (backend.hardware, backend.channel, f"`{backend.example}`")
         assert (backend.package is None) or f"pip install 'python-can[{backend.extra}]'" in needs
         assert (backend.driver is None) or backend.driver.replace("sudo ", "") in needs
-        assert backend.windows == ("Windows only" in needs)
+        assert backend.windows_only == ("Windows only" in needs)
         words = ({"fd", "fd-timing"}, {"filter"}, {"listen-only"}, {"errors"}, {"stamps"})
         assert [cell == "yes" for cell in has] == [bool(word & backend.features) for word in words]
         assert rates == (", ".join(f"{rate:g}" for rate in backend.bitrates_kbit) or "any")

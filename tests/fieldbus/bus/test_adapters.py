@@ -67,7 +67,9 @@ def test_can_fd_is_asked_for_as_an_interface_takes_it(name, has, monkeypatch):
         assert (given["timing"].nom_bitrate, given["timing"].data_bitrate) == (500_000, 2_000_000)
 
 
-@pytest.mark.parametrize("name", [name for name, one in BACKENDS.items() if one.package or one.library or one.windows])
+@pytest.mark.parametrize(
+    "name", [name for name, one in BACKENDS.items() if one.package or one.library or one.windows_only]
+)
 def test_a_port_that_cannot_be_opened_says_what_is_missing(name, monkeypatch):
     lacking(monkeypatch)
     monkeypatch.setattr(can, "Bus", lambda **_: exec("raise NameError('canGetNumberOfChannels')"))

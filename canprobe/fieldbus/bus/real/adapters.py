@@ -1,14 +1,12 @@
 """CAN adapters and the interfaces of python-can that reach them: what each needs, how its channels are written, and
 which are here.
 
-`BACKENDS` is the one table of that. Errors of a port that cannot be opened take their lines to type from it, and
+`adapters.toml` is the one table of that. Errors of a port that cannot be opened take their lines to type from it, and
 `canprobe adapters` prints it. Interfaces of python-can that are not in it work all the same; what they lack is what
 python-can says.
 
 On Linux most adapters (PEAK, Kvaser, candleLight, 8devices, Microchip) have a driver in the kernel, and are `socketcan`
 interfaces then: the libraries of their makers are for other systems, or for functions that the kernel's driver lacks.
-
-Source: python-can 4.6, manual, "Hardware Interfaces", and the modules of `can.interfaces`.
 """
 
 from __future__ import annotations
@@ -21,7 +19,8 @@ import json
 import logging
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,6 @@ from canprobe.errors import UsageError, did_you_mean, package_line
 from canprobe.fieldbus.bus.real.link import missing_ip, read_link, setting_line, sudo
 from canprobe.fieldbus.bus.real.socketcan import NO_SOCKETCAN, has_socketcan, how_to_make
 
-LOCAL_GROUP = "ff11::ca"
-"""A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
 SOCKETCAN = "socketcan"
 _FD_CLOCK_HZ = 80_000_000
 """Clock of the controller of CAN FD adapters."""
@@ -39,30 +36,11 @@ _WHERE_SHOWN = "`canprobe adapters` shows what works here"
 _ARPHRD_CAN = "280"
 _NET_FOLDER, _DEVICE_FOLDER = Path("/sys/class/net"), Path("/dev")
 _USB_SERIAL = ("ttyACM*", "ttyUSB*", "cu.usb*")  # the last one is that of macOS
-_ON_WINDOWS = sys.platform == "win32"
-_SERIAL_PORT = "COM3" if _ON_WINDOWS else "/dev/ttyACM0"
 
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """One interface of python-can.
-
-    Attributes:
-        hardware: adapters that it reaches, for people.
-        channel: form of its channels, for people.
-        example: one of its channels.
-        package: import name of the Python package that it needs; None where python-can alone does.
-        extra: extra of python-can that installs this package.
-        driver: driver or library that it needs, for people, with where it comes from; None where none is needed.
-        library: name of that library for the dynamic linker; None where none can be looked for.
-        windows: whether it exists on Windows only.
-        indexed: whether its channels are numbers.
-        module: driver of the Linux kernel for the same adapters, which are `socketcan` interfaces then.
-        has: what python-can reaches of it, in words: `fd` (CAN FD by bit rates, `fd-timing` by the timing of bits),
-            `filter` (of identifiers, below python-can), `listen-only`, `errors` (error frames, `error-classes` with
-            those of SocketCAN), `stamps` (of the adapter or its driver), `echo` (of frames that were sent, unmarked).
-        bitrates_kbit: bit rates that python-can sets it to, kbit/s; empty: those of its hardware.
-    """
+    """One interface of python-can; `adapters.toml` says what its fields are."""
 
     hardware: str
     channel: str
@@ -71,17 +49,17 @@ class Backend:
     extra: str | None = None
     driver: str | None = None
     library: str | None = None
-    windows: bool = False
+    windows_only: bool = False
     indexed: bool = False
     module: str | None = None
     has: str = ""
-    bitrates_kbit: tuple[float, ...] = ()
+    bitrates_kbit: Sequence[float] = ()
 
     @property
     def missing(self) -> tuple[str, ...]:
         """What it lacks here, each with the line to type or the place to get it."""
         lacks = []
-        if self.windows and sys.platform != "win32":
+        if self.windows_only and sys.platform != "win32":
             lacks.append(f"{self.driver} is for Windows only")
         if self.package is not None and importlib.util.find_spec(self.package) is None:
             lacks.append(
@@ -99,115 +77,19 @@ class Backend:
         return frozenset(self.has.split())
 
 
-BACKENDS: Mapping[str, Backend] = {
-    SOCKETCAN: Backend(
-        "adapters with a driver in the Linux kernel; vcan",
-        "name of the interface",
-        "can0",
-        has="fd filter listen-only errors error-classes stamps",
-    ),
-    "pcan": Backend(
-        "PEAK PCAN",
-        "name of the channel in PCAN-Basic",
-        "PCAN_USBBUS1",
-        driver="PCAN-Basic of peak-system.com",
-        library="PCANBasic" if _ON_WINDOWS else "pcanbasic",
-        module="peak_usb",
-        has="fd-timing listen-only errors stamps",
-        bitrates_kbit=(1000, 800, 500, 250, 125, 100, 95, 83, 50, 47, 33, 20, 10, 5),
-    ),
-    "kvaser": Backend(
-        "Kvaser",
-        "number, from 0",
-        "0",
-        driver="CANlib of kvaser.com",
-        library="canlib32" if _ON_WINDOWS else "canlib",
-        indexed=True,
-        module="kvaser_usb",
-        has="fd filter listen-only errors stamps",
-    ),
-    "ixxat": Backend(
-        "HMS Ixxat",
-        "number, from 0",
-        "0",
-        driver="the VCI 4 driver of ixxat.com",
-        windows=True,
-        indexed=True,
-        has="fd filter errors stamps",
-    ),
-    "vector": Backend(
-        "Vector VN, CANcase",
-        "number, from 0",
-        "0",
-        driver="the XL Driver Library of vector.com",
-        windows=True,
-        has="fd filter listen-only errors stamps",
-    ),
-    "slcan": Backend(
-        "CANable (slcan firmware), USBtin, Lawicel: a serial line",
-        "serial port",
-        _SERIAL_PORT,
-        package="serial",
-        extra="serial",
-        has="fd-timing listen-only",
-        bitrates_kbit=(1000, 750, 500, 250, 125, 100, 83.3, 50, 20, 10),
-    ),
-    "gs_usb": Backend(
-        "candleLight, CANable (candleLight firmware), CANtact, by USB",
-        "number, from 0",
-        "0",
-        package="gs_usb",
-        extra="gs-usb",
-        driver=f"libusb ({'of libusb.info' if _ON_WINDOWS else f'{sudo()}apt-get install -y libusb-1.0-0'})",
-        library="usb-1.0",
-        indexed=True,
-        module="gs_usb",
-        has="errors error-classes stamps",
-    ),
-    "usb2can": Backend(
-        "8devices USB2CAN",
-        "serial number of the device",
-        "ED000200",
-        driver="usb2can.dll of 8devices",
-        windows=True,
-        module="usb_8dev",
-        has="errors stamps",
-    ),
-    "serial": Backend(
-        "python-can's own serial protocol", "serial port", "/dev/ttyUSB0", "serial", "serial", has="errors stamps"
-    ),
-    "seeedstudio": Backend(
-        "Seeed USB-CAN analyzer",
-        "serial port",
-        "/dev/ttyUSB0",
-        package="serial",
-        extra="serial",
-        has="listen-only",
-        bitrates_kbit=(1000, 800, 500, 400, 250, 200, 125, 100, 50, 20, 10, 5),
-    ),
-    "robotell": Backend("Robotell USB-CAN", "serial port", "/dev/ttyUSB0", package="serial", extra="serial"),
-    "cantact": Backend("CANtact", "number, from 0", "0", "cantact", "cantact", indexed=True, has="listen-only stamps"),
-    "canalystii": Backend("CANalyst-II", "number, from 0", "0", "canalystii", "canalystii", has="stamps"),
-    "neovi": Backend(
-        "Intrepid neoVI, ValueCAN", "number, from 1", "1", "ics", "neovi", indexed=True, has="fd errors stamps"
-    ),
-    "socketcand": Backend(
-        "an interface of another machine, by socketcand (its host and port stand in ~/.canrc)",
-        "name of the interface there",
-        "can0",
-        has="errors error-classes stamps",
-    ),
-    "udp_multicast": Backend(
-        "none: processes on this machine or network",
-        "multicast address",
-        LOCAL_GROUP,
-        "msgpack",
-        "multicast",
-        has="fd stamps echo",
-    ),
-    "virtual": Backend("none: within one process", "any name", "vcan0", has="fd errors"),
-}
+def _read_backends() -> dict[str, Backend]:
+    text = Path(__file__).with_name("adapters.toml").read_text(encoding="utf-8")
+    found = {}
+    for name, row in tomllib.loads(text.replace("{sudo}", sudo())).items():
+        on_windows = row.pop("on_windows", {})
+        found[name] = Backend(**row | on_windows if sys.platform == "win32" else row)
+    return found
+
+
+BACKENDS: Mapping[str, Backend] = _read_backends()
 """Interface of python-can → what reaches it, the usual ones first."""
+LOCAL_GROUP = BACKENDS["udp_multicast"].example
+"""A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
 
 
 @dataclass(frozen=True, slots=True)
