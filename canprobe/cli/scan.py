@@ -6,6 +6,8 @@ boots with its new id at once and keeps it, unless --no-store is given.
 
 A node that only sends heartbeats is listed with its state, and a node id that two devices have with both serial
 numbers. "-" stands for what a node does not answer.
+
+With --motors it is motors that speak no CANopen (Damiao), on a bus of their own: their registers are read, no more.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ examples:
   canprobe scan --lss --assign 3 --channel can0        # the only node without an id gets 3
   canprobe scan --lss --assign 0x4711=3 --assign 0x4712=4 --channel can0
   canprobe scan mine.toml --lss --channel can0         # the nodes of the scene get their ids
+  canprobe scan --motors --channel can0                # Damiao motors: ids, ranges, watchdog, mode
 """
 _COLUMNS = ("node_id", "state", "vendor_id", "product_code", "revision_number", "serial_number", "device_name")
 _NUMBERS = 4
@@ -53,6 +56,7 @@ def add_arguments(parser: Parser) -> None:
         assignment,
         many=True,
     )
+    parser.add_option("--motors", "find motors that speak no CANopen, on a bus without CANopen nodes")
     parser.add_option("--no-store", "the devices lose their new ids when they lose power")
     parser.add_shared("--json", "-v")
 
@@ -77,6 +81,10 @@ def run(args: argparse.Namespace) -> None:
     from canprobe import api
 
     target = real_target(args, args.channel, channel_else="can0")
+    if args.motors:
+        found = api.scan(target, timeout_s=args.timeout, motors=True, say=args.report.say)
+        print_answer(args, found, lambda: _print_motors(found, target.channel))
+        return
     if not args.lss:
         nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
         print_answer(args, nodes, lambda: _print_nodes(nodes, target.channel))
@@ -94,6 +102,8 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
+    if args.motors and args.lss:
+        raise UsageError("scan: --motors or --lss, not both: motors have no LSS")
     for given, name in ((args.assign, "--assign"), (args.scene, "SCENE"), (args.no_store, "--no-store")):
         if given and not args.lss:
             raise UsageError(f"scan: {name} goes with --lss")
@@ -121,6 +131,22 @@ def _print_nodes(nodes: list[dict[str, Any]], where: str) -> None:
             state = node["state"]
             way = _STOPPED if state == "STOPPED" else "if it is only slow, give a larger --timeout"
             print(f"{name}: sends heartbeats ({state}), but answers no SDO request; {way}")
+
+
+def _print_motors(motors: list[dict[str, Any]], where: str) -> None:
+    if not motors:
+        print(f"no motor answers on {where}")
+        return
+    rows = [("motor", "MST_ID", "PMAX VMAX TMAX", "type", "watchdog", "mode")]
+    for one in motors:
+        ranges = " ".join("-" if each is None else f"{each:g}" for each in one["ranges"])
+        watchdog = {None: "-", 0: "off"}.get(one["timeout_ms"], f"{one['timeout_ms']} ms")
+        types = " or ".join(one["types"]) or "none that is known"
+        rows.append((str(one["motor_id"]), f"{one['mst_id']:03X}h", ranges, types, watchdog, one["mode"] or "-"))
+    print_table(rows)
+    for one in motors:
+        if one["devices"] > 1:
+            print(f"motor {one['motor_id']}: {one['devices']} answer with this id; leave one on the bus, and change it")
 
 
 def _print_commissioned(done: Commissioned, where: str) -> None:

@@ -26,25 +26,31 @@ from canprobe.cell.session.target import Target, open_bus, refuse_virtual
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.motor.search import find_motors
 
 MONITOR_PERIOD_NS = 100_000_000
 SILENCE_NS = 1_000_000_000
 """Time without a frame on a bus after which the state of its controller is read."""
 
 
-def scan(target: Target | Port, *, timeout_s: float | None = None, say: Say = quiet) -> list[dict[str, Any]]:
-    """List the nodes that answer or send heartbeats on a bus, with the identity that 1018h gives.
+def scan(
+    target: Target | Port, *, timeout_s: float | None = None, motors: bool = False, say: Say = quiet
+) -> list[dict[str, Any]]:
+    """List the nodes that answer or send heartbeats on a bus, with the identity that 1018h gives; or its motors.
 
     Args:
         target: the bus, or a port of it, which stays open.
         timeout_s: longest time to one SDO answer; by default that of a bring-up.
+        motors: whether to list motors that speak no CANopen instead: see `canprobe.fieldbus.motor.search.find_motors`.
         say: called with each warning about the interface's setting.
 
     Raises:
+        UsageError: when motors are asked for where CANopen nodes are heard.
         InterfaceError: when there is no such interface, or the CAN controller's state explains that no node answers.
     """
     with open_bus(target, say) if isinstance(target, Target) else contextlib.nullcontext(target) as port:
-        nodes = scan_nodes(port, timeout_s or BringUpSettings().sdo_s)
+        found = find_motors if motors else scan_nodes
+        nodes = found(port, timeout_s or BringUpSettings().sdo_s)
     if not nodes and isinstance(target, Target):
         need_controllers(target.interface, {target.channel: port})
     return nodes

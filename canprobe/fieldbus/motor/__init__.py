@@ -13,6 +13,7 @@ that is not asked is silent:
     protocol     bytes and numbers, both ways; `damiao.toml` has the ranges of all types, and all registers
     joint        what a motor turns: inertia and friction, stable at any step
     damiao       the motor: frames and time in, frames and the next deadline out
+    search       which motors there are, found by reading registers
     on_bus       several motors and CANopen nodes on one bus: whose identifiers are whose
 
 What masters trip over: numbers are places in ranges which no frame names (registers 21 to 23 have them). A motor in a
