@@ -46,7 +46,8 @@ def test_inject_lists_the_faults_of_motors_once(capsys):
     names = [kind["name"] for kind in kinds]
     assert len(names) == len(set(names))
     of_motors = [kind["name"] for kind in kinds if kind["needs"] == "motor"]
-    assert of_motors == ["brown-out", "over-temperature", "over-voltage", "under-voltage"]
+    limits = ["over-temperature", "over-voltage", "under-voltage"]
+    assert of_motors == ["brown-out", *limits, "watchdog-trip", "wrong-range", "encoder-wrap"]
 
 
 @pytest.mark.parametrize(("first", "status"), [(0.3, 0), (0.0, 1)])

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import math
+import struct
+
 import pytest
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus import load_eds
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
-from canprobe.fieldbus.motor.protocol import SPECIAL, TYPES, Feedback, MitCommand, MotorStatus, Special
+from canprobe.fieldbus.motor.protocol import (
+    REGISTER_ID,
+    SPECIAL,
+    TYPES,
+    Feedback,
+    MitCommand,
+    MotorStatus,
+    RegisterOp,
+    Rid,
+    Special,
+    pack_register,
+)
 from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, FaultyMotor
 
 MS = 1_000_000
@@ -102,6 +116,43 @@ def test_a_supply_outside_of_its_limits_trips_after_its_delay(line, name, delay_
     line.bus.end(fault)
     line.feedback(1, SPECIAL + bytes((Special.CLEAR,)))
     assert line.feedback(1).status == MotorStatus.ENABLED
+
+
+def test_a_watchdog_trips_although_frames_come_and_the_fault_is_latched(line):
+    line.feedback(1)
+    line.bus.inject("motor 1: watchdog-trip at 10 ms")
+    line.pass_ms(20)
+    assert line.feedback(1).status == MotorStatus.COMMUNICATION_LOST
+    line.feedback(1, SPECIAL + bytes((Special.CLEAR,)))
+    assert line.feedback(1).status == MotorStatus.ENABLED
+
+
+def test_a_motor_that_is_disabled_has_no_watchdog_to_trip(line):
+    line.bus.inject("motor 1: watchdog-trip")
+    assert line.feedback(1, bytes(8)).status == MotorStatus.DISABLED
+
+
+def test_with_other_ranges_a_motor_is_elsewhere_and_its_feedback_does_not_show_it(line):
+    line.feedback(1)
+    fault = line.bus.inject("motor 1: wrong-range ratio=0.5")
+    line.feedback(1, MitCommand(p=0.4, kp=50, kd=1).pack(DM4310), ms=500)
+    assert line.feedback(1).p == pytest.approx(0.4, abs=5e-3)
+    line.bus.end(fault)
+    assert line.feedback(1).p == pytest.approx(0.2, abs=5e-3)
+
+
+def test_ranges_that_a_master_wrote_meanwhile_stay(line):
+    fault = line.bus.inject("motor 1: wrong-range")
+    line.port.send_batch([(REGISTER_ID, pack_register(1, RegisterOp.WRITE, Rid.PMAX, struct.pack("<f", 6.0)))])
+    line.bus.end(fault)
+    line.pass_ms(1)
+    assert line.motors[0].motor.registers[Rid.PMAX] == 6.0
+
+
+def test_a_position_is_off_by_whole_turns(line):
+    line.feedback(1)
+    line.bus.inject("motor 1: encoder-wrap turns=-1")
+    assert line.feedback(1, bytes(8)).p == pytest.approx(-math.tau, abs=2e-3)
 
 
 def test_a_fault_waits_for_a_motor_to_be_enabled(line):

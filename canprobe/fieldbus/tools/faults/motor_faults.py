@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from typing import cast
 
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
-from canprobe.fieldbus.motor.protocol import MotorStatus
+from canprobe.fieldbus.motor.protocol import MotorStatus, Rid
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.tools.faults.fault import Effect, FaultKind
@@ -58,6 +59,50 @@ class OverTemperature(Effect):
     def end(self, t_ns: int) -> None:
         self._motor.heat = (30, 30)
         self._motor.exceeded_ns.pop(MotorStatus(int(self.fault.value("status"))), None)
+
+
+class WatchdogTrip(Effect):
+    """The watchdog of an enabled motor trips although frames come."""
+
+    name = "watchdog-trip"
+    needs = "motor"
+
+    def begin(self, t_ns: int) -> Sequence[Frame]:
+        self.node.advance(t_ns)
+        if (motor := cast(DamiaoMotor, self.node)).status is MotorStatus.ENABLED:
+            motor.turn(MotorStatus.COMMUNICATION_LOST)
+        return ()
+
+
+class WrongRange(Effect):
+    """Registers 21 to 23 are those of another type; they are put back at the end, unless somebody wrote them."""
+
+    name = "wrong-range"
+    needs = "motor"
+
+    def begin(self, t_ns: int) -> Sequence[Frame]:
+        self.node.advance(t_ns)
+        self._registers = cast(DamiaoMotor, self.node).registers
+        self._found = {int(rid): self._registers[rid] for rid in (Rid.PMAX, Rid.VMAX, Rid.TMAX)}
+        self._wrong = {rid: value * self.fault.value("ratio") for rid, value in self._found.items()}
+        self._registers |= self._wrong
+        return ()
+
+    def end(self, t_ns: int) -> None:
+        if self._wrong.items() <= self._registers.items():
+            self._registers |= self._found
+
+
+class EncoderWrap(Effect):
+    """The position is off by whole turns from here on, as where their count was lost."""
+
+    name = "encoder-wrap"
+    needs = "motor"
+
+    def begin(self, t_ns: int) -> Sequence[Frame]:
+        self.node.advance(t_ns)
+        cast(DamiaoMotor, self.node).joint.q += math.tau * self.fault.value("turns")
+        return ()
 
 
 MOTOR_FAULTS: Mapping[str, FaultKind] = {name: BUS_FAULTS[name] for name in _LINK} | {**kinds_of(sys.modules[__name__])}
