@@ -1,8 +1,7 @@
-"""can-utils and tshark as witnesses: what they see on the bus, and what they read in it, is what our logs say."""
+"""candump, cansend and tshark as witnesses: what they see on the bus, and what they read in it, is what our logs say."""
 
 from __future__ import annotations
 
-import re
 import shutil
 import signal
 import struct
@@ -19,7 +18,6 @@ from slow_scene import write_slow_scene
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.port import ERR_FLAG
-from canprobe.fieldbus.protocol.frame_bits import best_case_bits, worst_case_bits
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
 
 pytestmark = pytest.mark.vcan
@@ -95,30 +93,6 @@ class Candump(Tool):
     @property
     def frames(self) -> Frames:
         return [frame for frame in read_log(self._path) if frame[0] != MARKER]
-
-
-class Load(Tool):
-    """canbusload, one line a second; it counts when the constructor returns."""
-
-    def __init__(self, path: Path, *options: str) -> None:
-        super().__init__(path, tool("stdbuf"), "-oL", tool("canbusload"), *options, "vcan0@1000000")
-        self.wait_lines(1)
-
-    def wait_lines(self, count: int) -> None:
-        """Until it has counted for so many seconds more."""
-        wanted = len(self.rows) + count
-        while len(self.rows) < wanted:
-            time.sleep(0.1)
-
-    @property
-    def rows(self) -> list[tuple[int, ...]]:
-        """Frames, bits and data bits of each second."""
-        found = re.findall(r"vcan0@1000000 +(\d+) +(\d+) +(\d+)", self.out)
-        return [tuple(map(int, row)) for row in found]
-
-    @property
-    def total(self) -> tuple[int, ...]:
-        return tuple(map(sum, zip(*self.rows, strict=True)))
 
 
 def send(frame: str) -> None:
@@ -281,37 +255,3 @@ def test_cansend_asks_and_candump_hears_the_answer(served: Any, bench: Any) -> N
         bench.bus.until(complete, served)
     assert candump.frames == heard
     assert 0x185 not in by_id(heard), "TPDO1 of the drive is synchronous, and nobody sends a SYNC"
-
-
-@pytest.mark.slow(reason="one more tool of can-utils")
-def test_canbusload_counts_the_frames_and_bits_that_we_count(served: Any, bench: Any) -> None:
-    """Bits for the worst stuffing, as canbusload counts unless it is told to leave stuffing out."""
-    with Load(bench.folder / "worst.txt") as worst, Load(bench.folder / "best.txt", "-i") as best:
-        subprocess.run([tool("cangen"), "vcan0", "-g", "5", "-n", "150", "-I", "7E5", "-L", "r", "-D", "r"], check=True)
-        sizes = [len(data) for can_id, data, _ in bench.bus.hear() if can_id == 0x7E5]
-        worst.wait_lines(2)
-        best.wait_lines(1)
-        assert bench.bus.hear() == [], "a silent bus"
-    assert len(sizes) == 150
-    assert worst.total == (150, sum(map(worst_case_bits, sizes)), 8 * sum(sizes))
-    assert best.total == (150, sum(map(best_case_bits, sizes)), 8 * sum(sizes))
-
-
-@pytest.mark.slow(reason="one more tool of can-utils")
-def test_nodes_survive_what_cangen_throws_at_them(served: Any, bench: Any) -> None:
-    """Random identifiers and lengths, NMT commands and broken SDO requests among them."""
-    words = [tool("cangen"), "vcan0", "-g", "1", "-n", "1500", "-I", "r", "-L", "r", "-D", "r", "-v"]
-    out = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    lines = [line.split()[1].partition("#") for line in out.splitlines()]
-    thrown = [(int(can_id, 16), bytes.fromhex(data.replace(".", ""))) for can_id, _, data in lines]
-    assert len(thrown) == 1500
-    heard = by_id([frame[:2] for frame in bench.bus.hear()])
-    for can_id, datas in by_id(thrown).items():
-        left = iter(heard[can_id])
-        assert all(data in left for data in datas), f"{can_id:03X}: in this order in what we heard"
-    for node_id in NODES:
-        send(f"000#81{node_id:02X}")
-        bench.bus.until(lambda frame, n=node_id: frame[:2] == (0x700 + n, b"\0"), served)
-        send(f"{0x600 + node_id:03X}#4018100100000000")
-        answer = 0x580 + node_id, bytes.fromhex("431810015eca0000")
-        bench.bus.until(lambda frame, a=answer: frame[:2] == a, served)
