@@ -1,4 +1,4 @@
-"""candump, cansend and tshark as witnesses: what they see on the bus, and what they read in it, is what our logs say."""
+"""candump, cansend and tshark as witnesses: what they see on the bus and read in it is what our logs say."""
 
 from __future__ import annotations
 
