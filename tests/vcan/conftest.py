@@ -84,9 +84,9 @@ class Command:
     def send(self, number: int) -> None:
         self._process.send_signal(number)
 
-    def wait(self, patience_s: float = PATIENCE_S) -> int:
+    def wait(self) -> int:
         """Wait for the end; return the exit status. Nothing may be left of it."""
-        status = self._process.wait(stretched(patience_s))
+        status = self._process.wait(stretched(PATIENCE_S))
         assert self.children == []
         return status
 
@@ -212,10 +212,9 @@ class Bench:
         self.bus = Bus()
         self.start = Starter(folder)
 
-    def scene(self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", **options: Any) -> Path:
+    def scene(self, name: str, *, emulated: bool = True) -> Path:
         """A packaged scene as `write_slow_scene` alters it."""
-        path = self.folder / f"{name}-{rate_hz}-{emulated}-{bool(eds)}.toml"
-        return write_slow_scene(path, name, rate_hz=rate_hz, emulated=emulated, eds=eds, **options)
+        return write_slow_scene(self.folder / f"{name}-{emulated}.toml", name, emulated=emulated)
 
     def results(self, name: str) -> Results:
         return Results(self.folder / name)
