@@ -192,51 +192,48 @@ def test_a_joint_without_range_gets_a_placeholder_and_a_tilt_is_explained(tmp_pa
     assert "from straight down; it is the best of 400 tried postures" in capsys.readouterr().err
 
 
+@pytest.fixture
+def changed(tmp_path, urdf, capsys):
+    """A first scene whose URDF gets another text in the place of one, and that URDF."""
+
+    def change(old, new):
+        assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+        (copied,) = (tmp_path / "cell").glob("*.urdf")
+        copied.write_text(URDF.replace(old, new, 1))
+        capsys.readouterr()
+        return str(tmp_path / "cell" / "first.toml"), copied
+
+    return change
+
+
 @pytest.mark.parametrize(
-    ("velocity", "what"),
+    ("old", "new", "what"),
     [
-        ("3", "joint j4: expected a velocity in its <limit> of at least 0.000175 rad/s, got 1e-09; put it right there,"
-         " or set joints.j4.speed_deg_s"),
-        ("0.5", "joint rail: expected a velocity in its <limit> of at least 1e-05 m/s, got 1e-09; put it right there,"
-         " or set joints.rail.speed_mm_s"),
+        ('velocity="3"', 'velocity="1e-9"', "joint j4: expected a velocity in its <limit> of at least 0.000175 rad/s,"
+         " got 1e-09; put it right there, or set joints.j4.speed_deg_s"),
+        ('velocity="0.5"', 'velocity="1e-9"', "joint rail: expected a velocity in its <limit> of at least 1e-05 m/s,"
+         " got 1e-09; put it right there, or set joints.rail.speed_mm_s"),
+        ('lower="-2" upper="2"', 'lower="0" upper="0"', "joint j2: expected lower below upper in its <limit>, got 0"
+         " and 0; put it right there, or set joints.j2.min_deg and max_deg"),
     ],
 )  # fmt: skip
-def test_a_speed_limit_of_nearly_nothing_is_refused_with_file_and_joint(tmp_path, urdf, capsys, velocity, what):
-    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
-    (copied,) = (tmp_path / "cell").glob("*.urdf")
-    copied.write_text(URDF.replace(f'velocity="{velocity}"', 'velocity="1e-9"'))
-    capsys.readouterr()
-    assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 2
+def test_a_limit_of_nothing_is_refused_with_file_joint_and_key(changed, capsys, old, new, what):
+    scene, copied = changed(old, new)
+    assert main(["plan", scene]) == 2
     assert f"{copied}: {what}" in capsys.readouterr().err
 
 
-def test_a_range_of_nothing_is_refused_with_file_and_joint_until_the_section_has_one(tmp_path, urdf, capsys):
-    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
-    (copied,) = (tmp_path / "cell").glob("*.urdf")
-    copied.write_text(URDF.replace('lower="-2" upper="2"', 'lower="0" upper="0"', 1))
-    capsys.readouterr()
-    scene = str(tmp_path / "cell" / "first.toml")
-    assert main(["plan", scene]) == 2
-    said = capsys.readouterr().err
-    name = re.search(
-        f"{re.escape(str(copied))}: joint (\\w+): expected lower below upper in its <limit>, got 0 and 0; ", said
-    )[1]
-    assert f"or set joints.{name}.min_deg and max_deg" in said
-    main(["plan", scene, "--set", f"joints.{name}.min_deg=-114", "--set", f"joints.{name}.max_deg=114"])
+def test_a_range_of_the_section_replaces_that_of_the_urdf(changed, capsys):
+    scene, _ = changed('lower="-2" upper="2"', 'lower="0" upper="0"')
+    main(["plan", scene, "--set", "joints.j2.min_deg=-114", "--set", "joints.j2.max_deg=114"])
     assert "expected lower below upper" not in capsys.readouterr().err
 
 
-def test_a_speed_limit_of_the_section_replaces_that_of_the_urdf_however_low(tmp_path, urdf, capsys):
-    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
-    (copied,) = (tmp_path / "cell").glob("*.urdf")
-    copied.write_text(URDF.replace('velocity="2"', 'velocity="1e-9"'))
-    slow = [f"joints.{joint}.speed_deg_s={speed}" for joint, speed in (("j1", 1e-7), ("j2", 1), ("j3", 1))]
-    words = [word for value in slow for word in ("--set", value)]
-    capsys.readouterr()
-    assert main(["plan", str(tmp_path / "cell" / "first.toml"), *words]) == 2
-    assert "joint 2 would need" in (said := capsys.readouterr().err) and "allowed 5e-08" in said, (
-        "half of it by limits.joint_speed_share"
-    )
+def test_a_speed_limit_of_the_section_replaces_that_of_the_urdf_however_low(changed, capsys):
+    scene, _ = changed('velocity="2"', 'velocity="1e-9"')
+    assert main(["plan", scene, "--set", "joints.j1.speed_deg_s=1e-7"]) == 2
+    assert "joint 2 would need" in (said := capsys.readouterr().err)
+    assert "allowed 5e-08" in said, "half of it by limits.joint_speed_share"
 
 
 def chain_of(*joints, after=""):

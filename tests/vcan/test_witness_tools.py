@@ -13,7 +13,6 @@ from typing import Any, Self
 
 import pytest
 from patience import patience_s
-from slow_scene import write_slow_scene
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import read_candump
@@ -153,31 +152,7 @@ def read_log(path: Path) -> Frames:
     return [(can_id, data) for _, _, can_id, data in read_candump(path)]
 
 
-# ---------------------------------------------------------------- a bring-up, seen by candump and read by tshark
-
-
-@pytest.fixture(scope="module")
-def bring_up(start_shared: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Frames, Frames, Path]:
-    """Our log of a bring-up with drives and sensor, candump's of the same, and the path of ours."""
-    folder = tmp_path_factory.mktemp("witness")
-    with Candump(folder / "candump.log") as candump:
-        scene = write_slow_scene(folder / "press-slow.toml", "press")
-        command = start_shared("run", scene, *ON_VCAN0, "--duration", "0.2", "--out", folder / "results")
-        status = command.wait()
-        assert status == 0, command.err
-    ours = folder / "results" / "bus.log"
-    return read_log(ours), candump.frames, ours
-
-
-@pytest.mark.slow(reason="a bring-up for two tools; the default asks candump with less")
-def test_candump_saw_every_frame_that_we_logged(bring_up: tuple[Frames, Frames, Path]) -> None:
-    ours, theirs = by_id(bring_up[0]), by_id(bring_up[1])
-    assert len(bring_up[0]) > 1000
-    assert set(ours) == set(theirs)
-    for can_id, frames in ours.items():
-        assert theirs[can_id][: len(frames)] == frames, f"{can_id:03X}"
-        rest = theirs[can_id][len(frames) :]
-        assert all(can_id > 0x700 for _ in rest), f"{can_id:03X}: {len(rest)} frames that only candump saw"
+# ---------------------------------------------------------------- a bring-up, read by tshark
 
 
 FIELDS = (
@@ -214,9 +189,12 @@ def rebuild(row: dict[str, str]) -> bytes:
     return data
 
 
-@pytest.mark.slow(reason="a bring-up for two tools; the default asks candump with less")
-def test_tshark_reads_every_frame_of_the_bring_up_as_we_wrote_it(bring_up: tuple[Frames, Frames, Path]) -> None:
-    ours, _, path = bring_up
+@pytest.mark.slow(reason="a bring-up for one tool")
+def test_tshark_reads_every_frame_of_a_bring_up_as_we_wrote_it(bench: Any) -> None:
+    command = bench.start("run", bench.scene("press"), *ON_VCAN0, "--duration", "0.2", "--out", "results")
+    assert command.wait() == 0, command.err
+    path = bench.folder / "results" / "bus.log"
+    ours = read_log(path)
     words = [tool("tshark"), "-r", str(path), "-d", "can.subdissector,canopen", "-T", "fields", "-E", "separator=/t"]
     done = subprocess.run(
         [*words, *(word for field in FIELDS for word in ("-e", field))], capture_output=True, text=True, check=True
