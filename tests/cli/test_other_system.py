@@ -157,6 +157,16 @@ def test_a_console_writes_in_the_encoding_of_its_terminal():
     assert console.process.returncode == 0 and " ± " in out.decode("cp1252"), errors
 
 
+def test_a_console_that_nobody_reads_does_what_is_typed_and_ends():
+    """Its answers are more than a pipe holds."""
+    console = Beside("console", "puma260", "--json")
+    for line in (*["help"] * 100, "enable", "yes", "jog 1 +", "quit"):
+        console.type(line)
+    assert console.process.wait(timeout=60) == 0
+    out, errors = console.process.communicate()
+    assert out.count(b"print this list") < 100 and not errors
+
+
 def test_a_bus_of_python_can_is_scanned_and_a_device_on_it_examined(folder, group):
     served = ("--bus", "udp_multicast", "--channel", group)
     device = Beside("emulate", "--eds", "puma260_joint", "--node-id", "5", *served)
