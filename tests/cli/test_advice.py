@@ -29,6 +29,12 @@ def plan(scene: str, keys: dict[str, str]) -> int:
             {"bus.fd": r"bus\.fd = (true)", "sensor.eds": r'sensor\.eds = "(\S+)":'},
         ),
         (
+            "press",
+            {"cycle.rate_hz": "500", "sensor.rate_hz": "250"},
+            {"arm.grouped_rpdo": r"^  arm\.grouped_rpdo = (true) and", "bus.cob_ids": r'bus\.cob_ids = "(\S+)":'},
+        ),
+        ("press", {"bus.transmit_queue": "fifo"}, {"bus.transmit_queue": r'\(bus\.transmit_queue = "(\S+)"\):'}),
+        (
             "cylinder",
             {"cycle.rate_hz": "410"},
             {"cycle.rate_hz": r"take (\S+) Hz with", "sensor.rate_hz": r"take \S+ Hz with sensor\.rate_hz = (\S+) or"},
