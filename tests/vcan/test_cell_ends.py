@@ -52,6 +52,16 @@ def test_one_node_is_killed(bench: Any) -> None:
     five.end(143)
 
 
+@pytest.mark.slow(reason="a second killed master; the default kills that of test_cell_served.py")
+def test_emulated_nodes_go_with_a_master_that_is_killed(bench: Any) -> None:
+    command = bench.start("up", bench.scene("free"), *ON_VCAN0)
+    bench.bus.until_enabled(1, by=command)
+    (child,) = command.children
+    command.send(signal.SIGKILL)
+    while Path(f"/proc/{child}").exists():
+        bench.bus.hear()
+
+
 def test_another_master_is_at_work(bench: Any) -> None:
     command = bench.start("run", bench.scene("free", emulated=False), *ON_VCAN0, "--out", "results")
     heard = []
