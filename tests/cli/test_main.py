@@ -106,7 +106,10 @@ def test_version(capsys):
         (["emulate", "cylinder"], ("--channel", "missing")),
         (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "6-1"], ("--nodes", "1-6,16")),
         (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "126-127"], ("--nodes", "from 1 to 126")),
-        (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "1,17"], ("no node [17]", "[1, 2, 3, 4, 5, 6, 16]")),
+        (
+            ["emulate", "cylinder", "--channel", "vcan0", "--nodes", "1,126"],
+            ("no node [126]", "[1, 2, 3, 4, 5, 6, 16]"),
+        ),
         (["eds", "path", "puma260"], ("puma260", "puma260_joint")),
         (["eds"], ("ACTION",)),
     ],
@@ -190,7 +193,8 @@ def test_what_a_signal_ends_has_its_status(name, number, monkeypatch, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_a_monitor_that_is_ended_shows_what_it_knows(monkeypatch, capsys):
+@pytest.mark.parametrize("json_too", [[], ["--json"]])
+def test_a_monitor_that_is_ended_shows_what_it_knows(json_too, monkeypatch, capsys):
     """`timeout 5 canprobe monitor …` is a way to look for five seconds."""
 
     def views(*_, **__):
@@ -199,7 +203,7 @@ def test_a_monitor_that_is_ended_shows_what_it_knows(monkeypatch, capsys):
         signal.raise_signal(signal.SIGTERM)
 
     monkeypatch.setattr(api, "monitor", views)
-    assert main(["monitor", "free", "--channel", "vcan0"]) == 143
+    assert main(["monitor", "free", "--channel", "vcan0", *json_too]) == 143
     assert "can0" in capsys.readouterr().out
 
 

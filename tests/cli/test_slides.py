@@ -1,6 +1,7 @@
 """What users read of an arm whose joints slide: millimetres, and no degree."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,16 @@ from canprobe.cli import main
 from canprobe.errors import PlanError
 
 FREE = 'cell = "gantry"\n[scene]\nname = "s"\n[task]\nkind = "free"\n'
+
+
+def test_the_joint_check_moves_and_tells_in_mm(capsys):
+    assert main(["up", "gantry", "--check-joints", "--yes", "--set", "cycle.rate_hz=200"]) == 0
+    said = capsys.readouterr().err
+    assert re.findall(r"joint \d at .*", said) == [
+        f"joint {i} at {at}.00 mm: asked +3.49 mm, moved +3.49 mm: as expected"
+        for i, at in ((1, 200), (2, 200), (3, 150))
+    ]
+    assert "the arm stands at 200.00, 200.00, 150.00 mm, its flange at" in said
 
 
 def test_the_plan_has_speeds_in_mm_per_second(capsys):
