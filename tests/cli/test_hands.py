@@ -75,6 +75,7 @@ def test_a_move_in_millimetres(capsys):
         (("move", "puma260", "start"), "move asks before the motion and needs a terminal; --yes leaves that out"),
         (("move", "puma260", "1,2", "--yes"), "expected positions of 6 joints, got 2"),
         (("move", "puma260", "strat", "--yes"), "did you mean start?"),
+        (("move", "puma260", "start", "--speed", "20deg"), "expected a share such as 20% or 0.2"),
         (("move", "puma260", "--joint", "7", "--by", "1", "--yes"), "the arm has joints 1 to 6"),
         (("move", "puma260", "--joint", "3", "--by", "5mm", "--yes"), "joint 3 moves in deg"),
         (("move", "listen", "start", "--yes"), "expected a scene with an arm|has no arm"),
@@ -89,13 +90,6 @@ def test_what_cannot_be_is_one_clear_line_before_anything_is_sent(words, said, c
     monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
     *sent, line = told(capsys, *words, status=2).err.splitlines()
     assert re.search(said, line) and not sent
-
-
-def test_a_speed_is_a_share(capsys):
-    assert (
-        "expected a share such as 20% or 0.2"
-        in told(capsys, "move", "puma260", "start", "--speed", "20deg", status=2).err
-    )
 
 
 def test_a_posture_is_saved_without_touching_the_rest(mine, capsys):
