@@ -7,18 +7,15 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from full_disk import room_for
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.npz import read_npz
 from canprobe.cli import main
 from canprobe.errors import ResultsError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.lab.studies.cell_store import CellStore
-from canprobe.lab.studies.result import StudyResult, write_study
 
 ROOM = 2000
 
@@ -66,22 +63,6 @@ def test_a_run_whose_frames_cannot_be_written_lets_go_and_ends_with_the_same_sta
     for line in told[1:]:  # whatever else did not fit
         name = line.removeprefix(f"canprobe: {out}/").partition(":")[0]
         assert "cannot be written" in line and name in whole - left
-
-
-def test_a_table_leaves_no_part_of_a_file(scan, tmp_path):
-    table = pytest.importorskip("canprobe.cell.results.run_files")
-    pytest.importorskip("pyarrow")
-    with room_for(ROOM), pytest.raises(ResultsError, match=r"log\.parquet: cannot be written"):
-        table.write_parquet(read_npz(scan / "log.npz"), tmp_path / "log.parquet")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_study_leaves_no_part_of_a_file(tmp_path):
-    rows = [{"value": float(value)} for value in np.arange(1000)]
-    result = StudyResult("some", rows, (), {}, lambda path: path.write_text("x"))
-    with room_for(ROOM), pytest.raises(ResultsError, match=r"some\.csv: cannot be written"):
-        write_study(result, tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_study_s_cells_that_were_kept_before_are_whole(tmp_path):

@@ -48,19 +48,13 @@ def test_a_log_of_a_bad_master(tmp_path, capsys):
     assert "201#0F00983A0000" in (tmp_path / "j.html").read_text()
 
 
-def test_a_log_of_a_good_master_and_what_became_better(tmp_path, capsys):
-    bad, good = log_of(TargetElsewhere(), tmp_path / "bad.log"), log_of(Master(), tmp_path / "good.log")
-    assert main(["judge", *NODE, "--record", bad, "--json"]) == 1
-    (tmp_path / "bad.json").write_text(capsys.readouterr().out)
-    assert main(["judge", *NODE, "--record", good, "--baseline", str(tmp_path / "bad.json")]) == 0
-    assert "better: enable 01 target at enable" in capsys.readouterr().out
-
-
-def test_only_what_is_new_fails_where_ci_asks_for_that(tmp_path, capsys):
+def test_what_became_better_is_told_and_only_what_is_new_fails_where_ci_asks_for_that(tmp_path, capsys):
     logs = {"bad": log_of(TargetElsewhere(), tmp_path / "bad.log"), "good": log_of(Master(), tmp_path / "good.log")}
-    for name, log in logs.items():
-        main(["judge", *NODE, "--record", log, "--json"])
+    for (name, log), status in zip(logs.items(), (1, 0), strict=True):
+        assert main(["judge", *NODE, "--record", log, "--json"]) == status
         (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
+    assert main(["judge", *NODE, "--record", logs["good"], "--baseline", str(tmp_path / "bad.json")]) == 0
+    assert "better: enable 01 target at enable" in capsys.readouterr().out
     junit = tmp_path / "j.xml"
     bad = ["judge", *NODE, "--record", logs["bad"], "--junit", str(junit), "--fail-on"]
     for baseline, status, tag in (("bad", 0, "skipped"), ("good", 1, "failure")):

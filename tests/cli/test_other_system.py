@@ -72,12 +72,6 @@ def test_what_needs_no_posix_works_without_it(folder):
     assert failed == 0, f"{COMMANDS[failed - 1]}: {said}"
 
 
-@pytest.mark.slow(reason="a study in processes")
-def test_a_study_needs_no_posix(folder):
-    status, said = typed(folder, "study", "estimators", "--quick", "--out", "study")
-    assert status == 0, said
-
-
 MISSING = {
     "PCAN-Basic of peak-system.com is not installed": ("scan", "--bus", "pcan", "--channel", "PCAN_USBBUS1"),
     "canprobe replay FOLDER --bridge NAME": ("run", "free", "--bridge", "mcap", *SHORT, "fed"),
@@ -189,14 +183,6 @@ def test_a_bus_of_python_can_is_scanned_and_a_device_on_it_examined(folder, grou
         device.send_break()
     device.process.communicate(timeout=60)
     assert device.process.returncode == 143
-
-
-@pytest.mark.slow(reason="a master in real time")
-def test_a_master_is_judged_beside_served_nodes(folder, group):
-    master = (sys.executable, str(IMITATION.with_name("small_master.py")), "5", "udp_multicast", group)
-    served = ("--eds", "puma260_joint", "--node-id", "5", "--bus", "udp_multicast", "--channel", group)
-    status, said = typed(folder, "judge", *served, "--passive", "--without", "32,33,34", "--", *master)
-    assert status == 1 and "target at enable" in said and FAULT not in said
 
 
 def test_a_plan_says_what_its_system_cannot_do(folder):

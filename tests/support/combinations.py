@@ -2,21 +2,14 @@
 
 An arm is one of the URDFs of example-robot-data or a packaged cell, a drive one of `makes` with what vendors' files
 have besides, an array packaged or drawn. Each combination is a folder with files of the user's kind, so that
-`canprobe plan FOLDER/scene.toml` repeats it. From the command line:
-
-    python tests/support/combinations.py --count 200 --seed 1 --keep /tmp/combinations
+`canprobe plan FOLDER/scene.toml` repeats it.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
 import re
-import sys
-import tempfile
-import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -424,34 +417,3 @@ def outcome_of(path: Path) -> Outcome:
     except CanprobeError as error:
         return Outcome(None, f"{type(error).__name__}: {error}")
     return Outcome(None, None if result.summary["completed"] else str(result.summary["stop_reason"]))
-
-
-def main() -> int:
-    """Draw, plan and run combinations; 1 where one did not keep its word."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=20, help="combinations [20]")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the first one [1]")
-    parser.add_argument("--keep", metavar="DIR", type=Path, help="keep the files of each combination there")
-    args = parser.parse_args()
-    refused: Counter[str | None] = Counter()
-    broken = accepted = 0
-    with tempfile.TemporaryDirectory() as scratch:
-        for seed in range(args.seed, args.seed + args.count):
-            combination = draw(seed, (args.keep or Path(scratch)) / str(seed))
-            began = time.process_time()
-            outcome = outcome_of(combination.path)
-            spent = time.process_time() - began
-            accepted += outcome.plan is None
-            broken += not outcome.keeps
-            refused.update([] if outcome.plan is None else [key_of(outcome.plan)])
-            word = "refused" if outcome.plan is not None else "done"
-            print(f"{seed}: {word if outcome.keeps else 'BROKEN'} ({spent:.1f} s): {combination.what}")
-            for line in filter(None, (outcome.plan, outcome.run)):
-                print(f"    {line}", flush=True)
-    print(f"{args.count} combinations: {accepted} accepted, {args.count - accepted} refused, {broken} broken")
-    print("refused by: " + ", ".join(f"{key} {count}" for key, count in refused.most_common()))
-    return 1 if broken else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -43,7 +43,7 @@ class Bench(SdoWords):
         self.node_id, self.name = node.node_id, node.name
         self.port, self.power_on, self.end = port, power_on, end
         self.real_time = real_time
-        self._slack_ns, self._early_ns = (SLACK_MS * MS, MS) if real_time else (0, 0)
+        self._slack_ns = SLACK_MS * MS if real_time else 0
         self._heard: list[Heard] = []
 
     @property
@@ -74,11 +74,6 @@ class Bench(SdoWords):
         got = [self.next(within_ms) for _ in frames]
         assert [frame[:2] for frame in got] == list(frames)
         return got[-1].t_ns
-
-    def assert_after(self, t0_ns: int, t_ns: int, ms: float) -> None:
-        """`ms` passed from a frame that was sent to one that was heard: in lockstep exactly, on vcan at least."""
-        late_ns = t_ns - t0_ns - round(ms * MS)
-        assert -self._early_ns <= late_ns <= self._slack_ns, late_ns
 
     def silence(self, ms: float = 10) -> None:
         """Nothing comes."""

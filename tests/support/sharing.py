@@ -19,7 +19,6 @@ _NICE = 10
 _PATH = pytest.StashKey[Path]()
 _TESTS = pytest.StashKey[Sequence[str]]()
 WEIGHTS = {
-    "tests/cli/test_advice.py": 200.0,
     "tests/vcan/": 2.0,
     "tests/lab/gym/": 0.8,
     "tests/cell/recorded/": 0.7,
