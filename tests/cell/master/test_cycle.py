@@ -99,27 +99,24 @@ def goes_on_at(arrivals, *, on_arrival=True, drives=True):
 
 
 @pytest.mark.parametrize(
-    ("last_us", "begins_us", "looks"),
+    ("last_us", "begins_us", "looks", "in_lockstep_us"),
     [
-        (0, 0, 1),  # nodes on the same processor that go first
-        (300, 625, 2),
-        (900, 900, 3),  # no waiting for the next look
-        (1144, 1144, 3),
-        (1600, 1500, 3),  # late
+        (0, 0, 1, 625),  # nodes on the same processor that go first
+        (300, 625, 2, 625),
+        (900, 900, 3, 1145),  # no waiting for the next look, which lockstep has
+        (1144, 1144, 3, 1145),
+        (1600, 1500, 3, 1500),  # late
     ],
 )
-def test_on_a_running_clock_a_cycle_goes_on_once_the_last_tpdo_is_in(last_us, begins_us, looks):
-    assert goes_on_at([(TPDOS[0], 0), (TPDOS[1], last_us)]) == (begins_us, looks)
+def test_a_cycle_goes_on_once_the_last_tpdo_is_in_and_in_lockstep_at_a_look(last_us, begins_us, looks, in_lockstep_us):
+    arrivals = [(TPDOS[0], 0), (TPDOS[1], last_us)]
+    assert goes_on_at(arrivals) == (begins_us, looks)
+    assert goes_on_at(arrivals, on_arrival=False)[0] == in_lockstep_us
 
 
 def test_chatter_wakes_a_cycle_but_keeps_it_no_longer():
     chatter = [(0x7FF, us) for us in range(0, 2500, 10)]
     assert goes_on_at([(TPDOS[0], 100), *chatter])[0] == LOOKS[-1]
-
-
-@pytest.mark.parametrize(("last_us", "begins_us"), [(0, 625), (300, 625), (900, 1145), (1600, 1500)])
-def test_in_lockstep_it_goes_on_at_a_look(last_us, begins_us):
-    assert goes_on_at([(TPDOS[0], 0), (TPDOS[1], last_us)], on_arrival=False)[0] == begins_us
 
 
 def test_without_drives_there_is_nothing_to_go_on_with_before_the_first_look():

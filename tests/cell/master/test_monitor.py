@@ -47,16 +47,12 @@ def in_hold(recorded):
     return row, syncs[row], heard(recorded, syncs[row] + 1_000_000)
 
 
-def test_joints_force_and_image_are_those_of_the_cell(recorded, in_hold):
+def test_what_is_shown_is_the_cell(recorded, in_hold):
     result, _ = recorded
     row, _, view = in_hold
     assert view.q == pytest.approx(np.degrees(result.truth["q_rad"][row]), abs=0.05)
     assert view.force_n == pytest.approx(result.log["force_n"][row], abs=0.1)
     assert view.taxels.max() > 50 and view.torn_frames == 0
-
-
-def test_nodes_and_their_states(in_hold):
-    _, _, view = in_hold
     assert [n.node_id for n in view.nodes] == [1, 2, 3, 4, 5, 6, 16, 127]
     assert {n.state for n in view.nodes} == {"OPERATIONAL"}
     assert {n.drive for n in view.nodes[:6]} == {"OPERATION_ENABLED"}

@@ -153,13 +153,6 @@ def test_a_cell_that_fails_to_come_up_is_stopped_and_another_one_tried(monkeypat
     assert all(cell.doubted == {2} for cell in bench.cells[1:])
 
 
-@pytest.mark.parametrize("lasts_ns", [STEADY_NS, STEADY_NS + 1])
-def test_the_last_of_so_many_tries_may_succeed(monkeypatch, lasts_ns):
-    bench = Bench(monkeypatch, [*[{"fails": LOST}] * (BRING_UP_ATTEMPTS - 1), {}], lasts_ns)
-    bench.run()
-    assert bench.told()[1:] == [FAILED] * (BRING_UP_ATTEMPTS - 1) + [UP]
-
-
 @pytest.mark.parametrize("error", [UnhomedError(3, "is not homed"), STOP])
 def test_what_a_person_must_look_at_is_not_tried_again(monkeypatch, error):
     bench = Bench(monkeypatch, [{"fails": error}, {}])
@@ -168,15 +161,11 @@ def test_what_a_person_must_look_at_is_not_tried_again(monkeypatch, error):
     assert bench.told()[1:] == [FAILED, []]
 
 
-@pytest.mark.parametrize("again", [False, True])
-def test_after_so_many_failures_it_ends_and_a_new_request_begins_anew(monkeypatch, again):
-    bench = Bench(monkeypatch, [{"fails": LOST}] * (2 * BRING_UP_ATTEMPTS))
+def test_after_so_many_failures_it_ends(monkeypatch):
+    bench = Bench(monkeypatch, [{"fails": LOST}] * (BRING_UP_ATTEMPTS + 1))
     with pytest.raises(NodeError):
         bench.run()
-    if again:
-        with pytest.raises(NodeError):
-            bench.recovery.resume()
-    assert bench.told()[1:] == [FAILED] * (BRING_UP_ATTEMPTS * (1 + again)) + [[]] * (BRING_UP_ATTEMPTS * (1 - again))
+    assert bench.told()[1:] == [FAILED] * BRING_UP_ATTEMPTS + [[]]
 
 
 def test_the_last_cell_is_stopped_and_then_the_bus_closed(monkeypatch):
@@ -186,7 +175,7 @@ def test_the_last_cell_is_stopped_and_then_the_bus_closed(monkeypatch):
     assert bench.told() == [["start", "stop"], [*UP, "close"]] and bench.opened == -1
 
 
-def test_a_lost_cell_is_brought_up_on_request(monkeypatch):
+def test_a_lost_cell_is_brought_up_on_request_which_begins_anew(monkeypatch):
     bench = Bench(monkeypatch, [*[{"fails": LOST}] * BRING_UP_ATTEMPTS, {}])
     with pytest.raises(NodeError):
         bench.run()
