@@ -49,6 +49,11 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     return session
 
 
+def at_node(node_id, act):
+    """For `change`: something is done to one node."""
+    return lambda node: act(node) if node.node_id == node_id else None
+
+
 def done_to(session):
     """What bring-up says of each node, in their order."""
     return [line.split(") ", 1)[1] for line in session.said if re.match(r"node \d+: \(.*\) configur", line)]
@@ -190,12 +195,7 @@ def test_all_that_failed_is_told(tmp_path):
 
 def forgetting(index, value):
     """For `change`: node 4 holds another value than is written to an object."""
-
-    def forget(node):
-        if node.node_id == 4:
-            node.dictionary.on_write(index, lambda sub, _: node.dictionary.put(index, sub, value))
-
-    return forget
+    return at_node(4, lambda node: node.dictionary.on_write(index, lambda s, _: node.dictionary.put(index, s, value)))
 
 
 def test_a_required_value_that_does_not_stay_is_told(tmp_path):
@@ -223,16 +223,15 @@ def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(
 
 def test_another_expression_of_the_interpolation_time_is_tried(tmp_path):
     def refuse_tenths(node):
-        if node.node_id == 5:
-            node.dictionary.set_default(0x60C2, 2, -3)
-            node.dictionary.on_check(0x60C2, refuse)
+        node.dictionary.set_default(0x60C2, 2, -3)
+        node.dictionary.on_check(0x60C2, refuse)
 
     def refuse(subindex, value):
         if subindex == 2 and value == -4:
             raise SdoAbort(Abort.VALUE)
 
     nodes = {}
-    with open_session(tmp_path, change=refuse_tenths, nodes=nodes) as session:
+    with open_session(tmp_path, change=at_node(5, refuse_tenths), nodes=nodes) as session:
         held = {n: tuple(node.dictionary.number(0x60C2, sub) for sub in (1, 2)) for n, node in nodes.items()}
     assert held == {n: (25, -4) if n != 5 else (250, -5) for n in range(1, 7)}
     (remark,) = [line for line in session.said if "means the same" in line]
@@ -245,8 +244,6 @@ def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuse
     rtr_off = 1 << 30
 
     def keep(node):
-        if node.node_id != 3:
-            return
         for index in range(0x1800, 0x1804):
             node.dictionary.set_default(index, 1, node.dictionary.number(index, 1) | rtr_off)
             if refuses:
@@ -259,7 +256,7 @@ def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuse
             raise SdoAbort(Abort.VALUE)
 
     nodes = {}
-    with open_session(tmp_path, change=keep, nodes=nodes) as session:
+    with open_session(tmp_path, change=at_node(3, keep), nodes=nodes) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
         assert nodes[3].dictionary.number(0x1800, 1) == 0x4000_0183
 
@@ -267,42 +264,40 @@ def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuse
 @pytest.mark.parametrize(("subindex", "value"), [(1, 0), (2, 0), (2, None)])
 def test_a_quotient_of_units_without_sense_is_no_statement(tmp_path, subindex, value):
     def change(node):
-        if node.node_id == 3:
-            node.dictionary.set_default(0x6092, subindex, value or 0)
-            if value is None:
-                node.dictionary.entries.pop(0x6092 << 8 | subindex)
+        node.dictionary.set_default(0x6092, subindex, value or 0)
+        if value is None:
+            node.dictionary.entries.pop(0x6092 << 8 | subindex)
 
-    with open_session(tmp_path, change=change) as session:
+    with open_session(tmp_path, change=at_node(3, change)) as session:
         pass
     assert not any("units a motor turn" in line for line in session.said)
 
 
-@pytest.mark.parametrize(("revision", "taken"), [(0x1_0004, True), (0x2_0000, False), (0xFFFF, False)])
-def test_a_revision_of_the_same_major_number_is_taken(tmp_path, revision, taken):
-    def newer(node):
-        if node.node_id == 3:
-            node.dictionary.set_default(0x1018, 3, revision)
+def of_revision(number):
+    """For `change`: node 3 has another revision than its EDS describes."""
+    return at_node(3, lambda node: node.dictionary.set_default(0x1018, 3, number))
 
-    session = open_session(tmp_path, change=newer)
-    if taken:
-        with session:
-            (remark,) = [line for line in session.said if "revision" in line]
-        assert remark == (
+
+def test_a_revision_of_the_same_major_number_is_taken(tmp_path):
+    with open_session(tmp_path, change=of_revision(0x1_0004)) as session:
+        assert (
             "node 3: (joint 3) has revision 00010004h, puma260_joint.eds describes 00010000h: the same major revision,"
-            " taken"
+            " taken" in session.said
         )
-    else:
-        with pytest.raises(NodeError, match=rf"1018h:03 revision number expected 0x10000, got {revision:#x}"):
-            session.__enter__()
+
+
+@pytest.mark.parametrize("number", [0x2_0000, 0xFFFF])
+def test_another_major_revision_is_refused(tmp_path, number):
+    with pytest.raises(NodeError, match=rf"1018h:03 revision number expected 0x10000, got {number:#x}"):
+        open_session(tmp_path, change=of_revision(number)).__enter__()
 
 
 def test_a_drive_in_another_mode_is_not_enabled(tmp_path):
     def stay(node):
-        if node.node_id == 2:
-            node.dictionary.on_read(0x6061, lambda sub: node.dictionary.put(0x6061, 0, 1))
+        node.dictionary.on_read(0x6061, lambda sub: node.dictionary.put(0x6061, 0, 1))
 
     told = r"^node 2: \(joint 2\) is in mode 1 \(6061h\) after 6060h = 8 was written"
-    with open_session(tmp_path, change=stay, enable_s=0.3) as session, pytest.raises(NodeError, match=told):
+    with open_session(tmp_path, change=at_node(2, stay), enable_s=0.3) as session, pytest.raises(NodeError, match=told):
         session.cell.run(lambda _: Command())
     words = {d[:2] for _, i, d in frames(tmp_path) if 0x201 <= i <= 0x206}
     assert words == {b"\x00\x00", b"\x02\x00"}, "no drive was switched on: disabled or stopped"
@@ -313,15 +308,13 @@ def test_a_drive_that_changes_its_mode_late_is_waited_for(tmp_path):
     answers = []
 
     def change(node):
-        if node.node_id == 2:
-            right = node.dictionary.number(0x6061)
-            node.dictionary.on_read(0x6061, lambda _: node.dictionary.put(0x6061, 0, answer(right)))
+        node.dictionary.on_read(0x6061, lambda _: node.dictionary.put(0x6061, 0, answer()))
 
-    def answer(right):
-        answers.append(right if session.buses.lockstep.clock.now_ns() > began + 200 * MS else 1)
-        return 8 if answers[-1] != 1 else 1
+    def answer():
+        answers.append(8 if session.buses.lockstep.clock.now_ns() > began + 200 * MS else 1)
+        return answers[-1]
 
-    with open_session(tmp_path, change=change, enable_s=0.3) as session:
+    with open_session(tmp_path, change=at_node(2, change), enable_s=0.3) as session:
         began = session.buses.lockstep.clock.now_ns()
         session.cell.run(lambda _: Command(done=True))
     assert answers.count(1) == len(answers) - 1 > 3
@@ -377,8 +370,6 @@ def deaf_to_starts(number):
     """For `change`: node 3 does not hear its first NMT starts."""
 
     def deafen(node):
-        if node.node_id != 3:
-            return
         hear, left = node.receive, [number]
 
         def receive(can_id, data, t_ns):
@@ -389,7 +380,7 @@ def deaf_to_starts(number):
 
         node.receive = receive
 
-    return deafen
+    return at_node(3, deafen)
 
 
 def test_a_lost_start_is_sent_again(tmp_path):
@@ -438,14 +429,8 @@ def test_a_value_that_does_not_fit_its_object_is_refused(place, answer, told):
         answered(place, answer)
 
 
-def silent(node):
-    if node.node_id == 3:
-        node.receive = lambda can_id, data, t_ns: []
-
-
-def other_device(node):
-    if node.node_id == 3:
-        node.dictionary.set_default(0x1018, 2, 7)
+silent = at_node(3, lambda node: setattr(node, "receive", lambda *_: []))
+other_device = at_node(3, lambda node: node.dictionary.set_default(0x1018, 2, 7))
 
 
 @pytest.mark.parametrize("change", [deaf_to_starts(9), silent, other_device])
@@ -502,8 +487,6 @@ def test_answers_that_come_far_too_late_are_told_with_the_way_out(tmp_path):
 
 
 def boots_twice(node):
-    if node.node_id != 3:
-        return
     hear = node.receive
 
     def receive(can_id, data, t_ns):
@@ -514,7 +497,7 @@ def boots_twice(node):
 
 
 def test_a_node_that_boots_twice_is_brought_up(tmp_path):
-    with open_session(tmp_path, change=boots_twice) as session:
+    with open_session(tmp_path, change=at_node(3, boots_twice)) as session:
         assert "node 3: (joint 3) sent 2 boot-ups after its reset" in session.said
 
 
@@ -573,11 +556,10 @@ def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_
             if subindex not in takes and (not takes or value != kept[1]):
                 raise SdoAbort(Abort.READ_ONLY)
 
-        if node.node_id == 5:
-            node.dictionary.set_default(0x60C2, *kept)
-            node.dictionary.on_check(0x60C2, refuse)
+        node.dictionary.set_default(0x60C2, *kept)
+        node.dictionary.on_check(0x60C2, refuse)
 
-    session = open_session(tmp_path, change=fix, rate_hz=rate_hz)
+    session = open_session(tmp_path, change=at_node(5, fix), rate_hz=rate_hz)
     if told is None:
         with session:
             assert done_to(session) == ["configured, software 1.0"] * 6

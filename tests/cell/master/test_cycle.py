@@ -160,9 +160,6 @@ class Written(Port):
         super().send_batch(frames, t_ns)
         self.sent += [(self._now, *frame) for frame in frames]
 
-    def send_on(self, channel, frames):
-        self.send_batch(frames)
-
 
 def cycled(cycle, number, *, work=False):
     for _ in range(number):
@@ -197,19 +194,6 @@ def test_every_fifth_cycle_is_timed_and_the_last_ones_are_kept():
     assert (len(kept.period_error_ns), len(kept.response_ns), len(kept.compute_ns)) == (2, 2, 2)
 
 
-def test_a_cycle_that_comes_after_another_goes_on_on_its_grid():
-    port = Written()
-    first = a_cycle(port, drives=False)
-    cycled(first, 5)
-    port.sleep_until_ns(first.t_first_ns + round(19.3 * PERIOD_NS))
-    second = a_cycle(port, drives=False, before=first)
-    measurement = second.begin()
-    assert (measurement.cycle, measurement.t_ns) == (5, 20 * PERIOD_NS)
-    assert second.t_first_ns == first.t_first_ns and len(first.statistics.period_error_ns) == 6
-    assert first.begin().cycle == 5, "a cycle by itself"
-    assert a_cycle(port, drives=False).begin().t_ns == 0
-
-
 def test_frames_go_where_they_belong_and_what_came_before_a_sync_does_first():
     taken, left = [], []
     port = Written([(0x583, 100), (0x703, 200), (TPDOS[0], 300), (TPDOS[1], 300)])
@@ -223,25 +207,6 @@ def test_frames_go_where_they_belong_and_what_came_before_a_sync_does_first():
     port.drain = lambda: at.append(len(port.sent)) or drain()
     cycle.begin()
     assert at[0] == 1 and at[1:] == [2] * (len(at) - 1), "one look before the second SYNC"
-
-
-def test_requests_to_the_array_go_out_with_the_cycle_that_makes_them():
-    port = Written()
-    array, counters = SimpleNamespace(cob_ids=(0x511,), newest_cycle=2, channel="can0"), []
-    array.take = lambda number, counter, *_: counters.append(counter)
-    array.requests = lambda number: [(0x600, bytes((number,)))] if number == 3 else []
-    cycle = a_cycle(port, drives=False, tactile=array)
-    cycled(cycle, 5)
-    assert [(t - cycle.t_first_ns, data) for t, can_id, data in port.sent if can_id == 0x600] == [
-        (3 * PERIOD_NS + LOOKS[0] * 1000, b"\x03")
-    ]
-    assert cycle.begin().tactile_age == 3
-    assert counters == [0] * 6, "this SYNC has no counter"
-
-
-def test_without_drives_a_cell_counts_as_enabled():
-    measurement = a_cycle(Written(), drives=False).begin()
-    assert measurement.enabled and measurement.q is None and measurement.tactile_age is None
 
 
 # Observers of a cell: what they see, and that they cannot harm it.

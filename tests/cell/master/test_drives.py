@@ -378,14 +378,6 @@ def test_rest_is_a_time_within_a_milliradian(period_ns):
     assert still.rested_ns == k * period_ns >= REST_NS
 
 
-def test_a_slow_motion_is_no_rest():
-    """A tenth of a radian a second: a quarter of a milliradian in each cycle."""
-    track = PositionTrack(100.0)
-    for k in range(200):
-        track.take(25 * k, k, k * PERIOD, guarded=False)
-        assert track.rested_ns <= REST_NS
-
-
 def test_a_milliradian_in_the_counts_of_each_drive():
     milliradians = np.abs(np.diag(MODEL.units_per_q)) / 1000
     assert milliradians.min() < MIN_REST_COUNTS < milliradians.max(), "the PUMA's encoders are coarse at the wrist"

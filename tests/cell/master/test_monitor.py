@@ -70,19 +70,6 @@ def test_load_and_sync(recorded, in_hold):
     assert 0.2 < load < result.plan.traffic.load
 
 
-def test_jitter_is_that_of_the_syncs(recorded, in_hold):
-    _, t_ns, _ = in_hold
-
-    def late(frames):
-        syncs = 0
-        for can_id, data, t in frames:
-            syncs += can_id == 0x080
-            yield can_id, data, t + 300_000 * (can_id == 0x080 and syncs % 100 == 0)
-
-    view = heard(recorded, t_ns + 1_000_000, late)
-    assert view.sync_jitter_us[1] == pytest.approx(300, abs=135)
-
-
 def test_a_silent_node_and_an_emergency_are_shown(recorded, in_hold):
     _, t_ns, _ = in_hold
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from canprobe.cell.master.conditions import BY_KEY, CONDITIONS, COUNTERS
+from canprobe.cell.master.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.drives import DriveAxis
 from canprobe.cell.master.supervision import CycleState, Limits, Reaction, TouchState
@@ -122,19 +122,6 @@ def felt(**patch):
 def test_a_limit_itself_is_kept_and_what_is_beyond_is_named(key, within, beyond, told):
     assert check(key)(within) is None
     assert told in str(check(key)(beyond))
-
-
-def test_what_is_counted():
-    """Each number of the cell, by the condition that counts it; without drives and array there are none of theirs."""
-    found = heard(EMCY_BASE + 1, *COMMUNICATION)
-    found.silent_taxels, found.slowed, found.restarts = 2, 3, 4
-    found.counters.error_frames, found.counters.overruns, found.counters.clock_steps = 5, 6, 7
-    expected = {"emcy_communication": 1, "silent_taxels": 2, "target_speed": 3, "estimator": 4}
-    expected |= {"error_frames": 5, "frames_dropped": 6, "clock_step": 7}
-    assert {key: n for key, count in COUNTERS if (n := count(found))} == expected
-    found.drives, found.tactile = SimpleNamespace(missed=8, implausible=100), SimpleNamespace(unusable=9, stale=10)
-    expected |= {"pdo_missed": 108, "torn_frame": 9, "sync_mismatch": 10}
-    assert {key: count(found) for key, count in COUNTERS} == expected
 
 
 def test_what_ends_the_enabling_of_the_drives_already():

@@ -10,7 +10,7 @@ import pytest
 from puma_arm import ELBOW_FORM, UPENN
 
 import canprobe
-from canprobe.cell.master.controller import Command, Measurement
+from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.drives import DriveAxis
 from canprobe.cell.master.supervision import CycleState, Limits
 from canprobe.cell.master.supervisor import JointGuard, PressDetector, Supervisor, outside_workspace
@@ -55,13 +55,6 @@ def test_the_least_force_that_is_a_press(looks, least):
     assert press.holds(least + 1e-9) and not press.holds(least - 1e-9)
 
 
-class Force(float):
-    """A sample that is its force."""
-
-    def differs_from(self, other):
-        return self != other
-
-
 class Run:
     """A supervisor of two nodes without an arm, cycle by cycle."""
 
@@ -72,9 +65,6 @@ class Run:
 
     def step(self, *, late=0, state=ControllerState.ACTIVE, periods=1, **measured):
         self.cycle += 1
-        if "tactile" in measured:
-            measured["tactile"] = Force(measured["tactile"])
-            self.seen.patch = SimpleNamespace(force=measured["tactile"])
         self.seen.controller_state = state
         t_ns = self.seen.measurement.t_ns + periods * PERIOD_NS
         self.supervisor.step(Measurement(self.cycle, t_ns, **measured), 1000 + t_ns, self.seen.overruns + late)
@@ -103,39 +93,6 @@ def test_late_cycles_are_a_share_of_those_of_the_last_second():
     assert run.step(late=1, periods=201).late_share == pytest.approx(1 / 200), "the others of that second are missing"
 
 
-def test_a_condition_that_does_not_stop_the_cell_is_noted_with_its_number_and_its_first_cycle():
-    run = Run()
-    run.step()
-    run.seen.counters.error_frames = 3
-    run.step()
-    run.seen.counters.error_frames = 5
-    run.step()
-    assert run.supervisor.counts["error_frames"] == 5 and run.supervisor.first == {"error_frames": 2}
-    assert run.supervisor.notes() == ["bus error frames: 5, the first in cycle 2"]
-
-
-def test_alive_is_what_has_changed_once():
-    run = Run()
-    for force in (0.0, 0.0, 0.0):
-        run.step(tactile=force)
-    assert not run.supervisor.array_alive
-    run.step(tactile=1.0)
-    assert run.supervisor.array_alive
-    run.step(tactile=1.0)
-    assert run.supervisor.array_alive
-
-
-def test_the_preload_is_the_highest_force_before_the_drives_are_enabled():
-    run = Run()
-    for force in (0.1, 0.4, 0.2):
-        run.step(tactile=force)
-    assert run.seen.force == 0.2
-    run.step(enabled=True)
-    run.step(tactile=3.0, enabled=True)
-    run.step(tactile=2.0)
-    assert run.seen.preload == 0.4 and run.seen.force == 2.0
-
-
 def test_something_worse_comes_before_a_hold_and_the_first_hold_before_the_second():
     run = Run()
     run.step(q_age=(0, 4), state=ControllerState.PASSIVE)
@@ -149,14 +106,6 @@ def test_something_worse_comes_before_a_hold_and_the_first_hold_before_the_secon
     assert found().condition.key == "nmt_state" and not run.supervisor.must_stop()
     run.seen.controller_state = ControllerState.BUS_OFF
     assert found().condition.key == "nmt_state" and run.supervisor.must_stop()
-
-
-def test_without_an_arm_nothing_presses_and_commands_pass():
-    run = Run()
-    run.step(tactile=2.0)
-    command = Command()
-    assert run.supervisor.guard_target(command) == (command, None)
-    assert run.seen.force == 2.0 and Run().seen.force == 0.0
 
 
 # The joint guard.

@@ -48,6 +48,9 @@ def assert_same(direct, lockstep):
         ),
         pytest.param(loaded("listen", sensor={"mode": "image", "rate_hz": 100.0}), id="listen"),
         pytest.param(loaded("free", "prbt"), id="free of another make"),
+        pytest.param(
+            loaded("cylinder", "external", task={"clearance_mm": 0.2}, shape={"also": ()}), id="an external arm"
+        ),
         pytest.param(loaded("turntable", task={"clearance_mm": 0.2}, shape={"also": ()}), id="turntable"),
     ],
 )

@@ -52,16 +52,6 @@ def test_a_touch_keeps_its_force_and_ends(rate, delay_ms):
     assert force.max() < 3.0 and np.isclose(force[force > 1.5].mean(), 2.0, rtol=0.1)
 
 
-def test_a_scan_without_a_bus_is_that_of_an_untimed_lockstep_bus():
-    scene = scene_of("cylinder", **{"shape.also": []})
-    direct, lockstep = (
-        run(replace(scene, bus=replace(scene.bus, interface=bus, timed=False))) for bus in ("direct", "lockstep")
-    )
-    ours, theirs = direct.cell.log.columns(), lockstep.cell.log.columns()
-    assert [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()] == []
-    assert "statusword" not in ours, "no drive has reported one"
-
-
 class Watched(flange_arm.EmulatedArm):
     """An emulated arm with a fault from a time on, whose clock has another zero; it notes how it was stopped."""
 

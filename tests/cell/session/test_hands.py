@@ -73,13 +73,6 @@ def test_profile_position_ends_within_a_count_near_the_way_and_within_the_limits
     assert (off <= lag * way.speed * np.abs(way.q[1] - way.q[0]) + 1e-3).all()
 
 
-def test_the_dynamic_arm_ends_within_its_droop():
-    with cell(plant__fidelity="dynamic") as opened:
-        opened.move("ready", 0.2)
-        off = np.abs(np.degrees(opened.read().q) - READY)
-        assert off.max() < 0.03
-
-
 @pytest.mark.parametrize("name", [name for name, _ in packaged("cell")])
 def test_no_joint_is_faster_than_its_limits_on_any_way(name):
     plan = make_plan(resolve(canprobe.load_scene(name)))
