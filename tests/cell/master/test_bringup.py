@@ -49,9 +49,13 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     return session
 
 
+def differing(acts):
+    """For `change`: something is done to some nodes, by their ids."""
+    return lambda node: acts.get(node.node_id, lambda _: None)(node)
+
+
 def at_node(node_id, act):
-    """For `change`: something is done to one node."""
-    return lambda node: act(node) if node.node_id == node_id else None
+    return differing({node_id: act})
 
 
 def done_to(session):
@@ -161,14 +165,6 @@ def test_the_nodes_are_configured_side_by_side(tmp_path):
         assert max(counts) - min(counts) <= 2
 
 
-def test_a_lost_answer_is_asked_for_again(tmp_path):
-    lost = Fault(BUS_FAULTS["drop"], 3, 300 * MS, 300 * MS)
-    with open_session(tmp_path, faults=[lost]) as session:
-        done = done_to(session)
-    assert done.pop(2) == "configured, software 1.0, 1 requests repeated"
-    assert done == ["configured, software 1.0"] * 5
-
-
 def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
     mute = Fault(BUS_FAULTS["drop"], 3, 300 * MS, 9000 * MS)
     with pytest.raises(NodeError, match=r"node 3: \(joint 3\) read of 1018h:01 failed: No SDO response") as failed:
@@ -180,116 +176,130 @@ def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
     assert len([t for t in others if t < times[1]]) > 20, "the others did not wait for node 3"
 
 
-def test_all_that_failed_is_told(tmp_path):
-    def refuse(node):
-        if node.node_id in (2, 5):
-            node.dictionary.entries.pop(0x606000)
-
-    with pytest.raises(NodeError) as failed:
-        open_session(tmp_path, change=refuse).__enter__()
-    text = str(failed.value)
-    assert text.startswith("node 2: (joint 2) write of 6060h:00 = ")
-    assert "; node 5: (joint 5) write of 6060h:00 = " in text and text.count("failed: Code 0x06090011") == 2
-    assert_left_pre_operational(tmp_path)
+def lacking(index, subindex=0):
+    return lambda node: node.dictionary.entries.pop(index << 8 | subindex)
 
 
-def forgetting(index, value):
-    """For `change`: node 4 holds another value than is written to an object."""
-    return at_node(4, lambda node: node.dictionary.on_write(index, lambda s, _: node.dictionary.put(index, s, value)))
+def holding(index, value):
+    """It holds another value than is written."""
+    return lambda node: node.dictionary.on_write(index, lambda sub, _: node.dictionary.put(index, sub, value))
 
 
-def test_a_required_value_that_does_not_stay_is_told(tmp_path):
-    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) 1017h:00 reads back 0x7 after 0x64 was written"):
-        open_session(tmp_path, change=forgetting(0x1017, 7)).__enter__()
+def of_identity(subindex, number):
+    return lambda node: node.dictionary.set_default(0x1018, subindex, number)
 
 
-def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(tmp_path):
-    def change(node):
-        forgetting(0x6066, 7)(node)
-        if node.node_id == 2:
-            node.dictionary.entries.pop(0x101601)
+def with_interpolation(subindex, value, fits):
+    """60C2h as delivered; what is written to it is refused unless it fits."""
 
-    with open_session(tmp_path, change=change) as session:
-        assert done_to(session) == ["configured, software 1.0"] * 6
-    assert session.cell.notes.lines() == []
-    remarks = [line for line in session.said if "left as the device has it" in line]
-    assert remarks == [
-        "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as"
-        " the device has it (the node notices a dead master): the device will not notice a dead master",
-        "node 4: (joint 4) 6066h:00 reads back 0x7 after 0x32 was written: left as the device has it (following error"
-        " time-out): a drive that lags is given as long as the device has it",
-    ]
-
-
-def test_another_expression_of_the_interpolation_time_is_tried(tmp_path):
-    def refuse_tenths(node):
-        node.dictionary.set_default(0x60C2, 2, -3)
-        node.dictionary.on_check(0x60C2, refuse)
-
-    def refuse(subindex, value):
-        if subindex == 2 and value == -4:
+    def refuse(*written):
+        if not fits(*written):
             raise SdoAbort(Abort.VALUE)
 
-    nodes = {}
-    with open_session(tmp_path, change=at_node(5, refuse_tenths), nodes=nodes) as session:
-        held = {n: tuple(node.dictionary.number(0x60C2, sub) for sub in (1, 2)) for n, node in nodes.items()}
-    assert held == {n: (25, -4) if n != 5 else (250, -5) for n in range(1, 7)}
-    (remark,) = [line for line in session.said if "means the same" in line]
-    assert remark.startswith("node 5: (joint 5) takes 60C2h:01 = 250, 60C2h:02 = -5")
+    def change(node):
+        node.dictionary.set_default(0x60C2, subindex, value)
+        node.dictionary.on_check(0x60C2, refuse)
+
+    return change
 
 
-@pytest.mark.parametrize("refuses", [True, False])
-def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuses):
-    """It refuses to clear bit 30, or holds it whatever is written."""
+def never(*_):
+    return False
+
+
+def with_bit_30(node):
+    """TPDOs whose COB-IDs have bit 30: the device refuses to clear it, or holds it whatever is written."""
     rtr_off = 1 << 30
-
-    def keep(node):
-        for index in range(0x1800, 0x1804):
-            node.dictionary.set_default(index, 1, node.dictionary.number(index, 1) | rtr_off)
-            if refuses:
-                node.dictionary.on_check(index, refuse)
-            else:
-                node.dictionary.on_write(index, lambda s, v, i=index: node.dictionary.put(i, s, v | rtr_off * (s == 1)))
 
     def refuse(subindex, value):
         if subindex == 1 and not value & rtr_off:
             raise SdoAbort(Abort.VALUE)
 
+    def keep(index):
+        return lambda sub, value: node.dictionary.put(index, sub, value | rtr_off * (sub == 1))
+
+    for index in range(0x1800, 0x1804):
+        node.dictionary.set_default(index, 1, node.dictionary.number(index, 1) | rtr_off)
+    node.dictionary.on_check(0x1800, refuse)
+    node.dictionary.on_write(0x1801, keep(0x1801))
+
+
+ACCEPTED = {
+    1: (
+        of_identity(3, 0x1_0004),
+        "has revision 00010004h, puma260_joint.eds describes 00010000h: the same major revision, taken",
+    ),
+    2: (
+        lacking(0x1016, 1),
+        "write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as the device has it"
+        " (the node notices a dead master): the device will not notice a dead master",
+    ),
+    3: (with_bit_30, None),
+    4: (
+        holding(0x6066, 7),
+        "6066h:00 reads back 0x7 after 0x32 was written: left as the device has it (following error time-out): a drive"
+        " that lags is given as long as the device has it",
+    ),
+    5: (
+        with_interpolation(2, -3, lambda subindex, value: (subindex, value) != (2, -4)),
+        "takes 60C2h:01 = 250, 60C2h:02 = -5, which means the same as what it refused",
+    ),
+    6: (with_interpolation(1, 25, never), None),
+}
+
+
+def test_what_a_device_has_otherwise_and_may_is_remarked_and_taken(tmp_path):
     nodes = {}
-    with open_session(tmp_path, change=at_node(3, keep), nodes=nodes) as session:
+    acts = {node_id: act for node_id, (act, _) in ACCEPTED.items()}
+    with open_session(tmp_path, change=differing(acts), nodes=nodes) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
-        assert nodes[3].dictionary.number(0x1800, 1) == 0x4000_0183
+        held = {n: tuple(node.dictionary.number(0x60C2, sub) for sub in (1, 2)) for n, node in nodes.items()}
+        assert [nodes[3].dictionary.number(index, 1) >> 30 & 1 for index in (0x1800, 0x1801)] == [1, 1]
+    assert held == {n: (25, -4) if n != 5 else (250, -5) for n in range(1, 7)}
+    assert session.cell.notes.lines() == []
+    remarks = [line for line in session.said if re.match(r"node \d: \(joint \d\) (?!configur)", line)]
+    assert remarks == [f"node {i}: (joint {i}) {remark}" for i, (_, remark) in ACCEPTED.items() if remark]
 
 
-@pytest.mark.parametrize(("subindex", "value"), [(1, 0), (2, 0), (2, None)])
-def test_a_quotient_of_units_without_sense_is_no_statement(tmp_path, subindex, value):
-    def change(node):
-        node.dictionary.set_default(0x6092, subindex, value or 0)
-        if value is None:
-            node.dictionary.entries.pop(0x6092 << 8 | subindex)
+FAILING = {
+    1: (holding(0x1017, 7), "1017h:00 reads back 0x7 after 0x64 was written"),
+    2: (lacking(0x6060), "write of 6060h:00 = 0x8 failed: Code 0x06090011, Subindex does not exist"),
+    3: (of_identity(3, 0x2_0000), "1018h:03 revision number expected 0x10000, got 0x20000"),
+    4: (of_identity(3, 0xFFFF), "1018h:03 revision number expected 0x10000, got 0xffff"),
+    5: (with_interpolation(1, 0, never), "it holds 0x0"),
+    # 2.5 ms lie between 3 ms and 2 ms
+    6: (
+        with_interpolation(2, -3, lambda subindex, value: subindex == 1 or value == -3),
+        "it counts in 10^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits it",
+    ),
+}
 
-    with open_session(tmp_path, change=at_node(3, change)) as session:
-        pass
+
+def test_all_that_failed_is_told(tmp_path):
+    with pytest.raises(NodeError) as failed:
+        open_session(tmp_path, change=differing({node_id: act for node_id, (act, _) in FAILING.items()})).__enter__()
+    assert failed.value.node_id == 1
+    told = re.split(r"(?:^|; )node \d: \(joint \d\) ", str(failed.value))[1:]
+    assert [text.endswith(FAILING[i][1]) for i, text in enumerate(told, 1)] == [True] * 6, told
+    assert_left_pre_operational(tmp_path)
+
+
+def test_a_drive_that_keeps_its_interpolation_time_is_told_with_the_rate_that_fits_it(tmp_path):
+    told = r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 fits it$"
+    change = at_node(5, with_interpolation(1, 25, never))
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, change=change, rate_hz=200.0).__enter__()
+
+
+def test_a_quotient_of_units_without_sense_is_no_statement(tmp_path):
+    acts = {
+        1: lambda node: node.dictionary.set_default(0x6092, 1, 0),
+        2: lambda node: node.dictionary.set_default(0x6092, 2, 0),
+        3: lacking(0x6092, 2),
+    }
+    with open_session(tmp_path, change=differing(acts)) as session:
+        assert done_to(session) == ["configured, software 1.0"] * 6
     assert not any("units a motor turn" in line for line in session.said)
-
-
-def of_revision(number):
-    """For `change`: node 3 has another revision than its EDS describes."""
-    return at_node(3, lambda node: node.dictionary.set_default(0x1018, 3, number))
-
-
-def test_a_revision_of_the_same_major_number_is_taken(tmp_path):
-    with open_session(tmp_path, change=of_revision(0x1_0004)) as session:
-        assert (
-            "node 3: (joint 3) has revision 00010004h, puma260_joint.eds describes 00010000h: the same major revision,"
-            " taken" in session.said
-        )
-
-
-@pytest.mark.parametrize("number", [0x2_0000, 0xFFFF])
-def test_another_major_revision_is_refused(tmp_path, number):
-    with pytest.raises(NodeError, match=rf"1018h:03 revision number expected 0x10000, got {number:#x}"):
-        open_session(tmp_path, change=of_revision(number)).__enter__()
 
 
 def test_a_drive_in_another_mode_is_not_enabled(tmp_path):
@@ -430,10 +440,9 @@ def test_a_value_that_does_not_fit_its_object_is_refused(place, answer, told):
 
 
 silent = at_node(3, lambda node: setattr(node, "receive", lambda *_: []))
-other_device = at_node(3, lambda node: node.dictionary.set_default(0x1018, 2, 7))
 
 
-@pytest.mark.parametrize("change", [deaf_to_starts(9), silent, other_device])
+@pytest.mark.parametrize("change", [deaf_to_starts(9), silent, at_node(3, of_identity(2, 7))])
 def test_a_failure_ends_with_the_last_emcy_of_the_node(tmp_path, change):
     """Whatever it fails in; the EMCY came before anybody had spoken to it."""
     reports = Somebody(sending(0x083, "0050810000000000"))
@@ -536,36 +545,6 @@ def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path):
     assert result.summary["completed"] and result.summary["faults"] == []
     assert {"q_rad", "statusword"} <= set(result.log) and "torque_permille" not in result.log
     assert any(line.startswith("motor torque (torque_permille of log.npz): ") for line in result.summary["left_out"])
-
-
-@pytest.mark.parametrize(
-    ("kept", "takes", "rate_hz", "told"),
-    [
-        ((1, 25), (), 400.0, None),
-        ((1, 25), (), 200.0, r"write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 "),
-        ((1, 0), (), 400.0, r"; it holds 0x0$"),
-        # 2.5 ms lie between 3 ms and 2 ms
-        ((2, -3), (1,), 400.0, r"counts in 10\^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits"),
-    ],
-)
-def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_path, kept, takes, rate_hz, told):
-    """25·10⁻⁴ s as delivered; the sub-indices of 60C2h that it takes, besides the value that it has."""
-
-    def fix(node):
-        def refuse(subindex, value):
-            if subindex not in takes and (not takes or value != kept[1]):
-                raise SdoAbort(Abort.READ_ONLY)
-
-        node.dictionary.set_default(0x60C2, *kept)
-        node.dictionary.on_check(0x60C2, refuse)
-
-    session = open_session(tmp_path, change=at_node(5, fix), rate_hz=rate_hz)
-    if told is None:
-        with session:
-            assert done_to(session) == ["configured, software 1.0"] * 6
-    else:
-        with pytest.raises(NodeError, match=rf"^node 5: \(joint 5\).*{told}"):
-            session.__enter__()
 
 
 def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):

@@ -262,11 +262,6 @@ def test_an_observer_that_fails_is_left_out_and_the_run_goes_on(free, tmp_path):
     assert result.summary["cycle"]["observe_us"]["max"] > 0
 
 
-def test_without_observers_nothing_is_kept_and_nothing_is_said(free, tmp_path):
-    result = undrawn_run(free, out=tmp_path, duration_s=0.1)
-    assert result.summary["cycle"]["observe_us"] is None and result.summary["bridges"] is None
-
-
 def test_frames_without_a_cycle_do_not_pile_up():
     watcher = Watcher()
     observers = Observers((watcher,))

@@ -240,48 +240,27 @@ def refusal(bench):
     return str(caught.value)
 
 
-def test_a_run_with_drives_that_are_not_homed_is_refused_with_the_command(tmp_path):
-    bench = Bench(scene_of([35, 0, 35]), tmp_path)
-    assert refusal(bench) == (
-        "node 1: (joint 1) is not homed, or was switched off or moved since; nor are 3 (joint 3); type: canprobe"
-        " home free --bus socketcan --channel can0"
-    )
-    bench.home(0)
-    assert refusal(bench).startswith("node 3: (joint 3) is not homed")
-    assert not bench.words(3)
-    bench.home(2)
-    assert bench.run()
-
-
-def power_cycle(bench, scene):
-    node = bench.world.nodes[0]
-    node.receive(0, pack_nmt(NmtCommand.RESET_NODE, 1)[1], bench.bus.clock.now_ns())
-
-
-def move_by_hand(bench, scene):
-    bench.world.plant.set_ramp(0, 0.0, 5000.0, bench.bus.clock.now_ns(), bench.bus.clock.now_ns() + 1)
-
-
-def lose_the_record(bench, scene):
-    bench.record.write_text("{")
-
-
-def state_another_home(bench, scene):
-    bench.plan = canprobe.plan(with_joints(scene, home_deg=[11.0] + [None] * 5))
-
-
-def exchange_the_drive(bench, scene):
-    bench.world.nodes[0].dictionary.set_default(0x1018, 4, 4711)
-
-
-@pytest.mark.parametrize("act", [power_cycle, move_by_hand, lose_the_record, state_another_home, exchange_the_drive])
-def test_what_makes_a_record_worthless(tmp_path, act):
-    scene = scene_of([35])
+def test_what_makes_a_zero_worthless_and_a_run_be_refused_with_the_command(tmp_path):
+    scene = scene_of([35] * 5)
     bench = Bench(scene, tmp_path)
     bench.home()
     assert bench.run()
-    act(bench, scene)
-    assert "is not homed" in refusal(bench)
+    nodes, now_ns = bench.world.nodes, bench.bus.clock.now_ns()
+    nodes[0].receive(0, pack_nmt(NmtCommand.RESET_NODE, 1)[1], now_ns)  # as by its power
+    bench.world.plant.set_ramp(1, 0.0, 5000.0, now_ns, now_ns + 1)  # as by hand
+    homes = [joint.home_deg for joint in scene.joints.values()]
+    bench.plan = canprobe.plan(with_joints(scene, home_deg=[*homes[:2], homes[2] + 1.0, *homes[3:]]))
+    nodes[3].dictionary.set_default(0x1018, 4, 4711)  # another drive
+    assert refusal(bench) == (
+        "node 1: (joint 1) is not homed, or was switched off or moved since; nor are 2 (joint 2), 3 (joint 3), 4"
+        " (joint 4); type: canprobe home free --bus socketcan --channel can0"
+    )
+    bench.home(0, 1, 2)
+    assert refusal(bench).startswith("node 4: (joint 4) is not homed, or was switched off or moved since; type: ")
+    bench.home(3)
+    assert bench.run()
+    bench.record.write_text("{")
+    assert refusal(bench).startswith("node 1: (joint 1) is not homed")
 
 
 def test_the_record_names_what_homing_wrote_as_soon_as_the_joint_is_homed(tmp_path):

@@ -93,6 +93,14 @@ def test_late_cycles_are_a_share_of_those_of_the_last_second():
     assert run.step(late=1, periods=201).late_share == pytest.approx(1 / 200), "the others of that second are missing"
 
 
+def test_the_preload_is_the_highest_force_before_the_drives_are_enabled():
+    run, sample = Run(), SimpleNamespace(differs_from=lambda _: False)
+    for force, enabled in ((0.1, False), (0.4, False), (0.2, True), (3.0, True), (2.0, False)):
+        run.seen.patch = SimpleNamespace(force=force)
+        run.step(tactile=sample, enabled=enabled)
+    assert run.seen.preload == 0.4 and run.seen.force == 2.0
+
+
 def test_something_worse_comes_before_a_hold_and_the_first_hold_before_the_second():
     run = Run()
     run.step(q_age=(0, 4), state=ControllerState.PASSIVE)

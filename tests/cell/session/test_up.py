@@ -115,23 +115,17 @@ def scene(cell="puma260", *, real=False):
     return change(free, arm={"emulated": not real})
 
 
-def true_world(scene, change_units=lambda units: units, swapped=()):
-    """An arm whose motors are another one's: their units by joint, or two drives that have each other's node ids.
+def true_world(scene, change_units=lambda units: units):
+    """An arm whose motors are another one's, by their units.
 
     Where the arm stands its drives show what the cell file has there, as after zeros that were read at the marks.
     """
     plan = canprobe.plan(scene)
     arm, model = plan.setup.arm, plan.setup.arm.model
-    order = list(range(model.n))
-    if swapped:
-        i, j = swapped
-        order[i], order[j] = j, i
-    drives = tuple(arm.drives[i] for i in order)
     units = change_units(np.array(model.units_per_q))
-    zeros = joints_to_units(model, arm.q_start)[order] - units @ arm.q_start
+    zeros = joints_to_units(model, arm.q_start) - units @ arm.q_start
     truth = replace(plan.setup.truth, model=ArmModel(model.chain, model.joints, units, zeros))
-    setup = replace(plan.setup, arm=replace(arm, drives=drives), truth=truth)
-    return make_world(replace(plan, setup=setup), plan.node_ids)
+    return make_world(replace(plan, setup=replace(plan.setup, truth=truth)), plan.node_ids)
 
 
 def scaled(joint, factor):
@@ -149,24 +143,22 @@ def assert_disabled(session):
     assert not POWERED_STATES.intersection(map(state_of, words))
 
 
-def test_a_drive_that_obeys_the_wrong_way_round_is_named(cell):
-    cell.joins, said = on_node(2, lambda node: Obeying(node, -1.0)), []
-    with pytest.raises(NodeError, match=r"^node 2: \(joint 2\) it turned the wrong way$"):
-        canprobe.api.check_joints(scene(), say=said.append)
-    assert "joint 2 at 65.00 deg: asked +1.00 deg, turned -1.00 deg: it turned the wrong way" in said
-    assert sum("as expected" in line for line in said) == 5
-    assert_disabled(cell.session)
-
-
-def test_a_flipped_polarity_that_no_encoder_shows_is_seen_by_the_operator(cell):
+def test_drives_that_turn_the_wrong_way_are_named_by_their_encoders_or_by_who_watches(cell):
     """607Eh turns target and feedback round together: the arm moves the other way, and the numbers agree."""
-
-    cell.joins, cell.operator, said = on_node(3, flip), Watcher(), []
-    with pytest.raises(NodeError, match=r"^node 3: \(joint 3\) the operator did not see it turn that way: polarity"):
+    wrong = {2: lambda node: Obeying(node, -1.0), 3: flip}
+    cell.joins = lambda one: wrong.get(getattr(one, "node_id", None), lambda node: node)(one)
+    cell.operator, said = Watcher(), []
+    told = (
+        r"^node 2: \(joint 2\) it turned the wrong way;"
+        r" node 3: \(joint 3\) the operator did not see it turn that way: polarity"
+    )
+    with pytest.raises(NodeError, match=told):
         canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
-    (line,) = [line for line in said if line.startswith("joint 3 ")]
-    assert line.startswith("joint 3 at -15.00 deg: asked +1.00 deg, turned +1.00 deg: the operator did not see")
-    assert f"{REPORTED} 90.00, 65.00, -15.00," in said[-1]  # and the pose is not the arm's
+    assert "joint 2 at 65.00 deg: asked +1.00 deg, turned -1.00 deg: it turned the wrong way" in said
+    seen = "joint 3 at -15.00 deg: asked +1.00 deg, turned +1.00 deg: the operator did not see"
+    assert any(line.startswith(seen) for line in said)
+    assert sum("as expected" in line for line in said) == 4
+    assert f"{REPORTED} 90.00, 65.00, -15.00," in said[-1], "and the pose is not the arm's"
     assert_disabled(cell.session)
 
 
@@ -191,12 +183,6 @@ def test_an_interrupt_between_two_joints_disables_and_reports_what_was_done(cell
         canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
     assert re.match(r"joint 1 at 90.00 deg: asked -10.00 deg, turned -10.0\d deg, seen -\d+ deg: as expected", said[-2])
     assert_disabled(cell.session)
-
-
-def test_swapped_drives_are_seen(cell):
-    cell.operator, cell.world = Watcher({1, 3}), true_world(scene(), swapped=(1, 3))
-    with pytest.raises(NodeError, match=r"the operator did not see it turn.*; node .*the operator did not see it turn"):
-        canprobe.api.check_joints(scene(), operator=cell.operator)
 
 
 def test_a_right_arm_is_found_so(cell):
