@@ -330,31 +330,23 @@ def test_a_drive_that_changes_its_mode_late_is_waited_for(tmp_path):
     assert answers.count(1) == len(answers) - 1 > 3
 
 
-def test_a_kept_configuration_is_not_written_again(tmp_path):
-    nodes = {}
-    logs, kept = [], []
-    for run in range(2):
-        with open_session(tmp_path, nodes=nodes, scene="press", store=True) as session:
-            kept.append(["kept" in done for done in done_to(session)])
-        nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
-        logs.append(frames(tmp_path))
-        assert session.cell.notes.lines() == [], run
-    assert kept == [[False] * 7, [True] * 7]
-    assert len(writes_to(logs[0], 2)) > 25 and writes_to(logs[1], 2) == [(0x1016, 1)]  # the heartbeat consumer's end
-    assert writes_to(logs[1], 16) == [(0x2003, 0), (0x1016, 1)]  # and the tare, which is a command
+def test_a_kept_configuration_is_not_written_again_unless_the_scene_or_somebody_has_changed_it(tmp_path):
+    def brought_up(saved, **options):
+        """Which nodes kept their configuration, what they have stored, and what was sent."""
+        nodes = dict(saved)
+        with open_session(tmp_path, nodes=nodes, scene="press", store=True, **options) as session:
+            kept = ["kept" in done for done in done_to(session)]
+        assert session.cell.notes.lines() == []
+        return kept, {node_id: node.store.saved for node_id, node in nodes.items()}, frames(tmp_path)
 
-
-def test_another_scene_is_configured_anew_and_so_is_a_node_that_somebody_changed(tmp_path):
-    nodes = {}
-    with open_session(tmp_path, nodes=nodes, store=True):
-        pass
-    saved = {node_id: node.store.saved for node_id, node in nodes.items()}
-    nodes = dict(saved)
-    with open_session(tmp_path, nodes=nodes, rate_hz=200.0, store=True) as session:
-        assert not any("kept" in done for done in done_to(session))
+    kept, saved, log = brought_up({})
+    assert kept == [False] * 7 and len(writes_to(log, 2)) > 25
+    kept, saved, log = brought_up(saved)
+    assert kept == [True] * 7 and writes_to(log, 2) == [(0x1016, 1)], "the heartbeat consumer's end"
+    assert writes_to(log, 16) == [(0x2003, 0), (0x1016, 1)], "and the tare, which is a command"
+    assert brought_up(saved, rate_hz=200.0)[0] == [False] * 7
     saved[3] = {**saved[3], 0x102001: 0}
-    with open_session(tmp_path, nodes=dict(saved), store=True) as session:
-        assert ["kept" in done for done in done_to(session)] == [True, True, False, True, True, True]
+    assert brought_up(saved)[0] == [True, True, False, True, True, True, True]
 
 
 def test_any_write_over_sdo_takes_the_date_back():

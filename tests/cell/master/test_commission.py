@@ -86,23 +86,17 @@ def answering_when_selected(node):
     return node
 
 
-def test_a_device_that_is_found_again_ends_the_search_and_is_named(bus):
-    put(bus, make_node(5), answering_when_selected(make_node(7)), make_node(9))
+def test_a_device_that_is_found_again_ends_the_search_and_gets_an_id_by_its_name_alone(bus):
+    nodes = put(bus, make_node(5), answering_when_selected(make_node(7)), make_node(9))
     port = bus.port()
     told = r"^can0: the device 0xca5e:0x260:0x10000:0x7 .* again .* CiA 305, .* --assign 0xca5e:0x260:0x10000:0x7=ID,"
     with pytest.raises(BusError, match=told):
-        find_unconfigured(PumpedNetwork(port))
+        commission(port, [Wanted(3, "--assign", (*ANY, None))], must=True)
     assert port.clock.now_ns() < 20_000_000_000
-
-
-def test_a_device_that_is_found_again_gets_an_id_by_its_name_alone(bus):
-    stubborn, other = put(bus, answering_when_selected(make_node(7)), make_node(9))
-    with pytest.raises(BusError, match="again after it was found"):
-        commission(bus.port(), [Wanted(3, "--assign", (*ANY, None))], must=True)
-    assert (stubborn.node_id, other.node_id) == (255, 255), "which of them was meant?"
-    commission(bus.port(), [Wanted(3, "--assign", (*ANY, 7))], must=True)
-    assert (stubborn.node_id, other.node_id) == (3, 255)
-    assert commission(bus.port(), [], must=True).unconfigured == [address(9)]
+    assert [node.node_id for node in nodes] == [255] * 3, "which of them was meant?"
+    commission(port, [Wanted(3, "--assign", (*ANY, 7))], must=True)
+    assert [node.node_id for node in nodes] == [255, 3, 255]
+    assert commission(port, [], must=True).unconfigured == [address(5), address(9)]
 
 
 def test_lost_answers_do_not_give_a_wrong_address(bus):
