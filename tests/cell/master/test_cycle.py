@@ -24,10 +24,10 @@ class Port:
 
     stamps_arrival = True
 
-    def __init__(self, arrivals):
+    def __init__(self, arrivals=()):
         self._arrivals, self._coming = arrivals, []
         self.clock, self._now = self, 0
-        self.drains = 0
+        self.drains, self.sent = 0, []
 
     def now_ns(self):
         return self._now
@@ -36,6 +36,7 @@ class Port:
         self._now = max(self._now, t_ns)
 
     def send_batch(self, frames, t_ns=None):
+        self.sent += [(self._now, *frame) for frame in frames]
         if frames[0][0] == SYNC_ID:
             self._coming = sorted((self._now + us * 1000, can_id) for can_id, us in self._arrivals)
 
@@ -128,7 +129,7 @@ def test_without_drives_there_is_nothing_to_go_on_with_before_the_first_look():
 )
 def test_a_sync_more_than_half_a_period_late_is_an_overrun(late_periods, overruns, left_out):
     """The next deadline is on the grid of the first one: whole periods are left out, not caught up."""
-    port = Port([])
+    port = Port()
     cycle = a_cycle(port, drives=False)
     cycle.begin()
     cycle.end(None)
@@ -149,18 +150,6 @@ def test_an_array_that_was_never_heard_is_as_old_as_the_run():
     assert intake.measure(0).tactile_age == 20
 
 
-class Written(Port):
-    """A port that keeps what is sent."""
-
-    def __init__(self, arrivals=()):
-        super().__init__(arrivals)
-        self.sent = []
-
-    def send_batch(self, frames, t_ns=None):
-        super().send_batch(frames, t_ns)
-        self.sent += [(self._now, *frame) for frame in frames]
-
-
 def cycled(cycle, number, *, work=False):
     for _ in range(number):
         cycle.begin()
@@ -170,7 +159,7 @@ def cycled(cycle, number, *, work=False):
 
 
 def test_the_heartbeat_goes_every_100_ms_behind_the_commands():
-    port = Written()
+    port = Port()
     cycle = a_cycle(port, drives=False)
     cycled(cycle, 82)
     beats = [(t_ns - cycle.t_first_ns) // PERIOD_NS for t_ns, can_id, data in port.sent if can_id == 0x77F]
@@ -181,14 +170,14 @@ def test_the_heartbeat_goes_every_100_ms_behind_the_commands():
 
 
 def test_every_fifth_cycle_is_timed_and_the_last_ones_are_kept():
-    cycle = a_cycle(Written(), drives=False)
+    cycle = a_cycle(Port(), drives=False)
     cycled(cycle, 11, work=True)
     statistics = cycle.statistics
     assert (len(statistics.period_error_ns), len(statistics.response_ns), len(statistics.compute_ns)) == (11, 3, 3)
     assert all(
         0 < response <= work for response, work in zip(statistics.response_ns, statistics.compute_ns, strict=True)
     )
-    kept = a_cycle(Written(), drives=False, kept=2)
+    kept = a_cycle(Port(), drives=False, kept=2)
     cycled(kept, 11, work=True)
     kept = kept.statistics
     assert (len(kept.period_error_ns), len(kept.response_ns), len(kept.compute_ns)) == (2, 2, 2)
@@ -196,7 +185,7 @@ def test_every_fifth_cycle_is_timed_and_the_last_ones_are_kept():
 
 def test_frames_go_where_they_belong_and_what_came_before_a_sync_does_first():
     taken, left = [], []
-    port = Written([(0x583, 100), (0x703, 200), (TPDOS[0], 300), (TPDOS[1], 300)])
+    port = Port([(0x583, 100), (0x703, 200), (TPDOS[0], 300), (TPDOS[1], 300)])
     watch = SimpleNamespace(push=lambda can_id, *_: can_id == 0x703 and not taken.append(can_id))
     cycle = a_cycle(port, watch=watch, other=left.append)
     cycle.begin()

@@ -293,19 +293,6 @@ def test_what_follows_sync_is_sent_in_every_cycle_and_the_rest_on_change_and_aga
     assert counts == sent
 
 
-def test_the_first_drive_that_is_not_where_it_should_be_is_named():
-    group = make_group()
-    group.begin(0)
-    hear(group, [0] * 6)
-    assert group.enabled
-    group.begin(1)
-    hear(group, [0] * 6, skip=(3, 5))
-    for i in (4, 6):
-        group.push(0x180 + i, group.axes[i - 1].feedback[0].pack(0x21, 0, 0))
-    assert group.first_not_in(DriveState.OPERATION_ENABLED) == (3, "READY_TO_SWITCH_ON")
-    assert group.enabled_ones() == (True, True, True, False, True, False) and not group.enabled
-
-
 def test_a_tpdo_from_before_the_sync_is_late_and_the_times_of_answers_count_from_it():
     group = make_group()
 
@@ -362,37 +349,12 @@ def test_before_the_drive_is_enabled_everything_is_believed_but_nothing_at_rest(
     assert track.rested_ns == 0
 
 
-@pytest.mark.parametrize("period_ns", [1_000_000, PERIOD, 10_000_000])
-def test_rest_is_a_time_within_a_milliradian(period_ns):
-    """Noise of 12 counts on a fine encoder is rest."""
-    still = PositionTrack(100.0)
-    for k in range(1 + -(-REST_NS // period_ns)):
-        still.take((12, -12, 3)[k % 3], k, k * period_ns, guarded=False)
-    assert still.rested_ns == k * period_ns >= REST_NS
-
-
 def test_a_milliradian_in_the_counts_of_each_drive():
     milliradians = np.abs(np.diag(MODEL.units_per_q)) / 1000
     assert milliradians.min() < MIN_REST_COUNTS < milliradians.max(), "the PUMA's encoders are coarse at the wrist"
     assert rest_counts(MODEL) == pytest.approx(np.maximum(milliradians, MIN_REST_COUNTS))
     fine = dataclasses.replace(MODEL, units_per_q=100 * MODEL.units_per_q)
     assert rest_counts(fine) == pytest.approx(100 * milliradians)
-
-
-def test_a_start_and_a_stop_are_believed():
-    """A drive of 30 Hz behind a ramp that begins and ends at once: x'' = ω²(r − x) − 2 ζ ω x'."""
-    omega, dt, x, v = 188.0, 2.5e-3, 0.0, 0.0
-    track, reference = PositionTrack(BASE), 0.0
-    for k in range(200):
-        step = 40.0 if 50 <= k < 120 else 0.0
-        track.aim(step, 1)
-        for _ in range(50):
-            reference += step / 50
-            a = omega**2 * (reference - x) - 2 * 0.9 * omega * v
-            v += a * dt / 50
-            x += v * dt / 50
-        assert track.take(round(x), k, k * PERIOD, guarded=True), k
-    assert track.counts == pytest.approx(40 * 70, abs=1)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -22,7 +22,7 @@ class Motor:
         self.x = self.v = 0.0
         self.damping = damping
         self.w = 2.0 * damping / lag_s if lag_s else math.inf
-        self.period_s, self.share, self.stands = period_s, 1.0, False
+        self.period_s, self.stands = period_s, False
         self.reference = [0.0] * 3
 
     def step(self, target):
@@ -36,7 +36,7 @@ class Motor:
         n = 50
         for k in range(n):
             r = begin + (end - begin) * (k + 1) / n
-            self.v += (self.w**2 * (self.share * r - self.x) - 2.0 * self.damping * self.w * self.v) * self.period_s / n
+            self.v += (self.w**2 * (r - self.x) - 2.0 * self.damping * self.w * self.v) * self.period_s / n
             self.x += self.v * self.period_s / n
         return round(self.x)
 
@@ -113,12 +113,6 @@ def test_a_motor_that_stands_is_found_before_it_is_far_behind(speed, within_s, l
     targets = speed * COUNTS_PER_RAD * np.clip(t - 0.2, 0.0, None)
     cycles = found(Motor(lag_s), targets, stands_at=300) - 300
     assert 0 <= cycles * PERIOD_NS * 1e-9 <= within_s
-
-
-def test_a_motor_at_half_of_its_speed_is_found():
-    half = Motor(LAG_S)
-    half.share = 0.5
-    assert found(half, motions()["a ramp"]) * PERIOD_NS * 1e-9 < 0.2 + 0.04
 
 
 def test_a_drive_that_stands_beside_its_target_by_its_load_follows():

@@ -34,6 +34,10 @@ BEYOND = 0.01
 """Of its range, how far behind the end of a joint the limit switches of the plant are."""
 
 
+WORD, MODE, SPEED = "2b406000", "2f606000", "23816000"
+"""How writes of controlword, mode of operation and profile velocity begin."""
+
+
 def switch(joint, method):
     """Where the switch of a method is, deg."""
     beyond = BEYOND * (joint.max_deg - joint.min_deg)
@@ -57,10 +61,23 @@ def scene_of_make(make, folder, method, **keys):
     return change(scene_of([method], **keys), arm=arm, cycle={"rate_hz": 333.333})
 
 
+class Answering:
+    """A drive that answers as a function of it and a frame does."""
+
+    def __init__(self, node, answer):
+        self._node, self._answer = node, answer
+
+    def __getattr__(self, name):
+        return getattr(self._node, name)
+
+    def receive(self, can_id, data, t_ns):
+        return self._answer(self._node, can_id, data, t_ns)
+
+
 class Bench:
     """Real drives, as far as the cell can see: on a bus that outlives the cells."""
 
-    def __init__(self, scene, folder, *, faults=(), around=lambda node: node):
+    def __init__(self, scene, folder, *, faults=(), answer=None):
         self.plan = canprobe.plan(scene)
         self.bus = LockstepBus(VirtualClock(), "can0")
         self.world = make_world(self.plan, self.plan.node_ids, truth=False, homed=False)
@@ -68,7 +85,7 @@ class Bench:
         self.heard, self.said = [], []
         self.bus.recorder = lambda *frame: self.heard.append(frame)
         for node in self.world.nodes:
-            self.bus.attach(FaultyNode(node, faults) if faults else around(node))
+            self.bus.attach(FaultyNode(node, faults) if faults else Answering(node, answer) if answer else node)
 
     @property
     def frames(self):
@@ -93,9 +110,10 @@ class Bench:
             cell.run(controller)
         return seen[-1], self.world.plant.truth()["q"]
 
-    def words(self, node_id):
-        """Controlwords that a drive got by SDO."""
-        return [data[4] for i, data in self.frames if i == 0x600 + node_id and data[:4].hex() == "2b406000"]
+    def written(self, node_id, request):
+        """Values that a drive got by SDO, by the beginning of the request."""
+        frames = [data for can_id, data in self.frames if can_id == 0x600 + node_id and data[:4].hex() == request]
+        return [int.from_bytes(data[4:], "little") for data in frames]
 
     def states(self):
         return {node.application.state for node in self.world.nodes}
@@ -109,10 +127,7 @@ def test_homed_joints_are_where_the_cell_has_them_stay_known_and_inside_their_ra
     assert all("is homed" in told for told in bench.home())
     stands = getattr(next(iter(scene.joints.values())), end) + inward * (scene.limits.joint_margin_deg + 1.0)
     assert np.degrees(bench.world.plant.truth()["q"][0]) == pytest.approx(stands, abs=0.05)
-    modes = {
-        i: [d[4] for can_id, d in bench.frames if can_id == 0x600 + i and d[:4].hex() == "2f606000"] for i in (1, 2)
-    }
-    assert modes == {1: [8, 6, 8, 1, 8], 2: [8, 6, 8]}
+    assert [bench.written(node_id, MODE) for node_id in (1, 2)] == [[8, 6, 8, 1, 8], [8, 6, 8]]
     for _ in range(2):
         q, truth = bench.run()
         assert q == pytest.approx(truth, abs=2e-4)
@@ -128,7 +143,7 @@ def test_homing_leaves_a_drive_in_profile_position_as_quick_as_it_was(tmp_path):
     bench = Bench(scene, tmp_path)
     assert "inside its range" in bench.home()[0]
     wanted = [write.value for write in bench.plan.nodes[0].writes if write.index == 0x6081]
-    written = [int.from_bytes(d[4:], "little") for i, d in bench.frames if i == 0x601 and d[:4].hex() == "23816000"]
+    written = bench.written(1, SPEED)
     assert written[0] == written[-1] == wanted[0] and len(written) == 3
 
 
@@ -324,7 +339,7 @@ def test_a_switch_that_is_never_found(tmp_path, monkeypatch):
     monkeypatch.setattr(Plant, "limit_switches", lambda *_: (-np.inf, np.inf))
     bench = Bench(scene_of([17], homing_timeout_s=5.0), tmp_path)
     assert failure(bench) == ("node 1: (joint 1) did not find its home position by method 17 in 5 s (homing_timeout_s)")
-    assert bench.words(1)[-1] == 0x02
+    assert bench.written(1, WORD)[-1] == 0x02
     assert "joint 1 is stopped and disabled; it is not homed" in bench.said
 
 
@@ -336,31 +351,37 @@ def test_a_homing_error_of_the_drive(tmp_path, monkeypatch):
     )
 
 
-class Turned:
-    """A drive that takes the home offset with the other sign."""
+def turned(node, can_id, data, t_ns):
+    """It takes the home offset with the other sign."""
 
-    def __init__(self, node):
-        self._node = node
+    def other_sign(frame):
+        return frame[:4] + struct.pack("<i", -struct.unpack("<i", frame[4:])[0])
 
-    def __getattr__(self, name):
-        return getattr(self._node, name)
-
-    def receive(self, can_id, data, t_ns):
-        written = data[:4].hex() == "237c6000"
-        data = data[:4] + struct.pack("<i", -struct.unpack("<i", data[4:])[0]) if written else data
-        answers = self._node.receive(can_id, data, t_ns)
-        read = [(i, d) for i, d in answers if d[1:4].hex() == "7c6000" and d[0] >> 5 == 2]
-        turned = [(i, d[:4] + struct.pack("<i", -struct.unpack("<i", d[4:])[0])) for i, d in read]
-        return turned or answers
+    answers = node.receive(can_id, other_sign(data) if data[:4].hex() == "237c6000" else data, t_ns)
+    return [(i, other_sign(d) if d[1:4].hex() == "7c6000" and d[0] >> 5 == 2 else d) for i, d in answers]
 
 
-def test_a_drive_that_takes_the_home_offset_the_other_way_round(tmp_path):
-    bench = Bench(scene_of([35]), tmp_path, around=Turned)
-    assert re.fullmatch(
-        r"node 1: \(joint 1\) homed, but is at -(\d+) \(6064h\) where \1 was expected, with 607Ch = -\1: the drive may"
-        " count the home offset the other way round",
-        failure(bench),
-    )
+def deaf(node, can_id, data, t_ns):
+    """It confirms the command to enable operation and does not follow it."""
+    if (can_id, data[:5].hex()) == (0x601, "2b4060000f"):
+        return [(0x581, bytes.fromhex("6040600000000000"))]
+    return node.receive(can_id, data, t_ns)
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (
+            turned,
+            r"homed, but is at -(\d+) \(6064h\) where \1 was expected, with 607Ch = -\1: the drive may count the home"
+            " offset the other way round",
+        ),
+        (deaf, r"is SWITCHED_ON \d+ s after the command for OPERATION_ENABLED"),
+    ],
+)
+def test_a_drive_that_does_otherwise_than_it_confirms_is_named(tmp_path, answer, told):
+    bench = Bench(scene_of([35]), tmp_path, answer=answer)
+    assert re.fullmatch(rf"node 1: \(joint 1\) {told}", failure(bench))
 
 
 def test_without_profile_position_the_joint_is_left_at_its_switch(tmp_path):
@@ -378,8 +399,7 @@ def test_the_speed_of_the_way_back_is_written_in_the_unit_of_the_drive(tmp_path)
     scene = scene_of_make(make, tmp_path, 18, homing_speed_deg_s=90.0)
     bench = Bench(scene, tmp_path)
     bench.home()
-    (speed,) = [struct.unpack("<I", d[4:])[0] for i, d in bench.frames if i == 0x601 and d[:4].hex() == "23816000"]
-    assert speed == round(90 / 360 * 60 * scene.joints["joint_1"].gear)
+    assert bench.written(1, SPEED) == [round(90 / 360 * 60 * scene.joints["joint_1"].gear)]
 
 
 def test_a_drive_whose_position_window_is_switched_off_is_inside_its_range_in_the_next_run(tmp_path):
@@ -402,21 +422,6 @@ def test_a_drive_that_was_out_of_sight_is_not_homed_whatever_it_says(tmp_path):
         cell.__enter__()
     assert json.loads(bench.record.read_text())["nodes"].keys() == {"2"}
     assert refusal(bench).startswith("node 1: (joint 1) is not homed")
-
-
-class Deaf(Turned):
-    """A drive that confirms the command to enable operation and does not follow it."""
-
-    def receive(self, can_id, data, t_ns):
-        if (can_id, data[:5].hex()) == (0x601, "2b4060000f"):
-            return [(0x581, bytes.fromhex("6040600000000000"))]
-        return self._node.receive(can_id, data, t_ns)
-
-
-def test_a_drive_that_is_not_enabled_for_homing_is_named_with_its_state(tmp_path):
-    bench = Bench(scene_of([35]), tmp_path, around=Deaf)
-    told = r"node 1: \(joint 1\) is SWITCHED_ON \d+ s after the command for OPERATION_ENABLED"
-    assert re.fullmatch(told, failure(bench))
 
 
 class Once(Participant):
@@ -468,25 +473,18 @@ def test_a_record_is_gone_before_the_drive_moves(tmp_path):
     assert kept == [{}] and json.loads(bench.record.read_text())["nodes"].keys() == {"1"}
 
 
-class Odd(Turned):
-    """A drive whose statusword is that of no state, the first times that it is asked for it."""
+def test_a_drive_in_no_known_state_is_given_no_voltage_before_it_is_homed(tmp_path):
+    odd = iter([b"\x01\x06"] * 2)
 
-    def __init__(self, node):
-        super().__init__(node)
-        self._left = 2 * (node.node_id == 1)
-
-    def receive(self, can_id, data, t_ns):
-        answers = self._node.receive(can_id, data, t_ns)
-        if self._left and data[:4].hex() == "40416000":
-            self._left -= 1
-            return [(i, d[:4] + b"\x01\x06\0\0") for i, d in answers]
+    def answer(node, can_id, data, t_ns):
+        answers = node.receive(can_id, data, t_ns)
+        if (can_id, data[:4].hex()) == (0x601, "40416000"):
+            return [(i, d[:4] + next(odd, d[4:6]) + d[6:]) for i, d in answers]
         return answers
 
-
-def test_a_drive_in_no_known_state_is_given_no_voltage_before_it_is_homed(tmp_path):
-    bench = Bench(scene_of([35]), tmp_path, around=Odd)
+    bench = Bench(scene_of([35]), tmp_path, answer=answer)
     bench.home()
-    assert bench.words(1)[:3] == [0x00, 0x00, 0x06]
+    assert bench.written(1, WORD)[:3] == [0x00, 0x00, 0x06]
 
 
 def test_a_drive_that_does_not_say_where_it_is_left_keeps_no_record_and_the_others_theirs(tmp_path):

@@ -64,14 +64,6 @@ def test_a_column_has_the_shape_of_its_first_number_and_rows_before_it_are_nan()
     assert "c" not in log.columns(), "none of the rows that are kept has it"
 
 
-def test_a_controller_may_write_into_what_it_gave():
-    log, value = RunLog(), np.zeros(2)
-    for k in range(3):
-        value[:] = k
-        log.add({"a": value, "b": k if k else None})
-    np.testing.assert_array_equal(log.arrays()["a"], [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
-
-
 # What is lived with is told once a kind, with how often, to whom and when.
 
 

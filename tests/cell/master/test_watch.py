@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 
-from canprobe.cell.master.watch import MAX_NEW_ALARMS, NodeWatch
+from canprobe.cell.master.watch import NodeWatch
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
 
@@ -19,10 +17,6 @@ def told(watch: NodeWatch, node_id: int, code: int) -> None:
 
 def a_watch() -> NodeWatch:
     return NodeWatch((1, 2))
-
-
-def size_of(watch: NodeWatch) -> int:
-    return sum(sys.getsizeof(value) for value in vars(watch).values())
 
 
 def test_a_device_error_is_found_among_many_about_frames():
@@ -65,21 +59,6 @@ def test_what_a_device_said_before_the_start_is_over():
     assert watch.device_alarm is None and not watch.alarmed
     assert [event.emcy.code for event in watch.news()] == [OVERHEATED]  # but it is told
     assert watch.news() == []
-
-
-def test_memory_does_not_grow_with_what_is_said():
-    watch = a_watch()
-    for _ in range(MAX_NEW_ALARMS):
-        told(watch, 1, SYNC_LOST)
-        watch.push(0x80, b"", 0)
-    before = size_of(watch)
-    for _ in range(10_000):
-        told(watch, 1, SYNC_LOST)
-        watch.push(0x80, b"", 0)
-        watch.push(HEARTBEAT_BASE + 1, b"\x05", 0)
-    assert size_of(watch) <= before + 1000  # numbers have grown by a digit, a table by its first entry
-    assert len(watch.news()) == MAX_NEW_ALARMS
-    assert watch.foreign == "SYNC from another master"
 
 
 def state(watch: NodeWatch, node_id: int, code: int, t_ns: int = 0) -> bool:

@@ -32,21 +32,17 @@ from canprobe.mechanics.robot.model import ArmModel, joints_to_units
 REPORTED = "by its encoders the arm stands at"
 
 
-class Obeying:
-    """A drive that makes `factor` of every way it is told to go, and tells the truth about it."""
+class Hearing:
+    """A drive that gets the data of each frame as a function of identifier and data gives them."""
 
-    def __init__(self, node, factor):
-        self._node, self._factor, self._start = node, factor, None
+    def __init__(self, node, change):
+        self._node, self._change = node, change
 
     def __getattr__(self, name):
         return getattr(self._node, name)
 
     def receive(self, can_id, data, t_ns):
-        if can_id == 0x200 + self._node.node_id:
-            word, target = struct.unpack("<Hi", data)
-            self._start = target if self._start is None else self._start
-            data = struct.pack("<Hi", word, round(self._start + self._factor * (target - self._start)))
-        return self._node.receive(can_id, data, t_ns)
+        return self._node.receive(can_id, self._change(can_id, data), t_ns)
 
 
 class Watcher:
@@ -145,7 +141,17 @@ def assert_disabled(session):
 
 def test_drives_that_turn_the_wrong_way_are_named_by_their_encoders_or_by_who_watches(cell):
     """607Eh turns target and feedback round together: the arm moves the other way, and the numbers agree."""
-    wrong = {2: lambda node: Obeying(node, -1.0), 3: flip}
+    first = []
+
+    def reverse(can_id, data):
+        """Each way that it is told to go from its first target."""
+        if can_id != 0x202:
+            return data
+        word, target = struct.unpack("<Hi", data)
+        first.append(target)
+        return struct.pack("<Hi", word, 2 * first[0] - target)
+
+    wrong = {2: lambda node: Hearing(node, reverse), 3: flip}
     cell.joins = lambda one: wrong.get(getattr(one, "node_id", None), lambda node: node)(one)
     cell.operator, said = Watcher(), []
     told = (
@@ -354,15 +360,12 @@ def test_what_presses_on_the_array_stops_the_joint_and_is_named(cell):
     touching = canprobe.load_scene("press", {"cycle.rate_hz": 200.0, "bus.timed": False})
     forces, said = [], []
 
-    class Noting(Obeying):
-        """A drive beside which the true force is noted at each SYNC."""
+    def noting(can_id, data):
+        if can_id == SYNC_ID:
+            forces.append(cell.session.buses.world.plant.truth()["force"])
+        return data
 
-        def receive(self, can_id, data, t_ns):
-            if can_id == SYNC_ID:
-                forces.append(cell.session.buses.world.plant.truth()["force"])
-            return self._node.receive(can_id, data, t_ns)
-
-    cell.operator, cell.joins = Watcher({1}), on_node(1, lambda node: Noting(node, 1.0))
+    cell.operator, cell.joins = Watcher({1}), on_node(1, lambda node: Hearing(node, noting))
     pressed = r"the array showed 0\.\d+ N while joint 2 moved alone, and it went back"
     with pytest.raises(SafetyStop, match=f"^{pressed}: move the arm away"):
         canprobe.api.check_joints(touching, operator=cell.operator, say=said.append)
