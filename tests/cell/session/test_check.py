@@ -74,39 +74,40 @@ def test_nodes_are_left_as_they_were_found_and_no_drive_is_enabled():
     cell.assert_left_as_found()
 
 
-@pytest.mark.parametrize("share", [0.2, 0.6, 0.8])
-def test_a_check_that_is_interrupted_leaves_the_nodes_as_they_were_found(share, monkeypatch):
+def test_a_check_that_is_interrupted_leaves_the_nodes_as_they_were_found(monkeypatch):
     """Ctrl-C in a call of the port: while listening, reading, configuring, cycling, putting back."""
     monkeypatch.setattr("canprobe.cell.session.check.IDLE_S", 0.01)
-    calls = 0
 
-    def counted(cell, most):
-        nonlocal calls
-        calls, around = 0, cell.session.around
+    def calls_of_a_check(at=None):
+        """Number of calls of the port; one of them is interrupted, and what is put back then ends all the same."""
+        cell, calls = FoundCell("free", **{"bus.timed": False}), 0
+        around = cell.session.around
+
+        def counted(method):
+            def call(*arguments):
+                nonlocal calls
+                calls += 1
+                if calls == at:
+                    raise KeyboardInterrupt
+                return method(*arguments)
+
+            return call
 
         def wrapped(port):
             port = around(port)
             for name in ("send_batch", "drain", "wait"):
-                method = getattr(port, name)
-
-                def call(*arguments, method=method):
-                    nonlocal calls
-                    calls += 1
-                    if calls == most:
-                        raise KeyboardInterrupt
-                    return method(*arguments)
-
-                setattr(port, name, call)
+                setattr(port, name, counted(getattr(port, name)))
             return port
 
         cell.session.around = wrapped
-        return cell
+        with contextlib.suppress(KeyboardInterrupt):
+            measure_link(cell.session, 0.05)
+        cell.assert_left_as_found()
+        return calls
 
-    measure_link(counted(FoundCell("free", **{"bus.timed": False}), -1).session, 0.05)
-    cell = counted(FoundCell("free", **{"bus.timed": False}), round(share * calls))
-    with contextlib.suppress(KeyboardInterrupt):  # one while it puts back is held until that is done
-        measure_link(cell.session, 0.05)
-    cell.assert_left_as_found()
+    most = calls_of_a_check()
+    for share in (0.2, 0.6, 0.8):
+        calls_of_a_check(round(share * most))
 
 
 def test_an_array_that_sends_no_image_is_not_fit():
