@@ -26,11 +26,11 @@ ENABLED = DriveState.OPERATION_ENABLED.value
 NAN = float("nan")
 
 
-def make_group(torque=range(1, 7), transmission=1, repeat=40):
+def make_group(torque=range(1, 7), target=TARGET, transmission=1, repeat=40, **options):
     axes = []
     for i in range(1, 7):
         feedback = PdoLayout(0x180 + i, (STATUS, POSITION, TORQUE) if i in torque else (STATUS, POSITION))
-        axes.append(DriveAxis(i, (feedback,), (PdoLayout(0x200 + i, (WORD, TARGET), transmission),)))
+        axes.append(DriveAxis(i, (feedback,), (PdoLayout(0x200 + i, (WORD, target), transmission),), **options))
     return DriveGroup(tuple(axes), MODEL, repeat)
 
 
@@ -81,39 +81,32 @@ def test_a_fault_reset_that_did_not_take_gets_a_new_edge():
 
 # Drives of other makes: several PDOs each way, more in them than is needed, interpolated position.
 
-SPEED, MODE = PdoEntry(0x6081, 0, 32), PdoEntry(0x6061, 0, 8, True)
-RECORD = PdoEntry(0x60C1, 1, 32, True)
 
-
-def one_kind(feedback, commands, **options):
-    """Six drives whose TPDOs and RPDOs map these entries each."""
+def test_feedback_in_two_tpdos_and_values_that_nobody_reads():
+    speed, mode = PdoEntry(0x6081, 0, 32), PdoEntry(0x6061, 0, 8, True)
     axes = [
         DriveAxis(
             i,
-            tuple(PdoLayout(0x180 + 0x100 * k + i, entries) for k, entries in enumerate(feedback)),
-            tuple(PdoLayout(0x200 + 0x100 * k + i, entries) for k, entries in enumerate(commands)),
-            **options,
+            (PdoLayout(0x180 + i, (STATUS, mode)), PdoLayout(0x280 + i, (mode, POSITION, TORQUE))),
+            (PdoLayout(0x200 + i, (WORD,)), PdoLayout(0x300 + i, (TARGET, speed))),
+            constants={(0x6081, 0): 9},
         )
         for i in range(1, 7)
     ]
-    return DriveGroup(tuple(axes), MODEL)
+    group = DriveGroup(tuple(axes), MODEL)
 
+    def send(k, *values):
+        for axis in axes:
+            group.push(axis.feedback[k].cob_id, axis.feedback[k].pack(*values))
 
-def send(group, k, *values):
-    for axis in group.axes:
-        group.push(axis.feedback[k].cob_id, axis.feedback[k].pack(*values))
-
-
-def test_feedback_in_two_tpdos_and_values_that_nobody_reads():
-    group = one_kind([(STATUS, MODE), (MODE, POSITION, TORQUE)], [(WORD,), (TARGET, SPEED)], constants={(0x6081, 0): 9})
     group.begin(0)
-    send(group, 0, ENABLED, 8)
+    send(0, ENABLED, 8)
     assert not group.complete and not group.heard_all and group.targets.frames() == []
-    send(group, 1, 8, -55, 7)
+    send(1, 8, -55, 7)
     assert group.complete and group.enabled and group.torque_permille == [7] * 6
     assert dict(group.targets.frames())[0x301] == (-55).to_bytes(4, "little", signed=True) + (9).to_bytes(4, "little")
     group.begin(1)
-    send(group, 1, 8, -55, 7)
+    send(1, 8, -55, 7)
     group.end_collect()
     assert group.missed == 6 and group.ages() == (0,) * 6
 
@@ -141,12 +134,11 @@ def test_no_rpdo_goes_to_a_drive_that_was_never_heard():
 
 
 def test_interpolated_position_sets_bit_4_while_operation_is_enabled():
-    group = one_kind([(STATUS, POSITION)], [(WORD, RECORD)], mode=OperationMode.INTERPOLATED_POSITION)
-    words = []
-    states = [0x40, 0x21, 0x23, 0x27, 0x27]
-    for cycle, status in enumerate(states):
+    record = PdoEntry(0x60C1, 1, 32, True)
+    group, words = make_group(torque=(), target=record, mode=OperationMode.INTERPOLATED_POSITION), []
+    for cycle, status in enumerate([0x40, 0x21, 0x23, 0x27, 0x27]):
         group.begin(cycle)
-        send(group, 0, status, 5)
+        hear(group, [5] * 6, status)
         frame = group.targets.frames()[0][1]
         words.append(int.from_bytes(frame[:2], "little"))
         assert frame[2:] == (5).to_bytes(4, "little")

@@ -84,7 +84,7 @@ def motions(period_s=PERIOD_NS * 1e-9):
     }
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 2e-3, LAG_S, 2.0 * LAG_S])
+@pytest.mark.parametrize("lag_s", [0.0, LAG_S, 2.0 * LAG_S])
 @pytest.mark.parametrize("what", motions())
 def test_a_drive_with_any_lag_up_to_twice_the_stated_one_follows(what, lag_s):
     assert found(Motor(lag_s), motions()[what]) is None
@@ -138,7 +138,7 @@ def test_after_a_stall_of_the_master_the_drives_begin_from_rest(stall_ns):
         counts = motor.step(round(target))
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 2e-3, LAG_S, 1.5 * LAG_S])
+@pytest.mark.parametrize("lag_s", [0.0, 1.5 * LAG_S])
 @pytest.mark.parametrize("what", motions())
 def test_drives_follow_a_master_whose_every_sync_is_up_to_nearly_half_a_period_late(what, lag_s):
     rng = np.random.default_rng(11)

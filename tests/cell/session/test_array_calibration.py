@@ -182,7 +182,8 @@ def own_array(tmp_path_factory):
     folder = tmp_path_factory.mktemp("own")
     (folder / "mine.toml").write_text(packaged_files("calibrations")["inch16"].read_text())
     text = packaged_files("cells")["puma260"].read_text()
-    (folder / "cell.toml").write_text(text.replace("[sensor]\n", '[sensor]\ncalibration = "mine.toml"\n'))
+    text = text.replace("[sensor]\n", '[sensor]\ncalibration = "mine.toml"\n')
+    (folder / "cell.toml").write_text(text + "\n[cycle]\nrate_hz = 200.0\n")
     return folder
 
 
