@@ -20,6 +20,8 @@ from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 class Nodes(Participant):
     """The nodes of the process: they say nothing until they boot, all but ``silent``; `beside` comes before that."""
 
+    next_deadline_ns = None
+
     def __init__(self, boots_ns, silent=None, beside=()):
         self.next_deadline_ns = boots_ns
         self._frames = [*beside, *((0x700 + node_id, b"\0") for node_id in range(1, 7) if node_id != silent)]

@@ -140,11 +140,10 @@ def turn_z(angle):
 @pytest.mark.parametrize(
     ("way", "fidelity", "eds"),
     [
-        ({"along": (0, 0, 1), "in_probe_frame": True, "velocity": 0.1, "for_s": 1.0}, "ideal", None),
-        ({"joint": 3, "velocity": 0.5, "for_s": 1}, "dynamic", None),
+        ({"along": (0, 0, 1), "in_probe_frame": True, "velocity": 0.1, "for_s": 1.0}, "dynamic", None),
         ({"joint": 3, "velocity": 0.5, "for_s": 1}, "ideal", "no_cyclic_mode"),
     ],
-    ids=["probe", "joint 3", "profile position"],
+    ids=["probe", "profile position"],
 )
 def test_a_jog_goes_back_from_what_it_touches_at_half_of_the_limit(way, fidelity, eds, tmp_path, monkeypatch):
     monkeypatch.setattr(make, "operation_problems", lambda *_: [])  # the emulated array has its object in a press alone
