@@ -315,7 +315,7 @@ def test_drives_that_are_stopped_get_a_quick_stop_at_once_and_the_others_go_on()
         group.begin(cycle)
         hear(group, [0] * 6)
         words.append([int.from_bytes(data[:2], "little") for _, data in group.targets.frames()])
-    assert words[:3] == [[0x0F] * 6] * 3
+    assert group.enabled_ones() == (True,) * 6 and words[:3] == [[0x0F] * 6] * 3
     assert words[3] == [0x0F, 0x02, 0x0F, 0x0F, 0x02, 0x0F]
     assert words[4] == [0x00] * 6, "the way out is for all"
 
